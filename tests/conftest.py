@@ -76,3 +76,39 @@ def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixtur
     yield caplog
     # a stream that this test had is closed then
     LOGGER.handlers[:], LOGGER.propagate = handlers, propagate
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The runs folder of a test that works in its own folder; it is not made yet."""
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def said(capsys):
+    """A function that runs a command line, which must succeed, and returns what it prints."""
+    from gsbench.cli import run
+
+    def call(*words: object) -> str:
+        capsys.readouterr()
+        assert run([*map(str, words)]) == 0
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def refused(capsys):
+    """A function that runs a command line, which must be refused, and returns the line of why."""
+    from gsbench.cli import run
+
+    def call(*words: object) -> str:
+        capsys.readouterr()
+        assert run([*map(str, words)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("gsbench: ")
+        return line
+
+    return call

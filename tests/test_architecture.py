@@ -57,6 +57,7 @@ ONLY = {
 }
 
 Graph = Mapping[str, set[str]]
+TYPES_ONLY = "if TYPE_CHECKING:\n    {}\nelse:\n    pass"
 
 
 def modules() -> dict[str, Path]:
@@ -68,33 +69,37 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports_of(path: Path, inside_functions: bool = True) -> Iterator[str]:
-    """The dotted names that a file imports anywhere but for type checkers: modules, or names in
-    them."""
+def imports_of(path: Path, inside_functions: bool = True, for_types: bool = False) -> Iterator[str]:
+    """The dotted names that a file imports: modules, or names in them.
+
+    ``for_types`` includes the imports that only type checkers run.
+    """
     pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        types_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if isinstance(node, ast.If) and types_only and not for_types:
             pending += node.orelse
             continue
         if not inside_functions and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}: relative imports hide circles from these tests"
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         pending += ast.iter_child_nodes(node)
 
 
 @functools.cache
-def arrows(inside_functions: bool = True) -> dict[str, set[str]]:
+def arrows(inside_functions: bool = True, for_types: bool = False) -> dict[str, set[str]]:
     """For each module of gsbench, the modules of gsbench that it imports, and the names of foreign
     packages."""
     known = modules()
     graph: dict[str, set[str]] = {}
     for name, path in known.items():
         graph[name] = set()
-        for target in imports_of(path, inside_functions):
+        for target in imports_of(path, inside_functions, for_types):
             if not f"{target}.".startswith("gsbench."):
                 graph[name].add(target.split(".")[0])
             else:
@@ -183,9 +188,29 @@ def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
     return []
 
 
-def test_no_circle_of_modules() -> None:
-    found = circle(arrows())
+def test_no_circle_of_files() -> None:
+    """Imports for type checkers count: a reader follows them, too."""
+    found = circle(arrows(for_types=True))
     assert not found, f"{' imports '.join(found)}: the last of these imports closes a circle"
+
+
+@pytest.mark.parametrize(
+    "back", ["{}", "def later():\n    {}", "class A:\n    def later(self):\n        {}", TYPES_ONLY]
+)
+def test_a_planted_circle_of_files_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, back: str
+) -> None:
+    (tmp_path / "init").mkdir()
+    for name, text in {
+        "__init__": "",
+        "init/__init__": "",
+        "init/sfm": "from gsbench.init import report",
+        "init/report": back.format("from gsbench.init.sfm import Sfm"),
+    }.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.setattr("tests.test_architecture.PACKAGE", tmp_path)
+    found = circle(arrows.__wrapped__(for_types=True))
+    assert found == ["gsbench.init.report", "gsbench.init.sfm", "gsbench.init.report"]
 
 
 def test_no_circle_of_folders() -> None:

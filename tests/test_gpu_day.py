@@ -1,5 +1,7 @@
-"""scripts/gpu_day.sh without a GPU: no line of it may fail for the first time where time is
-short."""
+"""scripts/gpu_day.sh without a GPU.
+
+No line of it may fail for the first time where time is short.
+"""
 
 from __future__ import annotations
 
@@ -233,8 +235,7 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
 
 
 def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
-    """The packages, and the scene without tracks, of which a training takes the same points in
-    order."""
+    """The packages and the trackless scene, of which a training takes the same points."""
     from gsbench.scene.colmap import model_points, read_reference
     from gsbench.scene.readers import read_colmap
 

@@ -1,5 +1,7 @@
-"""Values are held against the annotations of dataclasses, gsbench's and a user's, in a line that
-names the key."""
+"""Values are held against the annotations of dataclasses, gsbench's and a user's.
+
+The line names the key.
+"""
 
 from __future__ import annotations
 
@@ -136,8 +138,10 @@ def test_library_callers_get_the_same_errors(make: Any, key: str) -> None:
 
 @dataclass
 class Own(ADC):
-    """A user's class: its own fields carry no rule but their type, and its author knows nothing of
-    this module."""
+    """A user's class.
+
+    Its own fields carry no rule but their type, and its author knows nothing of this module.
+    """
 
     patience: int = 5
 

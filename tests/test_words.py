@@ -1,5 +1,7 @@
-"""Every word on the command line is understood, or refused before any work: exit code 2 and one
-line that says why."""
+"""Every word on the command line is understood, or refused before any work.
+
+Exit code 2 and one line that says why.
+"""
 
 from __future__ import annotations
 
@@ -242,11 +244,7 @@ def test_no_setting_is_a_question(
 
 
 @pytest.mark.parametrize(
-    "command",
-    [
-        "check {} --dry-run allow_targets=[x]",
-        "check --dry-run allow_targets=[x] {}",
-    ],
+    "command", ["check {} --dry-run allow_targets=[x]", "check --dry-run allow_targets=[x] {}"]
 )
 def test_permission_counts_wherever_it_stands(
     command: str, capsys: pytest.CaptureFixture[str]

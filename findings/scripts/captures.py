@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +46,9 @@ MODEL = Path("sparse", "0")
 MOST_POINTS = 6000  # about what the smaller captures have
 
 
-def prepare(data: Path, out: Path) -> None:
-    """Write ``OUT/CAPTURE/{images,sparse/0}`` for each of `CAPTURES` that ``data`` holds; images
-    are a link."""
-    for name in CAPTURES:
+def prepare(data: Path, out: Path, names: Iterable[str] = CAPTURES) -> None:
+    """Write ``OUT/CAPTURE/{images,sparse/0}`` for each of ``names``; images are a link."""
+    for name in names:
         source, target = (data / name).resolve(), out / name
         if not source.is_dir() or (target / MODEL).is_dir():
             print(f"{name}: {'nothing in ' + str(data) if not source.is_dir() else 'is there'}")

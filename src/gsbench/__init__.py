@@ -1,5 +1,7 @@
-"""gsbench tests whether an idea helps 3D Gaussian Splatting. Photographs in; tables, statistics and
-pictures out."""
+"""gsbench tests whether an idea helps 3D Gaussian Splatting.
+
+Photographs in; tables, statistics and pictures out.
+"""
 
 import os
 import sys

@@ -20,8 +20,10 @@ MAX_PAUSE_SECONDS = 30.0
 
 
 class FetchError(GsbenchError):
-    """Error of the network or the server (exit code 1). The same command continues where it
-    stopped."""
+    """Error of the network or the server (exit code 1).
+
+    The same command continues where it stopped.
+    """
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,7 @@ class RetryPolicy:
 
 
 def with_retries(action: Callable[[], T], url: str, policy: RetryPolicy) -> T:
-    """The result of ``action``, which requests ``url`` and is repeated after failures of the
-    network.
+    """The result of ``action``, a request for ``url`` that is repeated after failures.
 
     Raises `InputError` for a permanent refusal by the server, and `FetchError` after the last try.
     """
@@ -105,8 +106,7 @@ def download(
 
 
 def _reason(error: Exception) -> str:
-    """The innermost cause of an error of requests, which wraps errors of urllib3, in a few
-    words."""
+    """The innermost cause, in a few words, of an error of requests, which wraps others."""
     import requests
     import urllib3
 

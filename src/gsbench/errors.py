@@ -2,8 +2,10 @@
 
 
 class GsbenchError(Exception):
-    """Base of all errors that gsbench raises on purpose. The message is one line: the cause, then
-    the remedy."""
+    """Base of all errors that gsbench raises on purpose.
+
+    The message is one line: the cause, then the remedy.
+    """
 
 
 class InputError(GsbenchError, ValueError):

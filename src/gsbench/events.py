@@ -10,10 +10,10 @@ from typing import ClassVar
 
 
 class Cause(IntEnum):
-    """Cause of a Gaussian's existence: its number in ``lineage.npz``, words, and a colour (r, g, b)
-    for pictures.
+    """Cause of a Gaussian's existence.
 
-    The colours are from Okabe and Ito (2008), so that colour-blind people can distinguish them.
+    Its number in ``lineage.npz``, words, and a colour (r, g, b) for pictures. The colours are from
+    Okabe and Ito (2008), so that colour-blind people can distinguish them.
     """
 
     words: str

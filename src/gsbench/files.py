@@ -33,8 +33,7 @@ NEARLY_NOTHING = 64 * 1024  # free bytes; with less, any failed write counts as 
 
 
 class DiskFullError(GsbenchError):
-    """Raised if the disk of the runs folder is full, so that no trial can continue (exit code
-    1)."""
+    """Raised if the disk of the runs folder is full: no trial can continue (exit code 1)."""
 
 
 @contextmanager
@@ -86,8 +85,10 @@ def writable_output(out: Path) -> Iterator[None]:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Make ``target`` a hard link to ``source``, or a copy where hard links do not work; replaces
-    ``target``."""
+    """Make ``target`` a hard link to ``source``, or a copy where hard links do not work.
+
+    Replaces ``target``.
+    """
     with atomic(target, sync=False) as temporary:
         try:
             os.link(source, temporary)
@@ -96,11 +97,10 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Open the regular file ``path`` and return its descriptor; a link as the last part is not
-    followed.
+    """Open the regular file ``path`` and return its descriptor.
 
-    Raises InputError for a link, a pipe or a device (whose reading may never end), and OSError as
-    `os.open` does.
+    A link as the last part is not followed. Raises InputError for a link, a pipe or a device (whose
+    reading may never end), and OSError as `os.open` does.
     """
     flags |= (
         getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -118,10 +118,10 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
 
 
 def require_no_links(runs: Path, place: Path, below: bool = False) -> None:
-    """Raise InputError if a part of the path from the folder ``runs`` to ``place`` is a link, a
-    pipe or a device.
+    """Raise InputError if a part of the path ``place`` is a link, a pipe or a device.
 
-    With ``below``, everything in the folder ``place`` is checked too. Missing parts are allowed.
+    Parts above the folder ``runs`` are not looked at. With ``below``, everything in the folder
+    ``place`` is checked too. Missing parts are allowed.
     """
     # A runs folder from someone else may hold links. Through them, a log would overwrite files
     # outside the folder, and packing or publishing would include such files.
@@ -158,8 +158,10 @@ def _no_plain_file(path: Path) -> InputError:
 
 
 def require_regular(path: Path) -> None:
-    """Raise InputError for a pipe, a device or a socket, whose reading may never end. A missing
-    file is allowed."""
+    """Raise InputError for a pipe, a device or a socket, whose reading may never end.
+
+    A missing file is allowed.
+    """
     with suppress(OSError):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
@@ -177,8 +179,10 @@ def sync_to_disk(path: Path) -> None:
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove temporary files of killed processes below ``folder``. No process may be writing
-    there."""
+    """Remove temporary files of killed processes below ``folder``.
+
+    No process may be writing there.
+    """
     for path in folder.rglob(".*"):
         if TEMPORARY.match(path.name) and path.is_file():
             with suppress(OSError):
@@ -226,8 +230,7 @@ def make_runs_folder(folder: Path) -> None:
 
 @contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of a full or read-only disk within the block into one line that names
-    ``folder``."""
+    """Turn errors of a full or read-only disk into one line that names ``folder``."""
     try:
         yield
     except Exception as error:

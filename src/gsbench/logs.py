@@ -20,8 +20,7 @@ LOGGER = logging.getLogger("gsbench")
 
 
 class _Printable(logging.Formatter):
-    """Makes log lines `printable`, because they may quote control characters from a file or a
-    program."""
+    """Makes log lines `printable`: they may quote control characters of others."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -57,8 +56,7 @@ def printable_output() -> Iterator[None]:
 
 
 class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
-    """Writes to the current ``sys.stderr``, which a calling program may have redirected since the
-    start."""
+    """Writes to the present ``sys.stderr``, which may have been redirected meanwhile."""
 
     def emit(self, record: logging.LogRecord) -> None:
         self.stream = sys.stderr
@@ -66,19 +64,17 @@ class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
 
 
 class _RootHandler(logging.Handler):
-    """Passes log lines on to the handlers that somebody else, such as Hydra, gave to the root
-    logger."""
+    """Passes log lines on to the root logger's handlers of somebody else, such as Hydra."""
 
     def emit(self, record: logging.LogRecord) -> None:
         logging.getLogger().handle(record)
 
 
 def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bool = False) -> None:
-    """Show gsbench's log lines of level INFO and above on stderr; ``through_root``: by the root
-    logger's handlers, too.
+    """Show gsbench's log lines of level INFO and above on stderr.
 
-    If one of these writes to the terminal, gsbench does not. ``verbose`` shows debug lines: True,
-    gsbench's; names of loggers, theirs.
+    ``through_root``: by the root logger's handlers, too. If one of these writes to the terminal,
+    gsbench does not. ``verbose`` shows debug lines: True, gsbench's; names of loggers, theirs.
     """
     names = (
         [verbose]
@@ -122,8 +118,7 @@ def _make_printable(record: logging.LogRecord) -> bool:
 
 @contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Also write everything that gsbench logs within the block, including tracebacks, to
-    ``path``."""
+    """Also write what gsbench logs within the block, with tracebacks, to ``path``."""
     handler = _QuietHandler(
         os.fdopen(open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a", encoding="utf-8")
     )

@@ -1,11 +1,11 @@
-"""The frame in which a scene is trained: the given coordinates, or moved to the origin and scaled
-to an ordinary size.
+"""The frame in which a scene is trained.
 
-3DGS has constants in world units: its near plane (0.2), the least distance between initial points,
-and the volume threshold of arXiv 2508.05187, "in the units of the COLMAP model". COLMAP leaves its
-models with the cameras around the origin, in a box with a diagonal of 10 units, so these constants
-fit such models. A capture in kilometres would lie before the near plane, and at UTM coordinates
-(5e5, 5.4e6) float32 has steps of half a metre.
+The given coordinates, or moved to the origin and scaled to an ordinary size. 3DGS has constants in
+world units: its near plane (0.2), the least distance between initial points, and the volume
+threshold of arXiv 2508.05187, "in the units of the COLMAP model". COLMAP leaves its models with the
+cameras around the origin, in a box with a diagonal of 10 units, so these constants fit such models.
+A capture in kilometres would lie before the near plane, and at UTM coordinates (5e5, 5.4e6) float32
+has steps of half a metre.
 
 So a model far from the origin, or of another order of size, is trained in COLMAP's frame. All
 results are given back in its own coordinates. Ordinary models are not touched, so their results
@@ -54,8 +54,10 @@ class Normalization:
 
     @property
     def is_far(self) -> bool:
-        """Return whether the scene's own coordinates need float64: it lies far from the origin for
-        its size."""
+        """Return whether the scene's own coordinates need float64.
+
+        It lies far from the origin for its size.
+        """
         return self.scale * max(map(abs, self.center)) > MAX_DISTANCE * COLMAP_SIZE
 
     def apply(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -75,14 +77,12 @@ IDENTITY = Normalization()
 
 
 def find_normalization(centers: ArrayLike) -> Normalization:
-    """Find the normalisation for a model with these camera ``centers`` [V, 3], by all cameras of
-    the model.
+    """Find the normalisation for a model by the ``centers`` [V, 3] of all its cameras.
 
     Splits and selections of images do not change it, and a few cameras far off hardly do.
     """
-    ordered = np.sort(
-        np.asarray(centers, dtype=np.float64).reshape(-1, 3), axis=0
-    )  # [V, 3], each axis by itself
+    places = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+    ordered = np.sort(places, axis=0)  # [V, 3], each axis by itself
     # COLMAP leaves out none of up to ten cameras. Here a single camera far off must not decide.
     left_out = max(1, round(TRIMMED * len(ordered))) if len(ordered) >= MIN_TRIMMED else 0
     kept = ordered[left_out : len(ordered) - left_out]

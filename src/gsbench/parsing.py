@@ -1,5 +1,4 @@
-"""Small JSON and YAML files, read with limits because someone else may have written or damaged
-them.
+"""Small JSON and YAML files, read with limits: others may have written or damaged them.
 
 Only regular files of at most `MAX_BYTES` are opened, so that a FIFO or a device cannot block the
 reader. Links are not followed; a user's own file is read by its `resolved` path. The content has at
@@ -46,8 +45,10 @@ LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class DamagedError(InputError):
-    """Raised for a file of gsbench that cannot be read or has wrong content; ``reason`` does not
-    name the file."""
+    """Raised for a file of gsbench that cannot be read or has wrong content.
+
+    ``reason`` does not name the file.
+    """
 
     def __init__(self, path: Path, reason: str) -> None:
         self.path, self.reason = path, one_line(reason)
@@ -61,8 +62,10 @@ def one_line(text: str) -> str:
 
 
 def read_bytes(path: Path, most: int = MAX_BYTES) -> bytes:
-    """The content of a regular file; raises DamagedError for any other file, FileNotFoundError for
-    a missing one."""
+    """The content of a regular file.
+
+    Raises DamagedError for any other file, FileNotFoundError for a missing one.
+    """
     with _opened(path) as descriptor:
         content = _read_up_to(descriptor, most + 1)
     if len(content) > most:
@@ -78,8 +81,10 @@ def read_tail(path: Path, count: int) -> bytes:
 
 
 def without_byte_order_mark(content: bytes) -> bytes:
-    """The content of a text file without UTF-8's byte order mark; raises InputError for UTF-16 and
-    UTF-32."""
+    """The content of a text file without UTF-8's byte order mark.
+
+    Raises InputError for UTF-16 and UTF-32.
+    """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
         raise InputError("it is UTF-16 or UTF-32: save it as UTF-8")
     return content.removeprefix(codecs.BOM_UTF8)
@@ -92,8 +97,10 @@ def resolved(path: Path) -> Path:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """Yield the descriptor of a regular file; errors within the block become errors that name the
-    file."""
+    """Yield the descriptor of a regular file.
+
+    Errors within the block become errors that name the file.
+    """
     try:
         # refuses links too: see `gsbench.files.require_no_links`
         if not stat.S_ISREG(os.lstat(path).st_mode):
@@ -114,8 +121,10 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 def _read_up_to(descriptor: int, most: int) -> bytes:
-    """Read at most ``most`` bytes. One call is enough, except for files such as in ``/proc`` that
-    report no size."""
+    """Read at most ``most`` bytes.
+
+    One call is enough, except for files such as in ``/proc`` that report no size.
+    """
     content = os.read(descriptor, min(most, os.fstat(descriptor).st_size + 1))
     parts = [content]
     while (left := most - sum(map(len, parts))) > 0 and (
@@ -126,8 +135,10 @@ def _read_up_to(descriptor: int, most: int) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file; raises as `read_bytes` does, and DamagedError if `fault_of` finds a
-    fault."""
+    """The value in a JSON file.
+
+    Raises as `read_bytes` does, and DamagedError if `fault_of` finds a fault.
+    """
     content = read_bytes(path)
     try:
         value = from_json(content)
@@ -139,11 +150,10 @@ def read_json(path: Path) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """The value in a YAML file; raises as `read_bytes` does, and DamagedError if it is no YAML or
-    has a fault.
+    """The value in a YAML file.
 
-    Numbers may be infinite, because users write settings in YAML and a class may have an infinite
-    default.
+    Raises as `read_bytes` does, and DamagedError if it is no YAML or has a fault. Numbers may be
+    infinite, because users write settings in YAML and a class may have an infinite default.
     """
     content = read_bytes(path, MAX_YAML_BYTES)
     try:
@@ -159,8 +169,10 @@ def read_yaml(path: Path) -> Any:
 
 
 class _Loader(LOADER):
-    """A safe loader for which a key that occurs twice in a mapping is an error; YAML would silently
-    drop the first."""
+    """A safe loader for which a key that occurs twice in a mapping is an error.
+
+    YAML would silently drop the first.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -204,9 +216,8 @@ def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str
     (unless ``infinite``) and at most ``most`` values, where a YAML alias counts each time it is
     used.
     """
-    containers: deque[tuple[tuple[Any, ...], Any]] = deque(
-        [((), [value])]
-    )  # with their places: the keys that lead there
+    # with their places: the keys that lead there
+    containers: deque[tuple[tuple[Any, ...], Any]] = deque([((), [value])])
     count = 0
     while containers:
         place, container = containers.popleft()
@@ -283,8 +294,10 @@ def _is_default(record: Record, field: Any) -> bool:
 
 
 def read_typed(path: Path, kind: type[T]) -> T:
-    """The JSON file as an object of ``kind``; raises as `read_bytes` does, and DamagedError naming
-    the first misfit."""
+    """The JSON file as an object of ``kind``.
+
+    Raises as `read_bytes` does, and DamagedError naming the first misfit.
+    """
     return parse_typed(read_bytes(path), kind, path)
 
 
@@ -297,10 +310,10 @@ def read_if_sound(path: Path, kind: type[T]) -> T | None:
 
 
 def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
-    """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``; raises DamagedError
-    for a misfit.
+    """Parse the JSON ``content`` of the file ``path`` as an object of ``kind``.
 
-    The parser refuses more than 200 levels and integers of more than 4,300 digits.
+    Raises DamagedError for a misfit. The parser refuses more than 200 levels and integers of more
+    than 4,300 digits.
     """
     try:
         reader: Any = kind
@@ -312,14 +325,18 @@ def parse_typed(content: bytes, kind: type[T], path: Path) -> T:
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """pydantic's reader of a type. Dataclasses have the configuration `STRICT`; other types get it
-    here."""
+    """pydantic's reader of a type.
+
+    Dataclasses have the configuration `STRICT`; other types get it here.
+    """
     return TypeAdapter(kind) if is_dataclass(kind) else TypeAdapter(kind, config=STRICT)
 
 
 def describe_misfit(error: ValidationError) -> str:
-    """Describe the first fault: ``is damaged: metrics.psnr is '27' (input should be a valid
-    number)``."""
+    """Describe the first fault.
+
+    ``is damaged: metrics.psnr is '27' (input should be a valid number)``.
+    """
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
     if kind == "json_invalid":

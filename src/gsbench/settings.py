@@ -30,8 +30,10 @@ MAX_NAME_BYTES = 100  # of a name: a folder's name can combine two, and file sys
 
 
 def is_folder_name(value: str) -> bool:
-    """Return whether a text can name a folder on any system, and fits the address of a trial
-    (``x:scene:arm:0``)."""
+    """Return whether a text can name a folder on any system.
+
+    It must also fit the address of a trial (``x:scene:arm:0``).
+    """
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
     return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
 
@@ -75,10 +77,10 @@ PLAIN = {
 
 
 def check_settings(settings: Any, group: str) -> None:
-    """Check every field of the dataclass object ``settings`` by its annotation, and convert it
-    (``1e3`` to 1000).
+    """Check every field of ``settings`` by its annotation, and convert it (``1e3`` to 1000).
 
-    Raises InputError that names ``group`` and the field, the allowed values, and the given value.
+    ``settings`` is an object of a dataclass. Raises InputError that names ``group`` and the field,
+    the allowed values, and the given value.
     """
     given = {field.name: getattr(settings, field.name) for field in option_fields(type(settings))}
     for name, value in check_values(type(settings), given, group).items():
@@ -163,8 +165,10 @@ def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -
 
 
 def _has_too_large(value: Any) -> bool:
-    """Return whether a value is or contains a whole number that does not fit into 64 bits, as torch
-    and JSON need."""
+    """Return whether a value has a whole number of more than 64 bits.
+
+    torch and JSON need fewer.
+    """
     if isinstance(value, Mapping):
         return any(map(_has_too_large, value.values()))
     if isinstance(value, list | tuple):
@@ -192,8 +196,10 @@ def _adapters(cls: type) -> dict[str, tuple[Any, TypeAdapter[Any]]]:
 
 
 def _hint(cls: type, name: str) -> Any:
-    """The annotation of a field with its constraints; Any if it uses a name that only type checkers
-    import."""
+    """The annotation of a field with its constraints.
+
+    Any if it uses a name that only type checkers import.
+    """
     owner = next(base for base in cls.__mro__ if name in inspect.get_annotations(base))
     holder = types.SimpleNamespace(__annotations__={name: inspect.get_annotations(owner)[name]})
     scope = vars(sys.modules[owner.__module__]) if owner.__module__ in sys.modules else {}

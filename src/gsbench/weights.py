@@ -31,8 +31,7 @@ ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)
 
 
 class MissingWeightsError(InputError):
-    """Raised for a weights file that is not found and cannot be downloaded, or that is not the
-    expected one."""
+    """Raised for a weights file that is neither found nor downloaded, or a wrong one."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,11 @@ class WeightsFile:
 
 
 def find_weights(spec: WeightsFile, folder: Path | None = None, download: bool = True) -> Path:
-    """The path of a checked copy of ``spec``, which is downloaded into the torch hub cache if it is
-    not found.
+    """The path of a checked copy of ``spec``.
 
-    Raises ``InputError`` if ``folder`` does not exist, and ``MissingWeightsError`` if every file
-    found has a wrong checksum, or if none is found and none can be downloaded.
+    It is downloaded into the torch hub cache if it is not found. Raises ``InputError`` if
+    ``folder`` does not exist, and ``MissingWeightsError`` if every file found has a wrong checksum,
+    or if none is found and none can be downloaded.
     """
     return find_all_weights([spec], folder, download)[0]
 
@@ -95,8 +94,7 @@ def find_all_weights(
 
 
 def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None) -> list[str]:
-    """The sha256 of files of ``specs`` without a published checksum that the user put into a
-    folder.
+    """The sha256 of files of ``specs`` that the user put there and nobody published.
 
     Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded
     from the address.
@@ -111,8 +109,10 @@ def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None
 
 
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
-    """The first file with the right checksum; raises ``MissingWeightsError`` if all files found
-    have a wrong one."""
+    """The first file with the right checksum.
+
+    Raises ``MissingWeightsError`` if all files found have a wrong one.
+    """
     faults = []
     for folder, sub_folders in folders:
         for path in _candidates(folder, spec.names, sub_folders):
@@ -130,12 +130,11 @@ def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path
 
 
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
-    """The tensors in ``path`` (.safetensors, or a PyTorch file read with ``weights_only``), on the
-    CPU, by name.
+    """The tensors in ``path``, on the CPU, by name.
 
-    ``entry`` is the key of the tensors in a PyTorch file that holds more. Raises
-    ``MissingWeightsError`` if the file is truncated, is not a weights file, or holds anything but
-    tensors.
+    It is a .safetensors file, or one of PyTorch, read with ``weights_only``. ``entry`` is the key
+    of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file is
+    truncated, is not a weights file, or holds anything but tensors.
     """
     import torch
 
@@ -164,8 +163,7 @@ def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
 
 
 def hub_cache() -> Path:
-    """The folder of torch.hub's downloaded checkpoints, below ``$TORCH_HOME``, else
-    ``$XDG_CACHE_HOME``."""
+    """The folder of torch.hub's checkpoints, below ``$TORCH_HOME``, else ``$XDG_CACHE_HOME``."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch"
     return Path(os.environ.get("TORCH_HOME", cache)).expanduser() / "hub" / "checkpoints"
 
@@ -198,8 +196,10 @@ def _candidates(folder: Path, names: tuple[str, ...], sub_folders: bool) -> list
 
 
 def _download(spec: WeightsFile, folder: Path) -> Path:
-    """Download ``spec`` into ``folder``. The file appears under its name only after it is complete
-    and checked."""
+    """Download ``spec`` into ``folder``.
+
+    The file appears under its name only after it is complete and checked.
+    """
     assert spec.url is not None
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / spec.names[0]

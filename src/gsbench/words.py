@@ -1,5 +1,7 @@
-"""Text for people: readable numbers, lists of names, suggestions for wrong words, and safe
-output."""
+"""Text for people.
+
+Readable numbers, lists of names, suggestions for wrong words, and safe output.
+"""
 
 import difflib
 import re
@@ -36,8 +38,10 @@ def readable_time(seconds: float) -> str:
 
 
 def signed(value: float, spec: str) -> str:
-    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign: +0.50,
-    −3.0%."""
+    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign.
+
+    +0.50, −3.0%.
+    """
     return true_minus(f"{value:+{spec}}")
 
 
@@ -76,8 +80,10 @@ def without_folders(text: str) -> str:
 
 
 def is_path(value: str) -> bool:
-    """Return whether a text can be a path: not empty, without control characters or an unknown
-    ``~user``."""
+    """Return whether a text can be a path.
+
+    Not empty, without control characters or an unknown ``~user``.
+    """
     try:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
     except RuntimeError:
@@ -85,8 +91,7 @@ def is_path(value: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """``text`` with its control characters escaped, so that a terminal shows them instead of acting
-    on them.
+    """``text`` with its control characters escaped: a terminal shows them, and does not act.
 
     Examples:
         >>> printable("red \\x1b[31m")

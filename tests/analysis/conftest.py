@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -12,11 +11,11 @@ from tests.analysis.synthetic import Plan, write_runs
 
 
 @pytest.fixture
-def make_experiment(tmp_path: Path) -> Callable[..., Experiment]:
+def make_experiment(tmp_path) -> Callable[..., Experiment]:
     """Write the trials of a plan below ``tmp_path`` and load them."""
 
-    def make(**plan: object) -> Experiment:
-        made = Plan(**plan)  # type: ignore[arg-type]
+    def make(**plan):
+        made = Plan(**plan)
         write_runs(tmp_path, made)
         return load_experiment(tmp_path, made.experiment)
 

@@ -19,7 +19,7 @@ OWN = {"eval__extra": {"mae": {"_target_": "mine.Mae"}}}
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> Path:
+def runs(tmp_path) -> Path:
     for seed in (0, 1):
         for densify in ("adc", "volumetric"):
             one_trial(tmp_path, seed, "aaaaaaaa", _densify=densify, psnr=27.0 + seed)
@@ -27,7 +27,7 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_tables_show_both_and_choose_either(runs: Path) -> None:
+def test_tables_show_both_and_choose_either(runs):
     experiment = load_experiment(runs, "exp")
     table = build_table(experiment)
     assert table.row_headings == ("scene", "init", "densify", KEY)
@@ -39,11 +39,11 @@ def test_tables_show_both_and_choose_either(runs: Path) -> None:
     assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
 
 
-def test_the_report_is_written(runs: Path) -> None:
+def test_the_report_is_written(runs):
     assert "mine.Mae" in build_report(load_experiment(runs, "exp"))
 
 
-def test_a_null_and_no_key_are_one_setting(tmp_path: Path) -> None:
+def test_a_null_and_no_key_are_one_setting(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
     one_trial(tmp_path, 1, "bbbbbbbb", {"eval__extra": None}, psnr=28.0)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
@@ -51,7 +51,7 @@ def test_a_null_and_no_key_are_one_setting(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["eval.extra.mea._target_", "densify.volume_treshold", "nothing"])
-def test_a_key_that_no_trial_has_is_refused(runs: Path, name: str) -> None:
+def test_a_key_that_no_trial_has_is_refused(runs, name):
     experiment = load_experiment(runs, "exp")
     with pytest.raises(InputError, match=f"no trial has a setting '{name}'"):
         build_table(experiment, rows=["scene", name])

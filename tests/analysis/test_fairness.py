@@ -33,7 +33,7 @@ def sheet(runs: Path, second: str = "longaxis", first: str = "adc") -> Table:
 
 
 def shown(table: Table) -> dict[str, tuple[str, str, str]]:
-    return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}  # type: ignore[misc]
+    return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}
 
 
 def change(paths: list[Path], arm: str, **values: Any) -> None:
@@ -44,13 +44,11 @@ def change(paths: list[Path], arm: str, **values: Any) -> None:
 
 
 @pytest.fixture
-def paths(tmp_path: Path) -> list[Path]:
+def paths(tmp_path) -> list[Path]:
     return write_arms(tmp_path, {name: densifier(name) for name in ("adc", "longaxis")})
 
 
-def test_settings_schedules_and_what_was_measured_stand_side_by_side(
-    tmp_path: Path, paths: list[Path]
-) -> None:
+def test_settings_schedules_and_what_was_measured_stand_side_by_side(tmp_path, paths):
     change(
         paths,
         "longaxis",
@@ -84,7 +82,7 @@ def test_settings_schedules_and_what_was_measured_stand_side_by_side(
     assert "densify.split_size" not in rows  # alike
 
 
-def test_only_trials_that_are_compared_count(tmp_path: Path, paths: list[Path]) -> None:
+def test_only_trials_that_are_compared_count(tmp_path, paths):
     """Seed 2 of the baseline has no partner, so its count is not part of the comparison."""
     shutil.rmtree(
         next(
@@ -98,7 +96,7 @@ def test_only_trials_that_are_compared_count(tmp_path: Path, paths: list[Path]) 
     assert "Compared: 2 pairs of trials of one scene and seed." in table.notes
 
 
-def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path: Path) -> None:
+def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path):
     write_arms(tmp_path, {"adc": densifier("adc")}, seeds=(0, 1))
     write_arms(tmp_path, {"longaxis": densifier("longaxis")}, seeds=(2,))
     table = sheet(tmp_path)
@@ -106,7 +104,7 @@ def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path: P
     assert "Compared: 0 pairs of trials of one scene and seed." in table.notes
 
 
-def test_long_values_are_cut() -> None:
+def test_long_values_are_cut():
     assert [_shown("x" * 60), _shown("x" * 61), _shown(3), _shown(None)] == [
         "x" * 60,
         "x" * 59 + "…",
@@ -115,13 +113,13 @@ def test_long_values_are_cut() -> None:
     ]
 
 
-def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path: Path, paths: list[Path]) -> None:
+def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path, paths):
     notes = sheet(tmp_path).notes
     assert notes[0] == "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
     assert f"Tuning. {NOTHING}" in notes
 
 
-def test_an_arm_of_ones_own_has_its_class_and_version(tmp_path: Path) -> None:
+def test_an_arm_of_ones_own_has_its_class_and_version(tmp_path):
     own = {"_target_": "largest.SplitLargest", "start": 50, "share": 0.1}
     found = write_arms(tmp_path, {"adc": densifier("adc"), "largest": own})
     change(
@@ -138,7 +136,7 @@ def test_an_arm_of_ones_own_has_its_class_and_version(tmp_path: Path) -> None:
     )
 
 
-def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: list[Path]) -> None:
+def test_trials_without_any_record_still_have_a_sheet(tmp_path, paths):
     for path in paths:
         for name in ("config.yaml", "events.jsonl"):
             (path / name).unlink()
@@ -153,7 +151,7 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path: Path, paths: lis
 # --- tuning
 
 
-def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
+def test_values_that_were_tried_here_are_said(tmp_path):
     arms = {
         f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)
     }
@@ -171,7 +169,7 @@ def test_values_that_were_tried_here_are_said(tmp_path: Path) -> None:
     )
 
 
-def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
+def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     write_arms(
         tmp_path,
         {"adc": densifier("adc"), "volumetric": densifier("volumetric", volume_threshold=0.06841)},
@@ -199,7 +197,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "tuning.json").write_text(content)
 
-    def tuning() -> list[str]:
+    def tuning():
         return [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
 
     (line,) = tuning()
@@ -222,9 +220,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path: Path) -> None:
 # --- where it stands
 
 
-def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(
-    tmp_path: Path, paths: list[Path]
-) -> None:
+def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(tmp_path, paths):
     page = build_report(load_experiment(tmp_path, "exp"))
     assert (
         page.index('<h2 id="h-verdict"')
@@ -234,9 +230,7 @@ def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(
     assert page.count("<caption>Fairness sheet") == 1
 
 
-def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(
-    tmp_path: Path, paths: list[Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(tmp_path, paths, capsys):
     assert tables(["exp", "--layout", "fairness"], tmp_path) == 0
     assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
     for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
@@ -255,7 +249,7 @@ def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(
         tables(["exp", "--layout", "fairness"], one)
 
 
-def test_the_latex_has_columns_that_wrap(tmp_path: Path, paths: list[Path]) -> None:
+def test_the_latex_has_columns_that_wrap(tmp_path, paths):
     text = to_latex(sheet(tmp_path))
     assert text.startswith("% needs \\usepackage{booktabs,array}\n")
     (spec,) = re.findall(r"\\begin\{tabular\}\{(.*)\}", text)
@@ -268,7 +262,7 @@ def test_the_latex_has_columns_that_wrap(tmp_path: Path, paths: list[Path]) -> N
 @pytest.mark.skipif(
     shutil.which("pdflatex") is None, reason="pdflatex with booktabs is not installed"
 )
-def test_the_latex_compiles(tmp_path: Path, paths: list[Path]) -> None:
+def test_the_latex_compiles(tmp_path, paths):
     document = f"\\documentclass{{article}}\\usepackage{{booktabs,array}}\\begin{{document}}{to_latex(sheet(tmp_path))}"
     (tmp_path / "a.tex").write_text(document + "\\end{document}")
     subprocess.run(

@@ -6,7 +6,6 @@ import io
 import json
 import statistics
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,7 +20,7 @@ from tests.analysis.test_tables import one_trial
 Make = Callable[..., Experiment]
 
 
-def test_a_row_is_a_trial_as_its_file_says(make_experiment: Make) -> None:
+def test_a_row_is_a_trial_as_its_file_says(make_experiment):
     experiment = make_experiment()
     frame = to_frame(experiment)
     assert len(frame) == len(experiment.trials) == 12
@@ -47,7 +46,7 @@ def test_a_row_is_a_trial_as_its_file_says(make_experiment: Make) -> None:
     assert frame["num_gaussians"].dtype == frame["seed"].dtype == pd.Int64Dtype()
 
 
-def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment: Make) -> None:
+def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment):
     experiment = make_experiment()
     means = to_frame(experiment).groupby(["scene", "densify"])["psnr"].agg(["mean", "std"])
     values = [
@@ -59,7 +58,7 @@ def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment: Make) -
     assert means.loc[("garden", "adc"), "std"] == pytest.approx(statistics.stdev(values), abs=1e-12)
 
 
-def test_what_is_missing_is_missing_and_what_was_swept_has_a_column(tmp_path: Path) -> None:
+def test_what_is_missing_is_missing_and_what_was_swept_has_a_column(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, flip=0.1, _num_init_points=None)
     one_trial(tmp_path, 0, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0, own=3.0)
     frame = to_frame(load_experiment(tmp_path, "exp"))
@@ -70,9 +69,7 @@ def test_what_is_missing_is_missing_and_what_was_swept_has_a_column(tmp_path: Pa
     assert frame["num_init_points"][1] == 3000
 
 
-def test_the_csv_of_trials_reads_back_as_the_frame(
-    make_experiment: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_csv_of_trials_reads_back_as_the_frame(make_experiment, tmp_path, capsys):
     frame = to_frame(make_experiment())
     assert tables(["exp", "--format", "trials"], tmp_path) == 0
     again = pd.read_csv(io.StringIO(capsys.readouterr().out))

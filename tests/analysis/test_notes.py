@@ -20,7 +20,7 @@ COMPARED = "so this does not compare at equal counts; densify.cap=governor makes
 
 
 def trials_of(tmp_path: Path, **plan: object) -> tuple[TrialResult, ...]:
-    write_runs(tmp_path, Plan(**plan))  # type: ignore[arg-type]
+    write_runs(tmp_path, Plan(**plan))
     return load_experiment(tmp_path, "exp").trials
 
 
@@ -41,9 +41,7 @@ def with_record(trial: TrialResult, **values: object) -> TrialResult:
         ({"garden": (1000, 979)}, "2 % fewer"),
     ],
 )
-def test_unlike_counts_are_said_over_the_scenes_that_both_have(
-    tmp_path: Path, counts: dict[str, tuple[int, int]], said: str
-) -> None:
+def test_unlike_counts_are_said_over_the_scenes_that_both_have(tmp_path, counts, said):
     made = trials_of(tmp_path, scenes=list(counts))
     trials = [
         with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"])
@@ -55,9 +53,7 @@ def test_unlike_counts_are_said_over_the_scenes_that_both_have(
     assert counts_sentence(trials, ADC, Arm("sfm", "mcmc")) == ""
 
 
-def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_several(
-    tmp_path: Path,
-) -> None:
+def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_several(tmp_path):
     made = trials_of(tmp_path, seeds=(0, 1))
     alike = [
         with_record(trial, held_out="every 8th image", test_views=6, train_views=42)
@@ -77,7 +73,7 @@ def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_se
     assert held_out_notes([with_record(trial, held_out="") for trial in made]) == []
 
 
-def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path: Path) -> None:
+def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path):
     for path in write_runs(
         tmp_path, Plan(inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",))
     ):
@@ -102,9 +98,7 @@ def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path:
 @pytest.mark.parametrize(
     ("lost", "rest"), [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")]
 )
-def test_of_what_is_left_out_three_are_named_and_all_are_counted(
-    tmp_path: Path, lost: int, rest: str
-) -> None:
+def test_of_what_is_left_out_three_are_named_and_all_are_counted(tmp_path, lost, rest):
     paths = write_runs(tmp_path, Plan())
     for path in paths[:lost]:
         (path / "results.json").unlink()

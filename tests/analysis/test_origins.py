@@ -33,7 +33,7 @@ def hashes(cloud: str | None, init: str = "init1") -> dict[str, str]:
     return {"data": "d", "init": init} | ({} if cloud is None else {"cloud": cloud})
 
 
-def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path: Path) -> None:
+def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path):
     for seed, machine in enumerate((XEON, RYZEN, XEON, None)):
         one_trial(tmp_path, seed, psnr=27.0, _machine=machine)
     (note,) = (note for note in notes_of(tmp_path) if "machine" in note)
@@ -47,13 +47,13 @@ def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path:
     assert "machine   Ryzen (znver3, torch AVX2)" in explain_cell("exp:garden:psnr:adc", tmp_path)
 
 
-def test_one_machine_or_none_recorded_is_no_note(tmp_path: Path) -> None:
+def test_one_machine_or_none_recorded_is_no_note(tmp_path):
     one_trial(tmp_path, 0, psnr=27.0, _machine=XEON)
     one_trial(tmp_path, 1, psnr=27.0)
     assert not any("machine" in note for note in notes_of(tmp_path))
 
 
-def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path: Path) -> None:
+def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path):
     for seed, densify, cloud in ((0, "adc", A), (1, "adc", B), (0, "volumetric", A)):
         one_trial(tmp_path, seed, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
     assert (
@@ -62,7 +62,7 @@ def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path: Path) -> None:
     ) in notes_of(tmp_path)
 
 
-def test_compared_arms_with_unlike_clouds_are_marked_in_their_sheet(tmp_path: Path) -> None:
+def test_compared_arms_with_unlike_clouds_are_marked_in_their_sheet(tmp_path):
     for densify, cloud in (("adc", A), ("volumetric", B)):
         one_trial(tmp_path, 0, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
     sheet = fairness_table(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ from gsbench.analysis.paper import (
     published_names,
     published_table,
 )
-from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
@@ -39,7 +37,7 @@ def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
 
 
 @pytest.mark.shared
-def test_the_data_are_those_of_the_printed_tables(shared: Path) -> None:
+def test_the_data_are_those_of_the_printed_tables(shared):
     """Every number of the tables in the paper's text, row by row, with its printed digits."""
     paper, text = load_paper(), (shared / "paper.md").read_text()
     rows = [
@@ -66,12 +64,12 @@ def test_the_data_are_those_of_the_printed_tables(shared: Path) -> None:
         ] == row[1:]
 
 
-def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
+def test_what_the_paper_contradicts_follows_from_its_numbers():
     paper = load_paper()
     table1, table2 = (paper.tables[name] for name in ("table1", "table2"))
     text = "\n".join(paper.contradictions)
 
-    def pairs(quantity: str) -> list[tuple[float, float]]:
+    def pairs(quantity):
         keys = [
             [(scene, "dim", arm, quantity) for arm in ("adc", "volumetric")]
             for scene in paper.scenes("table1")
@@ -114,7 +112,7 @@ def test_what_the_paper_contradicts_follows_from_its_numbers() -> None:
     assert set(paper.scenes("table1")) - set(paper.scenes("table2")) == {"train"}
 
 
-def test_a_printed_number_stands_for_its_rounding_range() -> None:
+def test_a_printed_number_stands_for_its_rounding_range():
     assert PrintedNumber("0.27").range == pytest.approx((0.265, 0.275))
     assert PrintedNumber("0.270").range == pytest.approx((0.2695, 0.2705))
 
@@ -133,13 +131,11 @@ def test_a_printed_number_stands_for_its_rounding_range() -> None:
         (cell(0.130, 0.00056, 2), INTERVAL),
     ],
 )
-def test_agreement(measured: Cell, expected: str) -> None:
+def test_agreement(measured, expected):
     assert agreement(measured, PrintedNumber("0.12")) == expected
 
 
-def test_table1_has_the_papers_rows_and_marks_what_was_not_run(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_table1_has_the_papers_rows_and_marks_what_was_not_run(make_experiment):
     experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("garden", "bonsai"))
     measured, difference = paper_tables(experiment, "table1")
     assert [row.labels[0] for row in measured.rows[:-1]] == load_paper().scenes("table1")
@@ -159,7 +155,7 @@ def test_table1_has_the_papers_rows_and_marks_what_was_not_run(
     assert shown.split()[0].replace("−", "-") == f"{psnr.mean - 27.06:+.2f}"
 
 
-def test_scenes_that_the_paper_lacks_come_last(make_experiment: Callable[..., Experiment]) -> None:
+def test_scenes_that_the_paper_lacks_come_last(make_experiment):
     experiment = make_experiment(
         experiment="table1", inits=("dim",), scenes=("courtyard", "garden")
     )
@@ -170,15 +166,13 @@ def test_scenes_that_the_paper_lacks_come_last(make_experiment: Callable[..., Ex
     ]
 
 
-def test_table1_names_a_stand_in_for_the_papers_initialiser(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment):
     experiment = make_experiment(experiment="table1", inits=("sfm",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1")
     assert any("from sfm replace the paper's DIM" in note for note in difference.notes)
 
 
-def test_table2_has_the_papers_columns(make_experiment: Callable[..., Experiment]) -> None:
+def test_table2_has_the_papers_columns(make_experiment):
     experiment = make_experiment(experiment="table2", inits=("dim", "sfm"), scenes=("garden",))
     measured, _ = paper_tables(experiment, "table2")
     assert [c.heading for c in measured.columns] == [
@@ -189,25 +183,21 @@ def test_table2_has_the_papers_columns(make_experiment: Callable[..., Experiment
     ]
 
 
-def test_another_lpips_is_not_compared_with_the_papers(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_another_lpips_is_not_compared_with_the_papers(make_experiment):
     experiment = make_experiment(experiment="table1", inits=("dim",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1", metrics=["psnr", "flip"])
     assert [column.group for column in difference.columns] == ["PSNR (dB)", "PSNR (dB)"]
     assert any("no such number: flip" in note for note in difference.notes)
 
 
-def test_an_experiment_without_the_papers_arms_is_refused(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_an_experiment_without_the_papers_arms_is_refused(make_experiment):
     experiment = make_experiment(densifiers=("none",), scenes=("garden",))
     with pytest.raises(InputError, match="no trial for table2"):
         paper_tables(experiment, "table2")
     assert build_table(experiment).rows
 
 
-def test_the_verb_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_verb_prints_and_writes(tmp_path, capsys):
     runs = tmp_path / "runs"
     write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     assert tables(["table1"], runs) == 0
@@ -227,9 +217,7 @@ def test_the_verb_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "ratio of totals" in capsys.readouterr().out
 
 
-def test_the_verb_names_bad_options_and_left_out_trials(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_names_bad_options_and_left_out_trials(tmp_path, capsys):
     path = write_runs(tmp_path, Plan())[0]
     (path / "results.json").write_text("{")
     with pytest.raises(InputError, match="no trial has iterations=7"):
@@ -242,9 +230,7 @@ def test_the_verb_names_bad_options_and_left_out_trials(
     assert load_experiment(tmp_path, "exp").trials
 
 
-def test_below_the_differences_stands_what_the_paper_says_of_its_setup(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_below_the_differences_stands_what_the_paper_says_of_its_setup(make_experiment):
     _, difference = paper_tables(
         make_experiment(experiment="table1", inits=("dim",), scenes=("garden",)), "table1"
     )
@@ -252,9 +238,7 @@ def test_below_the_differences_stands_what_the_paper_says_of_its_setup(
         assert "The paper on hardware: it trained on one NVIDIA RTX 2080." in written
 
 
-def test_the_papers_own_set_up_has_the_papers_layout(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_papers_own_set_up_has_the_papers_layout(tmp_path, capsys):
     write_runs(tmp_path, Plan(experiment="table1_own", inits=("dim_paper",), scenes=("garden",)))
     assert tables(["table1_own"], tmp_path) == 0
     out = capsys.readouterr().out
@@ -270,7 +254,7 @@ def test_the_papers_own_set_up_has_the_papers_layout(
 
 
 @pytest.mark.parametrize("name", published_names())
-def test_every_paper_names_its_source_and_has_sane_numbers(name: str) -> None:
+def test_every_paper_names_its_source_and_has_sane_numbers(name):
     paper = load_published(name)
     assert paper.title
     assert "github.com/" in paper.source or "arxiv.org/" in paper.source
@@ -283,15 +267,13 @@ def test_every_paper_names_its_source_and_has_sane_numbers(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", published_names())
-def test_scenes_and_methods_are_called_as_gsbench_calls_them(name: str) -> None:
+def test_scenes_and_methods_are_called_as_gsbench_calls_them(name):
     paper = load_published(name)
     assert all((conf_dir() / "scene" / f"{scene}.yaml").is_file() for scene, _ in paper.printed)
     assert (conf_dir() / "densify" / f"{paper.densify}.yaml").is_file()
 
 
-def test_ours_stand_beside_the_printed_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ours_stand_beside_the_printed_numbers(tmp_path, capsys):
     for seed, psnr in enumerate((27.41, 27.41, 27.41)):
         one_trial(tmp_path, seed, psnr=psnr, ssim=0.9, lpips_vgg_raw=0.2)
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
@@ -308,7 +290,7 @@ def test_ours_stand_beside_the_printed_numbers(
     assert "### Difference from 3dgs" in capsys.readouterr().out
 
 
-def test_what_cannot_be_compared_is_said(tmp_path: Path) -> None:
+def test_what_cannot_be_compared_is_said(tmp_path):
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
     with pytest.raises(InputError, match="no trial here is of one of them"):
         published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")

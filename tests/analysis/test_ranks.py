@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ Make = Callable[..., Experiment]
 
 
 @pytest.fixture
-def seven(make_experiment: Make) -> Experiment:
+def seven(make_experiment) -> Experiment:
     return make_experiment(
         scenes=SCENES, densifiers=ARMS, effect={"psnr": 2.0, "lpips_vgg_raw": -0.1}
     )
@@ -35,21 +34,21 @@ def seven(make_experiment: Make) -> Experiment:
 @pytest.mark.parametrize(
     ("arms", "q"), [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)]
 )
-def test_the_critical_values_are_those_of_demsar(arms: int, q: float) -> None:
+def test_the_critical_values_are_those_of_demsar(arms, q):
     """Demšar 2006, table 5a."""
     assert critical_difference(arms, 14) == pytest.approx(
         q * np.sqrt(arms * (arms + 1) / (6 * 14)), rel=5e-4
     )
 
 
-def test_the_example_of_demsar() -> None:
+def test_the_example_of_demsar():
     """Demšar 2006, section 3.2.2: four classifiers on 14 data sets have the critical difference
     1.25."""
     assert critical_difference(4, 14) == pytest.approx(1.25, abs=0.005)
 
 
 @pytest.mark.parametrize("metric", ["psnr", "lpips_vgg_raw"])
-def test_the_best_arm_has_rank_one(seven: Experiment, metric: str) -> None:
+def test_the_best_arm_has_rank_one(seven, metric):
     ranking = rank_arms(seven.trials, quantity(metric, seven.trials))
     assert ranking is not None
     assert (ranking.arms[0], ranking.ranks[0]) == (Arm("sfm", "volumetric"), 1.0)
@@ -64,7 +63,7 @@ def test_the_best_arm_has_rank_one(seven: Experiment, metric: str) -> None:
     assert sum(ranking.ranks) == pytest.approx(6)
 
 
-def test_groups_are_the_largest_that_do_not_differ() -> None:
+def test_groups_are_the_largest_that_do_not_differ():
     made = Ranking(
         quantity("psnr", []),
         tuple(Arm("sfm", c) for c in "abcde"),
@@ -87,13 +86,13 @@ def test_groups_are_the_largest_that_do_not_differ() -> None:
     [{"scenes": SCENES[:5], "densifiers": ARMS}, {"scenes": SCENES, "densifiers": ("adc",)}],
     ids=["five scenes", "one arm"],
 )
-def test_few_scenes_or_arms_have_no_ranking(make_experiment: Make, plan: dict[str, object]) -> None:
+def test_few_scenes_or_arms_have_no_ranking(make_experiment, plan):
     experiment = make_experiment(**plan)
     assert rank_arms(experiment.trials, quantity("psnr", experiment.trials)) is None
     assert "Ranks of all arms" not in build_report(experiment)
 
 
-def test_a_scene_that_lacks_an_arm_is_left_out(seven: Experiment) -> None:
+def test_a_scene_that_lacks_an_arm_is_left_out(seven):
     trials = [trial for trial in seven.trials if (trial.scene, trial.densify) != ("c", "mcmc")]
     ranking = rank_arms(trials, quantity("psnr", trials))
     assert ranking is not None
@@ -102,7 +101,7 @@ def test_a_scene_that_lacks_an_arm_is_left_out(seven: Experiment) -> None:
     assert rank_arms(two, quantity("psnr", two)) is None
 
 
-def test_equal_arms_do_not_differ(make_experiment: Make) -> None:
+def test_equal_arms_do_not_differ(make_experiment):
     experiment = make_experiment(
         scenes=SCENES,
         densifiers=ARMS,
@@ -118,7 +117,7 @@ def test_equal_arms_do_not_differ(make_experiment: Make) -> None:
     assert ranking.groups == [(0, 2)]
 
 
-def test_report_and_site_have_the_picture(seven: Experiment, tmp_path: Path) -> None:
+def test_report_and_site_have_the_picture(seven, tmp_path):
     write_archive(seven, tmp_path / "exp.zip")
     assert run(["site", str(tmp_path / "exp.zip"), "--out", str(tmp_path / "site")]) == 0
     for page in (build_report(seven), (tmp_path / "site" / "index.html").read_text()):

@@ -43,7 +43,7 @@ ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory) -> Path:
     """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else
     differs."""
     folder = tmp_path_factory.mktemp("runs")
@@ -52,16 +52,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def experiment(runs: Path) -> Experiment:
+def experiment(runs) -> Experiment:
     return load_experiment(runs, "exp")
 
 
 @pytest.fixture(scope="module")
-def page(experiment: Experiment) -> str:
+def page(experiment) -> str:
     return build_report(experiment)
 
 
-def test_a_picture_that_arms_share_is_shown_once(tmp_path: Path) -> None:
+def test_a_picture_that_arms_share_is_shown_once(tmp_path):
     for path in write_runs(tmp_path, Plan(scenes=["garden"], views=1)):
         arm = path.parent.name
         (path / "figures").mkdir()
@@ -103,7 +103,7 @@ class Elements(HTMLParser):
         return [attrs for name, attrs in self.found if name == tag]
 
 
-def test_the_page_is_well_formed_and_needs_nothing_else(page: str) -> None:
+def test_the_page_is_well_formed_and_needs_nothing_else(page):
     elements = Elements(page)
     assert elements.open == []
     for tag, attribute in (("img", "src"), ("link", "href"), ("script", "src"), ("iframe", "src")):
@@ -113,7 +113,7 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page: str) -> None:
     assert not re.search(r"url\(|@import|https?://|fetch\(|XMLHttp", page)
 
 
-def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page: str) -> None:
+def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page):
     elements = Elements(page)
     assert elements.all("html") == [{"lang": "en"}]
     assert all(attrs.get("alt") for attrs in elements.all("img"))
@@ -131,7 +131,7 @@ def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page: str) -> None
     assert len(ids) == len(set(ids))
 
 
-def test_the_verdict_comes_first(page: str) -> None:
+def test_the_verdict_comes_first(page):
     headings = re.findall(r"<h2[^>]*>([^<]+)", page)
     assert headings[:2] == ["Verdict", "Tables"]
     assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw; " in page
@@ -140,7 +140,7 @@ def test_the_verdict_comes_first(page: str) -> None:
     assert "LPIPS Alex" not in verdicts  # not run: no row
 
 
-def test_what_a_verdict_does_not_say_stands_beside_it(page: str) -> None:
+def test_what_a_verdict_does_not_say_stands_beside_it(page):
     """The arms have other counts, and equal trials other times."""
     headline = re.search(r'<div class="verdict"><p><strong>([^<]*)</strong>', page)
     assert headline is not None
@@ -153,23 +153,23 @@ def test_what_a_verdict_does_not_say_stands_beside_it(page: str) -> None:
     assert times[1] == "4"  # adc takes 50, 51 and 52 s, volumetric 65 to 67 s
 
 
-def test_the_same_files_give_the_same_page(experiment: Experiment, page: str) -> None:
+def test_the_same_files_give_the_same_page(experiment, page):
     assert build_report(experiment) == page
 
 
-def test_every_trial_is_traceable(experiment: Experiment, page: str) -> None:
+def test_every_trial_is_traceable(experiment, page):
     assert all(trial.label in page for trial in experiment.trials)
     assert "pycolmap 4.2.1" in page
 
 
-def test_texture_energy_is_the_squared_gradient() -> None:
+def test_texture_energy_is_the_squared_gradient():
     ramp = np.repeat(np.arange(40, dtype=np.uint8)[None, :, None] * 3, 30, axis=0).repeat(3, axis=2)
     energy = texture_energy(ramp)  # a slope of 3 levels a pixel everywhere
     assert energy[15, 20] == pytest.approx(9.0)
     assert texture_energy(np.full((9, 9, 3), 7, dtype=np.uint8)).max() == 0
 
 
-def test_whole_views_are_the_worst_the_median_and_the_best(experiment: Experiment) -> None:
+def test_whole_views_are_the_worst_the_median_and_the_best(experiment):
     """Of a scene with three views, each picked by another gain."""
     trials = [trial for trial in experiment.trials if trial.scene == "garden"]
     first, second = (
@@ -193,7 +193,7 @@ def test_whole_views_are_the_worst_the_median_and_the_best(experiment: Experimen
     assert len(both) == 3
 
 
-def test_of_one_or_two_views_each_is_shown_once(tmp_path: Path) -> None:
+def test_of_one_or_two_views_each_is_shown_once(tmp_path):
     for count, named in (
         (1, ["the only view"]),
         (2, ["the view with the least gain", "the view with the largest gain"]),
@@ -208,7 +208,7 @@ def test_of_one_or_two_views_each_is_shown_once(tmp_path: Path) -> None:
         assert sorted(view.view for view in views) == [f"view00{k}" for k in range(count)]
 
 
-def test_missing_or_damaged_pictures_are_named(tmp_path: Path) -> None:
+def test_missing_or_damaged_pictures_are_named(tmp_path):
     paths = write_runs(tmp_path, Plan(views=2, pictures=True))
     (paths[0] / "renders" / "view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
     (paths[1] / "point_cloud.ply").write_bytes(b"ply\nformat ascii 1.0\n")
@@ -218,7 +218,7 @@ def test_missing_or_damaged_pictures_are_named(tmp_path: Path) -> None:
     assert "is not a readable 3DGS PLY" in text
 
 
-def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
+def test_volumes_are_those_of_the_ellipsoids(experiment):
     path = experiment.trials[0].path / "point_cloud.ply"
     vertices = PlyData.read(path)["vertex"]
     scales = np.exp(np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64))
@@ -232,7 +232,7 @@ def test_volumes_are_those_of_the_ellipsoids(experiment: Experiment) -> None:
     )
 
 
-def test_logged_histograms_are_shares_of_all_trials_together() -> None:
+def test_logged_histograms_are_shares_of_all_trials_together():
     """Ten Gaussians of one trial and thirty of another; the second alone has an iteration 8."""
     edges = [-4.0, -3.0, -1.0, 0.0]
     rows = [
@@ -246,13 +246,13 @@ def test_logged_histograms_are_shares_of_all_trials_together() -> None:
         SimpleNamespace(folder=SimpleNamespace(curves=lambda name, kind, own=own: own))
         for own in rows
     ]
-    found = _logged_histograms(trials)  # type: ignore[arg-type]
+    found = _logged_histograms(trials)
     assert list(found) == [4, 8]
     assert np.array(found[4]) == pytest.approx(np.array([[10**-3.5, 0.25], [10**-0.5, 0.75]]))
     assert np.array(found[8]) == pytest.approx(np.array([[10**-2.0, 1.0]]))
 
 
-def test_the_share_above_the_threshold_is_said(experiment: Experiment, page: str) -> None:
+def test_the_share_above_the_threshold_is_said(experiment, page):
     found = [
         10 ** log10_volumes(t.path / "point_cloud.ply")
         for t in experiment.trials
@@ -261,14 +261,14 @@ def test_the_share_above_the_threshold_is_said(experiment: Experiment, page: str
     assert f"sfm-adc: {np.mean(np.concatenate(found) > 0.03):.2%} of volumes exceed 0.03." in page
 
 
-def test_growth_and_pruning_by_cause_are_a_table(page: str) -> None:
+def test_growth_and_pruning_by_cause_are_a_table(page):
     events = page.split("<caption>Gaussians by cause, mean of a trial</caption>")[1].split(
         "</table>"
     )[0]
     assert '<th scope="row">split volume</th><td>0</td><td>100</td>' in events
 
 
-def test_a_truncated_point_cloud_is_refused(tmp_path: Path, experiment: Experiment) -> None:
+def test_a_truncated_point_cloud_is_refused(tmp_path, experiment):
     content = (experiment.trials[0].path / "point_cloud.ply").read_bytes()
     (tmp_path / "half.ply").write_bytes(content[: len(content) // 2])
     with pytest.raises(
@@ -277,7 +277,7 @@ def test_a_truncated_point_cloud_is_refused(tmp_path: Path, experiment: Experime
         log10_volumes(tmp_path / "half.ply")
 
 
-def test_mean_curves_use_common_steps() -> None:
+def test_mean_curves_use_common_steps():
     assert mean_by_step([[(1, 2.0), (2, 4.0), (3, 9.0)], [(2, 6.0), (1, 0.0)], []]) == [
         (1, 1.0),
         (2, 5.0),
@@ -296,7 +296,7 @@ CHARTS = {
 
 
 @pytest.mark.parametrize("chart", list(CHARTS))
-def test_charts_are_well_formed_and_stay_inside(chart: str) -> None:
+def test_charts_are_well_formed_and_stay_inside(chart):
     figure = ElementTree.fromstring(CHARTS[chart]("<&>"))
     svg = next(element for element in figure if element.tag == "svg")
     _, _, width, height = map(float, svg.attrib["viewBox"].split())
@@ -314,7 +314,7 @@ def test_charts_are_well_formed_and_stay_inside(chart: str) -> None:
     assert svg.attrib["aria-label"].startswith("<&>")
 
 
-def test_a_line_chart_puts_values_where_they_belong() -> None:
+def test_a_line_chart_puts_values_where_they_belong():
     figure = ElementTree.fromstring(line_chart("t", [("a", [(0, 0), (5, 10), (10, 0)])], "x", "y"))
     points = [
         tuple(map(float, p.split(",")))
@@ -325,7 +325,7 @@ def test_a_line_chart_puts_values_where_they_belong() -> None:
     assert y0 == y2 > y1  # up is smaller in SVG
 
 
-def test_charts_have_their_margins() -> None:
+def test_charts_have_their_margins():
     figure = ElementTree.fromstring(line_chart("t", [("a", [(0, 0), (10, 10)])], "x", "y"))
     assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 250"
     x, y = 58 + 304 * 10 / 10.4, 206 - 180 * 10 / 10.4
@@ -340,7 +340,7 @@ def test_charts_have_their_margins() -> None:
     ]
 
 
-def test_each_line_has_a_colour_and_dashes_of_its_own() -> None:
+def test_each_line_has_a_colour_and_dashes_of_its_own():
     figure = ElementTree.fromstring(
         line_chart("t", [(str(k), [(0, k), (1, k)]) for k in range(7)], "x", "y")
     )
@@ -356,7 +356,7 @@ def test_each_line_has_a_colour_and_dashes_of_its_own() -> None:
     "values",
     [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)],
 )
-def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], log: bool) -> None:
+def test_an_axis_has_round_ticks_within_its_range(values, log):
     """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and
     middle are named."""
     axis = Axis(values, log, 100.0, 300.0)
@@ -396,9 +396,7 @@ def test_an_axis_has_round_ticks_within_its_range(values: tuple[float, float], l
         ((1, 1e6), True, [1, 100, 1e4, 1e6], ["1", "100", "10k", "1M"]),
     ],
 )
-def test_ticks_of_an_axis(
-    values: tuple[float, float], log: bool, ticks: list[float], labels: list[str]
-) -> None:
+def test_ticks_of_an_axis(values, log, ticks, labels):
     axis = Axis(values, log, 0.0, 100.0)
     assert axis.ticks == pytest.approx(ticks)
     assert [axis.label(tick) for tick in axis.ticks] == labels
@@ -420,18 +418,18 @@ def test_ticks_of_an_axis(
         (-2.5e6, "−2.5M"),
     ],
 )
-def test_a_short_number_has_three_digits(value: float, text: str) -> None:
+def test_a_short_number_has_three_digits(value, text):
     assert short_number(value) == text
 
 
-def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict() -> None:
+def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict():
     green, red, grey = "#1b7837", "#b2182b", "#555555"
     up, down = ForestRow("s", 0.2, Interval(0.1, 0.3)), ForestRow("s", -0.2, Interval(-0.3, -0.1))
     assert [up.color(1), up.color(-1), down.color(1), down.color(-1)] == [green, red, red, green]
     assert ForestRow("s", 0.2).color(1) == ForestRow("s", 0.2, Interval(-0.1, 0.5)).color(1) == grey
 
 
-def test_an_axis_from_zero_begins_at_zero() -> None:
+def test_an_axis_from_zero_begins_at_zero():
     axis = Axis([0.0, 10.0], False, 0.0, 104.0)
     assert [axis.to_px(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
 
@@ -447,8 +445,8 @@ def test_an_axis_from_zero_begins_at_zero() -> None:
     ],
 )
 def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
-    tmp_path: Path, settings: dict[str, object], expected: float | None
-) -> None:
+    tmp_path, settings, expected
+):
     write_arms(tmp_path, {"adc": {}, "volumetric": settings}, seeds=(0,))
     assert _threshold(load_experiment(tmp_path, "exp").trials) == expected
     write_arms(
@@ -458,22 +456,20 @@ def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
     assert _threshold(load_experiment(tmp_path / "b", "exp").trials) == own
 
 
-def test_nothing_to_draw_is_an_empty_string() -> None:
+def test_nothing_to_draw_is_an_empty_string():
     assert line_chart("t", [("a", [])], "x", "y") == ""
     assert line_chart("t", [("a", [(0, 1), (1, 0)])], "x", "y", log=True) == ""
     assert forest_plot("t", [], "x", 1) == ""
 
 
-def test_the_verb_writes_the_file(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_writes_the_file(runs, tmp_path, capsys):
     assert report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "sub").iterdir()] == ["r.html"]
 
 
-def test_one_trial_of_each_arm_is_no_verdict(tmp_path: Path) -> None:
+def test_one_trial_of_each_arm_is_no_verdict(tmp_path):
     write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",), effect={"psnr": 9.0}))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert ">garden</text>" in page
@@ -482,7 +478,7 @@ def test_one_trial_of_each_arm_is_no_verdict(tmp_path: Path) -> None:
     assert "▲ better" not in page
 
 
-def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path: Path) -> None:
+def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path):
     write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     page = build_report(load_experiment(tmp_path, "table1"))
     assert "Table 1, difference from the printed values" in page
@@ -491,7 +487,7 @@ def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path: Path)
     )
 
 
-def test_costs_stand_under_the_verdict(page: str) -> None:
+def test_costs_stand_under_the_verdict(page):
     """20,010 and 26,010 Gaussians on the average, 51.025 and 66.025 s; seeds 0 to 2 add as many
     seconds."""
     costs = page.split('aria-label="Cost">')[1].split("</ul>")[0]
@@ -504,13 +500,13 @@ def test_costs_stand_under_the_verdict(page: str) -> None:
     assert "mean of scenes</text>" in page
 
 
-def test_a_wide_picture_is_shown_smaller() -> None:
+def test_a_wide_picture_is_shown_smaller():
     uri = _jpeg_uri(np.zeros((10, 2400, 3), dtype=np.uint8))
     with Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))) as shown:
         assert shown.size == (1200, 5)
 
 
-def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path: Path) -> None:
+def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path):
     for path in write_runs(tmp_path, Plan(densifiers=("adc",), seeds=(0,), scenes=("garden",))):
         for name in ("events.jsonl", "metrics.jsonl", "config.yaml"):
             (path / name).unlink()
@@ -519,7 +515,7 @@ def test_a_single_arm_and_bare_results_still_make_a_report(tmp_path: Path) -> No
     assert "No trained model was found" in text
 
 
-def test_swept_settings_become_arms_of_their_own(tmp_path: Path) -> None:
+def test_swept_settings_become_arms_of_their_own(tmp_path):
     for cap, config_hash in ((10_000, "aaaaaaaa"), (20_000, "bbbbbbbb")):
         plan = Plan(gaussians={"adc": cap, "volumetric": cap}, scenes=("garden",))
         for path in write_runs(tmp_path / str(cap), plan):
@@ -540,14 +536,14 @@ def test_swept_settings_become_arms_of_their_own(tmp_path: Path) -> None:
     assert "sfm-volumetric max_gaussians=10000 against sfm-adc max_gaussians=10000" in page
 
 
-def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path: Path) -> None:
+def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path):
     write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "equal in every metric" in page
     assert "had no effect" in page
 
 
-def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path: Path) -> None:
+def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path):
     write_runs(tmp_path, Plan(scenes=("courtyard",), effect={"psnr": 2.0}, views=3))
     write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": -2.0}, views=3))
     write_runs(tmp_path, Plan(scenes=("stump",), views=3))
@@ -561,13 +557,13 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path: 
     assert line in build_report(load_experiment(tmp_path, "exp"))
 
 
-def test_no_scene_is_named_where_none_is_decided(tmp_path: Path) -> None:
+def test_no_scene_is_named_where_none_is_decided(tmp_path):
     write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
     (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
     assert by_scene_lines(judged.verdicts) == []
 
 
-def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
+def test_points_of_a_search_are_not_held_against_each_other(tmp_path):
     write_runs(tmp_path, Plan())
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
     points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
@@ -591,7 +587,7 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
     assert "densify.volume_threshold = 0.6841 (point 1)" in page
 
 
-def test_a_forest_has_a_scale_whatever_its_range() -> None:
+def test_a_forest_has_a_scale_whatever_its_range():
     """A range of -.09 to .09 had zero as its one tick."""
     for reach in (0.0886, 0.09, 0.11, 1.0, 3.3, 940.0):
         chart = forest_plot(

@@ -21,7 +21,7 @@ def rewrite(path: Path, **changes: object) -> None:
     (path / "results.json").write_text(json.dumps(data | changes))
 
 
-def test_every_complete_trial_is_read(tmp_path: Path) -> None:
+def test_every_complete_trial_is_read(tmp_path):
     paths = write_runs(tmp_path, Plan())
     experiment = load_experiment(tmp_path, "exp")
     assert {trial.path for trial in experiment.trials} == set(paths)
@@ -29,7 +29,7 @@ def test_every_complete_trial_is_read(tmp_path: Path) -> None:
     assert experiment.seeds == (0, 1, 2)
 
 
-def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path: Path) -> None:
+def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
     for cap in (1, 2):
         write_arms(tmp_path, {"adc": {"cap": cap}}, seeds=(1, 0))
     trials = load_experiment(tmp_path, "exp").trials
@@ -39,7 +39,7 @@ def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path: Path)
     ) * 2
 
 
-def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path: Path) -> None:
+def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path):
     write_runs(tmp_path, Plan())
     (tmp_path / "exp" / ".hydra").mkdir()
     (tmp_path / "exp" / "report.html").write_text("")
@@ -82,7 +82,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", list(DAMAGES))
-def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path: Path, damage: str) -> None:
+def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path, damage):
     paths = write_runs(tmp_path, Plan())
     spoil, words = DAMAGES[damage]
     spoil(paths[4])
@@ -93,7 +93,7 @@ def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path: Path, damag
     assert str(paths[4].parent.relative_to(tmp_path)) in experiment.warnings[0]
 
 
-def test_a_failed_trial_says_why(tmp_path: Path) -> None:
+def test_a_failed_trial_says_why(tmp_path):
     path = write_runs(tmp_path, Plan())[0]
     (path / "results.json").unlink()
     (path / "failed.json").write_text(
@@ -104,7 +104,7 @@ def test_a_failed_trial_says_why(tmp_path: Path) -> None:
     )
 
 
-def test_an_unknown_experiment_names_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_experiment_names_the_known_ones(tmp_path):
     write_runs(tmp_path, Plan())
     (tmp_path / "store").mkdir()
     assert list_experiments(tmp_path) == ["exp"]
@@ -114,14 +114,14 @@ def test_an_unknown_experiment_names_the_known_ones(tmp_path: Path) -> None:
         load_experiment(tmp_path / "nowhere", "demo")
 
 
-def test_an_experiment_without_a_usable_trial_is_an_error(tmp_path: Path) -> None:
+def test_an_experiment_without_a_usable_trial_is_an_error(tmp_path):
     for path in write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,))):
         (path / "results.json").unlink()
     with pytest.raises(InputError, match="no complete trial among 2 folders"):
         load_experiment(tmp_path, "exp")
 
 
-def test_views_must_average_to_the_metrics_of_their_trial(tmp_path: Path) -> None:
+def test_views_must_average_to_the_metrics_of_their_trial(tmp_path):
     path = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))[0]
     trial = next(trial for trial in load_experiment(tmp_path, "exp").trials if trial.path == path)
     views = read_views(trial)
@@ -136,13 +136,13 @@ def test_views_must_average_to_the_metrics_of_their_trial(tmp_path: Path) -> Non
         read_views(trial)
 
 
-def test_json_lines_end_at_a_damaged_line(tmp_path: Path) -> None:
+def test_json_lines_end_at_a_damaged_line(tmp_path):
     (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
     assert read_rows(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
     assert read_rows(tmp_path / "absent.jsonl") == []
 
 
-def test_reading_and_tabulating_load_no_torch() -> None:
+def test_reading_and_tabulating_load_no_torch():
     modules = "verbs.results, analysis.statistics, analysis.images, analysis.report.build"
     imports = "; ".join(f"import gsbench.{module}" for module in modules.split(", "))
     code = f"import sys; {imports}; sys.exit('torch' in sys.modules or 'mlflow' in sys.modules)"

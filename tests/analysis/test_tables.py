@@ -65,7 +65,7 @@ def texts(table: Table) -> list[list[str]]:
     ]
 
 
-def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path: Path) -> None:
+def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path):
     for seed, psnr in enumerate((27.0, 27.1, 27.5)):
         one_trial(tmp_path, seed, psnr=psnr)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
@@ -73,7 +73,7 @@ def test_a_cell_is_mean_and_sample_deviation_over_trials(tmp_path: Path) -> None
     assert texts(table) == [["garden", "sfm", "adc", "27.20 ± 0.26"]]
 
 
-def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path: Path) -> None:
+def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path):
     for densify, psnr, flip in (
         ("adc", 27.001, 0.1),
         ("none", 26.0, 0.3),
@@ -89,13 +89,13 @@ def test_the_best_is_bold_and_ties_after_rounding_are_both_best(tmp_path: Path) 
     assert not any(row.entries[2].bold for row in table.rows)  # a count is a cost, not a merit
 
 
-def test_bold_is_by_scene_not_by_table(make_experiment: Make) -> None:
+def test_bold_is_by_scene_not_by_table(make_experiment):
     table = build_table(make_experiment(effect={"psnr": 1.0}), metrics=["psnr"])
     bold = {row.labels[:3] for row in table.rows if row.entries[0].bold}
     assert bold == {(s, "sfm", "volumetric") for s in ("courtyard", "garden", "mean of 2 scenes")}
 
 
-def test_no_mean_is_shown_where_no_scene_has_every_arm(tmp_path: Path) -> None:
+def test_no_mean_is_shown_where_no_scene_has_every_arm(tmp_path):
     paths = write_runs(tmp_path, Plan())
     for path in [*paths[0:3], *paths[9:]]:  # courtyard has volumetric alone, garden adc
         shutil.rmtree(path)
@@ -105,7 +105,7 @@ def test_no_mean_is_shown_where_no_scene_has_every_arm(tmp_path: Path) -> None:
     assert [row[0] for row in texts(table)] == ["courtyard", "garden"]
 
 
-def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path: Path) -> None:
+def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path):
     paths = write_runs(tmp_path, Plan())
     (paths[0] / "results.json").unlink()  # courtyard, adc, seed 0
     for path in paths[9:]:  # garden, volumetric
@@ -124,23 +124,21 @@ def test_missing_and_incomplete_cells_are_marked_with_their_count(tmp_path: Path
     )
 
 
-def test_an_unavailable_metric_is_na_with_its_reason(make_experiment: Make) -> None:
+def test_an_unavailable_metric_is_na_with_its_reason(make_experiment):
     table = build_table(make_experiment(), metrics=["lpips_alex"])
     assert {row.entries[0].text for row in table.rows} == {"n/a"}
     assert "LPIPS Alex: n/a, weights file alexnet.pth not found." in table.notes
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_where_another_lpips_alone_was_asked_for_it_has_the_column(
-    there: bool, tmp_path: Path
-) -> None:
+def test_where_another_lpips_alone_was_asked_for_it_has_the_column(there, tmp_path):
     measured = {"lpips_squeeze": 0.1} if there else {}
     one_trial(tmp_path, 0, settings={"eval__lpips": ["squeeze"]}, psnr=27.0, **measured)
     keys = [quantity.key for quantity in choose_quantities(load_experiment(tmp_path, "exp").trials)]
     assert [key for key in keys if key.startswith("lpips")] == ["lpips_squeeze"]
 
 
-def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path: Path) -> None:
+def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path):
     one_trial(tmp_path, 0, psnr=27.0)
     table = build_table(load_experiment(tmp_path, "exp"))
     assert [column.heading for column in table.columns][1] == "LPIPS VGG raw ↓"
@@ -158,7 +156,7 @@ def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path
         ("hashes", ({"data": "a"}, {"data": "b"})),
     ],
 )
-def test_a_cell_never_mixes_conditions(tmp_path: Path, key: str, values: tuple) -> None:
+def test_a_cell_never_mixes_conditions(tmp_path, key, values):
     for seed, value in enumerate(values):
         one_trial(tmp_path, seed, psnr=27.0, **{f"_{key}": value})
     named = "data" if key == "hashes" else key
@@ -166,7 +164,7 @@ def test_a_cell_never_mixes_conditions(tmp_path: Path, key: str, values: tuple) 
         build_table(load_experiment(tmp_path, "exp"))
 
 
-def test_a_cell_never_mixes_settings(tmp_path: Path) -> None:
+def test_a_cell_never_mixes_settings(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
     one_trial(tmp_path, 1, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0)
     experiment = load_experiment(tmp_path, "exp")
@@ -178,7 +176,7 @@ def test_a_cell_never_mixes_settings(tmp_path: Path) -> None:
     assert [row.labels for row in table.rows] == [("garden", "0.03"), ("garden", "0.1")]
 
 
-def test_settings_that_only_say_where_a_trial_ran_do_not_matter(tmp_path: Path) -> None:
+def test_settings_that_only_say_where_a_trial_ran_do_not_matter(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
     one_trial(
         tmp_path, 1, "bbbbbbbb", {"tracking__name": "off", "scene__path": "/elsewhere"}, psnr=28.0
@@ -189,14 +187,14 @@ def test_settings_that_only_say_where_a_trial_ran_do_not_matter(tmp_path: Path) 
     )
 
 
-def test_one_seed_twice_is_refused(tmp_path: Path) -> None:
+def test_one_seed_twice_is_refused(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
     one_trial(tmp_path, 0, "bbbbbbbb", psnr=27.0)
     with pytest.raises(InputError, match="seed 0 twice"):
         build_table(load_experiment(tmp_path, "exp"))
 
 
-def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path: Path) -> None:
+def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
     one_trial(tmp_path, 0, psnr=27.0)
     one_trial(tmp_path, 0, psnr=28.0, _densify="volumetric", _iterations=7000)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
@@ -220,8 +218,8 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path: Pa
     ],
 )
 def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
-    tmp_path: Path, second_budget: dict, blocked: tuple[int | None, int], compared: bool
-) -> None:
+    tmp_path, second_budget, blocked, compared
+):
     first, second = ({} if count is None else {"blocked_by_cap": count} for count in blocked)
     one_trial(tmp_path, 0, psnr=27.0, _events=first)
     one_trial(tmp_path, 0, psnr=28.0, _densify="none", _budget=second_budget, _events=second)
@@ -230,7 +228,7 @@ def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
     assert ("garden: not compared, no best marked: budget differ." in table.notes) is not compared
 
 
-def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path: Path) -> None:
+def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path):
     for scene, psnrs in (("a", (20.0, 22.0)), ("b", (30.0, 31.0))):
         for seed, psnr in enumerate(psnrs):
             one_trial(tmp_path, seed, psnr=psnr, _scene=scene)
@@ -243,7 +241,7 @@ def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path: Path) -> None:
         assert table.rows[-1].entries[0].text == f"{mean:.2f} ± {std:.2f}"
 
 
-def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path) -> None:
+def test_costs_are_averaged_by_both_rules(make_experiment, tmp_path):
     for scene, adc, volumetric in (("a", 1_000_000, 2_000_000), ("b", 3_000_000, 3_000_000)):
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=adc)
         one_trial(
@@ -257,7 +255,7 @@ def test_costs_are_averaged_by_both_rules(make_experiment: Make, tmp_path: Path)
     assert relative_change(arms[0], [], lambda trial: trial.record.num_gaussians) is None
 
 
-def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path: Path) -> None:
+def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path):
     for seed, (early, late) in enumerate(((20.0, 27.0), (22.0, 28.0))):
         one_trial(tmp_path, seed, psnr=late, _metrics_at={"7000": {"metrics": {"psnr": early}}})
     experiment = load_experiment(tmp_path, "exp")
@@ -270,7 +268,7 @@ def test_metrics_of_earlier_iterations_have_columns_of_their_own(tmp_path: Path)
         build_table(experiment, metrics=["psnr@9000"])
 
 
-def test_unknown_names_are_refused(make_experiment: Make) -> None:
+def test_unknown_names_are_refused(make_experiment):
     experiment = make_experiment()
     with pytest.raises(InputError, match="unknown metric 'pnsr'"):
         build_table(experiment, metrics=["pnsr"])
@@ -278,7 +276,7 @@ def test_unknown_names_are_refused(make_experiment: Make) -> None:
         build_table(experiment, rows=["scene", "densify.grad_tresh"])
 
 
-def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path: Path) -> None:
+def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path):
     paths = write_runs(tmp_path, Plan(experiment="exp"))
     (paths[-1] / "results.json").write_text("{")
     notes = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr", "lpips_alex"]).notes
@@ -297,14 +295,14 @@ def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path: Path
     )
 
 
-def test_rows_are_in_the_order_of_numbers_then_of_text(tmp_path: Path) -> None:
+def test_rows_are_in_the_order_of_numbers_then_of_text(tmp_path):
     for cap in (9, 10, 100, None):
         one_trial(tmp_path, 0, f"{cap or 0:08x}", {"densify__cap": cap}, psnr=20.0)
     table = build_table(load_experiment(tmp_path, "exp"), rows=["densify.cap"], metrics=["psnr"])
     assert [row.labels for row in table.rows] == [("9",), ("10",), ("100",), ("None",)]
 
 
-def test_markdown(make_experiment: Make) -> None:
+def test_markdown(make_experiment):
     text = to_markdown(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert lines[0].startswith("| scene | PSNR (dB) ↑ adc | PSNR (dB) ↑ volumetric |")
@@ -313,7 +311,7 @@ def test_markdown(make_experiment: Make) -> None:
     assert "**" in text
 
 
-def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment: Make) -> None:
+def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment):
     experiment = make_experiment()
     rows = list(
         csv.DictReader(io.StringIO(to_csv(build_table(experiment, metrics=["psnr", "gaussians"]))))
@@ -348,7 +346,7 @@ class Balance(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_html_is_well_formed_and_escaped(make_experiment: Make) -> None:
+def test_html_is_well_formed_and_escaped(make_experiment):
     experiment = make_experiment()
     parser = Balance()
     parser.feed(to_html_page(build_table(experiment, rows=["scene", "init"], columns=["densify"])))
@@ -360,7 +358,7 @@ def test_html_is_well_formed_and_escaped(make_experiment: Make) -> None:
     assert all(f">{name}</th>" in heads for name in ("adc", "volumetric"))
 
 
-def test_latex_escapes_what_is_special() -> None:
+def test_latex_escapes_what_is_special():
     assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 ? \\#1"
 
 
@@ -375,7 +373,7 @@ def has_latex() -> bool:
 
 
 @pytest.mark.skipif(not has_latex(), reason="pdflatex with booktabs is not installed")
-def test_latex_compiles(make_experiment: Make, tmp_path: Path) -> None:
+def test_latex_compiles(make_experiment, tmp_path):
     experiment = make_experiment()
     (experiment.trials[0].path / "results.json").write_text("{")
     experiment = load_experiment(tmp_path, "exp")
@@ -396,7 +394,7 @@ def test_latex_compiles(make_experiment: Make, tmp_path: Path) -> None:
     assert (tmp_path / "table.pdf").is_file()
 
 
-def test_latex_has_as_many_cells_as_columns(make_experiment: Make) -> None:
+def test_latex_has_as_many_cells_as_columns(make_experiment):
     source = to_latex(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
     width = len(re.search(r"begin\{tabular\}\{(\w+)\}", source)[1])
     body = source.split("\\midrule")[1].split("\\bottomrule")[0]
@@ -405,7 +403,7 @@ def test_latex_has_as_many_cells_as_columns(make_experiment: Make) -> None:
     } == {width}
 
 
-def test_results_written_by_hand_are_plain_json(make_experiment: Make) -> None:
+def test_results_written_by_hand_are_plain_json(make_experiment):
     trial = make_experiment().trials[0]
     assert json.loads((trial.path / "results.json").read_text())["metrics"] == trial.metrics
 
@@ -419,8 +417,8 @@ def test_results_written_by_hand_are_plain_json(make_experiment: Make) -> None:
     ],
 )
 def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
-    tmp_path: Path, gaussians: int, seconds: float, headings: list[str]
-) -> None:
+    tmp_path, gaussians, seconds, headings
+):
     write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
     trials = load_experiment(tmp_path, "exp").trials
     object.__setattr__(trials[0].record, "num_gaussians", gaussians)
@@ -463,8 +461,8 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     ],
 )
 def test_the_first_table_says_how_weakly_its_metrics_agree_with_people(
-    make_experiment: Callable[..., Experiment], metrics: tuple[str, ...], said: str
-) -> None:
+    make_experiment, metrics, said
+):
     """Values of arXiv 2511.06830, table 3, SROCC of the main set."""
     table = build_table(make_experiment(), metrics=metrics)
     first, second = with_agreement([table, table])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from gsbench.runs.layout import FROM_PIXELS, MASKS
 from tests.analysis.synthetic import Plan, write_runs
 
 
-def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path: Path) -> None:
+def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path):
     """Steps grow from left to right, so texture does; the render is off by the tenth of a column's
     number."""
     write_runs(

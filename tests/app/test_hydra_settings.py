@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from gsbench import cli
@@ -11,18 +9,13 @@ from gsbench.app.command import compose_trials
 from gsbench.config.command_words import check_search_path
 from gsbench.errors import InputError
 
-
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 SWEEP = ["densify=adc,none", "seed=0,1", "init=random", "tracking=none"]
 
 
-def test_a_sweep_has_one_time() -> None:
+def test_a_sweep_has_one_time():
     """Microseconds, so that two of them never agree by chance; each densifier is a composition of
     its own."""
     trials = compose_trials(
@@ -61,13 +54,10 @@ def test_a_sweep_has_one_time() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(
-    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_refused_in_a_line(words, text, refused):
     if "hydra/launcher=joblib" in words:
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    assert cli.run([*words, "--dry-run"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused(*words, "--dry-run")
     assert text in line
 
 
@@ -83,15 +73,12 @@ def test_what_cannot_be_is_refused_in_a_line(
     ],
     ids=" ".join,
 )
-def test_what_is_hydras_is_taken_and_a_look_writes_nothing(
-    words: list[str], runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run([*words, "--dry-run"]) == 0
-    assert f"{1 + ('-m' in words)} trial" in capsys.readouterr().out
+def test_what_is_hydras_is_taken_and_a_look_writes_nothing(words, runs, said):
+    assert f"{1 + ('-m' in words)} trial" in said(*words, "--dry-run")
     assert list(runs.parent.iterdir()) == []
 
 
-def test_settings_read_hydras_node() -> None:
+def test_settings_read_hydras_node():
     """Each job's own number, although trials that differ in the seed share a composition."""
     words = [
         "name=x-${hydra:runtime.choices.densify}-${hydra:job.num}",
@@ -110,29 +97,24 @@ def test_settings_read_hydras_node() -> None:
     assert trial.values["name"] == "x-volumetric"
 
 
-def test_a_search_is_not_called_a_trial(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["-m", "densify.volume_threshold=interval(.01,1)", "--dry-run"]) == 0
-    out = capsys.readouterr().out
+def test_a_search_is_not_called_a_trial(said):
+    out = said("-m", "densify.volume_threshold=interval(.01,1)", "--dry-run")
     assert "search" in out
     assert "20 points" in out
     assert "1 trial" not in out
 
 
-def test_a_glob_of_characters_works_as_it_is_advised(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["-m", 'densify=glob("[av]*")', "--dry-run"]) == 0
-    assert "sfm-adc" in capsys.readouterr().out
+def test_a_glob_of_characters_works_as_it_is_advised(said):
+    assert "sfm-adc" in said("-m", 'densify=glob("[av]*")', "--dry-run")
 
 
 @pytest.mark.parametrize(
     "words", [["--config-dir", "own", "--help"], ["-h", "--config-dir=own"], ["-m", "--help"]]
 )
-def test_help_is_given_wherever_it_is_asked_for(
-    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_is_given_wherever_it_is_asked_for(words, tmp_path, said):
     (tmp_path / "own" / "densify").mkdir(parents=True)
     (tmp_path / "own" / "densify" / "patient.yaml").write_text("defaults: [adc]\n")
-    assert cli.run(words) == 0
-    out = capsys.readouterr().out
+    out = said(*words)
     assert "Verbs" in out
     # a folder's own choices are listed
     assert ("patient" in out) == any("own" in word for word in words)
@@ -148,6 +130,6 @@ def test_help_is_given_wherever_it_is_asked_for(
         "hydra[searchpath]=extend_list('pkg://strange')",
     ],
 )
-def test_no_package_is_searched_however_it_is_written(word: str) -> None:
+def test_no_package_is_searched_however_it_is_written(word):
     with pytest.raises(InputError):
         check_search_path([word], [])

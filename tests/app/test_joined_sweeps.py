@@ -26,11 +26,7 @@ KNOWN = {
 }
 
 
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 def arms(*words: str) -> list[tuple[str, int]]:
@@ -40,7 +36,7 @@ def arms(*words: str) -> list[tuple[str, int]]:
     ]
 
 
-def test_words_are_shared_own_or_given() -> None:
+def test_words_are_shared_own_or_given():
     grids = [
         {"densify": "adc"},
         {"densify": "volumetric", "densify.volume_threshold": "1,2", "seed": "7"},
@@ -53,7 +49,7 @@ def test_words_are_shared_own_or_given() -> None:
     assert words_of_grids({"seed": "0,1"}, [], given) == [["seed=0,1", *given]]
 
 
-def test_thresholds_beside_a_baseline_that_knows_none() -> None:
+def test_thresholds_beside_a_baseline_that_knows_none():
     trials = compose_trials(["+experiment=threshold"])
     places = ["/".join(TrialFolder.of(trial.values).path.parts[-2:]) for trial in trials]
     assert len(places) == len(set(places)) == 21
@@ -66,7 +62,7 @@ def test_thresholds_beside_a_baseline_that_knows_none() -> None:
         assert compose_one(trial.overrides).values == trial.values  # as `retry` composes it
 
 
-def test_the_command_line_speaks_to_every_grid_that_knows_the_setting() -> None:
+def test_the_command_line_speaks_to_every_grid_that_knows_the_setting():
     own = arms("+experiment=threshold", "densify.volume_threshold=0.5,0.7", "seed=4")
     assert own == [("adc", 4), ("volumetric-0.5", 4), ("volumetric-0.7", 4)]
     trials = compose_trials(
@@ -79,7 +75,7 @@ def test_the_command_line_speaks_to_every_grid_that_knows_the_setting() -> None:
         arms("+experiment=threshold", "densify=mcmc")
 
 
-def test_grids_in_a_users_own_experiment(tmp_path: Path) -> None:
+def test_grids_in_a_users_own_experiment(tmp_path):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     file = tmp_path / "own" / "experiment" / "mine.yaml"
     search = f"hydra.searchpath=[file://{tmp_path}/own]"
@@ -113,20 +109,14 @@ def test_grids_in_a_users_own_experiment(tmp_path: Path) -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(
-    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["-m", *words] if len(words) < 2 and "grids" not in words[0] else words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_what_cannot_be_is_refused_in_a_line(words, text, refused):
+    line = refused(*["-m", *words] if len(words) < 2 and "grids" not in words[0] else words)
     assert text in line
 
 
-def test_plan_dry_run_and_retry_see_one_experiment(
-    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, said):
     words = ["+experiment=threshold", "densify.volume_threshold=0.5", "seed=0"]
-    assert cli.run([*words, "--dry-run"]) == 0
-    assert "2 trials: 2 missing" in capsys.readouterr().out
+    assert "2 trials: 2 missing" in said(*words, "--dry-run")
     trials = compose_trials(words)
     add_to_plan(trials)
     first, second = (TrialFolder.of(trial.values).path for trial in trials)
@@ -136,8 +126,8 @@ def test_plan_dry_run_and_retry_see_one_experiment(
     write_results(first, trials[0].values)
     ran: list[Path] = []
 
-    def run_trials(again: list[object]) -> int:
-        ran.extend(TrialFolder.of(trial.values).path for trial in again)  # type: ignore[attr-defined]
+    def run_trials(again):
+        ran.extend(TrialFolder.of(trial.values).path for trial in again)
         return 0
 
     monkeypatch.setattr("gsbench.app.command.run_trials", run_trials)

@@ -72,15 +72,8 @@ class Fake:
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
-
-
-@pytest.fixture
-def sweep(runs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    def run(fake: Fake, *words: str) -> int:
+def sweep(runs, monkeypatch) -> Callable[..., int]:
+    def run(fake, *words):
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run([*SWEEP, *words])
 
@@ -96,7 +89,7 @@ def clear(arm: str, seed: int) -> float:
     return 26 + 2 * (arm == "volumetric") + 1e-3 * np.sin(seed + len(arm))
 
 
-def test_a_clear_difference_ends_at_the_first_look(sweep: Callable[..., int], runs: Path) -> None:
+def test_a_clear_difference_ends_at_the_first_look(sweep, runs):
     fake = Fake(clear)
     assert sweep(fake) == 0
     assert fake.batches == [[("adc", 0), ("volumetric", 0), ("adc", 1), ("volumetric", 1)]]
@@ -104,9 +97,7 @@ def test_a_clear_difference_ends_at_the_first_look(sweep: Callable[..., int], ru
     assert (verdict.outcome, verdict.pairs.seeds, verdict.late) == ("supported", 2, 0)
 
 
-def test_a_decided_sweep_given_again_runs_nothing(
-    sweep: Callable[..., int], runs: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_decided_sweep_given_again_runs_nothing(sweep, runs, caplog):
     assert sweep(Fake(clear)) == 0
     again = Fake(clear)
     with caplog.at_level(logging.INFO):
@@ -120,9 +111,7 @@ def verdicts_of(runs: Path) -> list[Verdict]:
     return judge(read_experiment(runs / "stop").trials, read_declarations(runs / "stop")[-1])
 
 
-def test_noise_gets_all_seeds_and_each_trial_is_launched_once(
-    sweep: Callable[..., int], runs: Path
-) -> None:
+def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep, runs):
     fake = Fake(noise)
     assert sweep(fake) == 0
     assert [len(batch) for batch in fake.batches] == [4, 2, 2]
@@ -132,9 +121,7 @@ def test_noise_gets_all_seeds_and_each_trial_is_launched_once(
 
 
 @pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
-def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing(
-    sweep: Callable[..., int], runs: Path, psnr: Callable[[str, int], float]
-) -> None:
+def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing(sweep, runs, psnr):
     assert sweep(Fake(psnr)) == 0
     experiment = read_experiment(runs / "stop")
     found = active_declaration(experiment.folder, experiment.trials)
@@ -148,9 +135,7 @@ def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing
     assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
 
 
-def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
-    sweep: Callable[..., int], runs: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(sweep, runs, caplog):
     fake = Fake(lambda arm, seed: clear(arm, seed) if arm != "mcmc" else noise(arm, seed))
     with caplog.at_level(logging.INFO):
         assert sweep(fake, "densify=adc,volumetric,mcmc") == 0
@@ -160,9 +145,7 @@ def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(
     assert "2 of 12 trials were not needed" in caplog.text
 
 
-def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(
-    sweep: Callable[..., int], runs: Path
-) -> None:
+def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(sweep, runs):
     assert sweep(Fake(noise, stops_at=2)) == cli.INTERRUPTED
     (plan,) = read_declarations(runs / "stop")
     fake = Fake(noise)
@@ -173,9 +156,7 @@ def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(
     assert not any(verdict.late for verdict in verdicts_of(runs))
 
 
-def test_a_failed_seed_ends_the_looks_and_its_return_decides(
-    sweep: Callable[..., int], runs: Path
-) -> None:
+def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep, runs):
     assert sweep(Fake(clear, fails=1)) == 1
     (verdict,) = verdicts_of(runs)
     assert not verdict.final
@@ -185,9 +166,7 @@ def test_a_failed_seed_ends_the_looks_and_its_return_decides(
 
 
 @pytest.mark.slow
-def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(
-    sweep: Callable[..., int], runs: Path
-) -> None:
+def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep, runs):
     assert sweep(Fake(noise)) == 0
     for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
         file.write_text(
@@ -200,16 +179,14 @@ def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(
 
 
 @pytest.mark.slow
-def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep: Callable[..., int]) -> None:
+def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep):
     fake = Fake(noise)
     assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
     assert len(fake.batches) == 8  # a call for each trial
     assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_settings_make_arms_and_the_report_opens_with_the_looks(
-    sweep: Callable[..., int], runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, capsys, said):
     """Arms that differ in a setting alone are told apart as in the report."""
     fake = Fake(clear)
     assert (
@@ -234,8 +211,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     assert f"{pair}, on this scene: better in PSNR (dB)" in text
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
-    assert cli.run(["tables", "stop"]) == 0
-    assert "Seeds come in planned looks" in capsys.readouterr().out
+    assert "Seeds come in planned looks" in said("tables", "stop")
 
 
 @pytest.mark.parametrize(
@@ -250,13 +226,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_looked_at_is_refused_before_any_trial(
-    sweep: Callable[..., int],
-    runs: Path,
-    words: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_looked_at_is_refused_before_any_trial(sweep, runs, words, message, capsys):
     fake = Fake(clear)
     assert sweep(fake, *words) == 2
     (line,) = [
@@ -267,14 +237,12 @@ def test_what_cannot_be_looked_at_is_refused_before_any_trial(
     assert not runs.exists()
 
 
-def test_one_trial_is_no_sweep(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run([*TINY, "launch.stop_when_decided=true"]) == 2
-    assert "adds seeds to a sweep" in capsys.readouterr().err
+def test_one_trial_is_no_sweep(runs, refused):
+    assert "adds seeds to a sweep" in refused(*TINY, "launch.stop_when_decided=true")
 
 
-def test_a_dry_run_says_when_it_looks_and_writes_nothing(
-    runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run([*SWEEP, "--dry-run"]) == 0
-    assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in capsys.readouterr().out
+def test_a_dry_run_says_when_it_looks_and_writes_nothing(runs, said):
+    assert "looks at 2, 3, 4 seeds, 4 trials until the first, 8 at most" in said(
+        *SWEEP, "--dry-run"
+    )
     assert not runs.exists()

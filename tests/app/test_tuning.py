@@ -104,21 +104,15 @@ class Fake:
         return [trial for trial in self.trained if trial.values["name"] == "fair"]
 
 
-@pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "conf" / "experiment").mkdir(parents=True)
-    return tmp_path / "runs"
-
-
 Sweep = Callable[..., int]
 
 
 @pytest.fixture
-def sweep(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sweep:
-    def run(fake: Fake, *words: str, file: str = FILE) -> int:
-        (tmp_path / "conf" / "experiment" / "fair.yaml").write_text(file)
+def sweep(runs, tmp_path, monkeypatch) -> Sweep:
+    def run(fake, *words, file=FILE):
+        conf = tmp_path / "conf" / "experiment"
+        conf.mkdir(parents=True, exist_ok=True)
+        (conf / "fair.yaml").write_text(file)
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run(["--config-dir", str(tmp_path / "conf"), *WORDS, *words])
 
@@ -136,9 +130,7 @@ def chosen(runs: Path, arm: str) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_the_best(
-    sweep: Sweep, runs: Path
-) -> None:
+def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_the_best(sweep, runs):
     fake = Fake()
     assert sweep(fake) == 0
     # a point of both arms at a time, then the sweep as a whole
@@ -163,9 +155,7 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
 @pytest.mark.slow
 @pytest.mark.slow
-def test_killed_anywhere_it_goes_on_and_chooses_the_same(
-    stops: int, sweep: Sweep, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_anywhere_it_goes_on_and_chooses_the_same(stops, sweep, runs, tmp_path, monkeypatch):
     whole = Fake()
     assert sweep(whole) == 0
     expected = [tuning(runs, arm) for arm in KEYS]
@@ -189,9 +179,7 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(
     ],
 )
 @pytest.mark.slow
-def test_no_record_sets_what_was_not_searched(
-    strange: dict[str, Any], sweep: Sweep, runs: Path
-) -> None:
+def test_no_record_sets_what_was_not_searched(strange, sweep, runs):
     assert sweep(Fake()) == 0
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
     record = json.loads(file.read_text())
@@ -205,9 +193,7 @@ def test_no_record_sets_what_was_not_searched(
 
 
 @pytest.mark.slow
-def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(
-    sweep: Sweep, runs: Path
-) -> None:
+def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep, runs):
     assert sweep(Fake(), "launch.stop_when_decided=true", "seed=0,1,2") == 0
     more = Fake()
     assert sweep(more, "launch.stop_when_decided=true", "seed=0,1,2") == 0
@@ -217,7 +203,7 @@ def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(
 
 
 @pytest.mark.slow
-def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, runs: Path) -> None:
+def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep, runs):
     fake = Fake()
     words = [
         "scene.sector=0,1",
@@ -236,8 +222,8 @@ def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep: Sweep, r
 
 @pytest.mark.slow
 def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the_sweep(
-    sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    sweep, runs, capsys
+):
     assert sweep(Fake(fails=[0])) == 1
     assert [point.value is None for point in tuning(runs, "adc").points] == [
         True,
@@ -258,23 +244,21 @@ def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the
     )
 
 
-def test_a_typed_value_takes_the_place_of_an_interval(sweep: Sweep, runs: Path) -> None:
+def test_a_typed_value_takes_the_place_of_an_interval(sweep, runs):
     fake = Fake()
     assert sweep(fake, "densify.stop=200", "hydra.sweeper.tune.points=1") == 0
     assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {200}
     assert chosen(runs, "volumetric").keys() == {"densify.volume_threshold"}
 
 
-def test_zero_points_tune_nothing(sweep: Sweep, runs: Path) -> None:
+def test_zero_points_tune_nothing(sweep, runs):
     fake = Fake()
     assert sweep(fake, "hydra.sweeper.tune.points=0") == 0
     assert fake.batches == [4]
     assert not list(runs.glob("*/tuning.json"))
 
 
-def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
-    sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(sweep, runs, capsys):
     look = ["--dry-run"]
     assert sweep(Fake(), *look) == 0
     said = capsys.readouterr().out
@@ -287,7 +271,7 @@ def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(
     assert not runs.exists()
 
 
-def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interval_searches_one_arm(runs, monkeypatch):
     """A search is the tuning of one arm: its best is trained with the seeds of the command."""
     fake = Fake()
     monkeypatch.setattr("gsbench.app.command.run_batch", fake)
@@ -315,9 +299,7 @@ def test_an_interval_searches_one_arm(runs: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_a_metric_of_ones_own_is_made_best_in_the_direction_of_its_class(
-    sweep: Sweep, runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_metric_of_ones_own_is_made_best_in_the_direction_of_its_class(sweep, runs, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     Path("own.py").write_text(
         "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
@@ -343,7 +325,7 @@ def notes(runs: Path, *words: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep: Sweep, runs: Path) -> None:
+def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep, runs):
     assert sweep(Fake()) == 0
     adc, volumetric = notes(runs)
     best = chosen(runs, "volumetric")
@@ -369,9 +351,7 @@ SENTENCE = (
 
 
 @pytest.mark.slow
-def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(
-    sweep: Sweep, runs: Path
-) -> None:
+def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep, runs):
     assert sweep(Fake(), file=UNEVEN) == 0
     lines = notes(runs)
     assert f"Tuning. {SENTENCE}" in lines
@@ -385,9 +365,7 @@ def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(
 
 
 @pytest.mark.slow
-def test_trials_from_before_the_tuning_and_with_other_values_are_named(
-    sweep: Sweep, runs: Path
-) -> None:
+def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep, runs):
     assert sweep(Fake()) == 0
     for file in (runs / "fair").glob("*/random-volumetric/*/results.json"):
         file.write_text(
@@ -437,9 +415,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("file", "word", "part"), MISTAKES)
-def test_mistakes_are_one_line_before_any_work(
-    file: str, word: str, part: str, sweep: Sweep, runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_one_line_before_any_work(file, word, part, sweep, runs, capsys):
     fake = Fake()
     assert sweep(fake, *([word] if word else []), file=file) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -448,7 +424,7 @@ def test_mistakes_are_one_line_before_any_work(
     assert not runs.exists()
 
 
-def test_hydra_shows_the_defaults_of_the_class() -> None:
+def test_hydra_shows_the_defaults_of_the_class():
     defaults = {
         field.name: field.default
         if field.default_factory is dataclasses.MISSING

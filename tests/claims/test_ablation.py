@@ -22,7 +22,6 @@ from gsbench.claims.ablation import (
     off_settings,
     runs_to_train,
 )
-from gsbench.cli import run
 from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
 from gsbench.densify.volumetric import Volumetric
@@ -44,7 +43,7 @@ def on(*names: str) -> Run:
     return frozenset(names)
 
 
-def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
+def test_what_acts_within_another_is_trained_only_where_that_is_on():
     runs = runs_to_train(NESTED)
     assert runs == [
         on("rule", "shrink", "once"),
@@ -60,7 +59,7 @@ def test_what_acts_within_another_is_trained_only_where_that_is_on() -> None:
     assert off_settings(on("rule", "shrink", "once"), NESTED) == {}
 
 
-def test_switches_within_each_other_are_refused() -> None:
+def test_switches_within_each_other_are_refused():
     circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
     with pytest.raises(InputError, match="circle"):
         runs_to_train(circle)
@@ -80,7 +79,7 @@ def test_switches_within_each_other_are_refused() -> None:
 @pytest.mark.parametrize(
     "arm", [name for name in options("densify") if name != "none" and "/" not in name]
 )
-def test_every_declared_switch_of_every_arm_makes_another_densifier(arm: str) -> None:
+def test_every_declared_switch_of_every_arm_makes_another_densifier(arm):
     """Its settings are those of the class, allowed there, and act on the arm as configured."""
     values = compose_one([f"densify={arm}"]).values["densify"]
     own = type(build("densify", values, [])).SWITCHES
@@ -91,7 +90,7 @@ def test_every_declared_switch_of_every_arm_makes_another_densifier(arm: str) ->
     assert all(switch.within in {"", *own} for switch in own.values())
 
 
-def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on() -> None:
+def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on():
     once = compose_one(["densify=volumetric_once"]).values["densify"]
     assert list(declared_switches(Volumetric.SWITCHES, once)) == [
         "volume_rule",
@@ -106,7 +105,7 @@ def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on() -
     assert set().union(*(switch.off for switch in Volumetric.SWITCHES.values())) <= set(defaults)
 
 
-def test_a_yaml_declares_switches_that_are_no_part_of_a_result() -> None:
+def test_a_yaml_declares_switches_that_are_no_part_of_a_result():
     values: dict[str, Any] = {
         "grow": 1,
         "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}},
@@ -123,7 +122,7 @@ def test_a_yaml_declares_switches_that_are_no_part_of_a_result() -> None:
             declared_switches({}, {"switches": wrong})
 
 
-def test_a_name_that_is_no_switch_is_named_with_the_nearest() -> None:
+def test_a_name_that_is_no_switch_is_named_with_the_nearest():
     with pytest.raises(InputError, match="did you mean shrink"):
         choose_switches(NESTED, ["shrnk"], "x")
     with pytest.raises(InputError, match="declares no switch"):
@@ -151,7 +150,7 @@ def write_ablation(
     return keys
 
 
-def test_each_combination_is_judged_against_all_parts(tmp_path: Path) -> None:
+def test_each_combination_is_judged_against_all_parts(tmp_path):
     keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": 0.0})
     verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
     found = {str(one.question.arm): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
@@ -169,7 +168,7 @@ def test_each_combination_is_judged_against_all_parts(tmp_path: Path) -> None:
     )
 
 
-def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -> None:
+def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
     keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": -0.2})
     last = list(keys)[-1]
     for path in (tmp_path / "exp").glob(f"{keys[last]['courtyard']}-seed*/results.json"):
@@ -197,27 +196,13 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path: Path) -
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_words_are_refused_in_a_line(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    assert run(["ablate", *(word for word in TINY if word != "densify=none"), *words]) == 2
-    (line,) = [
-        line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")
-    ]
-    assert message in line
-    assert not (tmp_path / "runs").exists()
+def test_bad_words_are_refused_in_a_line(runs, words, message, refused):
+    assert message in refused("ablate", *(word for word in TINY if word != "densify=none"), *words)
+    assert not (runs).exists()
 
 
 @pytest.mark.slow
-def test_the_verb_trains_each_run_once_and_judges_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+def test_the_verb_trains_each_run_once_and_judges_it(runs, said):
     words = [
         *(word for word in TINY if word != "densify=none"),
         "densify=adc",
@@ -225,7 +210,6 @@ def test_the_verb_trains_each_run_once_and_judges_it(
         "name=parts",
     ]
     words += ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
-    assert run(["ablate", *words]) == 0
-    out = capsys.readouterr().out
+    out = said("ablate", *words)
     assert "adc: 1 part (size), 2 runs, 4 trials" in out
     assert "| without size | " in out

@@ -13,7 +13,6 @@ import yaml
 
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.claims.archive import unpack_archive, write_archive
-from gsbench.cli import run
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -44,7 +43,7 @@ def rewrite(file: Path, change: Callable[[dict[str, bytes]], None]) -> None:
             archive.writestr(name, data)
 
 
-def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
+def test_results_settings_and_views_come_back(tmp_path):
     file = export(tmp_path)
     there = load_experiment(tmp_path / "runs", "exp")
     back = unpack_archive(file, tmp_path / "other")
@@ -58,7 +57,7 @@ def test_results_settings_and_views_come_back(tmp_path: Path) -> None:
     ).read_text()
 
 
-def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path: Path) -> None:
+def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path):
     file = export(tmp_path, MANY)
     assert file.stat().st_size < 300_000
     before = file.read_bytes()
@@ -66,7 +65,7 @@ def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path: Path) 
     assert file.read_bytes() == before
 
 
-def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
+def test_no_pixels_and_no_paths_of_the_machine(tmp_path):
     runs = tmp_path / "runs"
     (path, *_) = write_runs(runs, Plan(pictures=True, views=2))
     config = yaml.safe_load((path / "config.yaml").read_text())
@@ -98,7 +97,7 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path: Path) -> None:
     )
 
 
-def test_it_is_an_ro_crate(tmp_path: Path) -> None:
+def test_it_is_an_ro_crate(tmp_path):
     """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2
     (packaging)."""
     file = export(tmp_path)
@@ -118,7 +117,7 @@ def test_it_is_an_ro_crate(tmp_path: Path) -> None:
     assert all(by_id[part]["@type"] == "File" for part in parts)
     assert all(int(by_id[part]["contentSize"]) == len(content[part]) for part in parts)
 
-    def references(value: object) -> set[str]:
+    def references(value):
         if isinstance(value, dict):
             own = {value["@id"]} if value.keys() == {"@id"} else set()
             return own.union(*map(references, value.values()))
@@ -207,9 +206,7 @@ def flip_a_bit(file: Path) -> None:
         ),
     ],
 )
-def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
-    tmp_path: Path, damage: Callable[[Path], None], message: str
-) -> None:
+def test_damage_of_every_kind_is_one_line_and_leaves_nothing(tmp_path, damage, message):
     file = export(tmp_path)
     damage(file)
     with pytest.raises(InputError) as raised:
@@ -220,7 +217,7 @@ def test_damage_of_every_kind_is_one_line_and_leaves_nothing(
     assert {path.name for path in tmp_path.iterdir()} <= {"runs", "exp.zip", "other"}
 
 
-def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_too_large_is_not_unpacked(tmp_path, monkeypatch):
     file = export(tmp_path)
     monkeypatch.setattr("gsbench.claims.archive.MAX_BYTES", 1000)
     with pytest.raises(InputError, match="no archive of gsbench's has so many"):
@@ -228,25 +225,22 @@ def test_a_file_too_large_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    runs = tmp_path / "runs"
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    runs, tmp_path, caplog, said, refused
+):
     first, second, *_ = write_runs(runs, Plan())
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
-    assert run(["export", "--results", "exp", "--out", str(tmp_path / "out" / "a.zip")]) == 0
-    assert capsys.readouterr().out.startswith(f"{tmp_path / 'out' / 'a.zip'}: results of exp, ")
+    assert said("export", "--results", "exp", "--out", tmp_path / "out" / "a.zip").startswith(
+        f"{tmp_path / 'out' / 'a.zip'}: results of exp, "
+    )
     assert "does not average" in caplog.text
     assert "not JSON" in caplog.text
     assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10
     for path in runs.glob("exp/*/*/*/per_view.csv"):
         path.write_text("")
-    assert run(["export", "--results", "exp", "--out", str(tmp_path / "b.zip")]) == 2
-    assert "no whole trial to export" in capsys.readouterr().err
+    assert "no whole trial to export" in refused(
+        "export", "--results", "exp", "--out", tmp_path / "b.zip"
+    )
     assert not (tmp_path / "b.zip").exists()
     for words in (
         ["--results", "exp", "exp:courtyard:adc:0"],
@@ -254,5 +248,4 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
         ["exp:courtyard:adc:0"],
         [],
     ):
-        assert run(["export", *words]) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
+        refused("export", *words)

@@ -92,7 +92,7 @@ def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
     return check.verdicts(run_looks(check.declaration, check.judged, run))
 
 
-def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path: Path) -> None:
+def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path):
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001)
     first = looked(check, runner)
     assert [verdict.word for verdict in first] == ["supported"]
@@ -102,14 +102,14 @@ def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path
     assert [one.verdict.interval for one in again] == [one.verdict.interval for one in first]
 
 
-def test_seeds_are_added_look_by_look_up_to_the_most(tmp_path: Path) -> None:
+def test_seeds_are_added_look_by_look_up_to_the_most(tmp_path):
     runner = FakeRunner(noise=2.0)
     (verdict,) = looked(check_of(tmp_path), runner)
     assert verdict.word == "undecided"
     assert runner.batches == [4, 2, 2]
 
 
-def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Path) -> None:
+def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path):
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001, fails=1)
     (verdict,) = looked(check, runner)
     assert (verdict.word, runner.batches) == ("undecided", [4])
@@ -122,7 +122,7 @@ def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path: Pat
     assert (verdict.word, runner.batches) == ("supported", [4, 2])
 
 
-def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path) -> None:
+def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path):
     file = parse_claims(content() | {"scenes": {"courtyard": None, "garden": None}})
     check = prepare(
         file, tmp_path, lambda trials: ["no data"] * (trials[0].values["scene"]["name"] == "garden")
@@ -138,7 +138,7 @@ def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path: Path)
     assert nothing.declaration.hash != check.declaration.hash
 
 
-def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
+def test_settings_that_do_not_compose_name_their_place(tmp_path):
     for bad, message in (
         (
             changed("arms", "adc", to={"densify": "adcc"}),
@@ -153,7 +153,7 @@ def test_settings_that_do_not_compose_name_their_place(tmp_path: Path) -> None:
             prepare(parse_claims(bad), tmp_path, lambda trials: [])
 
 
-def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) -> None:
+def test_another_seed_is_another_folder_and_the_same_settings(tmp_path):
     trial = next(iter(check_of(tmp_path).first_trials.values()))
     other = with_seed(trial, 7)
     assert yaml.safe_load(other.yaml)["seed"] == other.values["seed"] == 7
@@ -164,7 +164,7 @@ def test_another_seed_is_another_folder_and_the_same_settings(tmp_path: Path) ->
     assert "seed=7" in other.overrides
 
 
-def test_the_page_says_all(tmp_path: Path) -> None:
+def test_the_page_says_all(tmp_path):
     check = check_of(tmp_path, says="it is <better> | by far")
     verdicts = looked(check, FakeRunner(noise=0.001))
     older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
@@ -236,12 +236,12 @@ def judged(
         (judged("undecided", untestable="no data"), "no data"),
     ],
 )
-def test_each_verdict_has_its_reason(one: ClaimVerdict, reason: str) -> None:
+def test_each_verdict_has_its_reason(one, reason):
     assert one.reason == reason
     assert one.word == ("not testable here" if reason == "no data" else one.verdict.outcome)
 
 
-def test_numbers_and_late_trials_on_the_page() -> None:
+def test_numbers_and_late_trials_on_the_page():
     assert [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)] == [
         "1,000",
         "-1,000",
@@ -253,22 +253,20 @@ def test_numbers_and_late_trials_on_the_page() -> None:
 
 
 def test_the_verb_on_made_up_trials_and_on_their_archive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    runs, tmp_path, monkeypatch, capsys, said, refused
+):
     runner = FakeRunner(noise=0.001)
     monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
     path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
     path.write_text(json.dumps(content()))
-    assert run(["check", str(path), "--dry-run"]) == 0
-    out = capsys.readouterr().out
+    out = said("check", path, "--dry-run")
     assert "1 claim to be tested" in out
     assert (
         "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps" in out
     )
     assert run(["check", str(path)]) == 0
     assert runner.batches == [4]
-    home = tmp_path / "runs" / "check_it"
+    home = runs / "check_it"
     assert (
         capsys.readouterr().out
         == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
@@ -276,8 +274,7 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
     assert "supported" in (home / "claims.html").read_text()
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     capsys.readouterr()
-    assert run(["check", str(path), "--from", str(archive)]) == 0
-    out = capsys.readouterr().out
+    out = said("check", path, "--from", archive)
     assert "supported            lpips: PSNR (dB) of volumetric against adc: +1.0" in out
     assert "judged on 4 trials: 1 scene, 2 seeds, two arms; looks planned at 2, 3, 4 seeds" in out
     assert run(["check", str(path), "--from", str(archive), "--out", str(page)]) == 0
@@ -292,23 +289,20 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
         ({"id": "other"}, "the file lacks claims that were declared: lpips"),
     ):
         path.write_text(json.dumps(content(**changes)))
-        assert run(["check", str(path), "--from", str(archive)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("check", path, "--from", archive)
     for words, message in (
         (["--from", str(archive), "--dry-run"], "runs nothing"),
         (["--from", str(archive), "--out", "page.txt"], "a page ends in .html"),
         (["--out", "page.html"], "--out goes with --from"),
         (["train.iterations=5"], "settings of a check are in its file of claims"),
     ):
-        assert run(["check", str(path), *words]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("check", path, *words)
 
 
 @pytest.mark.slow
 def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    runs, tmp_path, monkeypatch, capsys, said
+):
     words = dict(word.split("=", 1) for word in TINY)
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300, "train.opacity": 0.03}}
@@ -324,14 +318,12 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     path.write_text(
         json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2})
     )
-    assert run(["check", str(path), "--dry-run"]) == 0
-    assert "4 trials until the first look" in capsys.readouterr().out
-    assert not (tmp_path / "runs" / "check_it").exists()
-    assert run(["check", str(path)]) == 0
-    out = capsys.readouterr().out
+    assert "4 trials until the first look" in said("check", path, "--dry-run")
+    assert not (runs / "check_it").exists()
+    out = said("check", path)
     assert "  points: " in out
     assert "not testable here    size: too large" in out
-    home = tmp_path / "runs" / "check_it"
+    home = runs / "check_it"
     (declared,) = read_declarations(home)
     measured = [
         json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")
@@ -351,8 +343,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "elsewhere"))
     capsys.readouterr()
     recheck = ["check", str(path), "--from", str(archive)]
-    assert run(recheck) == 0
-    printed = capsys.readouterr().out
+    printed = said(*recheck)
     assert len(printed.splitlines()) < 15
     assert "?  claim" not in printed
     page = tmp_path / "pages" / "claims.html"
@@ -365,9 +356,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
 
 
 @pytest.mark.parametrize("key", ["allow_targets", "+allow_targets"])
-def test_a_file_of_claims_allows_no_code(
-    tmp_path: Path, key: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_of_claims_allows_no_code(tmp_path, key, monkeypatch):
     """A stranger's claims may name a class; only the one who types may let it run."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "stranger.py").write_text(

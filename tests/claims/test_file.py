@@ -7,7 +7,6 @@ import copy
 import dataclasses
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -67,14 +66,14 @@ def second_claim(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_the_files_that_ship_are_sound(path: Path) -> None:
+def test_the_files_that_ship_are_sound(path):
     file = read_claims(path)
     assert file.size
     assert len(file.claims) >= 4
     assert any(claim.not_testable for claim in file.claims)
 
 
-def test_words_of_a_trial_are_those_of_a_command_line() -> None:
+def test_words_of_a_trial_are_those_of_a_command_line():
     file = parse_claims(
         changed("claims", 0, "budget", to={"densify.max_gaussians": 15000, "densify.cap": None})
     )
@@ -90,7 +89,7 @@ def test_words_of_a_trial_are_those_of_a_command_line() -> None:
     assert file.words(file.claims[0], "courtyard", "volumetric")[2] == "scene=courtyard"
 
 
-def test_the_nearer_setting_counts() -> None:
+def test_the_nearer_setting_counts():
     content = changed("settings", to={"densify.max_gaussians": 1, "scene.max_size": 160})
     content["arms"]["adc"] = {"densify": "adc", "densify.max_gaussians": 2}
     content["claims"][0]["budget"] = {"densify.max_gaussians": 3}
@@ -98,8 +97,8 @@ def test_the_nearer_setting_counts() -> None:
     assert [word for word in words if "max_gaussians" in word] == ["densify.max_gaussians=3"]
 
 
-def test_the_direction_of_a_claim_is_the_sign_of_its_question() -> None:
-    def sign(direction: str) -> int:
+def test_the_direction_of_a_claim_is_the_sign_of_its_question():
+    def sign(direction):
         file = parse_claims(changed("claims", 0, "direction", to=direction))
         return file.question(
             file.claims[0], {"courtyard": ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")}
@@ -108,7 +107,7 @@ def test_the_direction_of_a_claim_is_the_sign_of_its_question() -> None:
     assert [sign(direction) for direction in ("higher", "same", "lower")] == [1, 0, -1]
 
 
-def test_the_question_has_what_decides_and_no_words() -> None:
+def test_the_question_has_what_decides_and_no_words():
     file = parse_claims(GOOD)
     keys = ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")
     question = file.question(file.claims[0], {"courtyard": keys})
@@ -124,7 +123,7 @@ def test_the_question_has_what_decides_and_no_words() -> None:
     assert other.question(other.claims[0], {"courtyard": keys}) == question
 
 
-def test_effects_are_differences_or_parts() -> None:
+def test_effects_are_differences_or_parts():
     absolute = parse_claims(GOOD).claims[0].effect
     relative = parse_claims(changed("claims", 0, "least", to="10%")).claims[0].effect
     assert (absolute.size, str(absolute)) == (0.005, "0.005")
@@ -230,13 +229,13 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
 @pytest.mark.parametrize(
     ("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD]
 )
-def test_bad_input_is_one_line(content: Callable[[], Any], message: str) -> None:
+def test_bad_input_is_one_line(content, message):
     with pytest.raises(InputError, match=message) as caught:
         parse_claims(content())
     assert "\n" not in str(caught.value)
 
 
-def test_a_metric_of_ones_own_needs_its_class() -> None:
+def test_a_metric_of_ones_own_needs_its_class():
     content = changed("claims", 0, "metric", to="sharpness")
     with pytest.raises(InputError, match=r"eval\.extra\.sharpness"):
         parse_claims(content)
@@ -244,7 +243,7 @@ def test_a_metric_of_ones_own_needs_its_class() -> None:
     assert parse_claims(content).claims[0].metric == "sharpness"
 
 
-def test_the_file_that_the_document_shows_is_sound() -> None:
+def test_the_file_that_the_document_shows_is_sound():
     page = (ROOT / "docs" / "claims.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     file = parse_claims(yaml.safe_load(block))
@@ -253,7 +252,7 @@ def test_the_file_that_the_document_shows_is_sound() -> None:
     assert [claim.id for claim in file.claims] == ["quality"]
 
 
-def test_files_that_cannot_be_read_say_so(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_say_so(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_claims(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="cannot be read"):

@@ -46,9 +46,7 @@ def page_of(trials: Sequence[TrialResult]) -> Page:
 
 
 @pytest.mark.parametrize("scenes", ["abcde", "abcdef"])
-def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(
-    tmp_path: Path, scenes: str
-) -> None:
+def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(tmp_path, scenes):
     page = page_of(made(tmp_path, tuple(scenes)))
     assert page.sections[0].verdict.word == "supported"
     assert ("scenes like these: supported; it is higher in 6 of 6" in to_text(page)) == (
@@ -58,10 +56,10 @@ def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(
     assert f"The paper: {SIZE}." in to_text(page)
 
 
-def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path: Path) -> None:
+def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path):
     trials = made(tmp_path, ("room",), seeds=2)
 
-    def lines(cpus: tuple[str, str]) -> tuple[str, ...]:
+    def lines(cpus):
         found = []
         for trial in trials:
             cpu = cpus[trial.seed]
@@ -84,7 +82,7 @@ def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path: 
     assert not any(words in line for line in plain for words in ("machine", "clouds"))
 
 
-def test_where_scenes_differ_in_the_initialiser_a_sheet_stands_for_each(tmp_path: Path) -> None:
+def test_where_scenes_differ_in_the_initialiser_a_sheet_stands_for_each(tmp_path):
     trials = [
         replace(
             one,

@@ -35,7 +35,7 @@ STUDIES = [
 ]
 
 
-def test_studies_are_the_units() -> None:
+def test_studies_are_the_units():
     found, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     interval = expected.confidence_interval()
     assert found.test is not None
@@ -47,7 +47,7 @@ def test_studies_are_the_units() -> None:
     assert found.prediction.high - found.test.mean == pytest.approx(half)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+def test_intervals_hold_the_truth_as_often_as_they_say():
     """Errors of two or three seeds' making, which random-effects methods would take as known."""
     rng, held = np.random.default_rng(0), 0
     for _ in range(600):
@@ -58,7 +58,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert held / 600 > 0.95 - 3 * (0.05 * 0.95 / 600) ** 0.5
 
 
-def test_no_mean_where_protocols_differ() -> None:
+def test_no_mean_where_protocols_differ():
     studies = [Study("a", 1.0, None, "paper-1"), Study("b", 1.1, None, "standard-1")]
     found = pool(studies)
     assert found.test is None
@@ -71,28 +71,26 @@ def test_no_mean_where_protocols_differ() -> None:
     assert alike.mean == pytest.approx(1.0)
 
 
-def test_one_study_is_no_pool_and_two_of_one_name_are_refused() -> None:
+def test_one_study_is_no_pool_and_two_of_one_name_are_refused():
     assert pool(STUDIES[:1]).test is None
     assert pool([]).test is None
     with pytest.raises(InputError, match="twice"):
         pool([STUDIES[0], STUDIES[0]])
 
 
-def test_a_mean_says_where_a_further_study_would_lie() -> None:
+def test_a_mean_says_where_a_further_study_would_lie():
     pooled, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     mean, spread = np.mean(EFFECTS), np.std(EFFECTS, ddof=1)
     own, reach = expected.confidence_interval(), stats.t.ppf(0.975, 3) * spread * 1.25**0.5
     assert describe(pooled) == [
         f"mean {mean:+.4g} (95 % interval {own.low:+.4g} to {own.high:+.4g}, p "
-        f"{expected.pvalue:.3g}) of 4 studies, "
-        "each with the same weight",
+        f"{expected.pvalue:.3g}) of 4 studies, each with the same weight",
         f"studies differ by a deviation of {spread:.3g}; a further one would lie between "
-        f"{mean - reach:+.4g} and "
-        f"{mean + reach:+.4g}",
+        f"{mean - reach:+.4g} and {mean + reach:+.4g}",
     ]
 
 
-def test_studies_are_rows_of_a_table() -> None:
+def test_studies_are_rows_of_a_table():
     _, _, first, second = markdown_table(
         pool([Study("a", 1.0, Interval(0.9, 1.25), "paper-1"), Study("b", -0.5)])
     )
@@ -125,7 +123,7 @@ def archive(
     return file
 
 
-def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
+def test_an_archive_is_a_study_of_its_pairs(tmp_path):
     file = archive(tmp_path, "lab")
     ((study,), _, _) = read_studies(file, WANTED, "lab")
     trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
@@ -147,7 +145,7 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path: Path) -> None:
     assert study.name == "lab"
 
 
-def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path) -> None:
+def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path):
     both = archive(tmp_path, "both", inits=("sfm", "dataset"))
     assert [study.name for study in read_studies(both, WANTED, "both")[0]] == [
         "both (dataset)",
@@ -166,16 +164,13 @@ def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path: Path)
     assert [("sfm" in note, "dataset" in note) for note in notes] == [(False, True), (True, False)]
 
 
-def test_trials_of_archives_can_be_chosen(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trials_of_archives_can_be_chosen(tmp_path, said):
     """As where one archive holds two initialisers, or two splits, under one name."""
     files = [
         str(archive(tmp_path, name, seed, inits=("sfm", "random")))
         for seed, name in enumerate("ab")
     ]
-    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=sfm"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric", "--where", "init=sfm")
     assert "of 2 studies" in out
     assert "| a |" in out
     assert out.startswith("volumetric against adc, difference in PSNR (dB), more is better\n")
@@ -183,7 +178,7 @@ def test_trials_of_archives_can_be_chosen(
     assert run(["pool", *files, "--arm", "volumetric", "--where", "init=none"]) == 2
 
 
-def test_unlike_budgets_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unlike_budgets_are_named(tmp_path, capsys):
     steered = archive(tmp_path, "steered", budget={"max_gaussians": 20_000, "cap": "governor"})
     growing = archive(tmp_path, "growing", seed=1, budget={"max_gaussians": None, "cap": None})
     assert run(["pool", str(steered), str(growing), "--arm", "volumetric"]) == 0
@@ -191,37 +186,30 @@ def test_unlike_budgets_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert sentence in capsys.readouterr().out
 
 
-def test_three_labs_make_a_mean(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_three_labs_make_a_mean(tmp_path, said):
     files = [str(archive(tmp_path, f"lab{k}", k)) for k in range(3)]
-    assert run(["pool", *files, "--arm", "volumetric"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric")
     assert "| lab0 | +" in out
     assert "of 3 studies" in out
     assert "a further one would lie between" in out
 
 
-def test_two_protocols_have_no_mean_and_one_can_be_chosen(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
     """Between archives and within one: every study is shown, and none is lost."""
     files = [
         str(archive(tmp_path, "a", 0)),
         str(archive(tmp_path, "b", 1, "both")),
         str(archive(tmp_path, "c", 2)),
     ]
-    assert run(["pool", *files, "--arm", "volumetric"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric")
     assert all(name in out for name in ("| a |", "| b (paper-1) |", "| b (standard-1) |", "| c |"))
     assert "no mean: the studies differ in protocol" in out
-    assert run(["pool", *files, "--arm", "volumetric", "--protocol", "paper-1"]) == 0
-    out = capsys.readouterr().out
+    out = said("pool", *files, "--arm", "volumetric", "--protocol", "paper-1")
     assert "of 3 studies" in out
     assert "b (standard-1): not asked for" in out
 
 
-def test_bad_sources_are_a_line_each_and_the_others_are_pooled(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_sources_are_a_line_each_and_the_others_are_pooled(tmp_path, capsys, refused):
     good = [archive(tmp_path, "good", 0), archive(tmp_path, "fine", 1)]
     cut = archive(tmp_path, "cut", 2)
     cut.write_bytes(cut.read_bytes()[:-500])
@@ -247,30 +235,19 @@ def test_bad_sources_are_a_line_each_and_the_others_are_pooled(
         (line,) = [line for line in lines if name in line]
         assert reason in line
     assert len(lines) == 6
-    assert run(["pool", str(cut), "--arm", "volumetric"]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    refused("pool", cut, "--arm", "volumetric")
 
 
-def test_labs_that_name_their_files_alike_are_told_apart(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_labs_that_name_their_files_alike_are_told_apart(tmp_path, said):
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)
     sources = [str(tmp_path / lab / "results.zip") for lab in ("one", "two")]
-    assert run(["pool", *sources, "--arm", "volumetric"]) == 0
-    assert f"| {sources[1]} |" in capsys.readouterr().out
+    assert f"| {sources[1]} |" in said("pool", *sources, "--arm", "volumetric")
 
 
-def test_a_metric_that_a_source_lacks_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert (
-        run(
-            ["pool", str(archive(tmp_path, "lab")), "--arm", "volumetric", "--metric", "lpips_alex"]
-        )
-        == 2
+def test_a_metric_that_a_source_lacks_is_named(tmp_path, refused):
+    assert "can be paired in lpips_alex" in refused(
+        "pool", archive(tmp_path, "lab"), "--arm", "volumetric", "--metric", "lpips_alex"
     )
-    assert "can be paired in lpips_alex" in capsys.readouterr().err
-    assert run(["pool", str(tmp_path / "lab.zip")]) == 2
-    assert "--arm" in capsys.readouterr().err
+    assert "--arm" in refused("pool", tmp_path / "lab.zip")

@@ -33,7 +33,7 @@ def verdict(final: bool) -> Verdict:
     return Verdict(BOTH, asked_quantity("psnr"), Pairs(()), final=final)
 
 
-def test_trials_come_seed_by_seed_and_each_once() -> None:
+def test_trials_come_seed_by_seed_and_each_once():
     assert trials_of_look(DECLARATION, [0], 2) == [("a", 7), ("b", 7), ("a", 5), ("b", 5)]
     assert trials_of_look(DECLARATION, [1], 9) == [("a", 5), ("c", 5), ("a", 7), ("c", 7)]
     both = trials_of_look(DECLARATION, [0, 1], 1)
@@ -51,9 +51,7 @@ def test_trials_come_seed_by_seed_and_each_once() -> None:
         ([(False, False)] * 3, [6]),
     ],
 )
-def test_looks_end_when_nothing_can_be_decided(
-    finals: list[tuple[bool, bool]], looked: list[int]
-) -> None:
+def test_looks_end_when_nothing_can_be_decided(finals, looked):
     batches: list[list[KeyAndSeed]] = []
     answers = iter(finals)
     verdicts = run_looks(
@@ -63,7 +61,7 @@ def test_looks_end_when_nothing_can_be_decided(
     assert [one.final for one in verdicts] == list(finals[min(len(looked), len(finals) - 1)])
 
 
-def test_a_pair_is_told_in_a_sentence() -> None:
+def test_a_pair_is_told_in_a_sentence():
     assert headline(verdict(False)) == "sfm-new against sfm-adc: no verdict yet, trials are missing"
     assert headline(replace(verdict(True), untestable="no scene")).endswith(
         "no verdict yet, no scene"

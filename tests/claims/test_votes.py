@@ -37,7 +37,7 @@ SHARP = {"left": "right", "right": "left"}
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pictures(tmp_path_factory) -> Path:
     """A runs folder with pictures: two scenes with seven views each, two seeds."""
     folder = tmp_path_factory.mktemp("votes")
     write_runs(
@@ -48,7 +48,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def runs(pictures: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def runs(pictures, monkeypatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(pictures))
     return pictures
 
@@ -69,7 +69,7 @@ def prefers(arm: str) -> Chooser:
 
 
 def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: str = "") -> Ballot:
-    votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)  # type: ignore[arg-type]
+    votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)
     finished = f"2026-11-27T00:{minute:02}:00Z"
     return Ballot(
         round=key.round, person=f"{person:016x}", finished=finished, votes=votes, name=name
@@ -122,7 +122,7 @@ def made_up(
 # ---- the page
 
 
-def test_the_page_tells_nothing_of_arms(runs: Path, tmp_path: Path) -> None:
+def test_the_page_tells_nothing_of_arms(runs, tmp_path):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
     text = (tmp_path / "page" / "index.html").read_text()
     for word in ("sfm", "volumetric", "courtyard", "garden", "view0", key.salt, "blurred"):
@@ -139,7 +139,7 @@ def test_the_page_tells_nothing_of_arms(runs: Path, tmp_path: Path) -> None:
     assert not set(map(key.commitment, key.showings)) & set(map(again.commitment, again.showings))
 
 
-def test_each_showing_has_the_pictures_that_its_key_says(runs: Path, tmp_path: Path) -> None:
+def test_each_showing_has_the_pictures_that_its_key_says(runs, tmp_path):
     page = tmp_path / "page"
     key = made(runs, page, "--pairs", "12")
     text = (page / "index.html").read_text()
@@ -164,10 +164,10 @@ def test_each_showing_has_the_pictures_that_its_key_says(runs: Path, tmp_path: P
                 np.testing.assert_array_equal(shown, np.asarray(Image.open(render)))
 
 
-def test_views_sides_repeats_and_traps_follow_the_rules(runs: Path, tmp_path: Path) -> None:
+def test_views_sides_repeats_and_traps_follow_the_rules(runs, tmp_path):
     key = made(runs, tmp_path / "page", "--pairs", "12")
     kinds = [one.kind for one in key.showings]
-    assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]  # type: ignore[arg-type]
+    assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]
     assert [one.left for one in key.pairs].count(ADC) == 6
     assert sorted(one.left for one in key.showings if one.kind == "trap") == 2 * ["blurred"] + 2 * [
         "photograph"
@@ -198,9 +198,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(runs: Path, tmp_path: Pa
             assert key.showings.index(showing) > key.showings.index(first)
 
 
-def test_more_pairs_than_views_are_said(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_more_pairs_than_views_are_said(runs, tmp_path, capsys):
     key = made(runs, tmp_path / "page", "--pairs", "40", "--people", "9")
     out = capsys.readouterr().out
     assert len(key.pairs) == 14
@@ -211,7 +209,7 @@ def test_more_pairs_than_views_are_said(
     assert "decide nothing: that needs 6 people" in capsys.readouterr().out
 
 
-def test_it_is_declared_and_leaves_other_declarations_alone(runs: Path, tmp_path: Path) -> None:
+def test_it_is_declared_and_leaves_other_declarations_alone(runs, tmp_path):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "7")
     declared = [one for one in read_declarations(runs / "exp") if one.vote_round == key.round]
     assert [(one.kind, one.votes, len(one.questions)) for one in declared] == [("votes", 84, 1)]
@@ -240,23 +238,13 @@ def test_it_is_declared_and_leaves_other_declarations_alone(runs: Path, tmp_path
         (["look", "exp"], "invalid choice"),
     ],
 )
-def test_bad_input_is_one_line(
-    runs: Path,
-    words: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: Any,
-) -> None:
+def test_bad_input_is_one_line(runs, words, message, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    assert run(["vote", *words]) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.count("\n") == 1
+    assert message in refused("vote", *words)
 
 
-def test_without_pictures_there_is_no_page(tmp_path: Path) -> None:
+def test_without_pictures_there_is_no_page(tmp_path):
     write_runs(tmp_path, Plan(experiment="bare"))
     trials = load_experiment(tmp_path, "bare").trials
     arms = choose_arms(sorted({trial.arm for trial in trials}), ())
@@ -268,9 +256,7 @@ def test_without_pictures_there_is_no_page(tmp_path: Path) -> None:
 # ---- files of votes
 
 
-def test_files_that_do_not_fit_are_refused(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_that_do_not_fit_are_refused(runs, tmp_path, refused):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
@@ -281,36 +267,33 @@ def test_files_that_do_not_fit_are_refused(
         (twice, "answers 17 of the 17 showings"),
         (foreign, "no round 000000000000"),
     ):
-        assert run(["vote", "judge", "exp", saved(tmp_path, bad)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("vote", "judge", "exp", saved(tmp_path, bad))
     for change in ({"person": "../../../x"}, {"round": ".."}, {"finished": "soon"}, {"votes": 1}):
         file = tmp_path / "changed.json"
         file.write_text(json.dumps(sound.to_json() | change))
-        assert run(["vote", "judge", "exp", str(file)]) == 2
-        assert "is damaged" in capsys.readouterr().err
+        assert "is damaged" in refused("vote", "judge", "exp", file)
     first = saved(tmp_path, sound)
-    assert run(["vote", "judge", "exp", first, first]) == 2
-    assert "same person" in capsys.readouterr().err
+    assert "same person" in refused("vote", "judge", "exp", first, first)
     assert run(["vote", "judge", "exp", first]) == 0
-    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 2
-    assert "other votes before" in capsys.readouterr().err
+    assert "other votes before" in refused(
+        "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))
+    )
 
 
-def test_a_changed_key_judges_nothing(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_changed_key_judges_nothing(runs, tmp_path, refused):
     key = made(runs, tmp_path / "page", "--pairs", "12")
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
     first = key.showings[0]
     swapped = [replace(first, left=first.right, right=first.left), *key.showings[1:]]
     file.write_text(json.dumps(replace(key, showings=tuple(swapped)).to_json()))
-    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))]) == 2
-    assert "was changed after the page was made" in capsys.readouterr().err
+    assert "was changed after the page was made" in refused(
+        "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))
+    )
     file.write_text(text)
 
 
-def test_names_of_strangers_stay_words(runs: Path, tmp_path: Path) -> None:
+def test_names_of_strangers_stay_words(runs, tmp_path):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
     careless = ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>")
     assert run(["vote", "judge", "exp", saved(tmp_path, careless)]) == 0
@@ -319,7 +302,7 @@ def test_names_of_strangers_stay_words(runs: Path, tmp_path: Path) -> None:
     assert "<img src=x" not in page
 
 
-def test_the_report_shows_where_people_and_lpips_disagree(runs: Path, tmp_path: Path) -> None:
+def test_the_report_shows_where_people_and_lpips_disagree(runs, tmp_path):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
     assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 0
     page = build_report(load_experiment(runs, "exp"))
@@ -339,7 +322,7 @@ def test_the_report_shows_where_people_and_lpips_disagree(runs: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("agree", range(10))
-def test_people_are_the_units_of_an_exact_test(agree: int) -> None:
+def test_people_are_the_units_of_an_exact_test(agree):
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5)
     ballots = [ballot(key, n, prefers("sfm-b" if n < agree else "sfm-a")) for n in range(9)]
     (pair,) = judge_round(key, ballots).pairs
@@ -352,10 +335,10 @@ def test_people_are_the_units_of_an_exact_test(agree: int) -> None:
     assert pair.scenes is None
 
 
-def test_scenes_are_the_units_of_the_other_statement() -> None:
+def test_scenes_are_the_units_of_the_other_statement():
     key = made_up(["sfm-a", "sfm-b"], scenes=7, views=3)
 
-    def choose(showing: Showing) -> str:
+    def choose(showing):
         return prefers("sfm-b" if showing.scene < "6" else "sfm-a")(showing)
 
     (pair,) = judge_round(key, [ballot(key, 1, choose)]).pairs
@@ -365,7 +348,7 @@ def test_scenes_are_the_units_of_the_other_statement() -> None:
     assert pair.scenes.p == pytest.approx(binomtest(6, 7).pvalue)
 
 
-def test_traps_latecomers_and_early_looks() -> None:
+def test_traps_latecomers_and_early_looks():
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5, people=6)
     good = [ballot(key, n, prefers("sfm-b"), minute=10 + n) for n in range(5)]
     blind = ballot(key, 8, lambda showing: "same", minute=1, name="Ann")
@@ -382,18 +365,18 @@ def test_traps_latecomers_and_early_looks() -> None:
     assert blind.label not in judge_round(allowed, [replace(blind, round=allowed.round)]).left_out
 
 
-def test_who_answers_by_side_is_inconsistent() -> None:
+def test_who_answers_by_side_is_inconsistent():
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5, traps=0)
     verdict = judge_round(key, [ballot(key, 1, lambda showing: "left")])
     assert (verdict.consistent, verdict.left) == (0.0, 1.0)
     assert judge_round(key, []).pairs == ()
 
 
-def test_more_arms_share_the_error_rate() -> None:
+def test_more_arms_share_the_error_rate():
     key = made_up(["sfm-a", "sfm-b", "sfm-c"], scenes=2, views=2)
     order = ["sfm-a", "sfm-c", "sfm-b", "photograph"]
 
-    def choose(showing: Showing) -> str:
+    def choose(showing):
         return max(
             SHARP,
             key=lambda side: (
@@ -411,13 +394,13 @@ def test_more_arms_share_the_error_rate() -> None:
     assert all(interval.low <= chance <= interval.high for _, chance, interval in verdict.ranking)
 
 
-def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
+def test_the_ranking_is_the_maximum_of_its_likelihood():
     rng = np.random.default_rng(3)
     wins = rng.integers(0, 20, (4, 5, 5)).astype(float)
     for counts, chances in zip(wins, bradley_terry(wins), strict=True):
         games = (counts + 0.5) * (1 - np.eye(5))
 
-        def loss(theta: np.ndarray, games: np.ndarray = games) -> float:
+        def loss(theta, games=games):
             return float((games * np.logaddexp(0, theta[None] - theta[:, None])).sum())
 
         theta = minimize(loss, np.zeros(5), tol=1e-12).x
@@ -427,7 +410,7 @@ def test_the_ranking_is_the_maximum_of_its_likelihood() -> None:
 @pytest.mark.parametrize(
     "name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"]
 )
-def test_without_an_effect_few_rounds_state_one(name: str) -> None:
+def test_without_an_effect_few_rounds_state_one(name):
     untruths = script("vote_untruths")
     people, scenes, both, votes = untruths.rates(untruths.KINDS[name], 0.0, 300)[1::2]
     # The error rate is 5 %; of 300 rounds, 8.8 % lie three standard errors above it.
@@ -436,7 +419,7 @@ def test_without_an_effect_few_rounds_state_one(name: str) -> None:
         assert votes > 0.3  # of a test that takes all votes as independent
 
 
-def test_intervals_of_a_ranking_hold_the_truth() -> None:
+def test_intervals_of_a_ranking_hold_the_truth():
     assert script("vote_untruths").ranking_misses(9, 9, 30) < 0.1
 
 
@@ -468,9 +451,7 @@ class Voter:
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_two_people_vote_by_keyboard_and_are_judged(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_people_vote_by_keyboard_and_are_judged(runs, tmp_path, capsys, said):
     key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
     address, files, last = (tmp_path / "page" / "index.html").as_uri(), [], len(key.showings)
     for width, chooser in ((1200, prefers(VOLUMETRIC)), (400, prefers(ADC))):
@@ -513,11 +494,10 @@ def test_two_people_vote_by_keyboard_and_are_judged(
             voter.press("Enter")
             voter.wait("document.getElementById('saved').textContent !== ''")
             saved_in = tmp_path / str(width)
-            browser.wait_for(lambda place=saved_in: list(place.glob("*.json")) or None, "the file")  # type: ignore[misc]
+            browser.wait_for(lambda place=saved_in: list(place.glob("*.json")) or None, "the file")
             files += [str(file) for file in saved_in.glob("*.json")]
     capsys.readouterr()
-    assert run(["vote", "judge", "exp", *files]) == 0
-    out = capsys.readouterr().out
+    out = said("vote", "judge", "exp", *files)
     assert "24 votes of 2 people; 24 were declared" in out
     assert "50 % of 24 votes (12 for it, 12 against it, 0 without a difference" in out
     assert "100 % of the pairs shown again" in out

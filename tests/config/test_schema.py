@@ -65,7 +65,7 @@ def needs(option: str) -> list[str]:
 @pytest.mark.parametrize(
     ("group", "option"), [(group, option) for group in GROUPS for option in options(group)]
 )
-def test_every_option_composes(group: str, option: str) -> None:
+def test_every_option_composes(group, option):
     extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
     extra += PLACES.get(option, [])
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
@@ -79,7 +79,7 @@ def test_every_option_composes(group: str, option: str) -> None:
 
 
 @pytest.mark.parametrize("option", options("densify"))
-def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None:
+def test_every_densifier_can_be_built_and_matches_its_class(option):
     config = composed(f"densify={option}", "train=paper", *needs(option))
     values, densifier = (
         config["densify"],
@@ -96,7 +96,7 @@ def test_every_densifier_can_be_built_and_matches_its_class(option: str) -> None
 
 
 @pytest.mark.parametrize("option", options("init"))
-def test_every_initialiser_shows_all_its_options(option: str, tmp_path: Path) -> None:
+def test_every_initialiser_shows_all_its_options(option, tmp_path):
     (tmp_path / "model.ply").write_text("ply\nend_header\n")
     extra = [f"init.path={tmp_path / 'model.ply'}"] if option in ("ply", "points") else []
     values = composed(f"init={option}", *extra)["init"]
@@ -105,7 +105,7 @@ def test_every_initialiser_shows_all_its_options(option: str, tmp_path: Path) ->
     assert names == set(values) - {"_target_", "name"}
 
 
-def test_the_paper_schedule_is_the_class_default() -> None:
+def test_the_paper_schedule_is_the_class_default():
     values = composed("train=paper")["train"]
     defaults = dataclasses.asdict(TrainConfig(name="paper"))
     assert {key: list(v) if isinstance(v, tuple) else v for key, v in defaults.items()} == {
@@ -120,12 +120,12 @@ def sweep_size(experiment: str) -> int:
             "config", overrides=[f"+experiment={experiment}"], return_hydra_config=True
         )
     size = 1
-    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():  # type: ignore[union-attr]
+    for value in OmegaConf.to_container(config.hydra.sweeper.params).values():
         size *= len(str(value).split(","))
     return size
 
 
-def test_the_demo_downloads_little_and_declares_what_it_measures() -> None:
+def test_the_demo_downloads_little_and_declares_what_it_measures():
     trials = compose_trials(["+experiment=demo"], multirun=True)
     asked = {
         (tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials
@@ -134,7 +134,7 @@ def test_the_demo_downloads_little_and_declares_what_it_measures() -> None:
     assert asked == {(("squeeze",), "flip")}
 
 
-def test_experiments_have_the_size_of_the_paper() -> None:
+def test_experiments_have_the_size_of_the_paper():
     assert sweep_size("table1") == 13 * 2 * 3
     assert sweep_size("table2") == 12 * 2 * 2 * 3
     assert sweep_size("demo") == 6
@@ -157,7 +157,7 @@ def test_experiments_have_the_size_of_the_paper() -> None:
         (["train.background=[0,0,2]"], "train.background"),
     ],
 )
-def test_rules_name_the_key(overrides: list[str], key: str) -> None:
+def test_rules_name_the_key(overrides, key):
     with pytest.raises(InputError, match=key):
         composed(*overrides)
 
@@ -177,14 +177,12 @@ def test_rules_name_the_key(overrides: list[str], key: str) -> None:
         (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
     ],
 )
-def test_a_declared_metric_exists_and_is_measured(words: list[str], error: str) -> None:
+def test_a_declared_metric_exists_and_is_measured(words, error):
     with pytest.raises(InputError, match=error):
         composed(*words)
 
 
-def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     text = "class Known:\n    direction = 1\n    def measure(self, image, truth): return 1.0\n"
     text += "class Unknown(Known):\n    direction = 0\n"
@@ -204,7 +202,7 @@ def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(
                 build_metrics(values, ["declared_metrics"])
 
 
-def test_wrong_type_in_a_component_names_the_key() -> None:
+def test_wrong_type_in_a_component_names_the_key():
     with pytest.raises(InputError, match=r"densify\.max_gaussians"):
         build("densify", composed("densify.max_gaussians=1.5")["densify"], [])
     with pytest.raises(InputError, match=r"densify\.cap.*'soft'"):
@@ -212,7 +210,7 @@ def test_wrong_type_in_a_component_names_the_key() -> None:
 
 
 @pytest.mark.slow
-def test_every_component_of_gsbench_checks_its_own_options() -> None:
+def test_every_component_of_gsbench_checks_its_own_options():
     """`build` leaves it to them; what is wrong in every kind of option is a list of lists."""
     for group, option in [
         (name, option) for name in ("init", "densify") for option in options(name)
@@ -223,7 +221,7 @@ def test_every_component_of_gsbench_checks_its_own_options() -> None:
                 build(group, values | {key: [[None]]}, [])
 
 
-def test_only_trusted_code_is_imported() -> None:
+def test_only_trusted_code_is_imported():
     check_target("gsbench.densify.ADC", "densify", [])
     check_target("mine.Densifier", "densify", ["mine"])
     for target in ("os.system", "gsbench_evil.X", "minefield.X"):
@@ -231,7 +229,7 @@ def test_only_trusted_code_is_imported() -> None:
             check_target(target, "densify", ["mine"])
 
 
-def test_hash_ignores_what_cannot_change_a_result() -> None:
+def test_hash_ignores_what_cannot_change_a_result():
     base = config_hash(composed())
     assert (
         config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu"))
@@ -243,7 +241,7 @@ def test_hash_ignores_what_cannot_change_a_result() -> None:
     assert config_hash(composed("scene.max_size=200")) != base
 
 
-def test_asking_for_more_metrics_is_another_result() -> None:
+def test_asking_for_more_metrics_is_another_result():
     words = ("eval.more=[gmsd]", "eval.fps=[640,480]", "eval.fps=[64,48]")
     assert len({config_hash(composed(*word)) for word in [(), *((word,) for word in words)]}) == 4
 
@@ -259,15 +257,13 @@ def test_asking_for_more_metrics_is_another_result() -> None:
         (["eval.extra.fps._target_=mine.Mine", "allow_targets=[mine]"], "none of"),
     ],
 )
-def test_metrics_that_are_not_measured_or_known_are_refused(words: list[str], said: str) -> None:
+def test_metrics_that_are_not_measured_or_known_are_refused(words, said):
     with pytest.raises(InputError, match=re.escape(said)):
         composed(*words)
     assert composed("eval.primary=fps", "eval.fps=[640,480]")["eval"]["primary"] == "fps"
 
 
-def test_hash_follows_the_source_of_a_users_class(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hash_follows_the_source_of_a_users_class(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     own = ["densify._target_=own_densifier.Mine", "allow_targets=[own_densifier]"]
     hashes = []
@@ -277,9 +273,7 @@ def test_hash_follows_the_source_of_a_users_class(
     assert hashes[0] == hashes[2] != hashes[1]
 
 
-def test_hash_follows_the_source_of_a_users_metric(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hash_follows_the_source_of_a_users_metric(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     values = composed()
     own = ["eval.extra.edges._target_=own_metric.Mine", "allow_targets=[own_metric]"]
@@ -292,18 +286,18 @@ def test_hash_follows_the_source_of_a_users_metric(
 
 
 @pytest.mark.parametrize("name", ["psnr", "lpips", "view", "Edges", "a-b"])
-def test_names_of_own_metrics_are_their_own(name: str) -> None:
+def test_names_of_own_metrics_are_their_own(name):
     with pytest.raises(InputError, match=rf"eval\.extra\.{name}: name your metric"):
         composed(f"eval.extra.{name}._target_=mine.X", "allow_targets=[mine]")
 
 
-def test_values_of_a_trial_have_the_types_of_json() -> None:
+def test_values_of_a_trial_have_the_types_of_json():
     """OmegaConf 2.4 keeps tuples, and a record of a trial knows none."""
     values = composed()
     assert json.loads(json.dumps(values)) == values
 
 
-def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
+def test_an_own_metric_must_be_allowed_and_name_a_class():
     with pytest.raises(
         InputError, match=r"eval\.extra\.edges\._target_=mine\.X is not gsbench's own"
     ):
@@ -312,7 +306,7 @@ def test_an_own_metric_must_be_allowed_and_name_a_class() -> None:
         composed("eval.extra.edges=3")
 
 
-def test_no_training_needs_no_densifier() -> None:
+def test_no_training_needs_no_densifier():
     with pytest.raises(InputError, match="add densify=none"):
         composed("train=none", "densify=adc")
     assert composed("train=none", "densify=none")["train"]["iterations"] == 0
@@ -321,7 +315,7 @@ def test_no_training_needs_no_densifier() -> None:
 
 
 @pytest.mark.parametrize("threads", ["4097", "1000000000000", "0"])
-def test_no_more_threads_than_a_system_starts(threads: str) -> None:
+def test_no_more_threads_than_a_system_starts(threads):
     with pytest.raises(
         InputError, match=r"threads must be a whole number in \[1, 4096\] or 'auto'"
     ):
@@ -346,7 +340,7 @@ def test_no_more_threads_than_a_system_starts(threads: str) -> None:
         ("densify.volume_threshold=1e-3", True),
     ],
 )
-def test_a_text_is_kept_as_typed_or_refused(word: str, is_kept: bool) -> None:
+def test_a_text_is_kept_as_typed_or_refused(word, is_kept):
     if is_kept:
         check_words([word])
     else:

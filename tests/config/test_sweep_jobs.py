@@ -40,12 +40,12 @@ SWEEPS = {  # words, and how often Hydra composes for them
 
 
 @pytest.fixture
-def compositions(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def compositions(monkeypatch) -> list[list[str]]:
     """The words of each of Hydra's compositions of a job."""
     asked: list[list[str]] = []
     compose = ConfigLoaderImpl.load_sweep_config
 
-    def counted(self, master_config, sweep_overrides):  # type: ignore[no-untyped-def]
+    def counted(self, master_config, sweep_overrides):
         asked.append(sweep_overrides)
         return compose(self, master_config, sweep_overrides)
 
@@ -55,7 +55,7 @@ def compositions(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", list(SWEEPS))
 @pytest.mark.slow
-def test_every_job_is_what_its_words_say(name: str, compositions: list[list[str]]) -> None:
+def test_every_job_is_what_its_words_say(name, compositions):
     words, count = SWEEPS[name]
     trials = compose_trials(words, multirun=True)
     assert len(compositions) == count
@@ -68,7 +68,7 @@ def test_every_job_is_what_its_words_say(name: str, compositions: list[list[str]
 @pytest.mark.parametrize(
     "words", [["seed=0,-1"], ["train.iterations=5,-5"], ["seed=0,1", "scene.views=9,no"]]
 )
-def test_a_bad_value_is_refused_where_it_shares_a_composition(words: list[str]) -> None:
+def test_a_bad_value_is_refused_where_it_shares_a_composition(words):
     with pytest.raises(InputError, match=f"{words[-1].partition('=')[0]} must be"):
         compose_trials(words, multirun=True)
 
@@ -94,10 +94,10 @@ def test_a_bad_value_is_refused_where_it_shares_a_composition(words: list[str]) 
         ),
     ],
 )
-def test_values_that_may_be_set_after_the_rest(words: list[str], values: dict[str, object]) -> None:
+def test_values_that_may_be_set_after_the_rest(words, values):
     assert _plain_values(words) == values
 
 
-def test_a_trial_is_small_where_it_goes_to_another_process() -> None:
+def test_a_trial_is_small_where_it_goes_to_another_process():
     trials = compose_trials(["densify=adc,volumetric", "seed=0,1"], multirun=True)
     assert all(len(pickle.dumps(job_of(trial))) < 20_000 for trial in trials)

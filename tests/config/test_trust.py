@@ -233,9 +233,7 @@ MODES = {
 
 @pytest.mark.parametrize("mode", ["run", "dry run"])
 @pytest.mark.parametrize("case", STRANGE)
-def test_what_a_file_names_is_not_run(
-    case: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     settings, said = STRANGE[case]
     assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
     assert not Path("exploded").exists()
@@ -245,9 +243,7 @@ def test_what_a_file_names_is_not_run(
 @pytest.mark.parametrize(
     "case", ["a callback", "made of a text", "a module of a package", "logging", "a launcher"]
 )
-def test_nor_where_somebody_only_asks(
-    case: str, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nor_where_somebody_only_asks(case, mode, capsys, monkeypatch):
     settings, said = STRANGE[case]
     assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
     assert not Path("exploded").exists()
@@ -269,13 +265,7 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep
 @pytest.mark.parametrize("place_of_words", ["params", "grids"])
 @pytest.mark.parametrize("launcher", ["gsbench", "basic"])
 @pytest.mark.parametrize("case", JOBS)
-def test_nor_what_only_the_jobs_of_a_sweep_say(
-    case: str,
-    launcher: str,
-    place_of_words: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_nor_what_only_the_jobs_of_a_sweep_say(case, launcher, place_of_words, capsys, monkeypatch):
     words, said = JOBS[case]
     words = words | {"seed": "0,1"}
     node = {"params": words} if place_of_words == "params" else {"grids": [words]}
@@ -290,17 +280,13 @@ def test_nor_what_only_the_jobs_of_a_sweep_say(
 @pytest.mark.parametrize(
     "variables", [{"PYTHONPATH": "/strange"}, {"OMP_NUM_THREADS": "2"}, "${launch.sbatch}"]
 )
-def test_a_file_sets_no_variable(
-    variables: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_sets_no_variable(variables, capsys, monkeypatch):
     line = ask(experiment({"hydra": {"job": {"env_set": variables}}}), capsys, monkeypatch)
     assert "hydra.job.env_set can change what runs" in line
 
 
 @pytest.mark.parametrize("sweeper", ["gsbench", "basic"])
-def test_what_one_choice_of_a_sweep_brings_along_is_not_run(
-    sweeper: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_one_choice_of_a_sweep_brings_along_is_not_run(sweeper, capsys, monkeypatch):
     """Hydra configures the logging of a job before gsbench sees the job."""
     folder = Path("conf/scene")
     folder.mkdir(parents=True)
@@ -318,9 +304,7 @@ def test_what_one_choice_of_a_sweep_brings_along_is_not_run(
     assert not Path("exploded").exists()
 
 
-def test_a_launcher_in_a_strangers_file_is_not_run(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_launcher_in_a_strangers_file_is_not_run(capsys, monkeypatch):
     """Not even in the place of an installed one."""
     for group, target in (
         ("launcher", "hydra_plugins.bomb.Bomb"),
@@ -346,9 +330,7 @@ GSBENCH_WEIGHTS path
 """
 
 
-def test_only_variables_that_choose_threads_and_devices_are_free(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_variables_that_choose_threads_and_devices_are_free(monkeypatch):
     """Of another trainer's environment; all others could start code."""
     assert foreign_variables({"OMP_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": "1"}, []) == {}
     assert (
@@ -369,26 +351,20 @@ def test_only_variables_that_choose_threads_and_devices_are_free(
     ],
 )
 @pytest.mark.parametrize("mode", MODES)
-def test_a_search_path_imports_nothing(
-    word: str,
-    said: str,
-    mode: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_search_path_imports_nothing(word, said, mode, capsys, monkeypatch):
     Path("conf").mkdir()
     assert said in ask([*MODES[mode], word], capsys, monkeypatch)
     assert not Path("exploded").exists()
 
 
-def test_nor_does_completion(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nor_does_completion(monkeypatch):
     line = "gsbench hydra.searchpath=[pkg://bombs] densify="
     monkeypatch.setenv("COMP_LINE", line)
     assert cli.run(["-sc", "query=bash"]) == 2
     assert not Path("exploded").exists()
 
 
-def test_a_search_path_that_was_allowed_is_read(place: Path) -> None:
+def test_a_search_path_that_was_allowed_is_read(place):
     (place / "bombs" / "scene").mkdir()
     (place / "bombs" / "scene" / "own.yaml").write_text(
         "defaults: [courtyard, _self_]\nname: own\n"
@@ -412,12 +388,12 @@ def test_a_search_path_that_was_allowed_is_read(place: Path) -> None:
         "allow_targets=['']",
     ],
 )
-def test_permissions_are_typed_as_names(word: str) -> None:
+def test_permissions_are_typed_as_names(word):
     with pytest.raises(InputError, match="a list of names"):
         typed_permissions([word])
 
 
-def test_the_last_permission_counts() -> None:
+def test_the_last_permission_counts():
     assert typed_permissions(["allow_targets=[a]", "seed=1", "++allow_targets=[b,c.D]"]) == (
         "b",
         "c.D",
@@ -425,7 +401,7 @@ def test_the_last_permission_counts() -> None:
     assert typed_permissions(["seed=1"]) == ()
 
 
-def test_what_is_typed_is_allowed_in_files_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_typed_is_allowed_in_files_too(capsys):
     run = experiment({"allow_targets": ["os"], "densify": {"_target_": "mine.Mine"}})
     (trial,) = compose_trials(["hydra.searchpath=[conf]", *run[2:], "allow_targets=[mine]"])
     assert trial.values["allow_targets"] == ["mine"]  # and not what the file says
@@ -440,13 +416,13 @@ def test_what_is_typed_is_allowed_in_files_too(capsys: pytest.CaptureFixture[str
         ("mine.Popen", r"is subprocess\.Popen.*allow_targets=\[mine,subprocess\]"),
     ],
 )
-def test_trust_in_a_module_is_no_trust_in_what_it_imports(target: str, said: str) -> None:
+def test_trust_in_a_module_is_no_trust_in_what_it_imports(target, said):
     allow_modules(["mine"])
     with pytest.raises(InputError, match=said):
         build("densify", {"_target_": target, "name": "x"}, ["mine"])
 
 
-def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
+def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it():
     allow_modules(["mine"])
     assert load_class("mine.ADC", "densify", ["mine"]).__module__.startswith("gsbench.")
     assert load_class("mine.Mine", "densify", ["mine"]).__name__ == "Mine"
@@ -462,27 +438,18 @@ def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it() -> None:
         ({"size": 3}, "hydra.callbacks.x names no _target_"),
     ],
 )
-def test_callbacks_are_classes_of_the_allowed_module(
-    settings: dict[str, Any],
-    said: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_callbacks_are_classes_of_the_allowed_module(settings, said, capsys, monkeypatch):
     run = [*experiment({"hydra": {"callbacks": {"x": settings}}}), "allow_targets=[mine]"]
     assert said in ask(run, capsys, monkeypatch)
 
 
-def test_an_allowed_callback_is_made(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_allowed_callback_is_made(capsys, monkeypatch):
     nested = {"_target_": "mine.Calls", "in": {"_target_": "mine.Calls"}}
     run = [*experiment({"hydra": {"callbacks": {"x": nested}}}), "allow_targets=[mine]"]
     assert "the trials began" in ask(run, capsys, monkeypatch)
 
 
-def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(
-    place: Path,
-) -> None:
+def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(place):
     (place / "yaml.py").write_text(BOMB)
     (place / "json").mkdir()
     (place / "json" / "__init__.py").write_text(BOMB)
@@ -496,12 +463,12 @@ def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_install
         load_class("mine.Mine", "densify", ["mine"])
     allow_modules(["mine", "helper", "yaml", "json"])
     assert load_class("mine.Mine", "densify", ["mine"])
-    assert Path(str(importlib.util.find_spec("yaml").origin)) != place / "yaml.py"  # type: ignore[union-attr]
+    assert Path(str(importlib.util.find_spec("yaml").origin)) != place / "yaml.py"
     assert importlib.util.find_spec("bomb") is None
     assert not Path("exploded").exists()
 
 
-def test_looking_for_a_users_source_imports_nothing(place: Path) -> None:
+def test_looking_for_a_users_source_imports_nothing(place):
     (place / "bombs" / "sub.py").write_text("class Sub: ...\n")
     allow_modules(["bombs"])
     assert module_digest("bombs")
@@ -512,12 +479,12 @@ def test_looking_for_a_users_source_imports_nothing(place: Path) -> None:
 
 
 @pytest.mark.parametrize("target", ["os.system", "gsbench_evil.X", "minefield.X", "", None])
-def test_prefixes_end_at_dots(target: str | None) -> None:
+def test_prefixes_end_at_dots(target):
     with pytest.raises(InputError):
         check_target(target, "densify", ["mine", "mine.sub."])
 
 
-def test_options_of_slurm_that_choose_resources_need_no_permission() -> None:
+def test_options_of_slurm_that_choose_resources_need_no_permission():
     assert not SBATCH_RESOURCES & {
         "wrap",
         "export",
@@ -530,7 +497,7 @@ def test_options_of_slurm_that_choose_resources_need_no_permission() -> None:
     compose_one(["launch=slurm", "launch.sbatch={constraint: a100, mail-user: me}"])
 
 
-def test_a_module_that_ends_the_process_when_it_is_imported_is_an_error(place: Path) -> None:
+def test_a_module_that_ends_the_process_when_it_is_imported_is_an_error(place):
     (place / "mine.py").write_text("raise SystemExit(0)\n")
     allow_modules(["mine"])
     with pytest.raises(InputError, match=r"mine\.Mine cannot be imported \(SystemExit: 0\)"):

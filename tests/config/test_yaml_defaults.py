@@ -107,7 +107,7 @@ def plain(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("path", [path for path in FILES if path not in WHOLE])
-def test_what_yaml_and_class_both_state_is_the_same(path: str) -> None:
+def test_what_yaml_and_class_both_state_is_the_same(path):
     cls = class_of(path)
     if cls is None:  # a function, or a class without options
         return
@@ -129,9 +129,9 @@ def test_what_yaml_and_class_both_state_is_the_same(path: str) -> None:
     )
 
 
-def test_the_list_names_files_that_are_there() -> None:
+def test_the_list_names_files_that_are_there():
     assert DELIBERATE.keys() | WHOLE <= set(FILES)
-    assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {  # type: ignore[union-attr]
+    assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {
         "EvalConfig",
         "TrainConfig",
         "Sfm",

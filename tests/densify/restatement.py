@@ -1,9 +1,8 @@
-"""One refinement round, stated again from the formulas: numpy, one Gaussian at a time, no code
-shared with gsbench.
+"""One refinement round, stated again from the formulas.
 
-A Gaussian is a dict of raw parameters with its two Adam moments. The normal draws come in as an
-iterator of rows, in the order in which the rules use them: all first children, then all second
-ones.
+Numpy, one Gaussian at a time, no code shared with gsbench. A Gaussian is a dict of raw parameters
+with its two Adam moments. The normal draws come in as an iterator of rows, in the order in which
+the rules use them: all first children, then all second ones.
 """
 
 from __future__ import annotations
@@ -30,6 +29,14 @@ def rotation(q: np.ndarray) -> np.ndarray:
     )
 
 
+def opacity(row: Row) -> float:
+    return float(1 / (1 + np.exp(-row["opacity_logits"])))
+
+
+def logit(value: float) -> float:
+    return float(np.log(value / (1 - value)))
+
+
 def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
     child = {name: np.array(parent[name], copy=True) for name in PARAMETERS}
     child["means"], child["log_scales"] = mean, log_scales
@@ -42,8 +49,10 @@ def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
 def split_all(
     rows: list[Row], chosen: list[int], scales: dict[int, np.ndarray], noise: Iterator[np.ndarray]
 ) -> list[Row]:
-    """Two children for each chosen row, appended: every first child, then every second; the parents
-    go."""
+    """Two children for each chosen row, appended: every first child, then every second.
+
+    The parents go.
+    """
     children = []
     for _ in range(2):
         for i in chosen:
@@ -60,16 +69,15 @@ def adc_growth(
     noise: Iterator[np.ndarray],
     events: dict[str, int],
 ) -> list[Row]:
-    n = len(rows)
     clones = []
-    for i in range(n):
-        if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() <= 0.01 * extent:
-            clones.append(newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy()))
-    chosen = [
-        i
-        for i in range(n)
-        if mean_gradient[i] >= 0.0002 and np.exp(rows[i]["log_scales"]).max() > 0.01 * extent
-    ]
+    chosen = []
+    for i, row in enumerate(rows):
+        if mean_gradient[i] < 0.0002:
+            continue
+        if np.exp(row["log_scales"]).max() > 0.01 * extent:
+            chosen.append(i)
+        else:
+            clones.append(newborn(row, row["means"].copy(), row["log_scales"].copy()))
     events["cloned"], events["split_gradient"] = len(clones), len(chosen)
     scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
     return split_all(rows + clones, chosen, scales, noise)
@@ -93,7 +101,7 @@ def volume_growth(
 def prune(rows: list[Row], step: int, extent: float, events: dict[str, int]) -> list[Row]:
     kept, events["pruned_opacity"], events["pruned_size"] = [], 0, 0
     for row in rows:
-        if 1 / (1 + math.exp(-row["opacity_logits"])) < 0.005:
+        if opacity(row) < 0.005:
             events["pruned_opacity"] += 1
         elif step > 3000 and np.exp(row["log_scales"]).max() > 0.1 * extent:
             events["pruned_size"] += 1

@@ -14,29 +14,39 @@ from gsbench.densify import (
     DensifyContext,
     PixelGS,
     QuantileADC,
-    Refinement,
     ResGS,
     SteepGS,
 )
 from gsbench.errors import InputError
-from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.raster.base import Footprint, RenderOutput
+from gsbench.raster.base import Footprint
 from tests.densify import restatement
-from tests.densify.test_rounds import EXTENT, assert_same, noise_of, observe, prepared, to_rows
+from tests.densify.helpers import (
+    EXTENT,
+    Round,
+    at,
+    gathered,
+    generator,
+    noise_of,
+    rendered,
+    trained,
+    with_moments,
+)
+from tests.densify.restatement import logit, opacity
+from tests.densify.test_rounds import observe, prepared
 from tests.gaussians.helpers import random_gaussians
 
 
 def absgs_growth(
     rows: list[restatement.Row], signed: np.ndarray, absolute: np.ndarray, noise: object
 ) -> tuple[list[restatement.Row], int, int]:
-    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002; large: split
-    where absolute >= .0004, into two of 1 / 1.6."""
-    largest = [np.exp(row["log_scales"]).max() for row in rows]
-    clones = [i for i, size in enumerate(largest) if size <= 0.001 * EXTENT and signed[i] >= 0.0002]
-    chosen = [
-        i for i, size in enumerate(largest) if size > 0.001 * EXTENT and absolute[i] >= 0.0004
-    ]
+    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002.
+
+    Large: split where absolute >= .0004, into two of 1 / 1.6.
+    """
+    large = [np.exp(row["log_scales"]).max() > 0.001 * EXTENT for row in rows]
+    clones = [i for i in range(len(rows)) if not large[i] and signed[i] >= 0.0002]
+    chosen = [i for i in range(len(rows)) if large[i] and absolute[i] >= 0.0004]
     copies = [
         restatement.newborn(rows[i], rows[i]["means"].copy(), rows[i]["log_scales"].copy())
         for i in clones
@@ -53,20 +63,13 @@ def test_absgs_round(seed: int, step: int) -> None:
     trainable.values.log_scales.data[::4] -= 4.0  # a quarter below the size of a split
     draw = np.random.default_rng(seed)
     signed, absolute = draw.uniform(0, 4e-4, 60), draw.uniform(0, 8e-4, 60)
-    densifier.statistics["gradient_sum"] = torch.from_numpy(signed)
-    densifier.statistics["absolute_sum"] = torch.from_numpy(absolute)
-    densifier.statistics["visible_count"][:] = 1
-    rows, expected = to_rows(trainable), {}
-    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
-    noise = iter(noise_of(seed, [event.split_gradient]))
-    rows, cloned, split = absgs_growth(rows, signed, absolute, noise)
-    assert (event.cloned, event.split_gradient) == (cloned, split)
+    gathered(densifier, signed, absolute)
+    real = Round(densifier, trainable, step, seed)
+    noise = noise_of(seed, real.event.split_gradient)
+    rows, cloned, split = absgs_growth(real.rows, signed, absolute, noise)
+    assert (real.event.cloned, real.event.split_gradient) == (cloned, split)
     assert min(cloned, split) > 0
-    assert_same(trainable, restatement.prune(rows, step, EXTENT, expected))
-    assert expected == {name: getattr(event, name) for name in expected}
-    assert event.balances()
-    assert event.after == foreseen
+    real.check(rows)
 
 
 def test_both_gradients_are_gathered() -> None:
@@ -84,16 +87,16 @@ def test_every_500_iterations_opacities_are_lowered_to_the_ceiling() -> None:
     densifier = AbsGS()
     trainable, _ = prepared(densifier, 1)
     before = trainable.values.opacities.detach().clone()
-    event = densifier.refine(500, trainable, torch.Generator())  # no round yet
+    event = densifier.refine(500, trainable, generator())  # no round yet
     assert (before > 0.8).any()
     torch.testing.assert_close(trainable.values.opacities.detach(), before.clamp_max(0.8))
     assert not trainable.adam["opacity_logits"].first.any()
     assert not event.opacity_reset
-    assert densifier.refine(15_000, trainable, torch.Generator()) is None
-    assert densifier.refine(501, trainable, torch.Generator()) is None
-    refinement = Refinement(3000, trainable, torch.Generator(), event=None)  # type: ignore[arg-type]
+    assert densifier.refine(15_000, trainable, generator()) is None
+    assert densifier.refine(501, trainable, generator()) is None
+    refinement = at(3000, trainable)
     assert densifier.rules(refinement)[-2:] == [densifier.lower_opacity, densifier.reset_opacity]
-    densifier.refine(3000, trainable, torch.Generator())
+    densifier.refine(3000, trainable, generator())
     assert float(trainable.values.opacities.detach().max()) == pytest.approx(0.01)
 
 
@@ -103,9 +106,8 @@ def test_a_hard_cap_takes_those_farthest_above_their_own_threshold() -> None:
     trainable.values.log_scales.data[:30] = -9.0
     signed, absolute = torch.full((60,), 3e-4), torch.full((60,), 5e-4)  # 1.5 and 1.25 times theirs
     signed[7], absolute[50] = 9e-4, 2e-3
-    densifier.statistics |= {"gradient_sum": signed, "absolute_sum": absolute}
-    densifier.statistics["visible_count"][:] = 1
-    event = densifier.refine(600, trainable, torch.Generator())
+    gathered(densifier, signed, absolute)
+    event = densifier.refine(600, trainable, generator())
     assert (event.cloned, event.split_gradient) == (1, 1)
 
 
@@ -126,15 +128,10 @@ class Views:
     def show(self, densifier: ADC, trainable: TrainableGaussians) -> None:
         densifier.begin(trainable.values.detach(), DensifyContext(EXTENT))
         for view in range(VIEWS):
-            points = torch.zeros(COUNT, 2, dtype=torch.float64, requires_grad=True)
-            points.grad = torch.from_numpy(self.gradients[view])
-            none = torch.empty(0)
-            radii = torch.from_numpy(self.radii[view].astype(np.int32))
-            covered = torch.from_numpy(self.pixels[view].astype(np.int32))
+            none, covered = torch.empty(0), torch.from_numpy(self.pixels[view].astype(np.int32))
             footprint = Footprint(covered, torch.from_numpy(self.depths[view]), none, none)
-            render = RenderOutput(
-                none, none, radii, points, points.grad, lambda values=None, f=footprint: f
-            )
+            render = rendered(self.gradients[view], self.radii[view])
+            render.footprint = lambda values=None, f=footprint: f
             densifier.observe(view + 1, render)
 
     def mean_gradient(self, fraction: float | None) -> np.ndarray:
@@ -155,10 +152,7 @@ class Views:
 
 def started(seed: int, densifier: ADC) -> tuple[TrainableGaussians, Views]:
     gaussians = random_gaussians(COUNT, seed, log_scale=(-6.0, 0.3))
-    trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
-    for tensor in trainable.values.tensors().values():
-        tensor.grad = torch.full_like(tensor, 1e-3)
-    trainable.optimizer_step()
+    trainable = with_moments(gaussians)
     views = Views(seed)
     views.show(densifier, trainable)
     return trainable, views
@@ -169,21 +163,12 @@ def started(seed: int, densifier: ADC) -> tuple[TrainableGaussians, Views]:
 def test_pixel_gs_round(seed: int, fraction: float | None) -> None:
     densifier = PixelGS(near_fraction=fraction)
     trainable, views = started(seed, densifier)
-    rows, expected = to_rows(trainable), {}
-    foreseen = densifier.forecast(Refinement(3100, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
     gradient = views.mean_gradient(fraction)
     np.testing.assert_allclose(densifier.mean_gradient(), gradient, rtol=1e-5)
-    event = densifier.refine(3100, trainable, torch.Generator().manual_seed(seed))
-    noise = iter(noise_of(seed, [event.split_gradient]))
-    rows = restatement.prune(
-        restatement.adc_growth(rows, gradient, EXTENT, noise, expected), 3100, EXTENT, expected
-    )
-    assert_same(trainable, rows)
-    assert expected == {name: getattr(event, name) for name in expected}
-    assert event.cloned > 0
-    assert event.split_gradient > 0
-    assert event.balances()
-    assert event.after == foreseen
+    real = Round(densifier, trainable, 3100, seed)
+    noise = noise_of(seed, real.event.split_gradient)
+    real.check(restatement.adc_growth(real.rows, gradient, EXTENT, noise, real.counts))
+    assert min(real.event.cloned, real.event.split_gradient) > 0
     assert not densifier.statistics["pixel_sum"].any()  # gathered anew
 
 
@@ -192,33 +177,31 @@ def test_views_of_equal_footprints_count_as_in_adc() -> None:
     views, densifier, baseline = Views(5), PixelGS(near_fraction=None), ADC()
     views.pixels[:] = 7
     views.radii[:] = 1
-    trainable = TrainableGaussians(random_gaussians(COUNT), LearningRates(), EXTENT)
+    trainable = trained(random_gaussians(COUNT))
     for each in (densifier, baseline):
         views.show(each, trainable)
     torch.testing.assert_close(densifier.mean_gradient(), baseline.mean_gradient())
     views.pixels[1:] = 0
-    views.show(densifier, trainable)
-    np.testing.assert_allclose(
-        densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6
-    )
-    views.pixels[0] = 1
-    views.show(densifier, trainable)
-    np.testing.assert_allclose(
-        densifier.mean_gradient(), np.hypot(*views.gradients[0].T), rtol=1e-6
-    )
+    for pixels in (7, 1):
+        views.pixels[0] = pixels
+        views.show(densifier, trainable)
+        first = np.hypot(*views.gradients[0].T)
+        np.testing.assert_allclose(densifier.mean_gradient(), first, rtol=1e-6)
     densifier.stop = 1  # nothing is gathered after the window
     views.show(densifier, trainable)
     assert not densifier.statistics["pixel_sum"].any()
 
 
 def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
-    """The paper's motive: one view in which much of it is seen, three that see an edge and have no
-    gradient."""
+    """The paper's motive.
+
+    One view in which much of it is seen, three that see an edge and have no gradient.
+    """
     views, densifier, baseline = Views(0), PixelGS(near_fraction=None), ADC()
     views.gradients[:] = 0
     views.gradients[0] = 3e-4
     views.pixels[:], views.pixels[0], views.radii[:] = 2, 600, 50
-    trainable = TrainableGaussians(random_gaussians(COUNT), LearningRates(), EXTENT)
+    trainable = trained(random_gaussians(COUNT))
     for each in (densifier, baseline):
         views.show(each, trainable)
     assert (baseline.mean_gradient() < 2e-4).all()
@@ -228,55 +211,45 @@ def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
 def test_a_hard_cap_takes_those_of_the_largest_weighted_gradient() -> None:
     densifier = PixelGS(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
     trainable, views = started(1, densifier)
-    event = densifier.refine(600, trainable, torch.Generator())
+    event = densifier.refine(600, trainable, generator())
     assert event.after == COUNT + 5
     parents = densifier.lineage.state_dict()["parents"][COUNT:].unique()
-    assert sorted(parents.tolist()) == sorted(
-        np.argsort(-views.mean_gradient(0.37), kind="stable")[:5].tolist()
-    )
+    largest = np.argsort(-views.mean_gradient(0.37), kind="stable")[:5]
+    assert sorted(parents.tolist()) == sorted(largest.tolist())
 
 
 def test_a_render_that_does_not_say_is_refused() -> None:
     densifier = PixelGS()
     densifier.begin(random_gaussians(2), DensifyContext(1.0))
-    points = torch.zeros(2, 2, requires_grad=True)
-    points.grad = torch.zeros(2, 2)
     with pytest.raises(RuntimeError, match="footprint"):
-        densifier.observe(
-            1,
-            RenderOutput(torch.empty(0), torch.empty(0), torch.ones(2, dtype=torch.int32), points),
-        )
+        densifier.observe(1, rendered(torch.zeros(2, 2)))
 
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("rate", [0.1, 0.5, 3.0])
 def test_quantile_round(rate: float, step: int) -> None:
-    """The share with the largest gradients grows as in ADC, nobody that was never seen; then the
-    faintest go."""
+    """The share with the largest gradients grows as in ADC, nobody that was never seen.
+
+    Then the faintest go.
+    """
     densifier = QuantileADC(growth_rate=rate, prune_share=0.05)
     trainable, _ = prepared(densifier, 4)
     draws = np.random.default_rng(4)
     gradient = draws.uniform(0, 1e-6, 60) * (draws.random(60) < 0.8)
-    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
-    densifier.statistics["visible_count"][:] = 1
-    rows, expected = to_rows(trainable), {}
-    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(4))
+    gathered(densifier, gradient)
+    real = Round(densifier, trainable, step, 4)
+    event = real.event
     places = min(int(60 * rate), int((gradient > 0).sum()))
     chosen = np.zeros(60)
     chosen[np.argsort(-gradient, kind="stable")[:places]] = 1
     assert event.cloned + event.split_gradient == places
-    noise = iter(noise_of(4, [event.split_gradient]))
-    rows = restatement.adc_growth(rows, chosen, EXTENT, noise, expected)
+    noise = noise_of(4, event.split_gradient)
+    rows = restatement.adc_growth(real.rows, chosen, EXTENT, noise, real.counts)
     limit = np.quantile([row["opacity_logits"] for row in rows], 0.05)
-    faint = [row["opacity_logits"] < limit for row in rows]
-    huge = [step > 3000 and np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in rows]
-    assert_same(
-        trainable, [row for row, f, h in zip(rows, faint, huge, strict=True) if not f and not h]
-    )
-    assert event.pruned_opacity == sum(faint) > 0
-    assert event.balances()
-    assert event.after == foreseen
+    bright = [row for row in rows if row["opacity_logits"] >= limit]
+    most = 0.1 * EXTENT if step > 3000 else np.inf
+    real.check([row for row in bright if np.exp(row["log_scales"]).max() <= most], pruned=True)
+    assert event.pruned_opacity == len(rows) - len(bright) > 0
 
 
 def test_the_faintest_share_is_pruned_and_of_none_nobody() -> None:
@@ -292,7 +265,7 @@ def test_the_governor_moves_the_rate() -> None:
     densifier = QuantileADC(max_gaussians=80, cap="governor", start=500, stop=1200, prune_share=0.0)
     trainable, _ = prepared(densifier, 2)
     densifier.statistics["gradient_sum"] += 1e-6
-    event = densifier.refine(1100, trainable, torch.Generator())
+    event = densifier.refine(1100, trainable, generator())
     assert event.target == event.after == 80
 
 
@@ -309,13 +282,12 @@ def steep_gs_growth(
     noise: Iterator[np.ndarray],
     rate: float,
     threshold: float = -1e-6,
-    opacity: float = 0.5,
+    share: float = 0.5,
 ) -> tuple[list[restatement.Row], int]:
-    """Two halves on either side along the least eigenvector for each that reaches .0002 and has an
-    eigenvalue below.
+    """Two halves along the least eigenvector for who reaches .0002 with a value below.
 
-    Large: scales / 1.6, at the length of a draw each; small: as large as before, a step of the
-    means away.
+    They lie on either side of the parent. Large: scales / 1.6, at the length of a draw each; small:
+    as large as before, a step of the means away.
     """
     chosen = [
         i
@@ -332,15 +304,15 @@ def steep_gs_growth(
             child = restatement.newborn(
                 rows[i], rows[i]["means"] + side * length * least(matrices[i])[1], new
             )
-            share = opacity / (1 + np.exp(-rows[i]["opacity_logits"]))
-            child["opacity_logits"] = np.log(share / (1 - share))
-            children.append(child)
+            children.append(with_opacity(child, share * opacity(rows[i])))
     return [row for i, row in enumerate(rows) if i not in chosen] + children, len(chosen)
 
 
 def given(densifier: SteepGS, seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of three visible iterations: mean gradients [N] and symmetric matrices [N, 3, 3],
-    per iteration."""
+    """Statistics of three visible iterations.
+
+    Mean gradients [N] and symmetric matrices [N, 3, 3], per iteration.
+    """
     draw = np.random.default_rng(seed)
     gradient = draw.uniform(0, 4e-4, count)
     matrices = draw.normal(0, 1e-5, (count, 3, 3)) + 1e-5 * np.eye(3)
@@ -359,18 +331,13 @@ def test_steep_gs_round(seed: int, step: int) -> None:
     trainable.values.log_scales.data[::4] -= 3.0  # small ones, too
     trainable.set_step(step)
     gradient, matrices = given(densifier, seed)
-    rows, expected = to_rows(trainable), {}
-    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
     rate = trainable.position_rate
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
-    noise = iter(noise_of(seed, [event.split_gradient]))
-    rows, chosen = steep_gs_growth(rows, gradient, matrices, noise, rate)
+    real = Round(densifier, trainable, step, seed)
+    noise = noise_of(seed, real.event.split_gradient)
+    rows, chosen = steep_gs_growth(real.rows, gradient, matrices, noise, rate)
     assert 0 < chosen < (gradient >= 0.0002).sum()
-    assert event.split_gradient == chosen
-    assert_same(trainable, restatement.prune(rows, step, EXTENT, expected))
-    assert expected == {name: getattr(event, name) for name in expected}
-    assert event.balances()
-    assert event.after == foreseen
+    assert real.event.split_gradient == chosen
+    real.check(rows)
     assert not densifier.statistics["splitting_sum"].any()
     assert densifier.statistics["splitting_sum"].shape == (len(trainable), 3, 3)
 
@@ -393,12 +360,11 @@ def test_each_ingredient_can_be_taken_out() -> None:
     densifier = SteepGS(eigenvalue_threshold=None, opacity_factor=1.0)
     trainable, _ = prepared(densifier, 1)
     gradient, matrices = given(densifier, 1)
-    rows, rate = to_rows(trainable), trainable.position_rate
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(1))
-    assert event.split_gradient == (gradient >= 0.0002).sum()
-    noise = iter(noise_of(1, [event.split_gradient]))
-    rows, _ = steep_gs_growth(rows, gradient, matrices, noise, rate, threshold=np.inf, opacity=1.0)
-    assert_same(trainable, restatement.prune(rows, 600, EXTENT, {}))
+    rate = trainable.position_rate
+    real = Round(densifier, trainable, 600, 1)
+    assert real.event.split_gradient == (gradient >= 0.0002).sum()
+    noise = noise_of(1, real.event.split_gradient)
+    real.check(steep_gs_growth(real.rows, gradient, matrices, noise, rate, np.inf, 1.0)[0])
 
 
 def test_under_a_hard_cap_those_come_first_whom_a_split_helps_most() -> None:
@@ -407,7 +373,7 @@ def test_under_a_hard_cap_those_come_first_whom_a_split_helps_most() -> None:
     gradient, matrices = given(densifier, 2)
     order = [i for i in np.argsort([least(m)[0] for m in matrices]) if gradient[i] >= 0.0002]
     before = trainable.values.sh_dc.detach().clone()
-    event = densifier.refine(600, trainable, torch.Generator())
+    event = densifier.refine(600, trainable, generator())
     assert (event.split_gradient, event.after) == (3, 63)
     assert event.blocked_by_cap > 0
     kept = {tuple(row) for row in trainable.values.sh_dc.detach()[:57].tolist()}
@@ -426,7 +392,7 @@ def test_a_round_solves_for_the_eigenvectors_once(monkeypatch: pytest.MonkeyPatc
         return solve(matrices)
 
     monkeypatch.setattr(torch.linalg, "eigh", counting)
-    densifier.refine(600, trainable, torch.Generator())
+    densifier.refine(600, trainable, generator())
     assert sizes == [(gradient >= 0.0002).sum()]
 
 
@@ -437,14 +403,9 @@ def test_the_matrices_of_visible_iterations_add_up() -> None:
     before = densifier.statistics["splitting_sum"].clone()
     probe = torch.zeros(count, 3, 3, requires_grad=True)
     probe.grad = torch.arange(9.0).reshape(3, 3).expand(count, 3, 3)
-    points = torch.zeros(count, 2, dtype=torch.float64, requires_grad=True)
-    points.grad = torch.zeros(count, 2, dtype=torch.float64)
-    radii = torch.ones(count, dtype=torch.int32)
-    render = RenderOutput(torch.empty(0), torch.empty(0), radii, points, splitting_probe=probe)
-    densifier.observe(7, render)
-    densifier.observe(8, render)
-    torch.testing.assert_close(densifier.statistics["splitting_sum"] - before, 2 * probe.grad)
-    densifier.observe(densifier.stop, render)
+    render = rendered(torch.zeros(count, 2), splitting_probe=probe)
+    for step in (7, 8, densifier.stop):  # the last is after the window
+        densifier.observe(step, render)
     torch.testing.assert_close(densifier.statistics["splitting_sum"] - before, 2 * probe.grad)
     render.splitting_probe = None
     with pytest.raises(RuntimeError, match="splitting_matrix=True"):
@@ -454,35 +415,32 @@ def test_the_matrices_of_visible_iterations_add_up() -> None:
 WINDOW = {"start": 700, "stop": 12_000}  # of the authors
 
 
-def opacity(row: restatement.Row) -> float:
-    return 1 / (1 + np.exp(-row["opacity_logits"]))
-
-
 def with_opacity(row: restatement.Row, value: float, moments: bool = True) -> restatement.Row:
-    changed = row | {"opacity_logits": np.log(value / (1 - value))}
-    return (
-        changed
-        if moments
-        else changed | {f"{moment} opacity_logits": np.zeros(()) for moment in ("first", "second")}
-    )
+    changed = row | {"opacity_logits": np.array(logit(value))}
+    if not moments:
+        changed |= {f"{moment} opacity_logits": np.zeros(()) for moment in ("first", "second")}
+    return changed
 
 
 def residual_split(
-    rows: list[restatement.Row], gradient: np.ndarray, levels: np.ndarray, stage: int, noise: object
-) -> tuple[list[restatement.Row], int]:
-    """Who reaches .00067 times 2^((level - stage) / 3), or .00067 at the stage and above, keeps .3
-    of its opacity and gets a child: drawn from it, 1.6 times smaller, as opaque as it was."""
+    rows: list[restatement.Row], gradient: np.ndarray, stage: int, noise: Iterator[np.ndarray]
+) -> list[restatement.Row]:
+    """Who reaches .00067 times 2^((level - stage) / 3), at most .00067, gets a child.
+
+    It keeps .3 of its opacity. The child is drawn from it, 1.6 times smaller, as opaque as it was.
+    """
     parents, children = [], []
     for i, row in enumerate(rows):
-        threshold = 0.00067 * (2 ** ((levels[i] - stage) / 3) if levels[i] < stage else 1)
-        if gradient[i] < threshold:
+        level = row["level"]
+        if gradient[i] < 0.00067 * min(2 ** ((level - stage) / 3), 1):
             parents.append(row)
             continue
         scales = np.exp(row["log_scales"])
-        offset = restatement.rotation(row["quaternions"]) @ (scales * next(noise))  # type: ignore[call-overload]
-        children.append(restatement.newborn(row, row["means"] + offset, np.log(scales / 1.6)))
+        offset = restatement.rotation(row["quaternions"]) @ (scales * next(noise))
+        child = restatement.newborn(row, row["means"] + offset, np.log(scales / 1.6))
+        children.append(child | {"level": level + 1})
         parents.append(with_opacity(row, 0.3 * opacity(row), moments=False))
-    return parents + children, len(children)
+    return parents + children
 
 
 @pytest.mark.parametrize(("step", "stage"), [(800, 1), (2400, 3), (4100, 5)])
@@ -492,37 +450,28 @@ def test_res_gs_round(seed: int, step: int, stage: int) -> None:
     trainable, _ = prepared(densifier, seed)
     draw = np.random.default_rng(seed)
     gradient, levels = draw.uniform(0, 1e-3, 60), draw.integers(0, 8, 60)
-    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
-    densifier.statistics["visible_count"][:] = 1
+    gathered(densifier, gradient)
     densifier.statistics["level"] = torch.from_numpy(levels.astype(np.int32))
-    rows = to_rows(trainable)
-    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
-    noise = torch.randn(
-        event.split_gradient, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
-    )
-    grown, count = residual_split(rows, gradient, levels, stage, iter(noise.numpy()))
-    assert event.split_gradient == count > 0
+    real = Round(densifier, trainable, step, seed)
+    event = real.event
+    noise = torch.randn(event.split_gradient, 3, generator=generator(seed), dtype=torch.float64)
+    for row, level in zip(real.rows, levels, strict=True):
+        row["level"] = level
+    grown = residual_split(real.rows, gradient, stage, iter(noise.numpy()))
+    assert event.split_gradient == len(grown) - len(real.rows) > 0
     kept = [row for row in grown if opacity(row) >= 0.005]
-    assert_same(trainable, kept)
+    expected = [row.pop("level") for row in kept]
+    real.check(kept, pruned=True)
     assert (event.pruned_opacity, event.pruned_size, event.cloned) == (len(grown) - len(kept), 0, 0)
-    assert event.balances()
-    assert event.after == foreseen
-    below = [0.00067 * (2 ** ((level - stage) / 3) if level < stage else 1) for level in levels]
-    children = [
-        level + 1
-        for level, value, least in zip(levels, gradient, below, strict=True)
-        if value >= least
-    ]
-    everybody = [*levels, *children]
-    expected = [level for level, row in zip(everybody, grown, strict=True) if opacity(row) >= 0.005]
     assert densifier.statistics["level"].tolist() == expected  # and a round does not forget them
     assert not densifier.statistics["gradient_sum"].any()
 
 
 def test_the_stages_are_those_of_the_authors_loop() -> None:
-    """Their counters, one iteration after another: three parts of each phase, changes at 2,500 and
-    6,000, a pause of 500 iterations after each."""
+    """Their counters, one iteration after another.
+
+    Three parts of each phase, changes at 2,500 and 6,000, a pause of 500 iterations after each.
+    """
     changes, level, warm, last, ahead = [2500, 6000], 1, 0, 700, 2500
     count = (ahead - last) // 3
     stages, paused, reached = {}, {}, 0
@@ -555,7 +504,7 @@ def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterati
         trainable, _ = prepared(densifier, 3)
         densifier.statistics["gradient_sum"].zero_()
         before = trainable.values.opacities.detach().clone()
-        event = densifier.refine(step, trainable, torch.Generator())
+        event = densifier.refine(step, trainable, generator())
         if event is None:
             continue
         kept = before[before >= 0.005] if event.pruned_opacity else before
@@ -587,9 +536,8 @@ def test_gradients_are_gathered_from_500_on_but_not_in_the_pauses() -> None:
 
 def test_in_a_short_window_there_is_no_pause_and_phases_must_rise() -> None:
     densifier = ResGS(start=200, stop=1000)
-    assert [densifier.stage(step) for step in range(300, 1000, 100)] == sorted(
-        densifier.stage(step) for step in range(300, 1000, 100)
-    )
+    stages = [densifier.stage(step) for step in range(300, 1000, 100)]
+    assert stages == sorted(stages)
     assert not any(densifier.warming_up(step) for step in range(1000))
     # Phases end at 1 and 3: too short for three stages, each of which takes one iteration.
     shortest = ResGS(start=0, stop=6, interval=1, phase_ends=[0.2, 0.5])
@@ -602,11 +550,8 @@ def test_a_governed_round_ends_at_its_target() -> None:
     densifier = ResGS(max_gaussians=90, cap="governor", start=500, stop=1200)
     trainable, _ = prepared(densifier, 2)
     trainable.values.opacity_logits.data[:] = 1.0
-    densifier.statistics["gradient_sum"] = 1e-3 * torch.rand(
-        60, generator=torch.Generator().manual_seed(0)
-    )
-    densifier.statistics["visible_count"][:] = 1
-    event = densifier.refine(1100, trainable, torch.Generator())
+    gathered(densifier, 1e-3 * torch.rand(60, generator=generator()))
+    event = densifier.refine(1100, trainable, generator())
     assert event.target == event.after == 90
 
 
@@ -614,8 +559,7 @@ def test_a_hard_cap_admits_the_largest_gradients() -> None:
     densifier = ResGS(max_gaussians=63, cap="hard", **WINDOW)  # type: ignore[arg-type]
     trainable, _ = prepared(densifier, 2)
     trainable.values.opacity_logits.data[:] = 1.0
-    densifier.statistics["gradient_sum"] = torch.arange(60, dtype=torch.float64)
-    densifier.statistics["visible_count"][:] = 1
-    event = densifier.refine(800, trainable, torch.Generator())
+    gathered(densifier, torch.arange(60, dtype=torch.float64))
+    event = densifier.refine(800, trainable, generator())
     assert (event.split_gradient, event.after) == (3, 63)
     assert event.blocked_by_cap == 56

@@ -1,5 +1,7 @@
-"""Caps: freeze leaves a round out, the governor steers to a count; against counting one Gaussian at
-a time."""
+"""Caps: freeze leaves a round out, the governor steers to a count.
+
+Against counting one Gaussian at a time.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +15,9 @@ import torch
 from gsbench.densify import ADC, MCMC, Budgeted, DensifyContext, RefineEvent, Refinement, Volumetric
 from gsbench.densify.budget import find_factor
 from gsbench.errors import InputError
-from gsbench.gaussians.paper_values import LearningRates
-from gsbench.gaussians.trainable import TrainableGaussians
-from tests.densify.test_rounds import EXTENT, prepared, to_rows
+from tests.densify.helpers import EXTENT, at, generator, to_rows, trained
+from tests.densify.test_rounds import prepared
 from tests.gaussians.helpers import random_gaussians
-
-
-def generator(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def at(step: int, trainable: TrainableGaussians) -> Refinement:
-    return Refinement(step, trainable, generator(0), event=None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("kind", [ADC, Volumetric])
@@ -33,22 +26,18 @@ def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
     densifier = kind(max_gaussians=60, cap="freeze")
     trainable, _ = prepared(densifier, 3, count=60)
     # at the limit a round may go beyond it
-    assert densifier.refine(600, trainable, generator(0)).after > 60
+    assert densifier.refine(600, trainable, generator()).after > 60
     trainable.values.opacity_logits.data[:5] = -9.0  # to be pruned
     for tensor in trainable.values.tensors().values():
         tensor.grad = torch.ones_like(tensor)
     densifier.statistics["gradient_sum"] += 1e-3
     densifier.statistics["visible_count"] += 1
     before = to_rows(trainable)
-    event = densifier.refine(700, trainable, generator(0))
+    event = densifier.refine(700, trainable, generator())
     for old, new in zip(before, to_rows(trainable), strict=True):
         assert all(np.array_equal(old[name], new[name]) for name in old)
-    assert (event.pruned_opacity, event.cloned, event.split_gradient, event.split_volume) == (
-        0,
-        0,
-        0,
-        0,
-    )
+    counts = (event.pruned_opacity, event.cloned, event.split_gradient, event.split_volume)
+    assert counts == (0, 0, 0, 0)
     assert trainable.values.means.grad is not None
     assert event.after == event.before
     assert event.balances()
@@ -56,7 +45,7 @@ def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
     twin = kind(cap="soft")
     twin.begin(trainable.values.detach(), DensifyContext(EXTENT))
     twin.statistics = densifier.statistics
-    unlimited = twin.refine(700, trainable, generator(0))
+    unlimited = twin.refine(700, trainable, generator())
     assert unlimited.pruned_opacity >= 5
     assert event.blocked_by_cap == unlimited.after - (unlimited.before - 5) > 0
 
@@ -64,8 +53,8 @@ def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
 def test_a_frozen_training_still_resets_its_opacities() -> None:
     densifier = ADC(max_gaussians=60, cap="freeze")
     trainable, _ = prepared(densifier, 3, count=60)
-    densifier.refine(2900, trainable, generator(0))
-    event = densifier.refine(3000, trainable, generator(0))
+    densifier.refine(2900, trainable, generator())
+    event = densifier.refine(3000, trainable, generator())
     assert event.before == event.after > 60
     assert event.opacity_reset
     assert float(trainable.values.opacities.detach().max()) < 0.0101
@@ -119,16 +108,16 @@ def test_who_keeps_to_the_curve_ends_at_the_limit(kind: type[Budgeted]) -> None:
     densifier = kind(start=500, stop=1500, interval=100, max_gaussians=1100, cap="governor")  # type: ignore[call-arg]
     count, counts = 100, []
     for step in range(600, 1500, 100):
-        count = densifier.target(at(step, range(count)))  # type: ignore[arg-type]
+        count = densifier.target(at(step, range(count)))
         counts.append(count)
     progress = np.arange(1, 10) / 9  # the ninth round is the last
     np.testing.assert_allclose(counts, 100 + 1000 * (2 * progress - progress**2), atol=1.0)
     assert counts[-1] == 1100
-    late = densifier.target(at(1200, range(300)))  # type: ignore[arg-type]
+    late = densifier.target(at(1200, range(300)))
     assert late == 300 + round(800 * (1 - (2 / 3) ** 2))  # two rounds are left after it
     assert densifier.target(at(1400, range(late))) == 1100  # type: ignore[arg-type]
     densifier.start = 550  # between two rounds: 8.5 rounds from there to the last
-    assert densifier.target(at(600, range(100))) == 100 + round(1000 * (1 - (8 / 8.5) ** 2))  # type: ignore[arg-type]
+    assert densifier.target(at(600, range(100))) == 100 + round(1000 * (1 - (8 / 8.5) ** 2))
 
 
 @pytest.mark.parametrize("kind", [ADC, Volumetric])
@@ -139,7 +128,7 @@ def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
     scales = np.array([row["log_scales"] for row in to_rows(trainable)])
     opacities = trainable.values.opacities.detach().numpy()
     ungoverned = densifier.forecast(at(900, trainable))
-    event = densifier.refine(900, trainable, generator(0))
+    event = densifier.refine(900, trainable, generator())
     assert event.blocked_by_cap == max(0, ungoverned - event.after)
     assert event.target == 300 + round(150 * (1 - (2 / 3) ** 2))
     assert abs(event.after - event.target) <= 2
@@ -161,7 +150,7 @@ def test_the_governor_moves_a_volume_or_the_size_that_it_is_of(dimension: int) -
     )  # type: ignore[arg-type]
     trainable, gradient = prepared(densifier, 2, count=300)
     sizes = np.exp(np.array([row["log_scales"] for row in to_rows(trainable)]))  # [N, 3]
-    event = densifier.refine(900, trainable, generator(0))
+    event = densifier.refine(900, trainable, generator())
     factor = event.strictness
     assert factor != 1
     over, large = gradient >= 2e-4 * factor, sizes.max(-1) > 0.01 * EXTENT
@@ -187,12 +176,12 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
         False
     ] * 5 + [True] * 2
     assert densifier.may_cull(6000)  # it resets after it has pruned
-    locked = Refinement(3100, trainable, generator(0), RefineEvent(3100, len(trainable)))
+    locked = Refinement(3100, trainable, generator(), RefineEvent(3100, len(trainable)))
     densifier.govern(locked)
     assert locked.event.target < 60  # and yet
     assert locked.event.cull == 1
     opacities = trainable.values.opacities.detach().clone()
-    event = densifier.refine(14_900, trainable, generator(0))  # the last round
+    event = densifier.refine(14_900, trainable, generator())  # the last round
     assert event.target == 30
     assert event.strictness == pytest.approx(1e3)
     assert 1 < event.cull <= 10
@@ -208,7 +197,7 @@ def test_up_to_one_percent_over_its_target_a_count_is_not_culled(target: int, cu
     trainable.values.opacity_logits.data.copy_(
         torch.logit(torch.linspace(0.006, 0.06, 200, dtype=torch.float64))
     )
-    event = densifier.refine(14_900, trainable, generator(0))
+    event = densifier.refine(14_900, trainable, generator())
     assert (event.cull > 1) == culls
     assert event.after == (target if culls else 200)
 
@@ -217,7 +206,7 @@ def test_a_governed_mcmc_adds_what_is_missing() -> None:
     gaussians = random_gaussians(40)
     densifier = MCMC(start=0, stop=301, interval=100, max_gaussians=100, cap="governor")
     densifier.begin(gaussians, DensifyContext(1.0))
-    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
+    trainable = trained(gaussians, 1.0)
     events = [densifier.refine(step, trainable, generator(step)) for step in (100, 200, 300)]
     assert [event.after for event in events] == [event.target for event in events]
     assert events[-1].after == 100
@@ -265,5 +254,5 @@ def test_a_training_may_limit_the_count_further(
     assert densifier.allowance(at(600, range(count))) == allowed  # type: ignore[arg-type]
     assert asked == [7 if cap == "hard" else None]
     densifier.cap = "curve"  # follows its own
-    densifier.allowance(at(600, range(count)))  # type: ignore[arg-type]
+    densifier.allowance(at(600, range(count)))
     assert len(asked) == 1

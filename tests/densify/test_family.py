@@ -11,17 +11,18 @@ from gsbench.densify.base import faded, quantile, revised_logits
 from gsbench.densify.budget import Budgeted
 from gsbench.densify.mcmc import shared_opacity, spread_out
 from gsbench.errors import InputError
-from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.raster.base import RenderOutput
+from tests.densify.helpers import generator, rendered, trained
 from tests.gaussians.helpers import random_gaussians
 
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 8])
 @pytest.mark.parametrize("opacity", [0.1, 0.6, 0.95])
 def test_shared_opacity_preserves_centre_and_integral(copies: int, opacity: float) -> None:
-    """n coincident copies: the same opacity at the centre, and the same integral along a line
-    (numerically)."""
+    """n coincident copies.
+
+    The same opacity at the centre, and the same integral along a line (numerically).
+    """
     o = torch.tensor([opacity], dtype=torch.float64)
     new, factor = shared_opacity(o, torch.tensor([copies]))
     assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity)
@@ -69,7 +70,7 @@ def test_the_term_of_mcmc_in_the_loss() -> None:
 def test_mcmc_moves_and_adds_a_single_gaussian() -> None:
     densifier, trainable = mcmc_state(8, max_gaussians=9, growth=0.5)
     trainable.values.opacity_logits.data[1] = 0.0  # of two dead ones
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    event = densifier.refine(600, trainable, generator(0))
     assert (event.relocated, event.added, event.after) == (1, 1, 9)
     assert len(trainable) == 9
 
@@ -77,14 +78,14 @@ def test_mcmc_moves_and_adds_a_single_gaussian() -> None:
 def test_mcmc_leaves_a_model_alone_whose_gaussians_are_all_dead() -> None:
     densifier, trainable = mcmc_state(8, max_gaussians=50, growth=0.5)
     trainable.values.opacity_logits.data[:] = -9.0
-    event = densifier.refine(600, trainable, torch.Generator())
+    event = densifier.refine(600, trainable, generator())
     assert (event.relocated, event.added, event.after) == (0, 0, 8)
 
 
 def test_mcmc_shares_an_opacity_of_one_as_a_finite_logit() -> None:
     densifier, trainable = mcmc_state(4, max_gaussians=50, growth=5.0)
     trainable.values.opacity_logits.data[:] = 60.0
-    densifier.refine(600, trainable, torch.Generator())
+    densifier.refine(600, trainable, generator())
     assert float(trainable.values.opacities.detach().max()) == pytest.approx(1 - 1e-6, abs=1e-12)
 
 
@@ -93,12 +94,12 @@ def mcmc_state(count: int = 40, **options: object) -> tuple[MCMC, TrainableGauss
     gaussians.opacity_logits[: count // 4] = -9.0  # dead
     densifier = MCMC(**options)  # type: ignore[arg-type]
     densifier.begin(gaussians, DensifyContext(4.0))
-    return densifier, TrainableGaussians(gaussians, LearningRates(), 4.0)
+    return densifier, trained(gaussians)
 
 
 def test_mcmc_moves_the_dead_and_grows_to_an_exact_cap() -> None:
     densifier, trainable = mcmc_state(max_gaussians=50, growth=0.2)
-    rng = torch.Generator().manual_seed(0)
+    rng = generator(0)
     event = densifier.refine(600, trainable, rng)
     assert (event.before, event.relocated, event.added, event.after) == (40, 10, 8, 48)
     assert (trainable.values.opacities > densifier.min_opacity * 0.999).all()
@@ -110,16 +111,6 @@ def test_mcmc_moves_the_dead_and_grows_to_an_exact_cap() -> None:
     assert densifier.lineage.causes_of_living()["relocated"] > 0
 
 
-def test_mcmc_noise_moves_faint_gaussians_only() -> None:
-    densifier, trainable = mcmc_state()
-    trainable.values.opacity_logits.data[20:] = 4.0
-    before = trainable.values.means.detach().clone()
-    densifier.after_step(1, trainable, torch.Generator().manual_seed(1))
-    moved = (trainable.values.means - before).norm(dim=-1)
-    assert (moved[:10] > 0).all()
-    assert moved[20:].max().item() < 1e-12
-
-
 def test_mcmc_refuses_a_cap_below_the_initial_cloud() -> None:
     with pytest.raises(InputError, match=r"densify.max_gaussians .* initial cloud \(40\)"):
         mcmc_state(max_gaussians=39)
@@ -129,12 +120,8 @@ def test_mcmc_refuses_a_cap_below_the_initial_cloud() -> None:
 
 def test_absolute_gradient_is_what_absgrad_reads() -> None:
     gaussians = random_gaussians(3)
-    points = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
-    points.grad = torch.zeros(3, 2, dtype=torch.float64)
     absolute = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-    render = RenderOutput(
-        torch.empty(0), torch.empty(0), torch.ones(3, dtype=torch.int32), points, absolute
-    )
+    render = rendered(torch.zeros(3, 2), absolute=absolute)
     densifier = ADC(gradient="absolute")
     assert densifier.needs_absolute_gradient
     densifier.begin(gaussians, DensifyContext(1.0))
@@ -160,10 +147,8 @@ def test_none_never_changes_anything() -> None:
     gaussians = random_gaussians(4)
     densifier = NoDensifier()
     densifier.begin(gaussians, DensifyContext(1.0))
-    trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
-    assert all(
-        densifier.refine(step, trainable, torch.Generator()) is None for step in range(1, 3001)
-    )
+    trainable = trained(gaussians, 1.0)
+    assert all(densifier.refine(step, trainable, generator()) is None for step in range(1, 3001))
     assert len(trainable) == 4
 
 
@@ -172,16 +157,11 @@ def test_state_survives_saving() -> None:
     events = []
     for interrupted in (False, True):
         densifier = ADC(max_gaussians=500, cap="curve", start=500, stop=3000)
-        trainable = TrainableGaussians(
-            random_gaussians(50, log_scale=(-5, -1)), LearningRates(), 4.0
-        )
+        trainable = trained(random_gaussians(50, log_scale=(-5, -1)))
         densifier.begin(trainable.values.detach(), DensifyContext(4.0))
-        rng, draws = torch.Generator().manual_seed(5), np.random.default_rng(0)
+        rng, draws = generator(5), np.random.default_rng(0)
         for step in range(599, 701):
-            points = torch.zeros(len(trainable), 2, dtype=torch.float64, requires_grad=True)
-            points.grad = torch.from_numpy(draws.exponential(3e-4, (len(trainable), 2)))
-            radii = torch.ones(len(trainable), dtype=torch.int32)
-            densifier.observe(step, RenderOutput(torch.empty(0), torch.empty(0), radii, points))
+            densifier.observe(step, rendered(draws.exponential(3e-4, (len(trainable), 2))))
             event = densifier.refine(step, trainable, rng)
             events.append((interrupted, step, event))
             if interrupted and step == 650:
@@ -197,16 +177,14 @@ def test_threshold_strictness() -> None:
     counts = {}
     for inclusive in (True, False):
         densifier = ADC(threshold_inclusive=inclusive, gradient_threshold=2.5e-4)
-        trainable = TrainableGaussians(
-            random_gaussians(1, log_scale=(-9, -8)), LearningRates(), 4.0
-        )
+        trainable = trained(random_gaussians(1, log_scale=(-9, -8)))
         trainable.values.opacity_logits.data.fill_(2.0)
         densifier.begin(trainable.values.detach(), DensifyContext(4.0))
         densifier.statistics["gradient_sum"][:] = torch.tensor(2.5e-4)
         densifier.statistics["visible_count"][:] = 1
         # as float32 holds it
         densifier.gradient_threshold = float(densifier.statistics["gradient_sum"][0])
-        counts[inclusive] = densifier.refine(600, trainable, torch.Generator()).cloned
+        counts[inclusive] = densifier.refine(600, trainable, generator()).cloned
     assert counts == {True: 1, False: 0}
 
 
@@ -219,7 +197,7 @@ def test_mcmc_begins_the_moments_of_all_six_tensors_anew_at_the_sources(rule: st
     if rule == "add":
         trainable.values.opacity_logits.data[:10] = -1.0  # nobody is dead
     before = trainable.values.opacity_logits.detach().clone()
-    densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    densifier.refine(600, trainable, generator(0))
     after = trainable.values.opacity_logits.detach()
     count = 30 if rule == "relocate" else 40  # who lived stands first, in order
     sources = (after[:count] != before[40 - count :]).numpy()
@@ -237,7 +215,7 @@ def test_mcmc_shares_an_opacity_among_fifty_at_most() -> None:
     densifier, trainable = mcmc_state(2, max_gaussians=200, growth=50.0)
     trainable.values.opacity_logits.data[:] = torch.tensor([-4.0, 8.0])
     opacity = float(trainable.values.opacities[1].detach())
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    event = densifier.refine(600, trainable, generator(0))
     assert event.added == 100
     expected = max(1 - (1 - opacity) ** (1 / 50), densifier.min_opacity)
     assert float(trainable.values.opacities[1].detach()) == pytest.approx(expected, rel=1e-9)
@@ -263,8 +241,8 @@ def test_values_that_would_empty_or_fill_the_memory_are_refused(
 
 def test_mrnf_takes_an_empty_model() -> None:
     """A decay that took all of it: the trainer then says that no Gaussian was left."""
-    densifier, rng = MRNF(), torch.Generator()
-    gaussians = TrainableGaussians(random_gaussians(3, seed=1), LearningRates(), 1.0)
+    densifier, rng = MRNF(), generator()
+    gaussians = trained(random_gaussians(3, seed=1), 1.0)
     densifier.begin(gaussians.values, DensifyContext(1.0))
     densifier.statistics = {"seen": torch.zeros(0, dtype=torch.bool)}
     gaussians.edit(torch.zeros(3, dtype=torch.bool))

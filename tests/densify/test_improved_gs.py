@@ -6,21 +6,34 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis, Refinement
+from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis
 from gsbench.densify.scores import draw
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.raster.base import RenderOutput
 from tests.densify import restatement
-from tests.densify.test_rounds import EXTENT, assert_same, observe, prepared, to_rows
-from tests.densify.test_scores import COUNT, Room, alphas, at, find_edges, over_mean, started
+from tests.densify.helpers import (
+    EXTENT,
+    Round,
+    assert_same,
+    at,
+    gathered,
+    generator,
+    rendered,
+    to_rows,
+    trained,
+)
+from tests.densify.restatement import logit, opacity
+from tests.densify.test_rounds import observe, prepared
+from tests.densify.test_scores import COUNT, Room, alphas, find_edges, over_mean, started
 from tests.gaussians.helpers import random_gaussians
 
 
 def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[restatement.Row]:
-    """d = 0.45: centres at 3 d s along the longest axis; that axis times 0.55, the others times
-    sqrt(1 - 0.2025)."""
+    """d = 0.45: centres at 3 d s along the longest axis.
+
+    That axis times 0.55, the others times sqrt(1 - 0.2025).
+    """
     chosen = [i for i in range(len(rows)) if mean_gradient[i] >= 0.0008]
     children = []
     for side in (1, -1):
@@ -33,8 +46,7 @@ def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[resta
             child = restatement.newborn(
                 rows[i], rows[i]["means"] + side * 1.35 * scales[longest] * axis, np.log(new)
             )
-            opacity = 0.6 / (1 + np.exp(-rows[i]["opacity_logits"]))
-            child["opacity_logits"] = np.log(opacity / (1 - opacity))
+            child["opacity_logits"] = np.array(logit(0.6 * opacity(rows[i])))
             children.append(child)
     return [row for i, row in enumerate(rows) if i not in chosen] + children
 
@@ -45,31 +57,12 @@ def test_long_axis_round(seed: int, step: int) -> None:
     densifier = LongAxis(gradient="absolute", gradient_threshold=0.0008)
     trainable, _ = prepared(densifier, seed)
     gradient = np.random.default_rng(seed).uniform(0, 0.0016, len(trainable))
-    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
-    densifier.statistics["visible_count"][:] = 1
-    rows, expected = to_rows(trainable), {}
-    foreseen = densifier.forecast(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
-    event = densifier.refine(step, trainable, torch.Generator())
-    grown = halves(rows, gradient)
-    assert event.split_gradient == len(grown) - len(rows) > 0
-    assert event.cloned == 0
-    assert_same(trainable, restatement.prune(grown, step, EXTENT, expected))
-    assert expected == {name: getattr(event, name) for name in expected}
-    assert event.balances()
-    assert event.after == foreseen
-
-
-def test_a_hard_cap_holds() -> None:
-    densifier = LongAxis(max_gaussians=70, cap="hard", gradient_threshold=1e-6)
-    trainable, _ = prepared(densifier, 1)
-    event = densifier.refine(600, trainable, torch.Generator())
-    assert event.before + event.split_gradient == 70
-    assert event.blocked_by_cap > 0
-    assert event.balances()
-
-
-def opacity(row: restatement.Row) -> float:
-    return 1 / (1 + np.exp(-row["opacity_logits"]))
+    gathered(densifier, gradient)
+    real = Round(densifier, trainable, step)
+    grown = halves(real.rows, gradient)
+    assert real.event.split_gradient == len(grown) - len(real.rows) > 0
+    assert real.event.cloned == 0
+    real.check(grown)
 
 
 def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
@@ -82,13 +75,15 @@ def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
 
 @pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
 def test_the_edge_aware_score_of_each_gaussian(step: int, views: int) -> None:
-    """The mean over the views drawn, each over its own mean; 400 iterations after the first two
-    resets, over all."""
+    """The mean over the views drawn, each over its own mean.
+
+    400 iterations after the first two resets, over all.
+    """
     densifier = EdgeAware(score_views=2)
     trainable, _ = started(densifier, step)
     with torch.no_grad():
-        scores = densifier.scores(trainable.values, step, torch.Generator().manual_seed(step))
-    drawn = torch.randperm(3, generator=torch.Generator().manual_seed(step))[:views].tolist()
+        scores = densifier.scores(trainable.values, step, generator(step))
+    drawn = torch.randperm(3, generator=generator(step))[:views].tolist()
     np.testing.assert_allclose(
         scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9
     )
@@ -98,31 +93,31 @@ def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candi
     densifier = EdgeAware(gradient_threshold=3e-4)
     trainable, gradient = started(densifier, 0)
     for step, threshold in ((14_500, 3e-4), (14_600, 2e-4)):
-        over, _ = densifier.candidates(at(step, trainable, torch.Generator()))
+        over, _ = densifier.candidates(at(step, trainable))
         np.testing.assert_array_equal(over, gradient >= threshold)
-    np.testing.assert_allclose(
-        densifier.scores(trainable.values, 14_600, torch.Generator()), gradient
-    )
+    np.testing.assert_allclose(densifier.scores(trainable.values, 14_600, generator()), gradient)
     full = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT)
     trainable, _ = started(full, 0)
-    over, _ = full.candidates(at(14_600, trainable, torch.Generator()))
+    over, _ = full.candidates(at(14_600, trainable))
     np.testing.assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold stays
 
 
 @pytest.mark.parametrize("step", [600, 3100, 14_900])
 @pytest.mark.parametrize("seed", range(2))
 def test_edge_aware_round(seed: int, step: int) -> None:
-    """Who is drawn becomes two halves along the longest axis; the faint go but in the last round,
-    the huge stay."""
+    """Who is drawn becomes two halves along the longest axis.
+
+    The faint go but in the last round, the huge stay.
+    """
     densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
     trainable, gradient = started(densifier, seed)
     trainable.values.opacity_logits.data[3] = -9.0
     rows = to_rows(trainable)
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    event = densifier.refine(step, trainable, generator(seed))
     over = gradient >= (2e-4 if step > 14_500 else 3e-4)
     assert event.split_gradient == 9
     assert event.blocked_by_cap == over.sum() - 9
-    rng = torch.Generator().manual_seed(seed)
+    rng = generator(seed)
     with torch.no_grad():
         twin, _ = started(densifier, seed)
         twin.values.opacity_logits.data[3] = -9.0
@@ -145,7 +140,7 @@ def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> 
     trainable, gradient = started(densifier, 1)
     scores = expected_scores(trainable.values.detach(), [0, 1, 2])
     assert 0 < (scores == 0).sum() < COUNT
-    event = densifier.refine(700, trainable, torch.Generator().manual_seed(0))
+    event = densifier.refine(700, trainable, generator(0))
     assert event.split_gradient == ((scores > 0) & (gradient >= 1e-9)).sum()
     assert event.blocked_by_cap == ((scores == 0) & (gradient >= 1e-9)).sum()
 
@@ -160,7 +155,7 @@ def test_where_nothing_can_grow_no_view_is_rendered(
     monkeypatch.delattr(EdgeAware, "scores")
     candidates = torch.zeros(COUNT, dtype=torch.bool)
     candidates[: 0 if room else 5] = True
-    chosen, blocked = densifier.choose(at(600, trainable, torch.Generator()), candidates, 1)
+    chosen, blocked = densifier.choose(at(600, trainable), candidates, 1)
     assert not chosen.any()
     assert blocked == candidates.sum()
 
@@ -168,30 +163,30 @@ def test_where_nothing_can_grow_no_view_is_rendered(
 def test_the_growth_control_is_a_root() -> None:
     densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
     trainable, _ = started(densifier, 0)
-    rng = torch.Generator()
-    allowed = [
-        densifier.allowance(at(step, trainable, rng)) for step in (600, 7500, 14_500, 14_900)
-    ]
+    rng = generator()
+    allowed = [densifier.allowance(at(step, trainable)) for step in (600, 7500, 14_500, 14_900)]
     assert allowed == [int(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
     # shorter than the closing rounds
     short = EdgeAware(max_gaussians=1000, start=100, stop=400, interval=100)
     assert [short.limit(step) for step in (150, 200, 300)] == [707, 1000, 1000]
     densifier.max_gaussians = COUNT
-    assert densifier.allowance(at(7500, trainable, rng)) == 0
+    assert densifier.allowance(at(7500, trainable)) == 0
     event = densifier.refine(7500, trainable, rng)
     assert event.split_gradient == 0
     assert event.blocked_by_cap > 0
 
 
 def test_the_prunings_of_the_schedule() -> None:
-    """At iteration 300 below .02; at 3,300 and 6,300, after the round, the faintest fifth; resets
-    go to .05."""
+    """At iteration 300 below .02.
+
+    At 3,300 and 6,300, after the round, the faintest fifth; resets go to .05.
+    """
     densifier, events = EdgeAware(max_gaussians=60), {}
     for step in (299, 300, 3000, 3200, 3300, 6300, 9300, 12_300, 15_300):
         trainable, _ = prepared(densifier, 2)
         rows = to_rows(trainable)
         densifier.statistics["gradient_sum"].zero_()  # nobody grows
-        event = events[step] = densifier.refine(step, trainable, torch.Generator())
+        event = events[step] = densifier.refine(step, trainable, generator())
         if step == 3000:
             assert max(opacity(row) for row in to_rows(trainable)) == pytest.approx(0.05)
             continue
@@ -224,12 +219,8 @@ def begun(**options: object) -> tuple[GNS, Gaussians]:
 
 
 def seen(densifier: GNS, step: int) -> None:
-    points = torch.zeros(50, 2, dtype=torch.float64, requires_grad=True)
-    points.grad = torch.zeros(50, 2, dtype=torch.float64)
-    radii = torch.ones(50, dtype=torch.int32)
-    densifier.observe(
-        step, RenderOutput(torch.empty(0), torch.empty(0), radii, points, points.grad)
-    )
+    nothing = torch.zeros(50, 2, dtype=torch.float64)
+    densifier.observe(step, rendered(nothing, absolute=nothing))
 
 
 def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> float:
@@ -260,8 +251,7 @@ def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
 
 @pytest.mark.parametrize("sinks", [0.0, 2.0])
 def test_the_weight_follows_an_aim_that_falls_to_nothing(sinks: float) -> None:
-    """The authors' schedule, iteration by iteration, for opacities that stay once the first has set
-    the aim.
+    """The authors' schedule by iterations, for opacities that stay once the aim is set.
 
     Where they sank, the weight falls first, rests while the aim passes, and rises.
     """
@@ -303,8 +293,8 @@ def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, pl
 def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
     densifier = GNS(max_gaussians=40)
     trainable, _ = started(densifier, 0)
-    rng = torch.Generator().manual_seed(0)
-    assert densifier.allowance(at(14_500, trainable, rng)) == 120 - COUNT
+    rng = generator(0)
+    assert densifier.allowance(at(14_500, trainable)) == 120 - COUNT
     assert densifier.refine(15_000, trainable, rng) is not None  # the learning rate
     assert trainable.adam["opacity_logits"].rate == pytest.approx(4 * 0.05)
     assert densifier.refine(15_050, trainable, rng) is None
@@ -336,7 +326,7 @@ def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(
 ) -> None:
     densifier = GNS(max_gaussians=20)
     trainable, _ = started(densifier, 0)
-    event = densifier.refine(23_000, trainable, torch.Generator().manual_seed(0))
+    event = densifier.refine(23_000, trainable, generator(0))
     assert (event.pruned_opacity, event.after) == (COUNT - 20, 20)
     assert event.balances()
     assert (
@@ -350,7 +340,7 @@ def test_a_selection_that_has_met_its_budget_warns_of_nothing(
 ) -> None:
     densifier = GNS(max_gaussians=COUNT - 1)
     trainable, _ = started(densifier, 0)
-    assert densifier.refine(16_050, trainable, torch.Generator().manual_seed(0)).after == COUNT - 1
+    assert densifier.refine(16_050, trainable, generator(0)).after == COUNT - 1
     assert caplog.text == ""
 
 
@@ -374,14 +364,14 @@ def test_the_selection_survives_saving() -> None:
     for step in range(15_200, 15_400):
         first, second = (d.regularizer(gaussians) for d in (densifier, twin))
         assert (first is None) == (second is None) == ((step - 1) % 50 != 0)
-        assert first is None or float(first) == float(second)  # type: ignore[arg-type]
+        assert first is None or float(first) == float(second)
         seen(densifier, step)
         seen(twin, step)
     assert twin.weight == densifier.weight != 2e-4
 
 
 def test_the_rate_of_a_parameter_is_kept_in_its_state() -> None:
-    trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 1.0)
+    trainable = trained(random_gaussians(4), 1.0)
     trainable.set_rate("opacity_logits", 0.2)
     again = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 1.0)
     assert again.adam["opacity_logits"].rate == 0.2

@@ -9,21 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, Refinement
+from gsbench.densify import ADC, MCMC, MRNF, DensifyContext
 from gsbench.densify.mcmc import bounds
 from gsbench.densify.scores import draw
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.densify import restatement
-from tests.densify.test_rounds import EXTENT, assert_same, to_rows
+from tests.densify.helpers import EXTENT, assert_same, at, generator, to_rows, trained, with_moments
+from tests.densify.restatement import logit, opacity
 from tests.densify.test_scores import BLACK, COUNT, Room, alphas, find_edges, over_median, started
 from tests.gaussians.helpers import random_gaussians
-
-
-def opacity(row: restatement.Row) -> float:
-    return 1 / (1 + np.exp(-row["opacity_logits"]))
 
 
 def drawn(
@@ -46,7 +42,7 @@ def shared(row: restatement.Row, copies: int) -> restatement.Row:
     )
     kept = max(0.005, min(new, 1 - 1e-6))
     changed = restatement.newborn(row, row["means"].copy(), row["log_scales"] + math.log(o / total))
-    return changed | {"opacity_logits": np.log(kept / (1 - kept))}
+    return changed | {"opacity_logits": np.array(logit(kept))}
 
 
 def with_copies(rows: list[restatement.Row], sources: list[int]) -> list[restatement.Row]:
@@ -60,10 +56,7 @@ def with_copies(rows: list[restatement.Row], sources: list[int]) -> list[restate
 def prepared(count: int, seed: int, **options: Any) -> tuple[MCMC, TrainableGaussians]:
     gaussians = random_gaussians(count, seed)
     gaussians.opacity_logits[: count // 4] = -9.0
-    densifier, trainable = MCMC(**options), TrainableGaussians(gaussians, LearningRates(), 4.0)
-    for tensor in trainable.values.tensors().values():
-        tensor.grad = torch.full_like(tensor, 1e-3)
-    trainable.optimizer_step()
+    densifier, trainable = MCMC(**options), with_moments(gaussians)
     densifier.begin(trainable.values.detach(), DensifyContext(4.0))
     return densifier, trainable
 
@@ -73,8 +66,8 @@ def prepared(count: int, seed: int, **options: Any) -> tuple[MCMC, TrainableGaus
 def test_mcmc_round(seed: int, growth: float) -> None:
     densifier, trainable = prepared(40, seed, max_gaussians=55, growth=growth)
     rows = to_rows(trainable)
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
-    rng = torch.Generator().manual_seed(seed)
+    event = densifier.refine(600, trainable, generator(seed))
+    rng = generator(seed)
     dead = [opacity(row) <= 0.005 for row in rows]
     weights = [0.0 if gone else opacity(row) for row, gone in zip(rows, dead, strict=True)]
     sources = drawn(rows, weights, sum(dead), rng)
@@ -88,28 +81,25 @@ def test_mcmc_round(seed: int, growth: float) -> None:
 
 
 def test_mcmc_noise() -> None:
-    """R S S R^T times a normal draw, times sigmoid(-100 (o - .005)), times 5e5 and the rate of the
-    means."""
+    """R S S R^T times a normal draw, sigmoid(-100 (o - .005)), 5e5 and the means' rate."""
     densifier, trainable = prepared(40, 1)
     trainable.values.opacity_logits.data.copy_(torch.linspace(-9, 2, 40))
     trainable.set_step(1)
     rows = to_rows(trainable)
-    densifier.after_step(1, trainable, torch.Generator().manual_seed(0))
-    noise = torch.randn(
-        40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    ).numpy()
+    densifier.after_step(1, trainable, generator(0))
+    noise = torch.randn(40, 3, generator=generator(), dtype=torch.float64).numpy()
     for i, row in enumerate(rows):
         axes = restatement.rotation(row["quaternions"]) * np.exp(row["log_scales"])
         gate = 1 / (1 + np.exp(100 * (opacity(row) - 0.005)))
-        row["means"] = (
-            row["means"] + axes @ axes.T @ noise[i] * gate * 5e5 * trainable.position_rate
-        )
+        row["means"] += axes @ axes.T @ noise[i] * gate * 5e5 * trainable.position_rate
     assert_same(trainable, rows)
 
 
 def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views: the largest refine weight, and 1 + .25 times the mean edge score over
-    its median."""
+    """Over the three views.
+
+    The largest refine weight, and 1 + .25 times the mean edge score over its median.
+    """
     room, weight, edge = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
@@ -121,8 +111,10 @@ def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def half(row: restatement.Row, side: int) -> restatement.Row:
-    """Half a standard deviation to a side along the longest axis, which is halved; the others times
-    .85."""
+    """Half a standard deviation to a side along the longest axis, which is halved.
+
+    The others times .85.
+    """
     scales = np.exp(row["log_scales"])
     longest = int(np.argmax(scales))
     axis = restatement.rotation(row["quaternions"])[:, longest]
@@ -131,16 +123,13 @@ def half(row: restatement.Row, side: int) -> restatement.Row:
     child = restatement.newborn(
         row, row["means"] + side * 0.5 * scales[longest] * axis, np.log(new)
     )
-    opacity = 0.6 / (1 + np.exp(-row["opacity_logits"]))
-    child["opacity_logits"] = np.log(opacity / (1 - opacity))
-    return child
+    return child | {"opacity_logits": np.array(logit(0.6 * opacity(row)))}
 
 
 def decayed(row: restatement.Row, left: float) -> restatement.Row:
-    opacity = 1 / (1 + np.exp(-row["opacity_logits"])) - 0.004 * left
     return row | {
-        "opacity_logits": np.log(opacity / (1 - opacity)),
-        "log_scales": np.log(np.exp(row["log_scales"]) * (1 - 0.002 * left)),
+        "opacity_logits": np.array(logit(opacity(row) - 0.004 * left)),
+        "log_scales": row["log_scales"] + np.log(1 - 0.002 * left),
     }
 
 
@@ -165,11 +154,11 @@ def test_mrnf_round(step: int, room: int) -> None:
     densifier = MRNF(max_gaussians=COUNT + room, growth_share=0.4, growth_threshold=0.5)
     trainable, seen = begun(densifier, 1)
     rows, (weight, guidance) = to_rows(trainable), scored(trainable.values.detach())
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(0))
+    event = densifier.refine(step, trainable, generator(0))
 
-    rng = torch.Generator().manual_seed(0)
+    rng = generator(0)
     torch.randperm(3, generator=rng)  # the views: all three
-    opacities = np.array([1 / (1 + np.exp(-row["opacity_logits"])) for row in rows])
+    opacities = np.array([opacity(row) for row in rows])
     gone = (opacities < 1 / 255) | (np.arange(COUNT) == 6)
     assert gone.sum() == 7
     above = (weight > 0.5) & seen
@@ -195,7 +184,7 @@ def test_mrnf_round(step: int, room: int) -> None:
 def test_a_replacement_is_no_growth() -> None:
     densifier = MRNF(growth_share=0.0)
     trainable, _ = begun(densifier, 1)
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
+    event = densifier.refine(600, trainable, generator(0))
     assert (event.pruned_opacity, event.split_gradient, event.after) == (7, 7, COUNT)
 
 
@@ -206,13 +195,13 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
     for step, remaining in ((500, 0.5), (1000, 0.0), (2000, 0.0)):
         trainable.values.log_scales.data.copy_(before)
         with torch.no_grad():
-            densifier.decay(Refinement(step, trainable, torch.Generator(), event=None))  # type: ignore[arg-type]
+            densifier.decay(at(step, trainable))
         shrunk = (trainable.values.log_scales - before).exp()
         torch.testing.assert_close(shrunk, torch.full_like(shrunk, 1 - 0.002 * remaining))
-    single = TrainableGaussians(random_gaussians(3, dtype=torch.float32), LearningRates(), 4.0)
+    single = trained(random_gaussians(3, dtype=torch.float32))
     single.values.opacity_logits.data[:] = torch.tensor([50.0, -50.0, 0.0])
     with torch.no_grad():
-        densifier.decay(Refinement(1000, single, torch.Generator(), event=None))  # type: ignore[arg-type]
+        densifier.decay(at(1000, single))
     expected = [math.log((1 - 2**-23) / 2**-23), math.log(1e-12), 0.0]
     assert single.values.opacity_logits.tolist() == pytest.approx(expected, abs=0.1)
 
@@ -220,11 +209,7 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
 def test_rounds_and_their_end() -> None:
     densifier = MRNF(stop=1000)
     trainable, _ = begun(densifier, 0)
-    due = [
-        step
-        for step in range(1, 1100)
-        if densifier.refine(step, trainable, torch.Generator()) is not None
-    ]
+    due = [step for step in range(1, 1100) if densifier.refine(step, trainable, generator())]
     assert due == [200, 400, 600, 800]
 
 
@@ -240,9 +225,7 @@ def test_what_leaves_the_scene_by_size_goes() -> None:
 
 def test_the_bounds_hold_the_central_four_fifths() -> None:
     means = torch.tensor([[i, 10.0 * i, -i] for i in range(101)], dtype=torch.float64)
-    center, half_size, middle = bounds(
-        means[torch.randperm(101, generator=torch.Generator().manual_seed(0))]
-    )
+    center, half_size, middle = bounds(means[torch.randperm(101, generator=generator(0))])
     assert center.tolist() == [50, 500, -50]
     assert (half_size, middle) == (400, 80)
 
@@ -250,13 +233,13 @@ def test_the_bounds_hold_the_central_four_fifths() -> None:
 def test_noise_moves_the_faint_that_were_seen_and_is_limited() -> None:
     densifier, gaussians = MRNF(), random_gaussians(300, 2)
     gaussians.opacity_logits[:100], gaussians.opacity_logits[100:] = -9.0, 2.0
-    trainable = TrainableGaussians(gaussians, LearningRates(), 4.0)
+    trainable = trained(gaussians)
     densifier.begin(gaussians, DensifyContext(4.0))
     densifier.statistics["seen"][:200] = True
     densifier.statistics["seen"][50:100] = False
     trainable.set_step(1)
     before = trainable.values.means.detach().clone()
-    densifier.after_step(1, trainable, torch.Generator().manual_seed(0))
+    densifier.after_step(1, trainable, generator(0))
     moved = trainable.values.means.detach() - before
     weight = (
         (1 - torch.sigmoid(torch.tensor(-9.0, dtype=torch.float64))) ** 150
@@ -271,7 +254,7 @@ def test_noise_moves_the_faint_that_were_seen_and_is_limited() -> None:
     wild.statistics["seen"][:] = True
     before = trainable.values.means.detach().clone()
     size = bounds(before)[2]
-    wild.after_step(wild.stop, trainable, torch.Generator().manual_seed(0))
+    wild.after_step(wild.stop, trainable, generator(0))
     assert torch.equal(trainable.values.means, before)  # no more noise after the window
-    wild.after_step(1, trainable, torch.Generator().manual_seed(0))
+    wild.after_step(1, trainable, generator(0))
     assert float((trainable.values.means.detach() - before).abs().max()) == pytest.approx(size)

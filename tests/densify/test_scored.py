@@ -13,14 +13,17 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.train.loss import torch_photometric_loss
+from tests.densify.helpers import EXTENT, assert_same, at, gathered, generator, to_rows
+from tests.densify.restatement import opacity
 from tests.densify.test_adc_variants import absgs_growth
-from tests.densify.test_rounds import EXTENT, assert_same, to_rows
-from tests.densify.test_scores import BLACK, COUNT, Room, alphas, at, started
+from tests.densify.test_scores import BLACK, COUNT, Room, alphas, started
 
 
 def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views: the mean number of bad pixels, rounded down, and loss times number,
-    scaled to [0, 1]."""
+    """Over the three views.
+
+    The mean number of bad pixels, rounded down, and loss times number, scaled to [0, 1].
+    """
     room, total, weighted = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         image = ReferenceRasterizer().render(values, camera, 0, BLACK).image.detach()
@@ -37,8 +40,7 @@ def ready(densifier: FastGS, seed: int) -> tuple[TrainableGaussians, np.ndarray,
     trainable.values.log_scales.data[::4] -= 3.0
     draws = np.random.default_rng(seed)
     signed, absolute = draws.uniform(0, 4e-4, COUNT), draws.uniform(0, 2.4e-3, COUNT)
-    densifier.statistics["gradient_sum"] = torch.from_numpy(signed)
-    densifier.statistics["absolute_sum"] = torch.from_numpy(absolute)
+    gathered(densifier, signed, absolute)
     return trainable, signed, absolute
 
 
@@ -49,9 +51,9 @@ def test_fast_gs_round(seed: int, step: int) -> None:
     trainable, signed, absolute = ready(densifier, seed)
     trainable.values.opacity_logits.data[20:40] = -9.0
     rows, counts = to_rows(trainable), counted(trainable.values.detach(), 0.5)
-    event = densifier.refine(step, trainable, torch.Generator().manual_seed(seed))
+    event = densifier.refine(step, trainable, generator(seed))
 
-    rng = torch.Generator().manual_seed(seed)
+    rng = generator(seed)
     torch.randperm(3, generator=rng)  # the views: all three
     several = counts[0] > 5
     assert 5 < several.sum() < COUNT - 5
@@ -67,7 +69,7 @@ def test_fast_gs_round(seed: int, step: int) -> None:
     assert (event.cloned, event.split_gradient) == (cloned, split)
     assert split > 0
 
-    faint = np.array([1 / (1 + np.exp(-row["opacity_logits"])) < 0.005 for row in grown])
+    faint = np.array([opacity(row) < 0.005 for row in grown])
     huge = np.array([np.exp(row["log_scales"]).max() > 0.1 * EXTENT for row in grown]) & (
         step > 3000
     )
@@ -93,24 +95,24 @@ def test_after_the_window_the_rather_faint_and_those_that_err_most_go() -> None:
     trainable, _, _ = ready(densifier, 1)
     trainable.values.opacity_logits.data[:5] = -3.0  # .047
     rows, (_, scores) = to_rows(trainable), counted(trainable.values.detach(), 0.1)
-    event = densifier.refine(18_000, trainable, torch.Generator())
-    opacities = np.array([1 / (1 + np.exp(-row["opacity_logits"])) for row in rows])
+    event = densifier.refine(18_000, trainable, generator())
+    opacities = np.array([opacity(row) for row in rows])
     assert_same(
         trainable, [row for i, row in enumerate(rows) if opacities[i] >= 0.1 and scores[i] <= 0.9]
     )
     assert event.pruned_opacity == (opacities < 0.1).sum() >= 5
     assert event.pruned_size == ((scores > 0.9) & (opacities >= 0.1)).sum() > 0
     assert event.balances()
-    assert densifier.refine(15_000, trainable, torch.Generator()) is None
-    assert densifier.refine(16_500, trainable, torch.Generator()) is None
+    assert densifier.refine(15_000, trainable, generator()) is None
+    assert densifier.refine(16_500, trainable, generator()) is None
 
 
 def test_without_bad_pixels_nobody_grows() -> None:
     densifier = FastGS(error_threshold=1.0)
     trainable, _, _ = ready(densifier, 0)
-    event = densifier.refine(600, trainable, torch.Generator())
+    event = densifier.refine(600, trainable, generator())
     assert event.cloned == event.split_gradient == 0
-    rules = densifier.rules(at(600, trainable, torch.Generator()))
+    rules = densifier.rules(at(600, trainable))
     assert [rule.__name__ for rule in rules] == [
         "score",
         "grow_by_gradient",
@@ -118,7 +120,7 @@ def test_without_bad_pixels_nobody_grows() -> None:
         "lower_opacity",
         "reset_statistics",
     ]
-    over, _ = densifier.candidates(at(700, trainable, torch.Generator()))
+    over, _ = densifier.candidates(at(700, trainable))
     assert not over.any()
 
 

@@ -1,5 +1,4 @@
-"""Edge maps, sums over pixels, draws, and the two densifiers that use them, against restatements in
-numpy."""
+"""Edge maps, sums over pixels, draws, and two densifiers, against restatements in numpy."""
 
 from __future__ import annotations
 
@@ -8,14 +7,12 @@ import pytest
 import torch
 from PIL import Image, ImageFilter
 
-from gsbench.densify import DensifyContext, EdgeAware, Refinement, Taming
+from gsbench.densify import DensifyContext, EdgeAware, Taming
 from gsbench.densify.adc import ADC
 from gsbench.densify.scores import blended_sums, by_mean, by_median, draw, draw_views, edge_map
 from gsbench.errors import InputError
 from gsbench.eval.ssim import ssim_map
-from gsbench.events import RefineEvent
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import (
@@ -28,7 +25,16 @@ from gsbench.raster.reference import (
 from gsbench.scene.types import Camera
 from gsbench.train.loss import torch_photometric_loss
 from tests.densify import restatement
-from tests.densify.test_rounds import EXTENT, assert_same, to_rows
+from tests.densify.helpers import (
+    EXTENT,
+    assert_same,
+    at,
+    gathered,
+    generator,
+    to_rows,
+    with_moments,
+)
+from tests.densify.restatement import opacity
 from tests.gaussians.helpers import front_camera, random_gaussians
 
 COUNT = 60
@@ -66,9 +72,7 @@ def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """alpha T of every Gaussian in every pixel, [N, H, W], taken apart from all sums."""
     found = np.zeros((len(gaussians), HEIGHT, WIDTH))
     projected = project(gaussians, camera)
-    for tile, members in bin_gaussians(
-        projected.depths, *tile_rectangles(projected, camera, 16), 3
-    ):
+    for tile, members in bin_gaussians(projected.depths, *tile_rectangles(projected, camera), 3):
         for y in range(tile // 3 * 16, min(tile // 3 * 16 + 16, HEIGHT)):
             for x in range(tile % 3 * 16, min(tile % 3 * 16 + 16, WIDTH)):
                 index = projected.index[members]
@@ -114,9 +118,7 @@ def test_edges_are_those_that_pillow_finds(seed: int) -> None:
 def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
     gaussians, room = random_gaussians(COUNT, 3, log_scale=(-3.5, -0.5)), Room()
     gaussians.sh_dc[:] = -9.0  # all black: their own colours have no gradient
-    weights = torch.rand(
-        HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    weights = torch.rand(HEIGHT, WIDTH, 3, generator=generator(0), dtype=torch.float64)
     with torch.no_grad():  # as in a refinement
         sums, _ = blended_sums(room, 1, gaussians, 1, weights)
     expected = np.einsum("nyx,yxc->nc", alphas(gaussians, room.cameras[1]), weights.numpy())
@@ -133,11 +135,13 @@ def test_by_median_leaves_out_what_is_not_positive() -> None:
 
 
 def test_draws_are_in_proportion_and_without_replacement() -> None:
-    """Of four, two are drawn: the chance of each pair is known (first one, then one of the rest, by
-    score)."""
+    """Of four, two are drawn.
+
+    The chance of each pair is known (first one, then one of the rest, by score).
+    """
     scores = torch.tensor([9.0, 1.0, 2.0, 0.0, 3.0])
     candidates = torch.tensor([False, True, True, True, True])
-    rng, counts = torch.Generator().manual_seed(0), np.zeros(5)
+    rng, counts = generator(0), np.zeros(5)
     rounds = 4000
     for _ in range(rounds):
         drawn = draw(candidates, scores, 2, rng)
@@ -162,28 +166,18 @@ def test_draws_are_in_proportion_and_without_replacement() -> None:
 def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
     """Gaussians with moments and mean gradients, in a room with views."""
     gaussians = random_gaussians(COUNT, seed, log_scale=(-5.0, 0.3))
-    trainable = TrainableGaussians(gaussians, LearningRates(), EXTENT)
-    for tensor in trainable.values.tensors().values():
-        tensor.grad = torch.full_like(tensor, 1e-3)
-    trainable.optimizer_step()
+    trainable = with_moments(gaussians)
     densifier.begin(trainable.values.detach(), DensifyContext(EXTENT, views=Room()))
     gradient = np.random.default_rng(seed).uniform(0, 6e-4, COUNT)
-    densifier.statistics["gradient_sum"] = torch.from_numpy(gradient)
-    densifier.statistics["visible_count"][:] = 1
+    gathered(densifier, gradient)
     return trainable, gradient
-
-
-def at(step: int, trainable: TrainableGaussians, rng: torch.Generator) -> Refinement:
-    return Refinement(step, trainable, rng, RefineEvent(step, len(trainable)))
 
 
 def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:
     """The score over all three views, term by term."""
     room, values = Room(), trainable.values.detach()
-    scales, opacities = (
-        np.exp(values.log_scales.numpy()),
-        1 / (1 + np.exp(-values.opacity_logits.numpy())),
-    )
+    scales = np.exp(values.log_scales.numpy())
+    opacities = 1 / (1 + np.exp(-values.opacity_logits.numpy()))
     total = np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
         weights = alphas(values, camera)
@@ -218,7 +212,7 @@ def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.nda
 def test_the_taming_score_of_each_gaussian() -> None:
     densifier = Taming(max_gaussians=COUNT)
     trainable, gradient = started(densifier, 0)
-    densifier.score(at(600, trainable, torch.Generator()))
+    densifier.score(at(600, trainable))
     scores = densifier.statistics["score"].detach()
     np.testing.assert_allclose(scores, taming_scores(trainable, gradient), rtol=1e-4)
 
@@ -232,15 +226,13 @@ def test_taming_round(seed: int) -> None:
     scores = taming_scores(trainable, gradient)
     large = np.array([np.exp(row["log_scales"]).max() > 0.01 * EXTENT for row in rows])
     over = gradient >= 2e-4
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(seed))
-    small_share, large_share = (
-        12 * (over & ~large).sum() // over.sum(),
-        12 * (over & large).sum() // over.sum(),
-    )
+    event = densifier.refine(600, trainable, generator(seed))
+    small_share = 12 * (over & ~large).sum() // over.sum()
+    large_share = 12 * (over & large).sum() // over.sum()
     assert (event.cloned, event.split_gradient) == (small_share, large_share)
     assert event.blocked_by_cap == over.sum() - small_share - large_share
 
-    rng = torch.Generator().manual_seed(seed)
+    rng = generator(seed)
     torch.randperm(3, generator=rng)  # the views: all three
     given = torch.from_numpy(scores)
     cloned = draw(torch.from_numpy(over & ~large), given, small_share, rng).numpy()
@@ -249,7 +241,7 @@ def test_taming_round(seed: int) -> None:
     grown = restatement.adc_growth(
         rows, np.where(cloned | split, 1.0, 0.0), EXTENT, noise, expected
     )
-    faint = np.array([1 / (1 + np.exp(-row["opacity_logits"])) < 0.005 for row in grown])
+    faint = np.array([opacity(row) < 0.005 for row in grown])
     assert not faint.any()  # nothing to prune yet
     assert_same(trainable, grown)
     assert event.balances()
@@ -260,36 +252,33 @@ def test_taming_lets_a_single_candidate_grow() -> None:
     trainable, _ = started(densifier, 0)
     densifier.statistics["gradient_sum"][1:] = 0.0
     densifier.statistics["gradient_sum"][0] = 1e-3
-    event = densifier.refine(600, trainable, torch.Generator())
+    event = densifier.refine(600, trainable, generator())
     assert (event.cloned + event.split_gradient, event.blocked_by_cap) == (1, 0)
 
 
-def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
+def with_forty_faint() -> tuple[Taming, TrainableGaussians]:
     densifier = Taming(max_gaussians=COUNT, cap="hard")
     trainable, _ = started(densifier, 1)
     trainable.values.opacity_logits.data[:40] = -9.0
-    event = densifier.refine(600, trainable, torch.Generator().manual_seed(0))
-    assert 0 < event.pruned_opacity <= 20
-    trainable, _ = started(densifier, 1)
-    trainable.values.opacity_logits.data[:40] = -9.0
-    assert (
-        densifier.refine(500 + 2700, trainable, torch.Generator().manual_seed(0)).pruned_opacity > 0
-    )
-    trainable, _ = started(densifier, 1)
-    trainable.values.opacity_logits.data[:40] = -9.0
-    late = densifier.refine(600 + 2700, trainable, torch.Generator().manual_seed(0))
-    assert late.pruned_opacity == late.pruned_size == 0  # after 27 rounds no more
+    return densifier, trainable
+
+
+def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
+    for step in (600, 500 + 2700, 600 + 2700):
+        densifier, trainable = with_forty_faint()
+        event = densifier.refine(step, trainable, generator())
+        last = step == 600 + 2700  # after 27 rounds no more
+        assert last or 0 < event.pruned_opacity <= (20 if step == 600 else COUNT // 2)
+    assert event.pruned_opacity == event.pruned_size == 0
     assert densifier.statistics["score"].shape == (COUNT,)
     assert not densifier.statistics["score"].any()
 
 
 def test_taming_prunes_rather_those_of_low_score() -> None:
     """Of forty faint ones the twenty of the highest score are drawn a million times as rarely."""
-    densifier = Taming(max_gaussians=COUNT, cap="hard")
-    trainable, _ = started(densifier, 1)
-    trainable.values.opacity_logits.data[:40] = -9.0
+    densifier, trainable = with_forty_faint()
     densifier.statistics["score"] = torch.where(torch.arange(COUNT) % 2 == 0, 1e6, 1.0)
-    refinement = at(600, trainable, torch.Generator().manual_seed(0))
+    refinement = at(600, trainable, 0)
     before = trainable.values.means.detach().clone()
     densifier.prune(refinement)
     gone = [
@@ -302,11 +291,9 @@ def test_taming_prunes_rather_those_of_low_score() -> None:
 
 def test_taming_prunes_nobody_without_a_score() -> None:
     """Children of the same round have none."""
-    densifier = Taming(max_gaussians=COUNT, cap="hard")
-    trainable, _ = started(densifier, 1)
-    trainable.values.opacity_logits.data[:40] = -9.0
+    densifier, trainable = with_forty_faint()
     densifier.statistics["score"] = torch.where(torch.arange(COUNT) < 40, 0.0, 1e-3)
-    refinement = at(600, trainable, torch.Generator().manual_seed(0))
+    refinement = at(600, trainable, 0)
     densifier.prune(refinement)
     assert (refinement.event.pruned_opacity, len(trainable)) == (0, COUNT)
 
@@ -314,7 +301,7 @@ def test_taming_prunes_nobody_without_a_score() -> None:
 def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:
     densifier = Taming(max_gaussians=150, gradient_threshold=1e-9, stop=1500, prune_opacity=0.0)
     trainable, _ = started(densifier, 2)
-    counts, rng = [], torch.Generator().manual_seed(0)
+    counts, rng = [], generator(0)
     for step in range(600, 1500, 100):
         densifier.statistics["gradient_sum"] = (
             torch.rand(len(trainable), generator=rng, dtype=torch.float64) + 0.1
@@ -337,4 +324,4 @@ def test_without_views_it_says_what_is_missing() -> None:
     trainable, _ = started(densifier, 0)
     densifier.context = DensifyContext(EXTENT)
     with pytest.raises(RuntimeError, match=r"DensifyContext\.views"):
-        densifier.refine(600, trainable, torch.Generator())
+        densifier.refine(600, trainable, generator())

@@ -1,5 +1,7 @@
-"""What the base keeps for every densifier: statistics that follow edits, lineage, saving, and the
-table of causes."""
+"""What the base keeps for every densifier.
+
+Statistics that follow edits, lineage, saving, and the table of causes.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,7 @@ from gsbench.densify import (
     Volumetric,
 )
 from gsbench.densify.base import standard_normal
-from gsbench.gaussians.paper_values import LearningRates
-from gsbench.gaussians.trainable import TrainableGaussians
+from tests.densify.helpers import generator, trained
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -31,9 +32,9 @@ class Gathering(Densifier):
 
 
 def started(densifier: Densifier, count: int) -> Refinement:
-    gaussians = TrainableGaussians(random_gaussians(count), LearningRates(), 1.0)
+    gaussians = trained(random_gaussians(count), 1.0)
     densifier.begin(gaussians.values.detach(), DensifyContext(1.0))
-    return Refinement(7, gaussians, torch.Generator().manual_seed(0), RefineEvent(7, count))
+    return Refinement(7, gaussians, generator(0), RefineEvent(7, count))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -150,16 +151,14 @@ def test_an_event_that_does_not_add_up_says_so() -> None:
 
 def test_normal_draws_on_the_cpu_are_those_of_the_generator() -> None:
     like = torch.zeros(1, dtype=torch.float64)
-    drawn = standard_normal((4, 3), torch.Generator().manual_seed(3), like)
-    assert torch.equal(
-        drawn, torch.randn(4, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    )
+    drawn = standard_normal((4, 3), generator(3), like)
+    assert torch.equal(drawn, torch.randn(4, 3, generator=generator(3), dtype=torch.float64))
 
 
 def test_normal_draws_on_another_device_are_seeded_by_the_generator(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rng, again = (torch.Generator().manual_seed(3) for _ in range(2))
+    rng, again = (generator(3) for _ in range(2))
     seeds = []
 
     class There:
@@ -188,15 +187,15 @@ def test_a_keyword_that_no_base_takes_is_refused() -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:
-    """As the trainer does: everything in the checkpoint is moved to the GPU; the lineage belongs on
-    the CPU."""
+    """As the trainer does: everything in the checkpoint is moved to the GPU.
+
+    The lineage belongs on the CPU.
+    """
     cuda = torch.device("cuda")
     densifier = Gathering()
-    gaussians = TrainableGaussians(
-        random_gaussians(6).map(lambda tensor: tensor.to(cuda)), LearningRates(), 1.0
-    )
+    gaussians = trained(random_gaussians(6).map(lambda tensor: tensor.to(cuda)), 1.0)
     densifier.begin(gaussians.values.detach(), DensifyContext(1.0, device=cuda))
-    refinement = Refinement(7, gaussians, torch.Generator().manual_seed(0), RefineEvent(7, 6))
+    refinement = Refinement(7, gaussians, generator(0), RefineEvent(7, 6))
     densifier.clone(refinement, torch.arange(6, device=cuda) % 2 == 0)
     saved = densifier.state_dict()
     moved = {
@@ -210,7 +209,7 @@ def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:
     assert again.lineage.ids.tolist() == list(range(4, 9))
     assert again.lineage.state_dict()["ids"].numpy().tolist() == list(range(4, 9))
     like = gaussians.values.means.detach()
-    first = [standard_normal((9, 3), torch.Generator().manual_seed(5), like) for _ in range(2)]
+    first = [standard_normal((9, 3), generator(5), like) for _ in range(2)]
     assert torch.equal(*first)
-    rng = torch.Generator().manual_seed(5)
+    rng = generator(5)
     assert not torch.equal(standard_normal((9, 3), rng, like), standard_normal((9, 3), rng, like))

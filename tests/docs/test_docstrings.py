@@ -89,7 +89,7 @@ def unplain(path: Path) -> list[str]:
     ]
 
 
-def test_docstrings_and_titles_begin_with_a_verb_or_a_noun() -> None:
+def test_docstrings_and_titles_begin_with_a_verb_or_a_noun():
     paths = sorted({*(ROOT / "src").rglob("*.py"), *(ROOT / "scripts").rglob("*.py"), *TITLED})
     assert len(paths) > 200
     assert [line for path in paths for line in unplain(path)] == []
@@ -109,7 +109,7 @@ def test_docstrings_and_titles_begin_with_a_verb_or_a_noun() -> None:
         ('"""The file.\n\nWhat it holds."""\n# What is next\n# Which\na = 1  # what', [4]),
     ],
 )
-def test_unplain_words_are_found(source: str, lines: list[int]) -> None:
+def test_unplain_words_are_found(source, lines):
     found = [
         line for line, words in public_docstrings(ast.parse(source)) if first_word(words) in UNPLAIN
     ]
@@ -118,7 +118,7 @@ def test_unplain_words_are_found(source: str, lines: list[int]) -> None:
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples(name, capsys):
     result = doctest.testmod(importlib.import_module(name))
     assert result.failed == 0, capsys.readouterr().out
     written = len(PROMPT.findall(SOURCES[name].read_text(encoding="utf-8")))
@@ -134,12 +134,12 @@ def test_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_what_users_extend_has_an_example(extended: type, word: str) -> None:
+def test_what_users_extend_has_an_example(extended, word):
     assert extended.__module__ in SOURCES
     assert word in (extended.__doc__ or "").partition("Examples:")[2]
 
 
-def test_examples_are_sections_so_that_the_site_shows_them_as_code() -> None:
+def test_examples_are_sections_so_that_the_site_shows_them_as_code():
     for path in SOURCES.values():
         for before, line in re.findall(
             r"^( *)>>> (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE

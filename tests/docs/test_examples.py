@@ -42,7 +42,7 @@ def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path, monkeypatch) -> Iterator[Path]:
     """An empty working folder, from which modules can be imported; what was imported from it is
     forgotten."""
     for key in os.environ:
@@ -60,7 +60,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
-def test_library(folder: Path) -> None:
+def test_library(folder):
     found = run_blocks(ROOT / "docs" / "library.md", folder)
     assert sum(found["losses"][-10:]) < 0.9 * sum(found["losses"][:10])
     assert len(found["trained"]) > len(found["initial"])
@@ -68,7 +68,7 @@ def test_library(folder: Path) -> None:
         torch.testing.assert_close(found["again"].tensors()[name], tensor, rtol=0, atol=0)
 
 
-def test_densifier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_densifier(folder, capsys):
     found = run_blocks(ROOT / "docs" / "densifier.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     assert found["event"]["split_volume"] > 0
@@ -76,13 +76,13 @@ def test_densifier(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(results) == 1
 
 
-def test_rasterizer(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rasterizer(folder, capsys):
     found = run_blocks(ROOT / "docs" / "rasterizer.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
 
 
-def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_metric(folder, capsys):
     found = run_blocks(ROOT / "docs" / "metric.md", folder)
     shown = capsys.readouterr()
     assert found["status"] == 0, shown.err
@@ -117,7 +117,7 @@ def test_metric(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     )
 
 
-def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_initialiser(folder, capsys):
     """An initialiser from one file outside gsbench, through the real program."""
     found = run_blocks(ROOT / "docs" / "initialiser.md", folder)
     assert found["status"] == found["scan_status"] == 0, capsys.readouterr().err
@@ -129,7 +129,7 @@ def test_initialiser(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert values["init_report"]["init"] == "shell"
 
 
-def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: Path) -> None:
+def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder):
     """What its checklist asks of others."""
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
@@ -143,9 +143,9 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
         if b.startswith("# largest.py")
     )
     (folder / "largest.py").write_text(code)
-    import largest  # type: ignore[import-not-found]
+    import largest
 
-    def rounds(state: Any, first: int, last: int) -> Any:
+    def rounds(state, first, last):
         """Refinements ``first`` to ``last`` of a made-up training that goes on from ``state``."""
         densifier = largest.SplitLargest(
             start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
@@ -188,7 +188,7 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder: 
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
 
 
-def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
+def test_governed_class_of_the_document_ends_at_its_limit(folder):
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
     from gsbench.gaussians.trainable import TrainableGaussians
@@ -200,7 +200,7 @@ def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
         if b.startswith("# opaque.py")
     )
     (folder / "opaque.py").write_text(code)
-    import opaque  # type: ignore[import-not-found]
+    import opaque
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
     densifier = opaque.CloneOpaque(start=0, stop=500, max_gaussians=150, cap="governor")
@@ -215,7 +215,7 @@ def test_governed_class_of_the_document_ends_at_its_limit(folder: Path) -> None:
 @pytest.mark.parametrize(
     "document", ["README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
 )
-def test_links_between_documents_lead_somewhere(document: str) -> None:
+def test_links_between_documents_lead_somewhere(document):
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
         if "://" not in target:

@@ -13,7 +13,7 @@ fidelity = script("fidelity")
 PAGE = fidelity.PAGE.read_text(encoding="utf-8")
 
 
-def test_every_arm_has_a_row_and_the_page_is_made_of_them() -> None:
+def test_every_arm_has_a_row_and_the_page_is_made_of_them():
     assert sorted(fidelity.ARMS) == [option for option in options("densify") if "/" not in option]
     stated = fidelity.bounds_of(PAGE)
     assert set(stated) == set(fidelity.ARMS)
@@ -21,7 +21,7 @@ def test_every_arm_has_a_row_and_the_page_is_made_of_them() -> None:
 
 
 @pytest.mark.parametrize("arm", fidelity.ARMS)
-def test_the_largest_difference_is_no_larger_than_the_page_says(arm: str) -> None:
+def test_the_largest_difference_is_no_larger_than_the_page_says(arm):
     """Nor very much smaller: another processor rounds otherwise."""
     stated, found = float(fidelity.bounds_of(PAGE)[arm]), fidelity.measured(arm)
     assert found <= 10 * stated
@@ -29,7 +29,7 @@ def test_the_largest_difference_is_no_larger_than_the_page_says(arm: str) -> Non
     assert stated <= 1e-6
 
 
-def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_difference_would_be_seen(monkeypatch):
     """The measure is of the numbers themselves, and the tests behind it fail beyond their
     tolerance."""
     from tests.densify import restatement
@@ -42,7 +42,7 @@ def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
         fidelity.measured("adc")
 
 
-def test_sources_are_named_by_commit() -> None:
+def test_sources_are_named_by_commit():
     for name, arm in fidelity.ARMS.items():
         named = re.search(
             r"\b[0-9a-f]{7}\b|arXiv \d{4}\.\d{5}|^ours|pull request \d+|absgrad", arm.source
@@ -50,7 +50,7 @@ def test_sources_are_named_by_commit() -> None:
         assert named, name
 
 
-def test_differences_are_rounded_up() -> None:
+def test_differences_are_rounded_up():
     assert [fidelity.bound(d) for d in (0.0, 2e-9, 1e-12, 9.9e-16)] == [
         "0",
         "1e-8",

@@ -50,7 +50,7 @@ def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def finished_runs(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished_runs(environment, tmp_path_factory) -> Path:
     """A runs folder with an experiment of four trials, trained once for all workers of the tests:
     not to be changed."""
     runs = common_folder(tmp_path_factory) / "finished-runs"
@@ -82,13 +82,13 @@ SWEEP = ["-m", *SMALL, "name=attacked", "densify=adc,volumetric", "tracking=none
 
 
 @pytest.fixture
-def runs(finished_runs: Path, tmp_path: Path) -> Path:
+def runs(finished_runs, tmp_path) -> Path:
     """A copy of the finished experiment's runs folder, with its scene and initial cloud."""
     return shutil.copytree(finished_runs, tmp_path / "runs", symlinks=True)
 
 
 @pytest.fixture(scope="session")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def environment(tmp_path_factory) -> dict[str, str]:
     """The environment of the program: no weights, its own runs folder, the shared cache of compiled
     kernels."""
     kept = {
@@ -103,12 +103,10 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture
-def gsbench(environment: dict[str, str], tmp_path: Path) -> Run:
+def gsbench(environment, tmp_path) -> Run:
     """Call ``gsbench`` with arguments; returns the finished process with its output as text."""
 
-    def run(
-        *arguments: str, timeout: float = 240, cwd: Path = tmp_path, **changes: str
-    ) -> subprocess.CompletedProcess[str]:
+    def run(*arguments, timeout=240, cwd=tmp_path, **changes):
         return subprocess.run(
             [sys.executable, "-m", "gsbench.cli", *arguments],
             cwd=cwd,
@@ -178,7 +176,7 @@ def results_of(runs: Path, name: str) -> dict[str, Any]:
 
 
 @pytest.fixture
-def undisturbed(finished_runs: Path) -> dict[str, Any]:
+def undisturbed(finished_runs) -> dict[str, Any]:
     """The finished trials of ``SWEEP``, which nobody disturbed."""
     return {
         trial: found

@@ -3,8 +3,6 @@ outside."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from gsbench.cli import run
@@ -45,13 +43,13 @@ OWN = [
 
 
 def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_declaration_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     (tmp_path / "patient_arm.py").write_text(PATIENT)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
 
-    def tables(*words: str) -> str:
+    def tables(*words):
         capsys.readouterr()
         assert run(["tables", "arms", *words]) == 0
         return capsys.readouterr().out

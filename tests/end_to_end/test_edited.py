@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gsbench.runs.keys import PACKAGE
 from gsbench.system.install import conf_dir
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
@@ -26,19 +25,19 @@ QUICK = [
 ]
 
 
-def test_an_edited_loss_is_trained_with(gsbench: Run, tmp_path: Path) -> None:
+def test_an_edited_loss_is_trained_with(gsbench, tmp_path):
     copy = tmp_path / "copy" / "src" / "gsbench"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(conf_dir(), tmp_path / "copy" / "conf")
     changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
 
-    def train(*words: str) -> str:
+    def train(*words):
         # where kernels have to be compiled first
         done = gsbench(*QUICK, *words, timeout=900, **changes)
         assert done.returncode == 0, done.stderr
         return done.stdout + done.stderr
 
-    def results() -> dict[str, Any]:
+    def results():
         (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
         found: dict[str, Any] = json.loads(path.read_text())
         return found

@@ -17,7 +17,7 @@ from PIL import Image
 
 from gsbench.cli import run
 from gsbench.scene.types import ANGLE, DISTANCE
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 EVAL = ["eval.lpips=[squeeze]", "eval.download=false"]
@@ -25,7 +25,7 @@ SCENE = ["scene.views=12", "scene.width=96", "scene.height=72"]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str]) -> Path:
+def trained(tmp_path_factory, environment) -> Path:
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
     changed = environment | {"GSBENCH_RUNS": str(runs)}
@@ -47,7 +47,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str
 
 
 @pytest.fixture
-def runs(trained: Path, tmp_path: Path) -> Path:
+def runs(trained, tmp_path) -> Path:
     """A copy that the test may change."""
     return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
 
@@ -78,7 +78,7 @@ def better_renders(runs: Path, folder: Path, seed: int) -> Path:
     return folder
 
 
-def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench: Run, runs: Path) -> None:
+def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench, runs):
     own = trial(runs)
     for truth, settings in (
         (str(own), []),
@@ -113,13 +113,7 @@ def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench: Run, r
     assert "protocol standard-1" in shown.stdout
 
 
-def test_renders_stand_in_the_table_with_a_verdict(
-    gsbench: Run,
-    runs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_renders_stand_in_the_table_with_a_verdict(gsbench, runs, tmp_path, monkeypatch, capsys):
     for seed in (0, 1):
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = gsbench(
@@ -175,8 +169,8 @@ def test_renders_stand_in_the_table_with_a_verdict(
 
 
 def test_entered_twice_is_entered_once_and_a_place_is_taken_once(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    runs, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     first, other = (
         better_renders(runs, tmp_path / "first", 0),
@@ -190,9 +184,7 @@ def test_entered_twice_is_entered_once_and_a_place_is_taken_once(
     assert "seed 0 of random-theirs on courtyard is taken" in capsys.readouterr().err
 
 
-def test_two_folders_and_no_trial_at_all(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_folders_and_no_trial_at_all(runs, tmp_path, monkeypatch, capsys):
     """Without any scene: photographs in one folder, the renders of two methods in two others."""
     truth = Path(shutil.copytree(trial(runs) / "ground_truth", tmp_path / "photographs"))
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "empty"))
@@ -243,14 +235,7 @@ def test_two_folders_and_no_trial_at_all(
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_requests_are_one_line(
-    runs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    said: str,
-) -> None:
+def test_bad_requests_are_one_line(runs, tmp_path, monkeypatch, capsys, words, said):
     folders = {
         name: tmp_path / name.lower() for name in ("RENDERS", "PHOTOGRAPHS", "SMALLER", "FEWER")
     }
@@ -266,7 +251,7 @@ def test_bad_requests_are_one_line(
     assert error.count("gsbench: ") == 1
 
 
-def test_somebodys_model(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+def test_somebodys_model(gsbench, runs, tmp_path):
     """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers
     back."""
     model = tmp_path / "theirs.ply"

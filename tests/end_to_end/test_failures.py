@@ -8,17 +8,16 @@ import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.end_to_end.conftest import SMALL, SWEEP, Run, results_of
+from tests.end_to_end.conftest import SMALL, SWEEP, results_of
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def small_disk(tmp_path) -> Iterator[Path]:
     """A file system of three MiB; the test is skipped where this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -34,8 +33,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
-    gsbench: Run, undisturbed: dict[str, Any], small_disk: Path
-) -> None:
+    gsbench, undisturbed, small_disk
+):
     sweep = [word for word in SWEEP if word not in ("-m", "densify=adc,volumetric")]
     done = gsbench("-m", *sweep, "densify=adc", "seed=0,1", GSBENCH_RUNS=str(small_disk))
     assert done.returncode == 1, done.stderr
@@ -52,7 +51,7 @@ def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
     assert results == undisturbed[name]
 
 
-def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> None:
+def test_read_only_runs_folder_is_bad_input(gsbench, small_disk):
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     done = gsbench(*SMALL, GSBENCH_RUNS=str(small_disk))
     assert done.returncode == 2, done.stderr
@@ -63,16 +62,13 @@ def test_read_only_runs_folder_is_bad_input(gsbench: Run, small_disk: Path) -> N
     assert os.listdir(small_disk) == []
 
 
-def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(
-    gsbench: Run, tmp_path: Path
-) -> None:
+def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench, tmp_path):
     """One densifier is the user's own and fails while a file is absent."""
     (tmp_path / "mine.py").write_text(
         "from dataclasses import dataclass\nfrom pathlib import Path\nfrom gsbench.densify import "
-        "ADC\n\n\n"
-        "@dataclass\nclass Mine(ADC):\n    def begin(self, gaussians, context):\n"
-        "        if not Path('mended').exists():\n            raise RuntimeError('not yet')\n"
-        "        super().begin(gaussians, context)\n"
+        "ADC\n\n\n@dataclass\nclass Mine(ADC):\n    def begin(self, gaussians, context):\n        "
+        "if not Path('mended').exists():\n            raise RuntimeError('not yet')\n        "
+        "super().begin(gaussians, context)\n"
     )
     (tmp_path / "conf" / "densify").mkdir(parents=True)
     (tmp_path / "conf" / "densify" / "mine.yaml").write_text(

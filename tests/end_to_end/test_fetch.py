@@ -9,20 +9,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from gsbench.datasets.catalog import read_catalog
 from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners, Server, serve
-from tests.end_to_end.conftest import Run
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path) -> Iterator[Server]:
     folder = tmp_path / "archives"
     folder.mkdir()
     for dataset in read_catalog().values():
@@ -35,7 +33,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
         yield running
 
 
-def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path: Path) -> None:
+def test_fetch_then_table1_misses_nothing(gsbench, server, tmp_path):
     one = gsbench("scene=garden")
     assert one.returncode == 2
     assert "`gsbench fetch mipnerf360 garden` brings what is missing" in one.stderr
@@ -57,10 +55,8 @@ def test_fetch_then_table1_misses_nothing(gsbench: Run, server: Server, tmp_path
     assert (tmp_path / "data" / "tandt" / "truck" / "images" / "IMG_0001.JPG").is_file()
 
 
-def test_killed_and_started_again(
-    server: Server, tmp_path: Path, environment: dict[str, str], gsbench: Run
-) -> None:
-    def slowly(_: str, __: int, body: bytes) -> bytes:
+def test_killed_and_started_again(server, tmp_path, environment, gsbench):
+    def slowly(_, __, body):
         time.sleep(0.05)
         return body
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
@@ -60,10 +60,10 @@ def write_class(folder: Path, step: int, worse: bool) -> None:
     (folder / "mine.py").write_text(CLASS.format(step=step, worse=worse))
 
 
-def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench: Run, tmp_path: Path) -> None:
+def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench, tmp_path):
     changes = {"GSBENCH_RUNS": str(tmp_path / "runs")}
 
-    def do(*words: str) -> subprocess.CompletedProcess[str]:
+    def do(*words):
         return gsbench(*words, timeout=900, **changes)
 
     write_class(tmp_path, 0, worse=False)
@@ -87,14 +87,14 @@ def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench: Run, tmp_p
 
 
 def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_alone(
-    gsbench: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    gsbench, tmp_path, monkeypatch
+):
     for name, value in {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}.items():
         monkeypatch.setenv(name, value)
     home = tmp_path / "own" / "densifiers"  # a folder within the repository
     home.mkdir(parents=True)
 
-    def git(*words: str) -> str:
+    def git(*words):
         command = [
             "git",
             "-C",
@@ -125,7 +125,7 @@ def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_al
         sorted(os.listdir(home.parent / ".git")),
     )
 
-    def bisect() -> subprocess.CompletedProcess[str]:
+    def bisect():
         words = ["HEAD~12", "HEAD", *WORDS, "--least", "0.2", "--seeds", "3"]
         return gsbench(
             "bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs")

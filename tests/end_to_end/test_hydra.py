@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.conftest import Run
-
 pytestmark = pytest.mark.slow
 SECONDS = 900  # a trial of three iterations on a machine that has much else to do
 
@@ -73,7 +71,7 @@ def results_below(folder: Path) -> list[dict[str, float]]:
     return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
 
 
-def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> None:
+def test_an_experiment_file_has_all_of_hydra(gsbench, tmp_path):
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
@@ -103,9 +101,7 @@ def test_an_experiment_file_has_all_of_hydra(gsbench: Run, tmp_path: Path) -> No
     ("package", "launcher"),
     [("hydra_joblib_launcher", "joblib"), ("hydra_submitit_launcher", "submitit_local")],
 )
-def test_another_launcher_runs_a_trial_a_job(
-    gsbench: Run, tmp_path: Path, package: str, launcher: str
-) -> None:
+def test_another_launcher_runs_a_trial_a_job(gsbench, tmp_path, package, launcher):
     if find_spec(f"hydra_plugins.{package}") is None:
         pytest.skip(f"needs {package.replace('_', '-')} (group dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
@@ -119,14 +115,10 @@ def test_another_launcher_runs_a_trial_a_job(
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
 
 
-def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(
-    gsbench: Run, tmp_path: Path
-) -> None:
+def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench, tmp_path):
     (tmp_path / "own.py").write_text(
-        "from gsbench.densify import NoDensifier\n"
-        "class Own(NoDensifier):\n"
-        "    def observe(self, *rest, **named):\n"
-        "        raise RuntimeError('no luck')\n"
+        "from gsbench.densify import NoDensifier\nclass Own(NoDensifier):\n    def observe(self, "
+        "*rest, **named):\n        raise RuntimeError('no luck')\n"
     )
     words = [
         "-m",

@@ -12,14 +12,13 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 import yaml
 
-from tests.end_to_end.conftest import Run, start
+from tests.end_to_end.conftest import start
 from tests.end_to_end.test_hydra import SECONDS, TINY, results_below
 
 pytestmark = pytest.mark.slow
@@ -34,9 +33,7 @@ def need(package: str) -> None:
 
 
 @pytest.mark.parametrize("direction", ["minimize", "maximize"])
-def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(
-    gsbench: Run, tmp_path: Path, direction: str
-) -> None:
+def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, direction):
     need("hydra_optuna_sweeper")
     small = [word for word in TINY if not word.startswith("init.count")]
     words = [
@@ -57,7 +54,7 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(
     assert f"psnr of test views, {direction}d" in done.stderr
     psnr = defaultdict(list)
     for result in results_below(tmp_path / "runs" / "x"):
-        psnr[result["num_init_points"]].append(result["metrics"]["psnr"])  # type: ignore[index]
+        psnr[result["num_init_points"]].append(result["metrics"]["psnr"])
     assert all(len(values) == 2 for values in psnr.values())
     best = max(psnr, key=lambda count: statistics.fmean(psnr[count]))
     found = yaml.safe_load((tmp_path / "runs" / ".hydra" / "optimization_results.yaml").read_text())
@@ -66,7 +63,7 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(
     assert found["best_value"] == pytest.approx(sign * statistics.fmean(psnr[best]))
 
 
-def test_what_a_sweeper_does_not_understand_is_one_line(gsbench: Run, tmp_path: Path) -> None:
+def test_what_a_sweeper_does_not_understand_is_one_line(gsbench, tmp_path):
     need("hydra_optuna_sweeper")
     for words in (["hydra.sweeper.params=3"], ["hydra.sweeper.direction=up", "seed=0,1"]):
         done = gsbench(
@@ -77,7 +74,7 @@ def test_what_a_sweeper_does_not_understand_is_one_line(gsbench: Run, tmp_path: 
         assert done.stderr.splitlines()[-1].startswith("gsbench: ")
 
 
-def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench: Run, tmp_path: Path) -> None:
+def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench, tmp_path):
     need("hydra_optuna_sweeper")
     (tmp_path / "bomb.py").write_text("open('exploded', 'w')\ndef bomb(*rest): ...\n")
     for word in (
@@ -126,8 +123,8 @@ def ray_workers() -> list[psutil.Process]:
 
 
 def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
-    cluster: Any, environment: dict[str, str], tmp_path: Path, gsbench: Run
-) -> None:
+    cluster, environment, tmp_path, gsbench
+):
     words = ["-m", *TINY, "name=x", "seed=0,1,2,3,4,5,6,7", "hydra/launcher=ray"]
     words += [
         "hydra.launcher.ray.init.address=auto",
@@ -156,7 +153,7 @@ def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
 # ---- Hydra's own files and logs
 
 
-def test_hydra_writes_its_files_where_it_is_told(gsbench: Run, tmp_path: Path) -> None:
+def test_hydra_writes_its_files_where_it_is_told(gsbench, tmp_path):
     words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr
@@ -177,7 +174,7 @@ def test_hydra_writes_its_files_where_it_is_told(gsbench: Run, tmp_path: Path) -
     assert len(list((tmp_path / "runs" / "x").rglob("results.json"))) == 2
 
 
-def test_colours_of_a_log_reach_the_terminal(gsbench: Run, tmp_path: Path) -> None:
+def test_colours_of_a_log_reach_the_terminal(gsbench, tmp_path):
     need("hydra_colorlog")
     words = [*TINY, "name=x", "hydra/job_logging=colorlog", "hydra/hydra_logging=colorlog"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
@@ -185,13 +182,11 @@ def test_colours_of_a_log_reach_the_terminal(gsbench: Run, tmp_path: Path) -> No
     assert "\x1b[32mINFO" in done.stdout
 
 
-def test_debug_lines_are_shown_if_they_are_asked_for(gsbench: Run, tmp_path: Path) -> None:
+def test_debug_lines_are_shown_if_they_are_asked_for(gsbench, tmp_path):
     (tmp_path / "own.py").write_text(
-        "import logging\nfrom gsbench.densify import NoDensifier\n"
-        "class Own(NoDensifier):\n"
-        "    def observe(self, *rest, **named):\n"
-        "        logging.getLogger('gsbench.own').debug('a detail')\n"
-        "        logging.getLogger('other.own').debug('another detail')\n"
+        "import logging\nfrom gsbench.densify import NoDensifier\nclass Own(NoDensifier):\n    def "
+        "observe(self, *rest, **named):\n        logging.getLogger('gsbench.own').debug('a "
+        "detail')\n        logging.getLogger('other.own').debug('another detail')\n"
     )
     words = [*TINY, "densify._target_=own.Own", "allow_targets=[own]"]
     for name, word, shown in (

@@ -12,13 +12,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 from tests.claims.test_check import content
-from tests.end_to_end.conftest import SMALL, SWEEP, Run, results_of, start
+from tests.end_to_end.conftest import SMALL, SWEEP, results_of, start
 from tests.launch.test_declare import TINY
 from tests.processes import bytes_written
 
@@ -46,8 +45,8 @@ def training_log_size(runs: Path) -> int:
 
 
 def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
-    environment: dict[str, str], undisturbed: dict[str, Any], tmp_path: Path
-) -> None:
+    environment, undisturbed, tmp_path
+):
     runs = tmp_path / "runs"
     rng = random.Random(4)
     moments = [
@@ -103,9 +102,7 @@ def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
     assert results_of(runs, "attacked") == undisturbed
 
 
-def test_two_sweeps_at_once_share_the_work(
-    environment: dict[str, str], undisturbed: dict[str, Any], tmp_path: Path
-) -> None:
+def test_two_sweeps_at_once_share_the_work(environment, undisturbed, tmp_path):
     runs = tmp_path / "runs"
     both = [start(environment, tmp_path, runs, *SWEEP) for _ in range(2)]
     outputs = [process.communicate(timeout=300)[0] for process in both]
@@ -138,9 +135,7 @@ def holders(runs: Path) -> dict[str, int]:
     return found
 
 
-def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(
-    environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(environment, tmp_path):
     """A terminal sends Ctrl-C to every process of the command."""
     runs = tmp_path / "runs"
     process = start(
@@ -155,9 +150,7 @@ def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(
     wait_for(runs, "store/train/.*.partial/checkpoint-*.pt", process)
 
 
-def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(
-    environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(environment, tmp_path):
     runs = tmp_path / "runs"
     process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
     deadline = time.monotonic() + 120
@@ -199,9 +192,7 @@ def views(arm: Path) -> set[str]:
     }
 
 
-def test_a_killed_tuning_goes_on_and_its_values_are_trained(
-    gsbench: Run, environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_killed_tuning_goes_on_and_its_values_are_trained(gsbench, environment, tmp_path):
     program = [sys.executable, "-m", "gsbench.cli", *TUNED]
     with subprocess.Popen(
         program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
@@ -255,7 +246,7 @@ def count_done(runs: Path) -> int:
     return len(list(runs.glob("check_it/*/*/*/results.json")))
 
 
-def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path: Path) -> None:
+def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path):
     words = dict(word.split("=", 1) for word in TINY)
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}

@@ -18,7 +18,6 @@ from PIL import Image
 from gsbench.cli import run
 from gsbench.init import Dim, Sfm, SiftKornia
 from gsbench.init.base import MODEL_FOLDER
-from gsbench.init.sfm import ColmapInitializer
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import read_mask
@@ -51,7 +50,7 @@ SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def captures(tmp_path_factory) -> tuple[Path, Path]:
     """A COLMAP folder with masks of a disc that wanders and of a margin, and the same with noise
     below them."""
     folder = tmp_path_factory.mktemp("masked")
@@ -103,9 +102,7 @@ def bits(folder: Path) -> dict[str, str]:
     ],
     ids=["sfm", "kornia", "smaller", "taming", "fastgs", "schedule"],
 )
-def test_not_one_bit_under_a_mask_enters_a_trial(
-    captures: tuple[Path, Path], tmp_path: Path, words: list[str]
-) -> None:
+def test_not_one_bit_under_a_mask_enters_a_trial(captures, tmp_path, words):
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
     clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
@@ -128,7 +125,7 @@ def _points(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
 
 
-def test_without_masks_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: Path) -> None:
+def test_without_masks_the_noise_is_seen(captures, tmp_path):
     """So the test above can fail."""
     clean, noisy = (trial(tmp_path, capture, *SIFT, "scene.masks=null") for capture in captures)
     digests = [
@@ -141,8 +138,8 @@ def test_without_masks_the_noise_is_seen(captures: tuple[Path, Path], tmp_path: 
 
 
 def test_an_edited_mask_makes_the_trial_anew_and_one_that_is_put_back_finds_it(
-    captures: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    captures, tmp_path, capsys
+):
     capture = tmp_path / "edited"
     shutil.copytree(captures[0], capture)
     words = ["init=random", "init.count=500", "densify=none", "train.iterations=5"]
@@ -164,14 +161,12 @@ def test_an_edited_mask_makes_the_trial_anew_and_one_that_is_put_back_finds_it(
     assert json.loads((folder / "results.json").read_text())["hashes"] == first["hashes"]
 
 
-def test_bad_masks_end_in_one_line_before_any_work(
-    captures: tuple[Path, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_masks_end_in_one_line_before_any_work(captures, tmp_path, capfd):
     capture = tmp_path / "bad"
     shutil.copytree(captures[0], capture)
     mask = sorted((capture / "masks").iterdir())[2]
 
-    def said(*words: str) -> str:
+    def said(*words):
         capfd.readouterr()
         assert run([*QUICK, f"scene.path={capture}", f"runs={tmp_path / 'runs'}", *words]) != 0
         lines = [line for line in capfd.readouterr().err.splitlines() if str(capture) in line]
@@ -188,9 +183,7 @@ def test_bad_masks_end_in_one_line_before_any_work(
     )
 
 
-def test_another_program_is_refused_with_masks(
-    captures: tuple[Path, Path], tmp_path: Path, capfd
-) -> None:
+def test_another_program_is_refused_with_masks(captures, tmp_path, capfd):
     words = ["init=random", "densify=external/program", "densify.command='echo {data} {output}'"]
     words += [
         "allow_targets=[echo]",
@@ -212,12 +205,7 @@ def test_another_program_is_refused_with_masks(
 
 
 @pytest.mark.parametrize("make", [Sfm, SiftKornia, Dim])
-def test_no_keypoint_is_on_an_ignored_pixel(
-    captures: tuple[Path, Path],
-    tmp_path: Path,
-    make: type[ColmapInitializer],
-    request: pytest.FixtureRequest,
-) -> None:
+def test_no_keypoint_is_on_an_ignored_pixel(captures, tmp_path, make, request):
     """Without `prepare`, so that there is something to be found below the masks."""
     options = {"init": {"first_octave": 0, "max_num_features": 1500}, "net": {"max_keypoints": 500}}
     words = options["init" if make is Sfm else "net"] | {"two_view_tracks": True}

@@ -56,7 +56,7 @@ Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(tmp_path_factory) -> Path:
     """A COLMAP folder of the courtyard with exact cameras, and a cloud in the photographs'
     colours."""
     folder = tmp_path_factory.mktemp("made") / "good"
@@ -91,7 +91,7 @@ def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, 
 
 
 @pytest.fixture(scope="module")
-def original(good: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def original(good, tmp_path_factory) -> list[Path]:
     """Trials of the capture as it is, one for each seed."""
     runs = tmp_path_factory.mktemp("runs")
     return [train(runs / str(seed), good, COLMAP, f"seed={seed}") for seed in range(SEEDS)]
@@ -119,8 +119,8 @@ def copy_of(good: Path, folder: Path, change: Change, text: bool = False) -> Pat
 @settings(max_examples=6, phases=[Phase.generate])  # each example trains, so none is made simpler
 @given(st.floats(-4, 4), st.floats(0, 7), st.integers(0, 10**6))
 def test_a_similarity_changes_a_result_no_more_than_a_seed_does(
-    good: Path, original: list[Path], log_scale: float, log_shift: float, rotation_seed: int
-) -> None:
+    good, original, log_scale, log_shift, rotation_seed
+):
     random = Rotation.random(random_state=rotation_seed)
     shift = 10**log_shift * random.apply([0.6, -0.7, 0.39])
     similarity = pycolmap.Sim3d(10**log_scale, pycolmap.Rotation3d(random.as_quat()), shift)
@@ -218,18 +218,14 @@ def other_place(folder: Path, model: pycolmap.Reconstruction) -> None:
         pytest.param(partial(as_distorted, "SIMPLE_PINHOLE", 0), True, id="SIMPLE_PINHOLE"),
     ],
 )
-def test_another_name_or_format_changes_no_bit(
-    good: Path, original: list[Path], tmp_path: Path, change: Change, text: bool
-) -> None:
+def test_another_name_or_format_changes_no_bit(good, original, tmp_path, change, text):
     trial = train(tmp_path / "runs", copy_of(good, tmp_path / "copy", change, text), COLMAP)
     assert file_sha256(trial / "point_cloud.ply") == file_sha256(original[0] / "point_cloud.ply")
     renders, before = (sorted((one / "renders").iterdir()) for one in (trial, original[0]))
     assert [file_sha256(file) for file in renders] == [file_sha256(file) for file in before]
 
 
-def test_transforms_json_gives_the_result_of_the_colmap_model(
-    good: Path, original: list[Path], tmp_path: Path
-) -> None:
+def test_transforms_json_gives_the_result_of_the_colmap_model(good, original, tmp_path):
     folder = tmp_path / "frames"
     shutil.copytree(good / "images", folder / "images")
     model = pycolmap.Reconstruction(good / "sparse/0")

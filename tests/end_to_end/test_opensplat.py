@@ -28,7 +28,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trial(tmp_path_factory) -> Path:
     """The folder of a trial of OpenSplat on a small courtyard, with a schedule of growth as short
     as the training."""
     runs = tmp_path_factory.mktemp("runs")
@@ -65,7 +65,7 @@ def error(picture: np.ndarray, truth: np.ndarray) -> float:
     return float(np.square(picture.astype(float) - truth).mean())
 
 
-def test_its_renders_are_neither_turned_nor_shifted(trial: Path) -> None:
+def test_its_renders_are_neither_turned_nor_shifted(trial):
     """Each held-out photograph is nearer to its render than to the render mirrored, or moved by
     some pixels."""
     files = sorted((trial / "renders").glob("*.png"))
@@ -78,7 +78,7 @@ def test_its_renders_are_neither_turned_nor_shifted(trial: Path) -> None:
             assert error(render, truth) < error(other, truth), file.name
 
 
-def test_it_grows_on_the_schedule_that_it_is_given(trial: Path) -> None:
+def test_it_grows_on_the_schedule_that_it_is_given(trial):
     results = json.loads((trial / "results.json").read_text())
     assert results["num_gaussians"] > results["num_init_points"]
     assert VERSION in results["trained_by"]["said"]

@@ -26,7 +26,6 @@ from gsbench.datasets.catalog import read_catalog
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
-from tests.end_to_end.conftest import Run
 from tests.processes import heed_interrupts, is_running
 
 pytestmark = pytest.mark.slow
@@ -64,7 +63,7 @@ COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 
 @pytest.fixture(scope="module")
-def trainers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trainers(tmp_path_factory) -> Path:
     """A folder of configurations with the two trainers: a user's own YAML files."""
     folder = tmp_path_factory.mktemp("conf")
     (folder / "densify").mkdir()
@@ -74,9 +73,7 @@ def trainers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def home(
-    tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str], trainers: Path
-) -> Path:
+def home(tmp_path_factory, environment, trainers) -> Path:
     """A folder with a fetched scene, and a sweep over it of one arm of ours and two of other
     programs."""
     home = tmp_path_factory.mktemp("home")
@@ -128,9 +125,7 @@ def pixels(path: Path) -> str:
     return hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
 
 
-def test_two_programs_and_a_folder_of_renders_in_one_table(
-    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
     for seed in (0, 1):
@@ -179,9 +174,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(
     assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
 
 
-def test_its_model_is_one_as_any_other(
-    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_its_model_is_one_as_any_other(home, monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     viewed = load_viewed(find_trial("three:garden:cloud:0", home / "runs"), torch.device("cpu"))
     assert len(viewed.gaussians) == 2000
@@ -192,7 +185,7 @@ def test_its_model_is_one_as_any_other(
     assert "it has no model" in capsys.readouterr().err
 
 
-def test_what_is_recorded(home: Path) -> None:
+def test_what_is_recorded(home):
     model, renders = results(trial(home, "cloud")), results(trial(home, "painter"))
     assert (model["evaluated_from"], renders["evaluated_from"]) == ("model", "renders")
     assert model["trained_by"]["said"] == "painter 1.2.3"
@@ -207,7 +200,7 @@ def test_what_is_recorded(home: Path) -> None:
 
 
 @pytest.mark.parametrize("arm", ["cloud", "painter"])
-def test_no_test_photograph_reaches_it(home: Path, arm: str) -> None:
+def test_no_test_photograph_reaches_it(home, arm):
     """The trainer walked everything beside and below its input, links followed, and told what it
     found."""
     log = (trial(home, arm) / "trainer.log").read_text()
@@ -235,9 +228,7 @@ def test_no_test_photograph_reaches_it(home: Path, arm: str) -> None:
     assert "environment [] good" in log
 
 
-def test_done_is_done_and_another_version_is_another_result(
-    home: Path, trainers: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_done_is_done_and_another_version_is_another_result(home, trainers, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
     words = [
@@ -284,13 +275,8 @@ BAD_RENDERS = {
 
 @pytest.mark.parametrize(("arm", "expected"), [("cloud", BAD), ("painter", BAD_RENDERS)])
 def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
-    trainers: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arm: str,
-    expected: dict[str, str],
-) -> None:
+    trainers, tmp_path, monkeypatch, capsys, arm, expected
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     words = ["--config-dir", str(trainers), "-m", *COURTYARD, f"densify={arm}", "name=bad"]
     assert run([*words, f"densify.options.mode={','.join([*expected, 'good'])}"]) == 1
@@ -306,12 +292,7 @@ def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
         assert "observations 0" in Path(log[1]).read_text()
 
 
-def test_one_that_hangs_is_ended(
-    trainers: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_one_that_hangs_is_ended(trainers, tmp_path, monkeypatch, capsys):
     """With its child, though both are deaf to SIGTERM."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     words = [
@@ -336,9 +317,7 @@ def test_one_that_hangs_is_ended(
 
 
 @pytest.fixture
-def hanging(
-    environment: dict[str, str], trainers: Path, tmp_path: Path
-) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """gsbench with a trainer that hangs, deaf to SIGTERM, and the trainer's and its child's process
     ids."""
     words = [
@@ -376,9 +355,7 @@ def hanging(
     "signum",
     [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
 )
-def test_it_ends_with_gsbench(
-    hanging: tuple[subprocess.Popen[str], list[int]], signum: int
-) -> None:
+def test_it_ends_with_gsbench(hanging, signum):
     process, pids = hanging
     assert len(pids) == 2
     assert all(map(is_running, pids))
@@ -413,15 +390,7 @@ def test_it_ends_with_gsbench(
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
 )
-def test_bad_requests_are_one_line(
-    gsbench: Run,
-    trainers: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    said: str,
-) -> None:
+def test_bad_requests_are_one_line(gsbench, trainers, tmp_path, monkeypatch, capsys, words, said):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     assert run(["--config-dir", str(trainers), *COURTYARD, "densify=cloud", *words]) == 2
     error = capsys.readouterr().err

@@ -13,12 +13,12 @@ import pytest
 from PIL import Image
 
 from tests.conftest import ROOT
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
 
-def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
+def test_truncated_photo_is_named(gsbench, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     for i in range(4):
@@ -31,7 +31,7 @@ def test_truncated_photo_is_named(gsbench: Run, tmp_path: Path) -> None:
     assert "2.jpg" in done.stderr.strip().splitlines()[-1]
 
 
-def test_help_is_quick_to_load(gsbench: Run) -> None:
+def test_help_is_quick_to_load(gsbench):
     """No torch, no MLflow: the modules say so, whatever the machine's speed."""
     code = (
         "import sys, gsbench.cli as c; c.run(['--help']); "
@@ -44,9 +44,7 @@ def test_help_is_quick_to_load(gsbench: Run) -> None:
     assert "volumetric" in done.stdout
 
 
-def test_wheel_runs_a_trial_outside_the_checkout(
-    environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_wheel_runs_a_trial_outside_the_checkout(environment, tmp_path):
     pytest.importorskip(
         "hatchling", reason="building the wheel offline needs hatchling (group dev)"
     )

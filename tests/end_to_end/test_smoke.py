@@ -18,7 +18,7 @@ import yaml
 from PIL import Image
 
 from tests.conftest import ROOT
-from tests.end_to_end.conftest import FINISHED, SMALL, Run
+from tests.end_to_end.conftest import FINISHED, SMALL
 
 TINY = [*SMALL, "train.iterations=20", "tracking=none", "eval.lpips=[]", "eval.flip=false"]
 MORTAL = """
@@ -45,7 +45,7 @@ def trials_of(runs: Path, name: str = FINISHED) -> dict[str, Path]:
     return found
 
 
-def test_a_sweep_leaves_complete_trials(finished_runs: Path) -> None:
+def test_a_sweep_leaves_complete_trials(finished_runs):
     trials = trials_of(finished_runs)
     assert list(trials) == ["adc-0", "adc-1", "volumetric-0", "volumetric-1"]
     records = [json.loads((trial / "results.json").read_text()) for trial in trials.values()]
@@ -77,7 +77,7 @@ def test_a_sweep_leaves_complete_trials(finished_runs: Path) -> None:
     assert ((picture - truth) ** 2).mean() < 0.6 * flipped
 
 
-def test_the_same_command_again_computes_nothing(gsbench: Run, runs: Path) -> None:
+def test_the_same_command_again_computes_nothing(gsbench, runs):
     written = [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))]
     sweep = [
         "-m",
@@ -92,7 +92,7 @@ def test_the_same_command_again_computes_nothing(gsbench: Run, runs: Path) -> No
     assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
 
 
-def test_tables_and_report(gsbench: Run, runs: Path) -> None:
+def test_tables_and_report(gsbench, runs):
     table = gsbench("tables", FINISHED, GSBENCH_RUNS=str(runs))
     assert table.returncode == 0, table.stderr
     assert re.search(r"\| courtyard \| random \| volumetric \|.* ± ", table.stdout)
@@ -103,7 +103,7 @@ def test_tables_and_report(gsbench: Run, runs: Path) -> None:
     assert "data:image/" in page
 
 
-def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+def test_a_killed_trial_goes_on_to_the_same_bits(gsbench, runs, tmp_path):
     (tmp_path / "mortal.py").write_text(MORTAL)
     own = [
         "densify=adc",
@@ -124,7 +124,7 @@ def test_a_killed_trial_goes_on_to_the_same_bits(gsbench: Run, runs: Path, tmp_p
         assert (trial / name).read_bytes() == (whole / name).read_bytes()
 
 
-def test_the_readmes_own_densifier_acts(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+def test_the_readmes_own_densifier_acts(gsbench, runs, tmp_path):
     (code,) = re.findall(
         r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
     )
@@ -151,7 +151,7 @@ def test_the_readmes_own_densifier_acts(gsbench: Run, runs: Path, tmp_path: Path
     assert counts[0] < counts[1]
 
 
-def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
     settings = {word.split("=", 1)[0]: yaml.safe_load(word.split("=", 1)[1]) for word in TINY[1:]}
     claim = {
         "id": "points",
@@ -205,9 +205,7 @@ def test_a_claims_file_and_its_archive(gsbench: Run, runs: Path, tmp_path: Path)
         ("tabels", "tables"),
     ],
 )
-def test_a_misspelt_word_is_one_line_with_the_right_one(
-    gsbench: Run, tmp_path: Path, word: str, hint: str
-) -> None:
+def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word, hint):
     done = gsbench(word, GSBENCH_RUNS=str(tmp_path / "runs"))
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
@@ -217,7 +215,7 @@ def test_a_misspelt_word_is_one_line_with_the_right_one(
     assert not list(tmp_path.rglob("results.json"))
 
 
-def test_a_mirror_in_mlflow(gsbench: Run, runs: Path) -> None:
+def test_a_mirror_in_mlflow(gsbench, runs):
     done = gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
     wanted = [
@@ -235,7 +233,7 @@ def test_a_mirror_in_mlflow(gsbench: Run, runs: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="Slurm's commands are scripts of a shell here")
-def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: Path) -> None:
+def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
     """``sbatch`` keeps the script; its command is then run as Slurm would run one task of the
     array."""
     bin_folder = tmp_path / "bin"
@@ -283,7 +281,7 @@ def test_slurms_job_command_runs_the_trial(gsbench: Run, runs: Path, tmp_path: P
     assert list(trials_of(runs, "x")) == ["none-1"]
 
 
-def test_hydra_multirun_with_another_launcher(gsbench: Run, runs: Path) -> None:
+def test_hydra_multirun_with_another_launcher(gsbench, runs):
     words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
     done = gsbench(*words, GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr

@@ -39,7 +39,7 @@ TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def captures(tmp_path_factory) -> tuple[Path, Path]:
     """A COLMAP folder with points that all views made, and the same with noise in place of every
     eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")
@@ -70,9 +70,7 @@ def bits(folder: Path) -> dict[str, str]:
     ("init", "choice"),
     [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")],
 )
-def test_not_one_bit_of_a_test_photograph_enters_a_trial(
-    captures: tuple[Path, Path], tmp_path: Path, init: str, choice: str
-) -> None:
+def test_not_one_bit_of_a_test_photograph_enters_a_trial(captures, tmp_path, init, choice):
     """Poses aside, which are given here. Renders are equal too; what they are held against is
     not."""
     words = [f"init={init}", f"init.points_from={choice}"]
@@ -92,9 +90,7 @@ def test_not_one_bit_of_a_test_photograph_enters_a_trial(
         )
 
 
-def test_with_points_from_all_the_noise_is_seen(
-    captures: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_with_points_from_all_the_noise_is_seen(captures, tmp_path):
     """So the test above can fail."""
     words = [
         "init=sfm",
@@ -106,9 +102,7 @@ def test_with_points_from_all_the_noise_is_seen(
     assert bits(clean) != bits(noisy)
 
 
-def test_a_sector_is_recorded_with_its_views_and_their_distances(
-    captures: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_path):
     words = [
         "init=dataset",
         "densify=none",
@@ -131,9 +125,7 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(
     assert "angle_to_nearest" not in results["metrics"]
 
 
-def test_a_search_with_validation_views_never_sees_a_test_view(
-    captures: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_a_search_with_validation_views_never_sees_a_test_view(captures, tmp_path):
     """Not even with photographs replaced by noise does anything change, the fingerprint
     included."""
     words = ["init=dataset", "densify=none", "scene.validation=true"]

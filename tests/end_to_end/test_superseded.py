@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.cli import run
-from tests.end_to_end.conftest import SMALL, Run
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
@@ -37,15 +37,12 @@ OWN = [
 
 
 def test_an_edited_densifier_is_never_averaged_with_what_it_was(
-    gsbench: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    gsbench, tmp_path, monkeypatch, capsys
+):
     runs = str(tmp_path / "runs")
     monkeypatch.setenv("GSBENCH_RUNS", runs)
 
-    def train(*seeds: int) -> str:
+    def train(*seeds):
         """Trainings run in processes of their own, which import the file as it is."""
         done = gsbench(
             "-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs
@@ -53,7 +50,7 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
         assert done.returncode == 0, done.stderr
         return done.stderr
 
-    def ask(*words: str, code: int = 0) -> str:
+    def ask(*words, code=0):
         """Verbs read files only, and run here."""
         assert run(list(words)) == code
         said = capsys.readouterr()

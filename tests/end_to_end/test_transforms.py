@@ -83,7 +83,7 @@ def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(tmp_path_factory) -> Path:
     """A folder with a COLMAP model with points, and the same as transforms.json."""
     folder = tmp_path_factory.mktemp("transforms") / "yard"
     render_courtyard(folder, views=10, width=192, height=144)
@@ -113,7 +113,7 @@ def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
     return found
 
 
-def test_the_training_is_that_of_the_colmap_scene(scene: Path, tmp_path: Path) -> None:
+def test_the_training_is_that_of_the_colmap_scene(scene, tmp_path):
     colmap = trial(tmp_path, "colmap", scene)
     read = trial(tmp_path, "transforms", scene)
     first, second = (json.loads((folder / "results.json").read_text()) for folder in (colmap, read))
@@ -131,7 +131,7 @@ def test_the_training_is_that_of_the_colmap_scene(scene: Path, tmp_path: Path) -
         assert np.abs(pair[0] - pair[1]).mean() < 0.5  # levels
 
 
-def test_an_edited_file_makes_the_trial_anew(scene: Path, tmp_path: Path) -> None:
+def test_an_edited_file_makes_the_trial_anew(scene, tmp_path):
     folder = tmp_path / "edited"
     shutil.copytree(scene, folder)
     words = ["densify=none", "train.iterations=3"]
@@ -146,7 +146,7 @@ def test_an_edited_file_makes_the_trial_anew(scene: Path, tmp_path: Path) -> Non
     assert hashlib.sha256((after / "point_cloud.ply").read_bytes()).hexdigest() != digest
 
 
-def test_without_points_the_file_says_which_initialiser(scene: Path, tmp_path: Path, capfd) -> None:
+def test_without_points_the_file_says_which_initialiser(scene, tmp_path, capfd):
     folder = tmp_path / "bare"
     shutil.copytree(scene, folder)
     document = json.loads((folder / "transforms.json").read_text())
@@ -163,7 +163,7 @@ def _scene(capture: Any, cache: Path) -> Scene:
     return load_scene(capture, capture.model, cache, max_size=300)
 
 
-def test_photographs_with_distortion_come_out_the_same(shared: Path, tmp_path: Path) -> None:
+def test_photographs_with_distortion_come_out_the_same(shared, tmp_path):
     """Real photographs: COLMAP's SIMPLE_RADIAL as nerfstudio's OPENCV with k1."""
     source = shared / "data" / "herz_jesus_p25"
     folder = tmp_path / "church"

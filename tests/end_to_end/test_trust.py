@@ -20,7 +20,7 @@ BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Path:
+def capture(tmp_path) -> Path:
     """A folder with bombs of all names of the standard library and of everything that is
     installed."""
     folder, mark = tmp_path / "capture", tmp_path / "exploded"
@@ -66,7 +66,7 @@ def gsbench(
     )
 
 
-def test_no_module_of_the_current_folder_is_imported(capture: Path) -> None:
+def test_no_module_of_the_current_folder_is_imported(capture):
     own = "from gsbench.densify import NoDensifier\nclass Own(NoDensifier):\n    pass\n"
     (capture / "own.py").write_text(own)
     # what is installed comes before what lies here
@@ -88,7 +88,7 @@ def test_no_module_of_the_current_folder_is_imported(capture: Path) -> None:
     assert len(list((capture.parent / "runs" / "one").rglob("results.json"))) == 2
 
 
-def test_nor_by_a_process_of_its_own(capture: Path) -> None:
+def test_nor_by_a_process_of_its_own(capture):
     imports = "import posixpath; from gsbench.system.isolate import run_isolated"
     code = f"{imports}; print(run_isolated(posixpath.basename, 'a/b'))"
     done = gsbench(capture, start=("-P", "-c", code))
@@ -96,9 +96,7 @@ def test_nor_by_a_process_of_its_own(capture: Path) -> None:
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 
-def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
-    capture: Path,
-) -> None:
+def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(capture):
     code = "import runpy, sys; print(*sys.modules)"
     before = subprocess.run(
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
@@ -111,7 +109,7 @@ def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 
-def test_nor_by_another_trainer_that_tells_its_version(capture: Path) -> None:
+def test_nor_by_another_trainer_that_tells_its_version(capture):
     """``python -c`` imports from where it runs, so its version is asked for in an empty folder."""
     (capture.parent / "train.py").write_text(
         "import beside, sys; sys.exit('Error: trained ' + beside.WHAT)"

@@ -11,9 +11,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -82,7 +80,7 @@ def crossings(files: list[str]) -> int:
     return sum(one != other for one, other in itertools.pairwise(folders))
 
 
-def test_a_way_is_counted_by_its_folders() -> None:
+def test_a_way_is_counted_by_its_folders():
     outer, inner = (
         [(1, "app/a.py"), (2, "config/b.py")],
         [(1, "app/a.py"), (3, "app/c.py"), (4, "launch/d.py")],
@@ -91,16 +89,16 @@ def test_a_way_is_counted_by_its_folders() -> None:
     assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
 
 
-def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_from_the_yaml_to_the_split(tmp_path, monkeypatch):
     stacks: list[list[Frame]] = []
     calls: Counter[str] = Counter()
 
-    def watch(owner: Any, name: str, counts: Callable[..., bool] = lambda *given: True) -> None:
+    def watch(owner, name, counts=lambda *given: True):
         """Count the calls of ``owner.name`` whose arguments count, and note the stack at the
         first."""
         real = getattr(owner, name)
 
-        def watched(*given: Any, **named: Any) -> Any:
+        def watched(*given, **named):
             if counts(*given):
                 calls[name] += 1
                 if calls[name] == 1:
@@ -122,7 +120,7 @@ def test_from_the_yaml_to_the_split(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     compositions = 0
     enforce_permissions = compose.enforce_permissions  # for the command line, and for each job
 
-    def counted(*given: Any) -> Any:
+    def counted(*given):
         nonlocal compositions
         compositions += 1
         return enforce_permissions(*given)

@@ -1,5 +1,4 @@
-"""The correction of colours before metrics, against numpy's least squares and maps that are
-known."""
+"""The correction of colours, against numpy's least squares and known maps."""
 
 from __future__ import annotations
 

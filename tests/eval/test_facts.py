@@ -1,5 +1,7 @@
-"""The table of metrics: one place that everything asks, and what a user's metric may say of
-itself."""
+"""The table of metrics.
+
+One place that everything asks, and what a user's metric may say of itself.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""LPIPS against the published reference value, and its networks against an independent statement of
-their layers."""
+"""LPIPS against the published value, and its networks against another statement of them."""
 
 from __future__ import annotations
 
@@ -18,8 +17,10 @@ State = dict[str, Tensor]
 
 
 def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
-    """Weights of the right shapes from a fixed seed: a backbone's, keyed with ``prefix``, and the
-    heads'."""
+    """Weights of the right shapes from a fixed seed.
+
+    A backbone's, keyed with ``prefix``, and the heads'.
+    """
     generator = torch.Generator().manual_seed(0)
     shapes = {key: value.shape for key, value in BACKBONES[net].build().state_dict().items()}
     features = {}
@@ -36,8 +37,7 @@ def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
 
 
 def vgg_taps(x: Tensor, w: State) -> list[Tensor]:
-    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, written by torchvision's layer
-    numbers."""
+    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, by torchvision's numbers."""
     taps = []
     for block in ([0, 2], [5, 7], [10, 12, 14], [17, 19, 21], [24, 26, 28]):
         if block[0] > 0:
@@ -70,8 +70,7 @@ def alex_taps(x: Tensor, w: State) -> list[Tensor]:
 
 
 def textbook_lpips(first: Tensor, second: Tensor, taps, features: State, heads: State) -> Tensor:
-    """The definition of LPIPS v0.1 on batches [B, 3, H, W] in [-1, 1], with 1x1 convolutions as
-    heads."""
+    """LPIPS v0.1 by its definition, for [B, 3, H, W] in [-1, 1], 1x1 convolutions as heads."""
     shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
     total = torch.zeros(len(first))

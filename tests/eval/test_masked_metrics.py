@@ -90,8 +90,10 @@ def test_ignoring_what_is_perfect_makes_a_view_worse_and_what_is_bad_better(pair
 
 
 def test_lpips_of_a_mask_is_the_mean_of_its_maps_where_pixels_count(shared) -> None:
-    """Two pictures side by side, far enough apart for the network: the mask chooses the distance of
-    one of them."""
+    """Two pictures side by side, far enough apart for the network.
+
+    The mask chooses the distance of one of them.
+    """
     rng = np.random.default_rng(3)
     network = load_lpips("squeeze", shared / "weights", download=False)
     left, right = torch.rand(2, 1, 3, 256, 256, generator=torch.Generator().manual_seed(1)) * 2 - 1

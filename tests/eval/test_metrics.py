@@ -39,10 +39,8 @@ def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> float:
                 a = x[row : row + 11, column : column + 11, channel]
                 b = y[row : row + 11, column : column + 11, channel]
                 mean_a, mean_b = (window * a).sum(), (window * b).sum()
-                var_a, var_b = (
-                    (window * (a - mean_a) ** 2).sum(),
-                    (window * (b - mean_b) ** 2).sum(),
-                )
+                var_a = (window * (a - mean_a) ** 2).sum()
+                var_b = (window * (b - mean_b) ** 2).sum()
                 cov = (window * (a - mean_a) * (b - mean_b)).sum()
                 values.append(
                     (2 * mean_a * mean_b + 1e-4)

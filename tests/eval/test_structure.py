@@ -1,5 +1,4 @@
-"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, restatements with scipy and scikit-image, and values
-by hand."""
+"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, restatements, and values by hand."""
 
 from __future__ import annotations
 
@@ -54,8 +53,10 @@ PIQ = {
 
 @pytest.fixture(scope="module")
 def peer() -> Iterator[Callable[[str], Callable[..., torch.Tensor]]]:
-    """piq's function for a metric. Its modules are loaded one by one: the package as a whole wants
-    torchvision."""
+    """piq's function for a metric.
+
+    Its modules are loaded one by one: the package as a whole wants torchvision.
+    """
     spec = importlib.util.find_spec("piq")
     if spec is None:
         pytest.skip("piq is not installed")
@@ -107,9 +108,11 @@ def test_the_values_noted_here_are_those_of_piq(
 
 @pytest.mark.parametrize("size", [(161, 170), (187, 161), (192, 192)], ids=str)
 def test_ms_ssim_halves_as_its_authors_do(size: tuple[int, int]) -> None:
-    """Their ``imfilter(image, ones(2) / 4, 'symmetric')`` and every other pixel, restated with
-    scipy; SSIM itself is scikit-image's, and contrast and structure are its quotient by
-    luminance."""
+    """Their ``imfilter(image, ones(2) / 4, 'symmetric')``, restated with scipy.
+
+    Then every other pixel. SSIM itself is scikit-image's; contrast and structure are its quotient
+    by luminance.
+    """
     image, truth = (x.numpy() for x in pair(*size))
     products = []
     for channel in range(3):
@@ -139,10 +142,11 @@ def test_ms_ssim_halves_as_its_authors_do(size: tuple[int, int]) -> None:
 
 
 def test_gmsd_by_hand() -> None:
-    """A vertical edge of height 1 against none, as [2, 4] after halving: its similarity is c / (m²
-    + c) where m is not
-    0. Zeros outside make an edge all round the black picture's partner too, so both have black
-       borders."""
+    """A vertical edge of height 1 against none, as [2, 4] after halving.
+
+    Its similarity is c / (m² + c) where m is not 0. Zeros outside make an edge all round the black
+    picture's partner too, so both have black borders.
+    """
     truth = torch.zeros(12, 12, 3, dtype=torch.float64)
     image = truth.clone()
     image[4:8, 4:8] = 0.5  # 2x2 px of 0.5 in 6x6

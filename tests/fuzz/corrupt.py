@@ -1,5 +1,7 @@
-"""Ways in which files come to harm: cut, flipped, doubled, filled with NaN, infinities, zeros or
-huge counts."""
+"""Ways in which files come to harm.
+
+Cut, flipped, doubled, filled with NaN, infinities, zeros or huge counts.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Damaged models, PLY files, pictures and archives, read one by one; a program, so that a crash is
-seen as one.
+"""Damaged models, PLY files, pictures and archives, read one by one.
+
+A program, so that a crash is seen as one.
 
     python -m tests.fuzz.models FOLDER FIRST COUNT
 

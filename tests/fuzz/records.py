@@ -1,5 +1,6 @@
-"""Damaged files of a runs folder, one after the other; run as a program, so that a crash or a hang
-is seen as one.
+"""Damaged files of a runs folder, one after the other.
+
+Run as a program, so that a crash or a hang is seen as one.
 
     python -m tests.fuzz.records FOLDER FIRST COUNT [FILE]
 
@@ -289,8 +290,10 @@ def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
 
 
 def look(runs: Path, places: dict[str, Path]) -> int:
-    """Read everything as the verbs do; how much was refused or left out. Raises what is no
-    InputError."""
+    """Read everything as the verbs do; how much was refused or left out.
+
+    Raises what is no InputError.
+    """
     home = runs / EXPERIMENT
     refused = 0
 

@@ -1,5 +1,7 @@
-"""Damaged COLMAP models and PLY files end in one line or in a right result: never in a crash, a
-hang or nonsense."""
+"""Damaged COLMAP models and PLY files end in one line or in a right result.
+
+Never in a crash, a hang or nonsense.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""Damaged files of a runs folder cost themselves, never the rest: no crash, no hang, one line that
-names the file."""
+"""Damaged files of a runs folder cost themselves, never the rest.
+
+No crash, no hang, one line that names the file.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +55,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
 @pytest.mark.parametrize("damage", [*DAMAGES, "fifo", "folder"])
 @pytest.mark.parametrize("name", ["results.json", "plan.json", "config.yaml", "metrics.jsonl"])
 def test_the_verbs_say_one_line_for_a_damaged_file(
-    name: str,
-    damage: str,
-    places: dict[str, Path],
-    capsys: pytest.CaptureFixture[str],
+    name: str, damage: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = places[name]
     if damage in DAMAGES:

@@ -15,7 +15,7 @@ from gsbench.launch.jobs import Outcome, clouds_first, collect, job_folder
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     return tmp_path
 
@@ -33,21 +33,21 @@ def collected(folder: Path, failure: str | None = None) -> Outcome:
     return collect(job, trial.folder, [trial])
 
 
-def test_a_failed_job_is_told_by_the_trials_folder(folder: Path) -> None:
+def test_a_failed_job_is_told_by_the_trials_folder(folder):
     outcome = collected(folder, json.dumps({"message": "no scene\nat all", "bad_input": True}))
     assert outcome.message == f"no scene; log: {folder / 'log'}"
     assert (outcome.status, outcome.bad_input) == ("failed", True)
 
 
-def test_a_job_that_left_nothing_is_told_by_its_log(folder: Path) -> None:
+def test_a_job_that_left_nothing_is_told_by_its_log(folder):
     outcome = collected(folder)
     assert outcome.status == "failed"
     assert "ended without a result" in outcome.message
     assert "its last lines: RuntimeError: no luck" in outcome.message
 
 
-def test_one_trial_of_each_cloud_begins_first() -> None:
-    def trial(scene: str, seed: int) -> Any:
+def test_one_trial_of_each_cloud_begins_first():
+    def trial(scene, seed):
         return SimpleNamespace(values={"scene": scene, "init": "sfm", "seed": seed})
 
     trials = [trial(scene, seed) for scene in "ab" for seed in (0, 1)]
@@ -57,9 +57,7 @@ def test_one_trial_of_each_cloud_begins_first() -> None:
     ]
 
 
-def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(
-    tmp_path: Path,
-) -> None:
+def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(tmp_path):
     values = compose_one(["name=cluster", f"runs={tmp_path}"]).values
     folder = job_folder(values)
     script = folder / "2_submission.sh"

@@ -23,9 +23,7 @@ OWN = "densify._target_=mine.Patient"
         (["densify=adc"], []),
     ],
 )
-def test_a_class_of_ones_own_under_a_name_of_ours_is_told(
-    words: list[str], said: list[str]
-) -> None:
+def test_a_class_of_ones_own_under_a_name_of_ours_is_told(words, said):
     trials = [compose_one([*words, "allow_targets=[mine]", f"seed={seed}"]) for seed in (0, 1)]
     lines = borrowed_names(trials)
     assert len(lines) == len(said)

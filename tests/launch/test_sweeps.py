@@ -11,12 +11,10 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gsbench import cli
 from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import GROUPS, options, parse
 from gsbench.config.compose import Trial, compose_one
@@ -38,12 +36,7 @@ from gsbench.system.locks import BusyError, hold, is_held
 from tests.finished import record_of
 from tests.runs.test_trial_folder import edit
 
-
-@pytest.fixture(autouse=True)
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path / "runs"
+pytestmark = pytest.mark.usefixtures("runs")
 
 
 @cache
@@ -75,7 +68,7 @@ def finish(
     if not source.exists():
         source.write_bytes(b"photo")
     entry = Store(folder.runs / "store").get(
-        Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))  # type: ignore[arg-type,return-value]
+        Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))
     )
     (folder.path / "table.csv").write_text("a,b")
     (folder.path / "config.yaml").write_text("")
@@ -132,7 +125,7 @@ NAMES = {
 
 @pytest.mark.parametrize("group", GROUPS)
 @pytest.mark.slow
-def test_every_yaml_composes(group: str) -> None:
+def test_every_yaml_composes(group):
     assert options(group)
     for name in options(group):
         if group == "experiment":
@@ -147,7 +140,7 @@ def test_every_yaml_composes(group: str) -> None:
 
 
 @pytest.mark.slow
-def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
+def test_paper_experiments_have_the_papers_trials_and_share_them():
     table1, table2 = experiment("table1"), experiment("table2")
     assert (len(table1), len(table2)) == (78, 144)
     leaves = [
@@ -163,7 +156,7 @@ def test_paper_experiments_have_the_papers_trials_and_share_them() -> None:
         assert again.yaml.splitlines()[8:] == trial.yaml.splitlines()[8:]
 
 
-def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
+def test_grid_is_the_product_with_the_command_line_over_the_file():
     trials = compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])
     assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
         ("adc", 5),
@@ -178,7 +171,7 @@ def test_grid_is_the_product_with_the_command_line_over_the_file() -> None:
     assert {t.values["train"]["iterations"] for t in trials} == {10}
 
 
-def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
+def test_name_seed_and_machine_are_in_no_hash_and_settings_are():
     hash_of = lambda *words: config_hash(trial_values(*words))  # noqa: E731
     assert hash_of() == hash_of(
         "name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none"
@@ -227,7 +220,7 @@ def test_name_seed_and_machine_are_in_no_hash_and_settings_are() -> None:
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
 )
-def test_mistakes_are_one_line_with_what_is_allowed(words: list[str], parts: list[str]) -> None:
+def test_mistakes_are_one_line_with_what_is_allowed(words, parts):
     with pytest.raises(InputError) as caught:
         compose_trials(words)
     assert "\n" not in str(caught.value)
@@ -235,7 +228,7 @@ def test_mistakes_are_one_line_with_what_is_allowed(words: list[str], parts: lis
         assert part in str(caught.value)
 
 
-def test_mistake_in_a_users_yaml_names_the_file(tmp_path: Path) -> None:
+def test_mistake_in_a_users_yaml_names_the_file(tmp_path):
     (tmp_path / "own" / "train").mkdir(parents=True)
     (tmp_path / "own" / "train" / "mine.yaml").write_text(
         "defaults: [paper, _self_]\nname: mine\niteratons: 5\n"
@@ -245,7 +238,7 @@ def test_mistake_in_a_users_yaml_names_the_file(tmp_path: Path) -> None:
         compose_trials(words)
 
 
-def test_options_of_the_command_line() -> None:
+def test_options_of_the_command_line():
     assert parse(["-m", "a=1,2", "--dry-run"]) == (["a=1,2"], True, True)
     with pytest.raises(InputError, match="--dry-rum is not an option"):
         parse(["--dry-rum"])
@@ -254,8 +247,8 @@ def test_options_of_the_command_line() -> None:
 
 
 def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     words = [
         "-m",
@@ -290,12 +283,12 @@ def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
         " gsbench.x",
     ],
 )
-def test_foreign_targets_are_refused(target: str | None) -> None:
+def test_foreign_targets_are_refused(target):
     with pytest.raises(InputError, match="densify"):
         check_target(target, "densify", [])
 
 
-def test_own_and_allowed_targets_pass() -> None:
+def test_own_and_allowed_targets_pass():
     check_target("gsbench.densify.ADC", "densify", [])
     check_target("mine.sub.Class", "densify", ["mine"])
     check_target("mine.sub.Class", "densify", ["mine."])
@@ -307,7 +300,7 @@ def test_own_and_allowed_targets_pass() -> None:
 # ---- finished trials
 
 
-def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> None:
+def test_finished_trial_is_recognised_until_something_changes(runs):
     values = trial_values()
     assert why_not_done(values) == "results.json is not there, or not complete"
     results = finish(values)
@@ -337,9 +330,7 @@ def test_finished_trial_is_recognised_until_something_changes(runs: Path) -> Non
         ("half a file", "results.json is not JSON"),
     ],
 )
-def test_changes_are_noticed_and_named(
-    change: str, names: str, runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_changes_are_noticed_and_named(change, names, runs, monkeypatch):
     values = trial_values()
     finish(values, awaited=["lpips_vgg"] if change == "weights" else ())
     folder = TrialFolder.of(values).path
@@ -384,7 +375,7 @@ def test_changes_are_noticed_and_named(
     assert "\n" not in reason
 
 
-def test_a_dry_run_says_what_has_changed(runs: Path) -> None:
+def test_a_dry_run_says_what_has_changed(runs):
     values = trial_values()
     finish(values)
     trial = replace(_composed(), values=values)
@@ -395,7 +386,7 @@ def test_a_dry_run_says_what_has_changed(runs: Path) -> None:
     )
 
 
-def test_metric_that_cannot_come_later_does_not_hinder() -> None:
+def test_metric_that_cannot_come_later_does_not_hinder():
     values = trial_values()
     finish(
         values,
@@ -407,7 +398,7 @@ def test_metric_that_cannot_come_later_does_not_hinder() -> None:
     assert not why_not_done(values)
 
 
-def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
+def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do():
     values = trial_values()
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"}, awaited=["lpips_vgg"])
     assert not why_not_done(values, ["lpips_vgg", "flip"])
@@ -417,7 +408,7 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do() -> None:
 # ---- plan and states
 
 
-def test_what_is_awaited_is_not_read_from_the_prose_of_reasons() -> None:
+def test_what_is_awaited_is_not_read_from_the_prose_of_reasons():
     values = trial_values("seed=3")
     finish(
         values,
@@ -430,7 +421,7 @@ def test_what_is_awaited_is_not_read_from_the_prose_of_reasons() -> None:
     assert not why_not_done(values, ["lpips_vgg"])
 
 
-def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> None:
+def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs):
     trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2,3"], multirun=True)
     add_to_plan(trials[:2])
     add_to_plan(trials)
@@ -455,9 +446,7 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs: Path) -> 
     assert len(states_of_experiment(runs / "x")) == 3
 
 
-def test_damaged_plan_is_named_and_the_next_command_mends_it(
-    runs: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_plan_is_named_and_the_next_command_mends_it(runs, caplog):
     (runs / "x").mkdir(parents=True)
     (runs / "x" / "plan.json").write_text("{")
     assert read_plan(runs / "x") == {}
@@ -468,7 +457,7 @@ def test_damaged_plan_is_named_and_the_next_command_mends_it(
     assert len(read_plan(runs / "x")) == 1
 
 
-def test_dry_run_tells_states_and_time(runs: Path) -> None:
+def test_dry_run_tells_states_and_time(runs):
     trials = compose_trials(["name=x", "densify=adc,volumetric", "seed=0,1"], multirun=True)
     assert describe_plan(trials)[-1].startswith("time: no estimate")
     finish(trials[0].values, seconds=600)
@@ -486,9 +475,7 @@ def test_dry_run_tells_states_and_time(runs: Path) -> None:
     ]
 
 
-def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(
-    runs: Path,
-) -> None:
+def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs):
     finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
     finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
     finished = FinishedTrials(runs)
@@ -502,7 +489,7 @@ def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iteration
     )
 
 
-def test_estimate_is_of_the_same_scene_size_and_rasterizer_or_is_none(runs: Path) -> None:
+def test_estimate_is_of_the_same_scene_size_and_rasterizer_or_is_none(runs):
     finish(trial_values("train.iterations=100"), seconds=10)
     finished = FinishedTrials(runs)
     for words in (["scene.width=800"], ["scene.max_size=200"], ["raster=reference"]):
@@ -513,12 +500,12 @@ def test_estimate_is_of_the_same_scene_size_and_rasterizer_or_is_none(runs: Path
 
 
 @pytest.fixture
-def fake_trial(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+def fake_trial(monkeypatch):
     """Replace the trial by one that does what ``behaviour[seed]`` says, and records the order."""
     behaviour: dict[int, Exception] = {}
     order: list[int] = []
 
-    def run_one(trial: Any, mirror: Any, wait: bool) -> Outcome:
+    def run_one(trial, mirror, wait):
         seed = trial.values["seed"]
         error = behaviour.get(seed)
         if isinstance(error, BusyError) and not wait:
@@ -550,9 +537,7 @@ def _composed_sweep() -> list[Trial]:
     return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
 
 
-def test_failed_trial_does_not_stop_the_others(
-    fake_trial: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failed_trial_does_not_stop_the_others(fake_trial, capsys):
     behaviour, order = fake_trial
     behaviour[1] = RuntimeError("broken")
     set_up_logging()  # as the command line does
@@ -567,14 +552,14 @@ def test_failed_trial_does_not_stop_the_others(
     assert order == [1]
 
 
-def test_busy_trial_comes_last(fake_trial: Any) -> None:
+def test_busy_trial_comes_last(fake_trial):
     behaviour, order = fake_trial
     behaviour[0] = BusyError("another process is at it")
     assert run_trials(sweep()) == 0
     assert order == [1, 2, 0]
 
 
-def test_exit_code_2_only_if_all_failed_for_bad_input(fake_trial: Any) -> None:
+def test_exit_code_2_only_if_all_failed_for_bad_input(fake_trial):
     behaviour, _ = fake_trial
     behaviour.update({seed: InputError("no photos") for seed in range(3)})
     assert run_trials(sweep()) == 2
@@ -582,7 +567,7 @@ def test_exit_code_2_only_if_all_failed_for_bad_input(fake_trial: Any) -> None:
     assert run_trials(sweep()) == 1
 
 
-def test_full_disk_ends_the_sweep(fake_trial: Any) -> None:
+def test_full_disk_ends_the_sweep(fake_trial):
     behaviour, order = fake_trial
     behaviour[0] = DiskFullError("the disk is full")
     with pytest.raises(Exception, match="the disk is full"):
@@ -590,7 +575,7 @@ def test_full_disk_ends_the_sweep(fake_trial: Any) -> None:
     assert order == [0]
 
 
-def test_storage_errors_are_recognised(tmp_path: Path) -> None:
+def test_storage_errors_are_recognised(tmp_path):
     full = [
         "[Errno 28] No space left on device",
         "1200 requested and 304 written",
@@ -609,42 +594,34 @@ def test_storage_errors_are_recognised(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
-def test_verbs_that_write_say_storage_errors_in_one_line(
-    number: int, runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(*arguments: object) -> None:
+def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, refused):
+    def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
     monkeypatch.setattr("gsbench.launch.record.write_json", refuse)
-    assert cli.run(["status", "x", "--forget"]) == 2
-    said = capsys.readouterr().err
+    said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
     assert "plan.json" in said
 
 
 @pytest.mark.skipif(not hasattr(fcntl, "flock"), reason="needs flock")
-def test_a_file_system_without_locks_is_named(
-    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def refuse(descriptor: int, operation: int) -> None:
+def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
+    def refuse(descriptor, operation):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
     monkeypatch.setattr(fcntl, "flock", refuse)
-    assert cli.run(["status", "x", "--forget"]) == 2
-    assert "has no locks" in capsys.readouterr().err
+    assert "has no locks" in refused("status", "x", "--forget")
 
 
-def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
-    runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(runs, monkeypatch):
     values = trial_values()
     finish(values)
     trials = [replace(_composed(), values=values)]
     before = sorted(path for path in runs.rglob("*"))
 
-    def refuse(*arguments: object, **named: object) -> None:
+    def refuse(*arguments, **named):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(runs))
 
     for name in (
@@ -660,7 +637,7 @@ def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(
         run_batch([replace(_composed(), values=trial_values("seed=1"))])
 
 
-def test_lock_is_seen_and_freed(tmp_path: Path) -> None:
+def test_lock_is_seen_and_freed(tmp_path):
     path = tmp_path / "lock"
     assert not is_held(path)
     with hold(path, "work"):

@@ -6,7 +6,6 @@ import csv
 import json
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +16,6 @@ from PIL import Image
 
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.pipeline.steps import evaluate as evaluate_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
@@ -48,9 +46,9 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
         user_code=UserCode(),
         program=None,
     )
-    step = evaluate_step(None, TRAINED, parts)  # type: ignore[arg-type]
+    step = evaluate_step(None, TRAINED, parts)
     parts.program = SimpleNamespace(leaves_model=False)
-    measured = evaluate_step(None, TRAINED, parts)  # type: ignore[arg-type]
+    measured = evaluate_step(None, TRAINED, parts)
     new = {"more", "fps"}
     assert {key: measured.inputs[key] for key in new & measured.inputs.keys()} == {
         key: step.inputs[key] for key in new & step.inputs.keys()
@@ -58,9 +56,7 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
     return dict(step.inputs)
 
 
-def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeypatch):
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
@@ -72,11 +68,11 @@ def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(
     )
 
 
-def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch):
     case, sizes = CASES[-1], []
 
     class Watched(ReferenceRasterizer):
-        def render(self, gaussians: Any, camera: Any, *rest: Any) -> Any:
+        def render(self, gaussians, camera, *rest):
             sizes.append((camera.width, camera.height))
             return super().render(gaussians, camera, *rest)
 
@@ -93,7 +89,7 @@ def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch: pytest.Mon
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+def told(monkeypatch) -> list[tuple[Any, ...]]:
     """The progress that an evaluation reports."""
     told: list[tuple[Any, ...]] = []
     monkeypatch.setattr(
@@ -102,9 +98,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     return told
 
 
-def test_an_evaluation_measures_what_its_pictures_hold(
-    tmp_path: Path, truth: Gaussians, tiny_scene: Scene, told: list[tuple[Any, ...]]
-) -> None:
+def test_an_evaluation_measures_what_its_pictures_hold(tmp_path, truth, tiny_scene, told):
     """Metrics by the formula from the PNG files; the nearest training view by trying all; an
     earlier model's means."""
     store, init = Store(tmp_path), Step(INIT, {}, lambda folder: None)
@@ -135,7 +129,7 @@ def test_an_evaluation_measures_what_its_pictures_hold(
     with (folder / "per_view.csv").open() as stream:
         rows = {row["view"]: row for row in csv.DictReader(stream)}
 
-    def rendered(model: Gaussians, view: View) -> np.ndarray:
+    def rendered(model, view):
         image = (
             ReferenceRasterizer().render(model, view.camera, 3, torch.tensor([0.1, 0.2, 0.3])).image
         )
@@ -180,9 +174,7 @@ def test_an_evaluation_measures_what_its_pictures_hold(
     assert told == [("views", 1, 2), ("views", 2, 2), ("iteration 7", 1, 2), ("iteration 7", 2, 2)]
 
 
-def test_another_programs_renders_are_measured_as_they_are(
-    tmp_path: Path, tiny_scene: Scene, told: list[tuple[Any, ...]]
-) -> None:
+def test_another_programs_renders_are_measured_as_they_are(tmp_path, tiny_scene, told):
     store = Store(tmp_path)
     renders = store.path(TRAINED) / "renders"
     renders.mkdir(parents=True)

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from gsbench.config.compose import compose_one
 from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
@@ -49,7 +47,7 @@ class BareSource(CaptureSource):
         return BARE
 
 
-def test_the_keys_of_a_known_trial_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_keys_of_a_known_trial_stay(tmp_path, monkeypatch):
     """A photographs' trial without cameras: so the keys of the cameras that stand in for them are
     seen as well."""
     monkeypatch.setattr(scene_module, "version_of", lambda package: "4.0.0")

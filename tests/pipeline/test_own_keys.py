@@ -37,7 +37,7 @@ WRAPPED = (
 
 
 @pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def home(tmp_path, monkeypatch) -> Iterator[Path]:
     """The folder in which somebody types."""
     monkeypatch.chdir(tmp_path)
     yield tmp_path
@@ -53,7 +53,7 @@ def _forget() -> None:
 
 
 @pytest.fixture(autouse=True)
-def bare_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+def bare_capture(monkeypatch) -> None:
     monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
 
 
@@ -75,7 +75,7 @@ def moved(one: dict[str, str], other: dict[str, str]) -> set[str]:
     [METRIC, FROM_A_FUNCTION, WITHIN, WRAPPED],
     ids=["plain", "made by a function", "in a class", "wrapped"],
 )
-def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home: Path, text: str) -> None:
+def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home, text):
     words = ["+eval.extra.m._target_=mine.M"]
     found = []
     for value in ("1.0", "2.0", "1.0"):
@@ -85,7 +85,7 @@ def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home: Path,
     assert found[0] == found[2]
 
 
-def test_what_passes_a_class_on_counts_as_well(home: Path) -> None:
+def test_what_passes_a_class_on_counts_as_well(home):
     (home / "mine.py").write_text(METRIC.format("1.0"))
     found = []
     for value in ("3.0", "4.0"):
@@ -104,7 +104,7 @@ def test_what_passes_a_class_on_counts_as_well(home: Path) -> None:
     assert moved(*found) == {"config", "train", "evaluate"}
 
 
-def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home: Path) -> None:
+def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home):
     text = (
         "from dataclasses import dataclass\nfrom gsbench.densify import Volumetric\n"
         "@dataclass(kw_only=True)\nclass Mine(Volumetric):\n    weights: float = 1.0\n    "
@@ -128,9 +128,7 @@ def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home:
     }
 
 
-def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(monkeypatch):
     monkeypatch.setattr(
         "gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited")
     )

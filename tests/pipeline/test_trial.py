@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ from gsbench.runs.trial_folder import TrialFolder
 
 
 @pytest.mark.parametrize("code", [0, None, 3, "text"])
-def test_code_that_ends_the_process_is_a_failure(code: int | str | None, tmp_path: Path) -> None:
+def test_code_that_ends_the_process_is_a_failure(code, tmp_path):
     folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d" / "x")
     folder.path.mkdir(parents=True)
     with (
@@ -46,8 +45,8 @@ def test_code_that_ends_the_process_is_a_failure(code: int | str | None, tmp_pat
     ],
 )
 def test_a_rasterizer_that_cannot_run_or_offer_what_is_asked_is_refused_before_any_work(
-    words: list[str], here: bool, refusal: str | None
-) -> None:
+    words, here, refusal
+):
     parts = Parts(compose_one(["scene=courtyard", "device=cpu", *words]).values)
     if refusal is None:
         parts.check(here)
@@ -56,15 +55,13 @@ def test_a_rasterizer_that_cannot_run_or_offer_what_is_asked_is_refused_before_a
             parts.check(here)
 
 
-def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(monkeypatch):
     monkeypatch.setattr("gsbench.pipeline.parts.available_threads", lambda parallel: 100 + parallel)
     for words, threads in ((["threads=3"], 3), (["threads=auto", "launch.parallel=2"], 102)):
         assert Parts(compose_one(["scene=courtyard", *words]).values).threads == threads
 
 
-def test_only_the_threads_that_are_left_open_are_those_of_the_trial() -> None:
+def test_only_the_threads_that_are_left_open_are_those_of_the_trial():
     for word, threads in (("init.threads=auto", 3), ("init.threads=2", 2)):
         initializer: Any = Parts(
             compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values
@@ -72,19 +69,19 @@ def test_only_the_threads_that_are_left_open_are_those_of_the_trial() -> None:
         assert initializer.threads == threads
 
 
-def test_test_views_are_measured_earlier_where_the_training_comes_by() -> None:
+def test_test_views_are_measured_earlier_where_the_training_comes_by():
     words = ["scene=courtyard", "train.iterations=9", "eval.at=[7,3,9]"]
     assert Parts(compose_one(words).values).measured_earlier == [3, 7]
 
 
-def test_a_configuration_that_nobody_has_composed_may_run_no_more_than_one_that_was() -> None:
+def test_a_configuration_that_nobody_has_composed_may_run_no_more_than_one_that_was():
     values = compose_one(["scene=courtyard"]).values
     Parts(values)
     with pytest.raises(InputError, match="allow_targets"):
         Parts(values | {"densify": values["densify"] | {"_target_": "mine.Mine"}})
 
 
-def test_a_program_must_be_there_only_where_it_runs() -> None:
+def test_a_program_must_be_there_only_where_it_runs():
     command = "densify.command='/nowhere/program {data} {output}'"
     words = [
         "scene=courtyard",
@@ -137,7 +134,7 @@ function = len
 
 
 @pytest.fixture
-def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def own_module(tmp_path, monkeypatch) -> None:
     (tmp_path / "own_classes.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "own_classes", raising=False)
@@ -175,9 +172,7 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("init", {"_target_": "gsbench.init.Random", "count": 0}, "init"),
     ],
 )
-def test_a_part_that_cannot_be_made_is_refused_with_its_setting(
-    own_module: None, group: str, values: dict[str, object], said: str | None
-) -> None:
+def test_a_part_that_cannot_be_made_is_refused_with_its_setting(own_module, group, values, said):
     if said is None:
         made = build(group, values, ["own_classes"])
         assert type(made).__name__ == str(values["_target_"]).rpartition(".")[2]
@@ -190,9 +185,7 @@ def test_a_part_that_cannot_be_made_is_refused_with_its_setting(
 @pytest.mark.parametrize(
     ("name", "sound"), [("Named", True), ("Nameless", False), ("Taken", False)]
 )
-def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(
-    own_module: None, name: str, sound: bool
-) -> None:
+def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module, name, sound):
     values = {"name": "own", "_target_": f"own_classes.{name}"}
     if sound:
         assert build_own_rasterizer(values, ["own_classes"]).name == "named"
@@ -218,7 +211,7 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(
 
 
 @pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])
-def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path: Path, place: str) -> None:
+def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path, place):
     """Whoever sent the folder would choose the file that is written to."""
     trial = compose_one(["scene=courtyard", f"runs={tmp_path / 'runs'}"])
     outside = tmp_path / "outside"

@@ -1,5 +1,7 @@
-"""Compile Triton kernels for GPUs that are not there, with the arguments of real launches, and read
-what came out."""
+"""Compile Triton kernels for GPUs that are not there, and read what came out.
+
+The arguments are those of real launches.
+"""
 
 from __future__ import annotations
 
@@ -50,8 +52,10 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
 
 
 def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, ...]:
-    """What Triton compiles a kernel anew for: types, constants, and which arguments are divisible
-    by 16."""
+    """What Triton compiles a kernel anew for.
+
+    Types, constants, and which arguments are divisible by 16.
+    """
     backend = make_backend(GPUTarget("cuda", compute_capability, 32))
     binder = create_function_from_signature(launch.kernel.signature, launch.kernel.params, backend)
     _, kinds, _ = binder(*launch.arguments, **launch.named)
@@ -97,8 +101,7 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
 
 
 def innermost_loops(text: str) -> dict[str, int]:
-    """Instructions between a label and a branch back to it, where no other such loop lies
-    within."""
+    """Instructions between a label and a branch back to it, of the innermost loops."""
     labels: dict[str, int] = {}
     loops: dict[str, tuple[int, int]] = {}
     place = 0

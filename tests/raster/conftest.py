@@ -1,5 +1,8 @@
-"""Triton's interpreter runs kernels on the CPU. It must be chosen before Triton is imported, so the
-tests that use it run in processes of their own, which ``test_triton.py`` starts."""
+"""Triton's interpreter runs kernels on the CPU.
+
+It must be chosen before Triton is imported, so the tests that use it run in processes of their own,
+which ``test_triton.py`` starts.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,10 @@ INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def interpreter_fault(triton: str, numpy: str) -> str | None:
-    """Why the interpreter of this version of Triton fails with this version of NumPy; None if it
-    works."""
+    """Why the interpreter of this version of Triton fails with this version of NumPy.
+
+    None if it works.
+    """
     versions = [
         tuple(int(number) for number in re.findall(r"\d+", text)[:2]) for text in (triton, numpy)
     ]
@@ -27,10 +32,10 @@ collect_ignore = [] if INTERPRETING else ["test_triton_interpreted.py"]
 
 
 def _patch_once() -> None:
-    """Let the interpreter patch Triton's language once for each module, instead of at every call of
-    a function.
+    """Let the interpreter patch Triton's language once for each module.
 
-    That is most of its time; the patches of calls within a kernel are never taken back anyway.
+    Otherwise it does at every call of a function. That is most of its time; the patches of calls
+    within a kernel are never taken back anyway.
     """
     from triton.runtime import interpreter
 

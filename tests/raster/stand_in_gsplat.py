@@ -1,9 +1,9 @@
-"""A stand-in for the module ``gsplat`` on the CPU: the signatures, shapes and habits that the CUDA
-code of 1.5 has; `head` is that of 1.6.
+"""A stand-in for the module ``gsplat`` on the CPU.
 
-Projection, crossings and harmonics are gsplat's own torch definitions. Compositing is written here
-in plain torch, behind an autograd function that saves the means it was given and leaves the
-absolute gradient on them, as gsplat's does.
+The signatures, shapes and habits that the CUDA code of 1.5 has; `head` is that of 1.6. Projection,
+crossings and harmonics are gsplat's own torch definitions. Compositing is written here in plain
+torch, behind an autograd function that saves the means it was given and leaves the absolute
+gradient on them, as gsplat's does.
 """
 
 from __future__ import annotations
@@ -79,8 +79,10 @@ def spherical_harmonics(
 
 
 def head() -> SimpleNamespace:
-    """gsplat 1.6, as far as it differs: its harmonics find the camera in the pose, and check every
-    shape."""
+    """gsplat 1.6, as far as it differs.
+
+    Its harmonics find the camera in the pose, and check every shape.
+    """
 
     def spherical_harmonics(
         degrees_to_use: int,
@@ -128,8 +130,10 @@ def rasterize_to_pixels(
 
 
 class _Rasterize(torch.autograd.Function):
-    """The picture again in ``backward``, with a copy of the means for each pixel: absolute values
-    can be summed."""
+    """The picture again in ``backward``, with a copy of the means for each pixel.
+
+    Absolute values can be summed.
+    """
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
@@ -169,8 +173,10 @@ def _composite(
     backgrounds: Tensor,
     settings: Any,
 ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-    """Image [1, H, W, 3], alpha [1, H, W, 1], and a tile's Gaussians [K] with copies of their means
-    [P, K, 2]."""
+    """Image [1, H, W, 3] and alpha [1, H, W, 1].
+
+    And a tile's Gaussians [K] with copies of their means [P, K, 2].
+    """
     width, height, tile, offsets, members, _ = settings
     bounds = [*offsets.flatten().tolist(), len(members)]
     tiles_x = offsets.shape[-1]

@@ -1,5 +1,7 @@
-"""The CPU kernels as machine code for processors that are not here: every one compiles, with vector
-instructions."""
+"""The CPU kernels as machine code for processors that are not here.
+
+Every one compiles, with vector instructions.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,7 @@ FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles
 
 @cache
 def kernels() -> dict[str, Any]:
-    """The kernels of a training step and of a footprint, by name, as one such step has called
-    them."""
+    """The kernels of a training step and of a footprint, by name, after one such step."""
     case = Case(33, 49, 50, sh_degree=3)
     trainable = TrainableGaussians(case.gaussians().map(torch.Tensor.float), LearningRates(), 1.0)
     output = CpuRasterizer(threads=1).render(trainable.values, case.camera(), 3, torch.zeros(3))

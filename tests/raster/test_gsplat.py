@@ -1,5 +1,7 @@
-"""The adapter on gsplat, without a GPU: on a stand-in with gsplat's signatures, against the float64
-reference."""
+"""The adapter on gsplat, without a GPU.
+
+On a stand-in with gsplat's signatures, against the float64 reference.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,6 @@ import pytest
 import torch
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster import CONSTANTS
 from gsbench.raster.contract import Case, departures, render_with_gradients
 from gsbench.raster.gsplat import GsplatRasterizer, _DeviceCamera, _reaches_image, _square_radii
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
@@ -95,8 +96,10 @@ def test_screen_points_have_a_gradient_though_nothing_else_wants_one(library: Mo
 
 
 def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
-    """Without the garbage collector: a cycle through the graph would keep 60 MB a step at a million
-    Gaussians."""
+    """Without the garbage collector.
+
+    A cycle through the graph would keep 60 MB a step at a million Gaussians.
+    """
     rasterizer = GsplatRasterizer(library=library)
     camera, black = FAINT.camera(), torch.zeros(3)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
@@ -182,7 +185,7 @@ def test_square_radii_are_those_of_the_reference() -> None:
 def test_reach_agrees_with_the_tiles_of_the_reference() -> None:
     camera = front_camera(64, 48)
     projected = project(random_gaussians(300, seed=6, log_scale=(-4, 0)), camera)
-    low, high = tile_rectangles(projected, camera, CONSTANTS.tile)
+    low, high = tile_rectangles(projected, camera)
     reached = ((high - low) > 0).all(-1)
     ours = _reaches_image(projected.means + 0.5, projected.radii, 64, 48)
     assert (ours | ~reached).all()  # whatever reaches a tile there reaches the image here

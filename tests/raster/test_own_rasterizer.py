@@ -1,5 +1,7 @@
-"""A rasterizer from a file outside gsbench: that of docs/rasterizer.md, in the real program and by
-the contract."""
+"""A rasterizer from a file outside gsbench.
+
+That of docs/rasterizer.md, in the real program and by the contract.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The reference rasterizer against finite differences, a pixel-by-pixel restatement, and gsplat's
-own torch code."""
+"""The reference rasterizer against finite differences, a restatement and gsplat's torch code."""
 
 from __future__ import annotations
 
@@ -111,10 +110,8 @@ def test_matches_brute_force(shift: tuple[float, float]) -> None:
     gaussians = random_gaussians(60, seed=3, log_scale=(-3.5, -0.5))
     # opaque ones reach both the clamp of alpha and the early stop
     gaussians.opacity_logits[:8] = 6.0
-    camera, background = (
-        front_camera(37, 21, shift),
-        torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64),
-    )
+    camera = front_camera(37, 21, shift)
+    background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     out = ReferenceRasterizer().render(gaussians, camera, 0, background)
     image, alpha, covered = brute_force(gaussians, camera, background.numpy())
     np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
@@ -168,8 +165,10 @@ def test_gradients_match_finite_differences(degree: int) -> None:
 
 
 def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
-    """Moving the principal point moves every projected mean alike: the sum of the screen gradients
-    says by how much."""
+    """Moving the principal point moves every projected mean alike.
+
+    The sum of the screen gradients says by how much.
+    """
     gaussians = random_gaussians(30, seed=5)
     background = torch.zeros(3, dtype=torch.float64)
 
@@ -197,10 +196,8 @@ def test_projection_matches_gsplat() -> None:
     )
     gaussians, camera = random_gaussians(200, seed=7), front_camera(64, 48)
     matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = (
-        torch.from_numpy(camera.rotation),
-        torch.from_numpy(camera.translation),
-    )
+    matrix[:3, :3] = torch.from_numpy(camera.rotation)
+    matrix[:3, 3] = torch.from_numpy(camera.translation)
     intrinsics = torch.tensor(
         [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
     )

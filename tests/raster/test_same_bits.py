@@ -1,7 +1,7 @@
-"""Three runs of a step with raster=triton and its loss kernel give the same bits: on a GPU, or
-interpreted if tiny.
+"""Three runs of a step with raster=triton and its loss kernel give the same bits.
 
-The runs are on new memory, on used memory, and by new objects with new memory pools.
+On a GPU, or interpreted if tiny. The runs are on new memory, on used memory, and by new objects
+with new memory pools.
 """
 
 from __future__ import annotations

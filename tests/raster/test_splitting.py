@@ -1,5 +1,4 @@
-"""Splitting matrices against second derivatives that autograd takes of the definition, and against
-splits."""
+"""Splitting matrices against second derivatives by autograd, and against splits."""
 
 from __future__ import annotations
 
@@ -40,8 +39,10 @@ def heights(pixels: Tensor, mean: Tensor, conic: Tensor, opacity: Tensor) -> Ten
 
 
 class Slow:
-    """A case composited pixel by pixel from the heights of its Gaussians, and its loss: a fixed
-    weighting."""
+    """A case composited pixel by pixel from the heights of its Gaussians, and its loss.
+
+    A fixed weighting.
+    """
 
     def __init__(self, case: Case) -> None:
         self.case, self.camera, self.gaussians = case, case.camera(), case.gaussians()
@@ -65,15 +66,14 @@ class Slow:
         self.linear = [
             jacobian(lambda point: image_of(self.camera, point), mean) for mean in self.means
         ]
-        first, past = tile_rectangles(self.projected, self.camera, CONSTANTS.tile)  # [M, 2]
+        first, past = tile_rectangles(self.projected, self.camera)  # [M, 2]
         tiles = (self.pixels // CONSTANTS.tile).unsqueeze(0)  # [1, P, 2]
         self.reached = ((tiles >= first.unsqueeze(1)) & (tiles < past.unsqueeze(1))).all(
             -1
         )  # [M, P] as far as it goes
 
     def height(self, k: int, displacement: Tensor) -> Tensor:
-        """Of the k-th projected Gaussian, moved by ``displacement`` [3] in the world, linearly on
-        the image."""
+        """Of the k-th projected Gaussian, moved by ``displacement`` [3], linearly on the image."""
         moved = self.projected.means[k] + self.linear[k] @ displacement
         return heights(
             self.pixels,
@@ -88,12 +88,12 @@ class Slow:
         )
 
     def loss(self, s: Tensor) -> Tensor:
-        """Of heights [M, P]. The clamp to .99 passes the gradient; the heights decide what is
-        skipped."""
-        colour, through = (
-            torch.zeros(len(self.pixels), 3).double(),
-            torch.ones(len(self.pixels)).double(),
-        )
+        """Of heights [M, P].
+
+        The clamp to .99 passes the gradient; the heights decide what is skipped.
+        """
+        colour = torch.zeros(len(self.pixels), 3).double()
+        through = torch.ones(len(self.pixels)).double()
         alive = torch.ones(len(self.pixels), dtype=torch.bool)
         for k in self.order:
             alpha = s[k] + (s[k].detach().clamp_max(CONSTANTS.alpha_max) - s[k].detach())
@@ -122,8 +122,7 @@ class Slow:
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) -> None:
-    """The definition of the paper, one Gaussian at a time, with all derivatives taken by
-    autograd."""
+    """The paper's definition, one Gaussian at a time, all derivatives by autograd."""
     slow = Slow(case)
     s = slow.all_heights().detach().requires_grad_()
     (gradient,) = torch.autograd.grad(slow.loss(s), s)

@@ -1,5 +1,7 @@
-"""What executors share: checks of their inputs, reads from a device that do not wait, and the node
-of autograd."""
+"""What executors share.
+
+Checks of their inputs, reads from a device that do not wait, and the node of autograd.
+"""
 
 from __future__ import annotations
 
@@ -72,10 +74,8 @@ class Recording(StagedRasterizer[str]):
 
 
 def test_gradients_reach_the_stage_and_come_back() -> None:
-    rasterizer, leaves = (
-        Recording(),
-        random_gaussians(2).map(lambda tensor: tensor.requires_grad_()),
-    )
+    rasterizer = Recording()
+    leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     background = BLACK.clone().requires_grad_()
     output = rasterizer.render(leaves, camera(), 1, background, True, splitting_matrix=True)
     assert not output.radii.requires_grad
@@ -94,10 +94,8 @@ def test_gradients_reach_the_stage_and_come_back() -> None:
 
 
 def test_the_opacity_alone_may_be_differentiated() -> None:
-    rasterizer, leaves = (
-        Recording(),
-        random_gaussians(2).map(lambda tensor: tensor.requires_grad_()),
-    )
+    rasterizer = Recording()
+    leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
     ((_, _, request, g_image, g_alpha, want_splitting),) = rasterizer.calls
     assert g_image.shape == (3, 4, 3)
@@ -109,11 +107,9 @@ def test_the_opacity_alone_may_be_differentiated() -> None:
 
 
 def test_a_footprint_gets_the_frame_and_values() -> None:
-    rasterizer, leaves, view = (
-        Recording(),
-        random_gaussians(2).map(lambda tensor: tensor.requires_grad_()),
-        camera(),
-    )
+    rasterizer = Recording()
+    leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
+    view = camera()
     output = rasterizer.render(leaves, view, 1, BLACK)
     values = torch.ones(3, 4)
     output.require_footprint(values)

@@ -1,5 +1,7 @@
-"""The Triton rasterizer without a GPU: its tests in Triton's interpreter, each part in a process of
-its own."""
+"""The Triton rasterizer without a GPU.
+
+Its tests in Triton's interpreter, each part in a process of its own.
+"""
 
 from __future__ import annotations
 

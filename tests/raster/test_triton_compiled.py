@@ -1,5 +1,4 @@
-"""The Triton kernels compiled for GPUs that are not here, and what a step asks of the device beside
-them."""
+"""The Triton kernels compiled for GPUs that are not here, and what else a step asks of one."""
 
 from __future__ import annotations
 
@@ -44,8 +43,10 @@ WAITING = (
 
 
 class Answer:
-    """In place of `gsbench.raster.staged.Readback`: as if 2 rows of blocks and 7 pairs had been
-    counted."""
+    """In place of `gsbench.raster.staged.Readback`.
+
+    As if 2 rows of blocks and 7 pairs had been counted.
+    """
 
     asked = 0
 
@@ -81,11 +82,7 @@ def step(
     return gaussians, output
 
 
-@pytest.mark.parametrize(
-    "target",
-    TARGETS,
-    ids="sm_{}".format,
-)
+@pytest.mark.parametrize("target", TARGETS, ids="sm_{}".format)
 def test_kernels_compile_without_spills(
     launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,8 +115,10 @@ def test_kernels_compile_without_spills(
 
 
 def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
-    """Numbers of Gaussians, units and pixels change all the time; no kernel may be special to one
-    of them."""
+    """Numbers of Gaussians, units and pixels change all the time.
+
+    No kernel may be special to one of them.
+    """
     cases = (Case(33, 49, 50, 3), Case(32, 48, 64, 3), Case(1, 16, 1, 3))
     for case in cases:
         step(case)
@@ -135,8 +134,7 @@ def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
     "size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str
 )
 def test_a_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
-    """The fullest filters fewer rows than with programs of 32 rows, and few are idle that a smaller
-    one would fill."""
+    """The fullest filters fewer rows than with programs of 32 rows, and few are idle."""
     strips = -(-3 * size[0] // STRIP)
 
     def counted(rows: int) -> tuple[int, int]:
@@ -177,8 +175,10 @@ class Watch(TorchDispatchMode):
 
 
 def test_a_step_waits_once(launches: list[Launch]) -> None:
-    """On torch's device "meta", whose tensors have no values: reading one raises, copying one is
-    seen."""
+    """On torch's device "meta", whose tensors have no values.
+
+    Reading one raises, copying one is seen.
+    """
     gaussians = CASE.gaussians().map(lambda tensor: tensor.float().to("meta").requires_grad_())
     background = torch.zeros(3, device="meta")
     target = torch.zeros(CASE.height, CASE.width, 3, dtype=torch.uint8, device="meta")

@@ -42,7 +42,7 @@ TUNING = {
 }
 
 
-def test_experiments_are_folders_that_are_not_hidden(tmp_path: Path) -> None:
+def test_experiments_are_folders_that_are_not_hidden(tmp_path):
     assert list_experiments(tmp_path / "nowhere") == []
     for name in ("b", "a/scene/arm/trial", ".hidden", "store", "a/scene/.hidden/trial"):
         (tmp_path / name).mkdir(parents=True)
@@ -55,7 +55,7 @@ def test_experiments_are_folders_that_are_not_hidden(tmp_path: Path) -> None:
         experiment_home(tmp_path, "c")
 
 
-def test_the_folder_of_an_experiment_is_made_but_no_link(tmp_path: Path) -> None:
+def test_the_folder_of_an_experiment_is_made_but_no_link(tmp_path):
     make_home(tmp_path / "runs" / "x")
     make_home(tmp_path / "runs" / "x")
     assert (tmp_path / "runs" / "x").is_dir()
@@ -69,7 +69,7 @@ def tuning(tmp_path: Path, **changes: Any) -> Any:
     return read_typed(tmp_path / "tuning.json", TuningRecord)
 
 
-def test_the_best_point_is_the_one_with_the_best_value(tmp_path: Path) -> None:
+def test_the_best_point_is_the_one_with_the_best_value(tmp_path):
     assert tuning(tmp_path).best.value == 4.0
     assert tuning(tmp_path, direction=-1).best.value == 2.0
     assert (
@@ -89,7 +89,7 @@ def test_the_best_point_is_the_one_with_the_best_value(tmp_path: Path) -> None:
         ([{"settings": {"x": -1}, "value": 1.0}], "not above 0"),
     ],
 )
-def test_a_search_that_cannot_be_is_damaged(tmp_path: Path, points: list[Any], fault: str) -> None:
+def test_a_search_that_cannot_be_is_damaged(tmp_path, points, fault):
     with pytest.raises(DamagedError, match=fault):
         tuning(tmp_path, points=points)
     if "above" in fault:
@@ -101,7 +101,7 @@ def declared(hour: int, *metrics: str, **values: Any) -> Declaration:
     return Declaration(time=f"1970-01-01T{hour:02d}:00:00Z", questions=questions, **values)
 
 
-def test_a_declaration_knows_its_time_and_its_metric() -> None:
+def test_a_declaration_knows_its_time_and_its_metric():
     one = declared(2, "psnr@extrapolation", "ssim")
     assert one.moment == 7200
     assert one.when == "1970-01-01 02:00 UTC"
@@ -116,7 +116,7 @@ def test_a_declaration_knows_its_time_and_its_metric() -> None:
         Declaration(time="yesterday")
 
 
-def test_planned_trials_are_those_of_the_declaration_and_of_its_questions() -> None:
+def test_planned_trials_are_those_of_the_declaration_and_of_its_questions():
     asked = Question(metric="psnr", scenes={"garden": ("garden/a/1", "garden/b/2")}, seeds=(1, 0))
     both = Declaration(
         time=declared(1).time, questions=(asked,), trials={"garden/a/1": (2,), "room/a/1": (0,)}
@@ -132,7 +132,7 @@ def test_planned_trials_are_those_of_the_declaration_and_of_its_questions() -> N
     assert [one.names_trials for one in named] == [False, True, False, True]
 
 
-def test_a_declaration_is_in_force_since_its_first_equal(tmp_path: Path) -> None:
+def test_a_declaration_is_in_force_since_its_first_equal(tmp_path):
     first, second, third = (
         declared(1, "psnr"),
         declared(2, "psnr"),
@@ -148,7 +148,7 @@ def test_a_declaration_is_in_force_since_its_first_equal(tmp_path: Path) -> None
     assert latest_declaration([other, first, second, third]) is first
 
 
-def test_declarations_are_kept_in_the_order_of_time(tmp_path: Path) -> None:
+def test_declarations_are_kept_in_the_order_of_time(tmp_path):
     first, second = declared(1, "psnr"), declared(2, "ssim", looks=(2, 3))
     assert read_declarations(tmp_path) == []
     text = record_text([second, first])

@@ -8,7 +8,7 @@ import importlib.util
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -70,7 +70,7 @@ BESIDE: dict[str, tuple[str, ...]] = {
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def package(tmp_path, monkeypatch) -> Iterator[Path]:
     """A copy of gsbench that is not the one that runs, without files of a release, read as by a new
     process."""
     copy = shutil.copytree(
@@ -99,7 +99,7 @@ def again() -> None:
         lambda text: text.replace("0.8", "0.80"),
     ],
 )
-def test_comments_docstrings_and_layout_do_not_count(edit: Callable[[str], str]) -> None:
+def test_comments_docstrings_and_layout_do_not_count(edit):
     assert edit(SOURCE) != SOURCE
     assert syntax_of(edit(SOURCE).encode()) == syntax_of(SOURCE.encode())
 
@@ -117,12 +117,12 @@ def test_comments_docstrings_and_layout_do_not_count(edit: Callable[[str], str])
         lambda text: text + "(",
     ],
 )
-def test_whatever_can_change_a_number_counts(edit: Callable[[str], str]) -> None:
+def test_whatever_can_change_a_number_counts(edit):
     assert syntax_of(edit(SOURCE).encode()) != syntax_of(SOURCE.encode())
 
 
 @pytest.mark.parametrize("stage", ROOMS)
-def test_the_table_has_all_rooms_that_a_stage_imports(stage: str) -> None:
+def test_the_table_has_all_rooms_that_a_stage_imports(stage):
     known = (
         *ROOMS[stage],
         *BESIDE[stage],
@@ -136,12 +136,12 @@ def test_the_table_has_all_rooms_that_a_stage_imports(stage: str) -> None:
             assert any(file == room or file.startswith(f"{room}/") for room in known), file
 
 
-def test_rooms_are_there() -> None:
+def test_rooms_are_there():
     for room in {room for rooms in ROOMS.values() for room in rooms}:
         assert (PACKAGE / room).exists(), room
 
 
-def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path) -> None:
+def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package):
     before = states_of(ROOMS["train"])
     assert changed_rooms(before) == []
     loss = package / "train" / "loss.py"
@@ -162,9 +162,7 @@ def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package: Path)
     assert changed_rooms({"gone": "0"}) == ["gone"]
 
 
-def test_where_all_is_as_released_nothing_is_in_the_key(
-    package: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_all_is_as_released_nothing_is_in_the_key(package, monkeypatch):
     # before the first release
     assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])
     script("released").main()
@@ -188,7 +186,7 @@ def test_where_all_is_as_released_nothing_is_in_the_key(
     assert changed_rooms(released) == []
 
 
-def test_an_edit_while_this_process_works_is_told(package: Path) -> None:
+def test_an_edit_while_this_process_works_is_told(package):
     states_of(["train", "scene"])
     assert changed_since_asked(["train", "scene"]) == []
     with (package / "train" / "loss.py").open("a") as file:
@@ -203,7 +201,7 @@ CLASS = "class Mine: ...\n"
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def home(tmp_path, monkeypatch) -> Iterator[Path]:
     """A folder in which somebody types, whose modules are allowed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -228,7 +226,7 @@ def values_of(
     }
 
 
-def test_a_users_class_has_all_modules_that_were_allowed(home: Path) -> None:
+def test_a_users_class_has_all_modules_that_were_allowed(home):
     for name in ("own_code", "helper", "unrelated"):
         (home / f"{name}.py").write_text(CLASS)
     assert user_modules(values_of("gsbench.densify.ADC")) == {}
@@ -238,7 +236,7 @@ def test_a_users_class_has_all_modules_that_were_allowed(home: Path) -> None:
     assert user_modules(values_of("nowhere_to_be_found.X", allowed=("bash", "json", "yaml"))) == {}
 
 
-def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home: Path) -> None:
+def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home):
     (home / "pack" / "inner").mkdir(parents=True)
     (home / "pack" / "folder.py").mkdir()
     files = {
@@ -259,7 +257,7 @@ def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home: Path) -> N
     assert module_digest("pack") == first
 
 
-def test_an_imported_file_is_taken_as_it_was_until_it_is_loaded_again(home: Path) -> None:
+def test_an_imported_file_is_taken_as_it_was_until_it_is_loaded_again(home):
     own = home / "own_code.py"
     for text in ("A = 1\n", "A = 2\n"):  # not imported yet
         own.write_text(text)
@@ -275,7 +273,7 @@ def test_an_imported_file_is_taken_as_it_was_until_it_is_loaded_again(home: Path
     assert not has_changed_since_import("own_code")
 
 
-def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(home: Path) -> None:
+def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(home):
     (home / "own_code.py").write_text(CLASS)
     importlib.import_module("own_code")
     other = home / "elsewhere"
@@ -287,7 +285,7 @@ def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(
     assert module_digest("own_code", str(home)) is None
 
 
-def test_what_was_imported_and_is_not_named_is_told(home: Path) -> None:
+def test_what_was_imported_and_is_not_named_is_told(home):
     (home / "own_code.py").write_text(
         "import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS
     )
@@ -299,7 +297,7 @@ def test_what_was_imported_and_is_not_named_is_told(home: Path) -> None:
     assert unnamed_modules(before, {"own_code", "helper"}) == ["late"]
 
 
-def test_a_module_whose_file_is_gone_has_no_digest(tmp_path: Path) -> None:
+def test_a_module_whose_file_is_gone_has_no_digest(tmp_path):
     spec = importlib.util.spec_from_file_location("passing", tmp_path / "passing.py")
     assert spec is not None
     assert keys._digest_on_disk(spec) is None
@@ -307,7 +305,7 @@ def test_a_module_whose_file_is_gone_has_no_digest(tmp_path: Path) -> None:
     assert keys._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
 
 
-def test_a_file_that_has_just_come_is_found(home: Path) -> None:
+def test_a_file_that_has_just_come_is_found(home):
     """Python keeps the list of a folder's files as long as the folder has the same time."""
     assert module_digest("own_code") is None
     state = home.stat()
@@ -322,15 +320,15 @@ def test_a_file_that_has_just_come_is_found(home: Path) -> None:
 @pytest.mark.parametrize(
     ("one", "other"), [("f()", "g()"), ("1", "2"), ("if a:\n 'x'", "if a:\n 'y'")]
 )
-def test_only_docstrings_are_left_out(one: str, other: str) -> None:
+def test_only_docstrings_are_left_out(one, other):
     assert syntax_of(one.encode()) != syntax_of(other.encode())
 
 
-def test_a_digest_of_a_room_is_short() -> None:
+def test_a_digest_of_a_room_is_short():
     assert {len(state) for state in edited(states_of(ROOMS["evaluate"])).values()} <= {16}
 
 
-def test_flat_settings_keep_empty_groups_only_if_asked() -> None:
+def test_flat_settings_keep_empty_groups_only_if_asked():
     nested = {"a": {"b": 1, "c": {}}, "d": {"e": {"f": None}}}
     assert flatten(nested) == {"a.b": 1, "d.e.f": None}
     assert flatten(nested, keep_empty=True) == {"a.b": 1, "a.c": {}, "d.e.f": None}
@@ -346,7 +344,7 @@ class Own:
     hidden: int = field(default=0, init=False)
 
 
-def test_a_users_class_enters_a_key_with_its_code_and_all_its_options() -> None:
+def test_a_users_class_enters_a_key_with_its_code_and_all_its_options():
     user = UserCode({"tests": "0abc"}, {"densify": "tests.Own", "eval.extra.own": "gsbench.X"})
     options = {"threads": 2, "place": "a", "pair": [1, 2]}
     named = {"class": "tests.runs.test_keys.Own", "source": {"tests": "0abc"}} | options
@@ -368,7 +366,7 @@ def test_a_users_class_enters_a_key_with_its_code_and_all_its_options() -> None:
     }
 
 
-def test_a_rasterizer_enters_a_key_by_its_name_or_as_a_users_class() -> None:
+def test_a_rasterizer_enters_a_key_by_its_name_or_as_a_users_class():
     rasterizer = SimpleNamespace(name="cpu")  # defined outside gsbench
     assert rasterizer_inputs(rasterizer, UserCode({"m": "1"})) == {
         "name": "cpu",
@@ -378,9 +376,7 @@ def test_a_rasterizer_enters_a_key_by_its_name_or_as_a_users_class() -> None:
     assert rasterizer_inputs(Stage("cpu", 1)) == "cpu"
 
 
-def test_a_step_has_the_rooms_that_differ_and_asks_for_edits_only_of_processes(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_has_the_rooms_that_differ_and_asks_for_edits_only_of_processes(home, monkeypatch):
     monkeypatch.setattr(keys, "states_of", lambda rooms: {"scene": "released", "init": "1234"})
     monkeypatch.setattr(keys, "changed_since_asked", lambda rooms: ["init"])
     (home / "own_code.py").write_text(CLASS)

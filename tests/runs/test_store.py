@@ -34,11 +34,11 @@ def refuse(folder: Path) -> None:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path) -> Store:
     return Store(tmp_path / "store")
 
 
-def test_second_request_is_not_built(store: Store) -> None:
+def test_second_request_is_not_built(store):
     first = store.get(Step(LETTERS, {"x": 1}, write_letters))
     second = store.get(Step(LETTERS, {"x": 1}, refuse))
     assert not first.cached
@@ -48,8 +48,8 @@ def test_second_request_is_not_built(store: Store) -> None:
     assert second.seconds == first.seconds
 
 
-def test_what_other_code_may_have_built_is_not_kept(store: Store) -> None:
-    def changed() -> None:
+def test_what_other_code_may_have_built_is_not_kept(store):
+    def changed():
         raise InputError("the code was edited meanwhile")
 
     with pytest.raises(InputError, match="edited meanwhile"):
@@ -59,7 +59,7 @@ def test_what_other_code_may_have_built_is_not_kept(store: Store) -> None:
     assert store.get(Step(LETTERS, {"x": 1}, refuse, check=changed)).cached  # nothing was built now
 
 
-def test_every_input_and_the_version_make_another_key(store: Store) -> None:
+def test_every_input_and_the_version_make_another_key(store):
     keys = {
         LETTERS.key({"x": 1}),
         LETTERS.key({"x": 2}),
@@ -74,9 +74,7 @@ def test_every_input_and_the_version_make_another_key(store: Store) -> None:
 
 @pytest.mark.parametrize("name", ["a.txt", "sub/b.bin", MANIFEST])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
-def test_damage_is_named_and_mended(
-    store: Store, name: str, damage: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damage_is_named_and_mended(store, name, damage, caplog):
     path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path / name
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 4
@@ -95,7 +93,7 @@ def test_damage_is_named_and_mended(
     assert not list(store.root.glob("*/.*.removed"))
 
 
-def test_damage_is_removed_over_what_a_killed_removal_left(store: Store) -> None:
+def test_damage_is_removed_over_what_a_killed_removal_left(store):
     path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     left = path.with_name(f".{path.name}.removed")
     left.mkdir()
@@ -105,7 +103,7 @@ def test_damage_is_removed_over_what_a_killed_removal_left(store: Store) -> None
     assert not left.exists()
 
 
-def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store: Store) -> None:
+def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store):
     folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     path = folder / "a.txt"
     state = path.stat()
@@ -120,7 +118,7 @@ def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store: Stor
         read_manifest(folder)
 
 
-def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store: Store) -> None:
+def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store):
     folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     sound = (folder / MANIFEST).read_bytes()
     rng = random.Random(0)
@@ -148,7 +146,7 @@ def flip_a_bit(path: Path) -> None:
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
 
 
-def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store: Store) -> None:
+def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store):
     folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     flip_a_bit(folder / "a.txt")
     read_manifest(folder)
@@ -156,9 +154,7 @@ def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store: Stor
         read_manifest(folder, thorough=True)
 
 
-def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(
-    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(store, monkeypatch, caplog):
     step = Step(LETTERS, {"x": 1}, write_letters)
     path = store.get(step).path / "sub" / "b.bin"
     flip_a_bit(path)
@@ -178,14 +174,14 @@ def compare_no_checksums(folder: Path, thorough: bool = False) -> Manifest:
     return read_manifest(folder)
 
 
-def test_a_copy_of_the_store_is_believed_by_content(store: Store, tmp_path: Path) -> None:
+def test_a_copy_of_the_store_is_believed_by_content(store, tmp_path):
     folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
     os.utime(folder / "a.txt", ns=(1, 1))  # what copying does
     assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
 
 
-def test_failed_build_is_not_published_and_starts_afresh(store: Store) -> None:
-    def fail(folder: Path) -> None:
+def test_failed_build_is_not_published_and_starts_afresh(store):
+    def fail(folder):
         (folder / "half.txt").write_text("half")
         raise RuntimeError("no")
 
@@ -195,10 +191,10 @@ def test_failed_build_is_not_published_and_starts_afresh(store: Store) -> None:
     assert not (store.get(Step(LETTERS, {"x": 1}, write_letters)).path / "half.txt").exists()
 
 
-def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -> None:
+def test_resumable_build_finds_what_was_left_without_temporaries(store):
     stage = Stage("long", 1, resumable=True, scratch=("*.scratch",))
 
-    def half(folder: Path) -> None:
+    def half(folder):
         (folder / "half.txt").write_text("half")
         (folder / ".torn.tmp-123").write_text("to")
         (folder / "work.scratch").write_text("needed until published")
@@ -207,7 +203,7 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -
     with pytest.raises(KeyboardInterrupt):
         store.get(Step(stage, {}, half))
 
-    def rest(folder: Path) -> None:
+    def rest(folder):
         assert {path.name for path in folder.iterdir()} == {"half.txt", "work.scratch"}
         (folder / "rest.txt").write_text("rest")
 
@@ -216,7 +212,7 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store: Store) -
     assert set(read_manifest(entry.path).outputs) == {"half.txt", "rest.txt"}
 
 
-def test_a_killed_build_goes_on_without_its_links_and_its_torn_manifest(store: Store) -> None:
+def test_a_killed_build_goes_on_without_its_links_and_its_torn_manifest(store):
     stage, seen = Stage("long", 1, resumable=True), list[tuple[Stage, Path]]()
     step = Step(stage, {}, lambda folder: None)
     partial = store.partial(stage, step.key)
@@ -233,8 +229,8 @@ def test_a_killed_build_goes_on_without_its_links_and_its_torn_manifest(store: S
 
 
 def test_files_are_on_the_disk_before_their_manifest_and_the_folder_after_it_is_named(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    store, monkeypatch
+):
     synced: list[tuple[str, bool]] = []
     note = lambda path: synced.append((path.name, (path.parent / MANIFEST).exists()))  # noqa: E731
     monkeypatch.setattr("gsbench.runs.store.sync_to_disk", note)
@@ -242,7 +238,7 @@ def test_files_are_on_the_disk_before_their_manifest_and_the_folder_after_it_is_
     assert synced == [("a.txt", False), ("b.bin", False), ("letters", False)]
 
 
-def test_killed_between_manifest_and_rename_is_only_published(store: Store) -> None:
+def test_killed_between_manifest_and_rename_is_only_published(store):
     entry = store.get(Step(LETTERS, {"x": 1}, write_letters))
     os.replace(entry.path, store.partial(LETTERS, entry.key))
     again = store.get(Step(LETTERS, {"x": 1}, refuse))
@@ -250,7 +246,7 @@ def test_killed_between_manifest_and_rename_is_only_published(store: Store) -> N
     assert store.find(Step(LETTERS, {"x": 1}, refuse)) is not None
 
 
-def test_sweep_removes_leftovers_and_leaves_what_serves(store: Store) -> None:
+def test_sweep_removes_leftovers_and_leaves_what_serves(store):
     long = Stage("long", 1, resumable=True)
     entry = store.get(Step(long, {"x": 1}, write_letters))
     stale = store.partial(long, entry.key)
@@ -279,7 +275,7 @@ def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.slow
-def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -> None:
+def test_killed_at_random_moments_the_work_is_finished_and_right(store):
     """SIGKILL a process that builds three results, again and again; nothing torn is ever
     published."""
     rng = random.Random(1)
@@ -317,7 +313,7 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store: Store) -
 
 
 @pytest.mark.slow
-def test_rivals_do_the_work_once_and_say_what_they_wait_for(store: Store) -> None:
+def test_rivals_do_the_work_once_and_say_what_they_wait_for(store):
     processes = [toy(store, 1, "--slow") for _ in range(4)]
     results = [process.communicate(timeout=300) for process in processes]
     assert [process.returncode for process in processes] == [0, 0, 0, 0]
@@ -326,7 +322,7 @@ def test_rivals_do_the_work_once_and_say_what_they_wait_for(store: Store) -> Non
     assert any("waiting for toy" in err and "process" in err for err in waiting)
 
 
-def test_killed_rival_frees_its_lock(store: Store) -> None:
+def test_killed_rival_frees_its_lock(store):
     first = toy(store, 1, "--slow")
     key = TOY.key(toy_inputs(0))
     deadline = time.monotonic() + 20
@@ -342,7 +338,7 @@ def test_killed_rival_frees_its_lock(store: Store) -> None:
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
+def small_disk(tmp_path):
     """A file system of one MiB; the test is skipped where this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -358,11 +354,11 @@ def small_disk(tmp_path: Path):  # type: ignore[no-untyped-def]
     subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_full_disk_is_one_line_and_corrupts_nothing(small_disk: Path) -> None:
+def test_full_disk_is_one_line_and_corrupts_nothing(small_disk):
     store = Store(small_disk / "store")
     sound = store.get(Step(LETTERS, {"x": 1}, write_letters))
 
-    def big(folder: Path) -> None:
+    def big(folder):
         (folder / "big.bin").write_bytes(bytes(2 << 20))
 
     with pytest.raises(DiskFullError, match=r"is full: free some space") as caught:
@@ -374,7 +370,7 @@ def test_full_disk_is_one_line_and_corrupts_nothing(small_disk: Path) -> None:
     assert not store.get(Step(LETTERS, {"x": 2}, write_letters)).cached
 
 
-def test_read_only_store_serves_what_it_has_and_says_so(small_disk: Path) -> None:
+def test_read_only_store_serves_what_it_has_and_says_so(small_disk):
     store = Store(small_disk / "store")
     store.get(Step(LETTERS, {"x": 1}, write_letters))
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)

@@ -30,7 +30,7 @@ SECRET = "what nobody else may read or change"
 
 
 @pytest.fixture
-def outside(tmp_path: Path) -> Path:
+def outside(tmp_path) -> Path:
     """A private folder beside the runs folder."""
     folder = tmp_path / "outside"
     folder.mkdir()
@@ -39,7 +39,7 @@ def outside(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def trial(tmp_path: Path) -> Path:
+def trial(tmp_path) -> Path:
     """A finished trial in the runs folder, by its results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
     named = {
@@ -82,7 +82,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
 
 
 @pytest.mark.parametrize("case", WRITERS)
-def test_no_link_is_written_through(case: str, trial: Path, outside: Path) -> None:
+def test_no_link_is_written_through(case, trial, outside):
     name, write = WRITERS[case]
     (trial / name).symlink_to(outside / "private")
     with suppress(InputError, OSError):
@@ -91,7 +91,7 @@ def test_no_link_is_written_through(case: str, trial: Path, outside: Path) -> No
 
 
 @pytest.mark.parametrize("level", range(3))
-def test_a_linked_folder_is_no_place_of_trials(level: int, trial: Path, outside: Path) -> None:
+def test_a_linked_folder_is_no_place_of_trials(level, trial, outside):
     doomed = [trial.parents[2], trial.parents[1], trial.parent][level]
     doomed.rename(outside / "moved")
     doomed.symlink_to(outside / "moved")
@@ -120,9 +120,7 @@ def _pipe(path: Path, outside: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt", ".lock.holder"]
 )
-def test_a_trial_that_holds_something_strange_is_left_out(
-    name: str, make: Callable[[Path, Path], None], trial: Path, outside: Path
-) -> None:
+def test_a_trial_that_holds_something_strange_is_left_out(name, make, trial, outside):
     assert len(read_experiment(trial.parents[2]).trials) == 1
     (trial / name).parent.mkdir(exist_ok=True)
     make(trial / name, outside)
@@ -134,9 +132,7 @@ def test_a_trial_that_holds_something_strange_is_left_out(
 
 
 @pytest.mark.parametrize("make", [_link, _pipe])
-def test_no_link_and_no_pipe_is_read(
-    make: Callable[[Path, Path], None], trial: Path, outside: Path
-) -> None:
+def test_no_link_and_no_pipe_is_read(make, trial, outside):
     for name in ("declared.jsonl", ".lock", ".lock.holder"):
         make(trial / name, outside)
     with pytest.raises(DamagedError):
@@ -145,7 +141,7 @@ def test_no_link_and_no_pipe_is_read(
     assert describe_holder(trial / ".lock") == "another process"
 
 
-def test_a_store_builds_in_no_linked_folder(tmp_path: Path, outside: Path) -> None:
+def test_a_store_builds_in_no_linked_folder(tmp_path, outside):
     store, step = (
         Store(tmp_path / "runs" / "store"),
         Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0)),
@@ -164,9 +160,7 @@ def test_a_store_builds_in_no_linked_folder(tmp_path: Path, outside: Path) -> No
     assert (outside / "moved").is_dir()
 
 
-def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(
-    tmp_path: Path, outside: Path
-) -> None:
+def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path, outside):
     partial = tmp_path / "partial"
     (partial / "work").mkdir(parents=True)
     (partial / "work" / "images").symlink_to(outside)
@@ -177,7 +171,7 @@ def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(
     assert (outside / "private").read_text() == SECRET
 
 
-def test_a_pipe_in_the_place_of_a_lock_s_note_holds_nobody_up(tmp_path: Path) -> None:
+def test_a_pipe_in_the_place_of_a_lock_s_note_holds_nobody_up(tmp_path):
     os.mkfifo(tmp_path / "x.lock.holder")
     with hold(tmp_path / "x.lock", "this"):
         assert (tmp_path / "x.lock.holder").is_file()

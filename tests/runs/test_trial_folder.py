@@ -23,7 +23,7 @@ from tests.fuzz.records import EXPERIMENT, write_trial
 
 
 @pytest.fixture
-def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def trial(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     write_trial(tmp_path, "adc", 1)
     return write_trial(tmp_path, "adc", 0)
@@ -37,9 +37,7 @@ def edit(path: Path, old: str, new: str) -> None:
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
 
 
-def test_changed_results_are_left_out_and_named(
-    trial: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_changed_results_are_left_out_and_named(trial, capsys):
     edit(trial / "results.json", "26.5", "43.2")
     experiment = load_experiment(trial.parents[3], EXPERIMENT)
     assert [one.seed for one in experiment.trials] == [1]
@@ -58,7 +56,7 @@ def test_changed_results_are_left_out_and_named(
     assert "2 trials: 1 done, 1 damaged" in shown
 
 
-def test_other_spaces_and_another_time_are_no_change(trial: Path) -> None:
+def test_other_spaces_and_another_time_are_no_change(trial):
     path = trial / "results.json"
     path.write_text(json.dumps(json.loads(path.read_text())))
     os.utime(path, (1, 1))
@@ -66,7 +64,7 @@ def test_other_spaces_and_another_time_are_no_change(trial: Path) -> None:
     assert TrialFolder(trial).state() == "done"
 
 
-def test_results_without_a_record_of_them_are_believed(trial: Path) -> None:
+def test_results_without_a_record_of_them_are_believed(trial):
     path = trial / "results.json"
     content = json.loads(path.read_text())
     del content["made_of"]
@@ -75,9 +73,7 @@ def test_results_without_a_record_of_them_are_believed(trial: Path) -> None:
     assert TrialFolder(trial).record().metrics == {"psnr": 43.2}
 
 
-def test_changed_views_and_curves_are_not_used(
-    trial: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_changed_views_and_curves_are_not_used(trial, caplog):
     edit(trial / "per_view.csv", "a,25.5\nb,27.5", "a,24.5\nb,28.5")  # the mean is as it was
     edit(trial / "metrics.jsonl", "20.2", "40.2")
     (one,) = (
@@ -90,14 +86,14 @@ def test_changed_views_and_curves_are_not_used(
     assert len(one.folder.curves("events.jsonl")) == 10
 
 
-def test_settings_are_those_that_the_results_were_made_by(trial: Path) -> None:
+def test_settings_are_those_that_the_results_were_made_by(trial):
     """A configuration that is edited afterwards does not make the trial another one."""
     edit(trial / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')
     for one in load_experiment(trial.parents[3], EXPERIMENT).trials:
         assert one.config["densify.volume_threshold"] == 0.03
 
 
-def test_a_failed_trial_leaves_when_its_class_was_mended(trial: Path) -> None:
+def test_a_failed_trial_leaves_when_its_class_was_mended(trial):
     """Equal settings under another hash: a class was edited meanwhile, and the later trial is
     done."""
     old = trial.with_name(f"0ld0ld00-{trial.name.partition('-')[2]}")
@@ -121,7 +117,7 @@ def test_a_failed_trial_leaves_when_its_class_was_mended(trial: Path) -> None:
     ] == "failed"
 
 
-def test_a_folder_knows_its_place(trial: Path) -> None:
+def test_a_folder_knows_its_place(trial):
     folder = TrialFolder(trial)
     values = folder.settings()
     assert TrialFolder.of(values).path == trial
@@ -132,7 +128,7 @@ def test_a_folder_knows_its_place(trial: Path) -> None:
     assert folder.lock == trial / ".lock"
 
 
-def test_states_are_told_from_the_files(tmp_path: Path) -> None:
+def test_states_are_told_from_the_files(tmp_path):
     folder = TrialFolder(tmp_path / "x" / "s" / "a-b" / "01234567-seed0")
     folder.path.mkdir(parents=True)
     assert (folder.state(), folder.has_failed()) == ("missing", False)
@@ -145,7 +141,7 @@ def test_states_are_told_from_the_files(tmp_path: Path) -> None:
     assert folder.state() == "damaged"
 
 
-def test_the_stage_and_the_last_iteration_of_a_training(tmp_path: Path) -> None:
+def test_the_stage_and_the_last_iteration_of_a_training(tmp_path):
     folder = TrialFolder(tmp_path)
     assert folder.stage_and_step() == ("", 0)
     (tmp_path / "building.json").write_text(
@@ -161,7 +157,7 @@ def test_the_stage_and_the_last_iteration_of_a_training(tmp_path: Path) -> None:
     assert folder.stage_and_step() == ("train", 0)
 
 
-def test_a_configuration_that_cannot_be_used_is_refused(trial: Path) -> None:
+def test_a_configuration_that_cannot_be_used_is_refused(trial):
     assert TrialFolder(trial).configuration()["allow_targets"] == []
     edit(trial / "config.yaml", '"seed": 0', '"seed": "0"')
     with pytest.raises(DamagedError, match="seed is '0'"):
@@ -171,7 +167,7 @@ def test_a_configuration_that_cannot_be_used_is_refused(trial: Path) -> None:
         TrialFolder(trial).configuration()
 
 
-def test_equal_results_keep_their_time_and_others_do_not(trial: Path) -> None:
+def test_equal_results_keep_their_time_and_others_do_not(trial):
     folder, path = TrialFolder(trial), trial / "results.json"
     values, record = folder.settings(), folder.record()
     os.utime(path, ns=(1, 1))
@@ -194,9 +190,7 @@ def test_equal_results_keep_their_time_and_others_do_not(trial: Path) -> None:
     assert set(made_of.digests) == set(made_of.published)
 
 
-def test_only_small_files_and_what_tables_read_are_compared_by_content(
-    trial: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_small_files_and_what_tables_read_are_compared_by_content(trial, monkeypatch):
     folder = TrialFolder(trial)
     values, record = folder.settings(), folder.record()
     for name, size in (("small.png", 4), ("large.png", 5)):
@@ -208,7 +202,7 @@ def test_only_small_files_and_what_tables_read_are_compared_by_content(
     assert made_of.published.keys() - made_of.digests.keys() == {"large.png"}
 
 
-def test_views_are_checked_and_read_without_what_is_empty(trial: Path) -> None:
+def test_views_are_checked_and_read_without_what_is_empty(trial):
     (trial / "results.json").unlink()
     path = trial / "per_view.csv"
     path.write_text("view,psnr,ssim\na,1e30,\nb,-2,0.5\n")
@@ -219,13 +213,13 @@ def test_views_are_checked_and_read_without_what_is_empty(trial: Path) -> None:
             TrialFolder(trial).views()
 
 
-def test_a_changed_file_is_found_though_the_results_were_not_read_before(trial: Path) -> None:
+def test_a_changed_file_is_found_though_the_results_were_not_read_before(trial):
     edit(trial / "per_view.csv", "25.5", "24.5")
     with pytest.raises(DamagedError, match=r"per_view\.csv was changed after it was written"):
         TrialFolder(trial).views()
 
 
-def test_pictures_are_sorted_by_name(trial: Path) -> None:
+def test_pictures_are_sorted_by_name(trial):
     (trial / "renders").mkdir()
     for name in ("b.png", "a.png", "c.txt"):
         (trial / "renders" / name).touch()
@@ -251,9 +245,7 @@ def test_pictures_are_sorted_by_name(trial: Path) -> None:
         ),
     ],
 )
-def test_what_has_changed_since_is_named(
-    trial: Path, place: tuple[str, ...], value: object, reason: str
-) -> None:
+def test_what_has_changed_since_is_named(trial, place, value, reason):
     folder, path = TrialFolder(trial), trial / "results.json"
     values = folder.settings()
     folder.write_finished(values, replace(folder.record(), hashes={"config": config_hash(values)}))
@@ -270,7 +262,7 @@ def test_what_has_changed_since_is_named(
     assert re.search(reason, folder.why_not_done(values))
 
 
-def test_a_metric_that_can_be_computed_by_now_is_a_reason(trial: Path) -> None:
+def test_a_metric_that_can_be_computed_by_now_is_a_reason(trial):
     folder = TrialFolder(trial)
     values = folder.settings() | {"eval": {"primary": "x"}}
     asked: list[dict[str, object]] = []

@@ -46,7 +46,7 @@ def record(**changes: Any) -> Any:
     return record_from(json.dumps(RESULTS | changes).encode(), PATH)
 
 
-def test_results_without_a_count_are_those_of_renders_alone() -> None:
+def test_results_without_a_count_are_those_of_renders_alone():
     assert record().num_gaussians == 2
     assert record(evaluated_from="renders").num_gaussians == 2
     assert record(evaluated_from="renders", num_gaussians=None).num_gaussians is None
@@ -55,7 +55,7 @@ def test_results_without_a_count_are_those_of_renders_alone() -> None:
             record(evaluated_from=evaluated_from, num_gaussians=None)
 
 
-def test_unfinished_results_are_told_from_damaged_ones() -> None:
+def test_unfinished_results_are_told_from_damaged_ones():
     with pytest.raises(UnfinishedError, match="is unfinished, its status is 'running'"):
         record(status="running", seed="0")
     with pytest.raises(UnfinishedError, match="is unfinished, its status is missing"):
@@ -65,7 +65,7 @@ def test_unfinished_results_are_told_from_damaged_ones() -> None:
     assert not isinstance(caught.value, UnfinishedError)
 
 
-def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default() -> None:
+def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default():
     assert parse_typed(b'{"label": "a"}', MetricRecord, PATH) == MetricRecord(
         label="a", direction=0, decimals=3, unit=""
     )
@@ -90,7 +90,7 @@ def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default() -> None:
         ({"split": "every_nth", "validation": True}, "every_nth, validation"),
     ],
 )
-def test_the_rule_of_a_split_in_words(settings: dict[str, Any], text: str) -> None:
+def test_the_rule_of_a_split_in_words(settings, text):
     assert split_text({f"scene.{name}": value for name, value in settings.items()}) == text
 
 
@@ -107,9 +107,7 @@ def test_the_rule_of_a_split_in_words(settings: dict[str, Any], text: str) -> No
         ({"step": 1, "loss": "x"}, False),
     ],
 )
-def test_a_row_has_an_iteration_and_numbers(
-    row: dict[str, Any], sound: bool, tmp_path: Path
-) -> None:
+def test_a_row_has_an_iteration_and_numbers(row, sound, tmp_path):
     assert read_rows(tmp_path / "absent.jsonl") == []
     path = tmp_path / "metrics.jsonl"
     path.write_text(json.dumps({"step": 1}) + "\n" + json.dumps(row) + "\n")
@@ -127,15 +125,13 @@ def test_a_row_has_an_iteration_and_numbers(
         ([0, 1, 2, 3], [1, 0], False),
     ],
 )
-def test_a_histogram_has_an_edge_more_than_counts(
-    edges: list[float], counts: list[float], sound: bool, tmp_path: Path
-) -> None:
+def test_a_histogram_has_an_edge_more_than_counts(edges, counts, sound, tmp_path):
     path = tmp_path / "volume_histograms.jsonl"
     path.write_text(json.dumps({"step": 3, "log10_edges": edges, "counts": counts}) + "\n")
     assert len(read_rows(path, Histogram)) == sound
 
 
-def test_whole_lines_end_before_the_first_torn_one(tmp_path: Path) -> None:
+def test_whole_lines_end_before_the_first_torn_one(tmp_path):
     path = tmp_path / "metrics.jsonl"
     assert whole_lines(path) == []
     path.write_text('{"step": 1, "x": "kept as it is"}\n{"step": 2}\n{"st')

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from gsbench.scene.options import SceneConfig
 from gsbench.scene.transforms import read_transforms
 from gsbench.scene.transforms_keys import HARMLESS, REFUSED
 from gsbench.scene.types import Capture
+from tests.scene.cameras import cameras_of
 
 SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
 
@@ -40,24 +42,25 @@ def looking_at_origin(eye: np.ndarray) -> np.ndarray:
 EYES = [np.array([3 * math.cos(a), 3 * math.sin(a), 1.0]) for a in np.linspace(0, 5, 6)]
 
 
-def write(
-    folder: Path,
-    document: dict[str, Any] | None = None,
-    name: str = "transforms.json",
-    **changes: Any,
-) -> Path:
-    """A folder with six photographs and the file; ``changes`` are its further keys."""
-    frames = []
+def write(folder: Path, edit: Callable[[Any], object] | None = None, **changes: Any) -> Path:
+    """A folder with six photographs and the file, with ``changes`` and then edited by ``edit``."""
+    frames: list[dict[str, Any]] = []
     for k, eye in enumerate(EYES):
         path = folder / "images" / f"{k}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (40, 30), (40 * k, 100, 100)).save(path)
-        frames.append(
-            {"file_path": f"./images/{k}.png", "transform_matrix": looking_at_origin(eye).tolist()}
-        )
-    whole = (SHARED | {"frames": frames} | changes) if document is None else document
-    (folder / name).write_text(json.dumps(whole))
+        matrix = looking_at_origin(eye).tolist()
+        frames.append({"file_path": f"./images/{k}.png", "transform_matrix": matrix})
+    document = SHARED | {"frames": frames} | changes
+    if edit is not None:
+        edit(document)
+    (folder / "transforms.json").write_text(json.dumps(document))
     return folder
+
+
+def in_each_frame(**keys: Any) -> Callable[[Any], object]:
+    """An edit that gives all frames these keys."""
+    return lambda document: [frame.update(keys) for frame in document["frames"]]
 
 
 def capture_of(folder: Path, work: Path, **options: Any) -> Capture:
@@ -84,10 +87,8 @@ def test_a_point_falls_where_the_formulas_of_the_format_say(tmp_path: Path) -> N
             x, y, z, _ = np.linalg.inv(looking_at_origin(eye)) @ [*point, 1]
             wanted = [19.5 + 50 * x / -z, 15.5 - 51 * y / -z]
             np.testing.assert_allclose(project(model, f"images/{k}.png", point), wanted, atol=1e-9)
-    above = project(model, "images/0.png", np.array([0, 0, 0.5]))
-    assert above[1] < project(model, "images/0.png", np.zeros(3))[1], (
-        "what is higher is further up in the picture"
-    )
+    above, origin = (project(model, "images/0.png", np.array([0, 0, z])) for z in (0.5, 0))
+    assert above[1] < origin[1], "what is higher is further up in the picture"
 
 
 def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> None:
@@ -110,19 +111,14 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
         ply_file_path="p.ply",
     )
     lines = [f"{x} {y} {z} 10 20 {k}" for k, (x, y, z) in enumerate(saved)]
-    header = "ply\nformat ascii 1.0\nelement vertex 5\n" + "".join(
-        f"property double {c}\n" for c in "xyz"
-    )
-    header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
-    (folder / "p.ply").write_text(header + "\n".join(lines) + "\n")
+    names = ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"]
+    header = ["ply", "format ascii 1.0", "element vertex 5", *(f"property {n}" for n in names)]
+    (folder / "p.ply").write_text("\n".join([*header, "end_header", *lines, ""]))
     moved = capture_of(folder, tmp_path / "two")
-    models = [read_model(capture.model) for capture in (plain, moved)]  # type: ignore[arg-type]
-    for k in range(6):
-        one, other = (
-            model.find_image_with_name(f"images/{k}.png").cam_from_world().matrix()
-            for model in models
-        )
-        np.testing.assert_allclose(one, other, atol=1e-9)
+    one, other = (cameras_of(read_model(capture.model)) for capture in (plain, moved))  # type: ignore[arg-type]
+    for name, camera in one.items():
+        np.testing.assert_allclose(camera.rotation, other[name].rotation, atol=1e-9)
+        np.testing.assert_allclose(camera.translation, other[name].translation, atol=1e-9)
     cloud = read_cloud(moved.model)  # type: ignore[arg-type]
     np.testing.assert_allclose(cloud.points, points, atol=1e-9)
     assert cloud.colors.tolist() == [[10, 20, k] for k in range(5)]
@@ -147,13 +143,13 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
 )
 def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, params) -> None:
     shared = read_transforms(write(tmp_path / "shared", **said)).images["images/3.png"][0]
-    folder = write(tmp_path / "own")
-    document = json.loads((folder / "transforms.json").read_text())
-    own = {key: document.pop(key) for key in SHARED} | said
-    document["frames"] = [frame | own for frame in document["frames"]]
-    document["frames"][2]["fl_x"] = 60.0
-    (folder / "transforms.json").write_text(json.dumps(document))
-    frames = read_transforms(folder).images
+
+    def move_to_frames(document: Any) -> None:
+        own = {key: document.pop(key) for key in SHARED}
+        in_each_frame(**own, **said)(document)
+        document["frames"][2]["fl_x"] = 60.0
+
+    frames = read_transforms(write(tmp_path / "own", move_to_frames)).images
     for camera in (shared, frames["images/3.png"][0]):
         assert (camera.name, camera.width, camera.height) == (model, 40, 30)
         assert list(camera.params) == params
@@ -210,13 +206,10 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
 
 
 def test_a_file_that_names_masks_asks_for_their_folder(tmp_path: Path) -> None:
-    folder = write(tmp_path / "in")
-    document = json.loads((folder / "transforms.json").read_text())
+    folder = write(tmp_path / "in", lambda d: d["frames"][1].update(mask_path="masks/1.png"))
     (folder / "masks" / "images").mkdir(parents=True)
     for k in range(6):
         Image.new("L", (40, 30), 255).save(folder / "masks" / "images" / f"{k}.png.png")
-    document["frames"][1]["mask_path"] = "masks/1.png"
-    (folder / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"mask_path is not read: .*scene\.masks"):
         capture_of(folder, tmp_path / "a")
     found = capture_of(folder, tmp_path / "b", masks="masks")
@@ -227,101 +220,68 @@ def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
     folder = write(tmp_path / "in")
     capture = capture_of(folder, tmp_path / "a")
     assert capture.read_from == (folder / "transforms.json",)
-    document = json.loads((folder / "transforms.json").read_text())
-    document["fl_x"] = 49.0
-    (folder / "transforms.json").write_text(json.dumps(document))
+    write(folder, fl_x=49.0)
     assert capture_of(folder, tmp_path / "b").fingerprint != capture.fingerprint
+
+
+MIRRORED = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]
+NO_FOCAL, HIGHER = (
+    "no focal length",
+    "k4, k5 and k6 are read of OPENCV_FISHEYE and FULL_OPENCV alone",
+)
+OUTSIDE, ODD_SIZE = "lies outside the folder", "w and h must be whole numbers"
+LISTED = {"train_filenames": ["images/1.png"]}
+WRONG_KEYS = [
+    ({"applied_transform": MIRRORED}, "applied_transform .*mirrors"),
+    ({"applied_scale": 0}, "applied_scale must be positive"),
+    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not known here"),
+    *(({key: 0.1}, HIGHER) for key in ("k4", "k5", "k6")),
+    ({"is_fisheye": True, "p1": 0.1}, "OPENCV_FISHEYE has k1 to k4 alone"),
+    ({"fl_x": None, "fl_y": None}, NO_FOCAL),
+    ({"fl_y": None, "y_fov": 180}, NO_FOCAL),
+    ({"fl_y": 0}, NO_FOCAL),
+    *(({"fl_x": None, "camera_angle_x": angle}, NO_FOCAL) for angle in (4.0, 0)),
+    ({"fl_x": 0}, NO_FOCAL),
+    ({"h": 0}, ODD_SIZE),
+    ({"w": 40.5}, ODD_SIZE),
+    ({"fl_x": "50"}, "fl_x is '50'"),
+    (LISTED | {"test_filenames": ["images/9.png"]}, "held-out filenames"),
+    (LISTED | {"val_filenames": ["images/1.png"]}, "trained and tested on"),
+    ({"ply_file_path": "/etc/passwd"}, OUTSIDE),
+    ({"ply_file_path": "p.ply"}, "names p.ply, which is not there"),
+]
+MATRIX, ROW = r"frames\.1\.transform_matrix is ", r"frames\.1\.transform_matrix\.0 is "
+WRONG_FRAMES = [
+    (lambda f: f.pop("transform_matrix"), "lacks 'frames.1.transform_matrix'"),
+    (lambda f: f.update(transform_matrix=[[1, 0, 0, 0]]), MATRIX),
+    (lambda f: f["transform_matrix"][0].pop(), ROW),
+    (lambda f: f["transform_matrix"][0].append(0), ROW),
+    (lambda f: f["transform_matrix"].append([0] * 4), MATRIX),
+    (lambda f: f["transform_matrix"].__setitem__(0, [2, 0, 0, 0]), "scales, shears or mirrors"),
+    (lambda f: f["transform_matrix"].__setitem__(2, [0.0] * 4), "scales, shears or mirrors"),
+    (lambda f: f.update(rolling_shutter=[0, 0, 0.1, 0]), r"rolling_shutter \(frame 1\): "),
+    (lambda f: f.update(file_path="../secret.png"), OUTSIDE),
+    (lambda f: f.update(file_path="/etc/passwd"), OUTSIDE),
+    (lambda f: f.update(file_path="images/0.png"), r"images/0\.png is there twice"),
+]
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda d: d.pop("frames"), "lacks 'frames'"),
-        (lambda d: d["frames"][1].pop("transform_matrix"), "lacks 'frames.1.transform_matrix'"),
-        (
-            lambda d: d["frames"][1].update(transform_matrix=[[1, 0, 0, 0]]),
-            r"frames\.1\.transform_matrix is ",
-        ),
-        (
-            lambda d: d["frames"][1]["transform_matrix"][0].pop(),
-            r"frames\.1\.transform_matrix\.0 is ",
-        ),
-        (
-            lambda d: d["frames"][1]["transform_matrix"][0].append(0),
-            r"frames\.1\.transform_matrix\.0 is ",
-        ),
-        (
-            lambda d: d["frames"][1]["transform_matrix"].append([0] * 4),
-            r"frames\.1\.transform_matrix is ",
-        ),
-        (
-            lambda d: d["frames"][1]["transform_matrix"].__setitem__(0, [2, 0, 0, 0]),
-            "scales, shears or mirrors",
-        ),
-        (
-            lambda d: d["frames"][1]["transform_matrix"].__setitem__(2, [0.0] * 4),
-            "scales, shears or mirrors",
-        ),
-        (
-            lambda d: d.update(applied_transform=[[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]),
-            "applied_transform .*mirrors",
-        ),
-        (lambda d: d.update(applied_scale=0), "applied_scale must be positive"),
-        (
-            lambda d: d.update(camera_model="EQUIRECTANGULAR"),
-            "camera_model EQUIRECTANGULAR is not known here",
-        ),
+        *((lambda d, keys=keys: d.update(keys), said) for keys, said in WRONG_KEYS),
         *(
-            (
-                lambda d, key=key: d.update({key: 0.1}),
-                "k4, k5 and k6 are read of OPENCV_FISHEYE and FULL_OPENCV alone",
-            )
-            for key in ("k4", "k5", "k6")
-        ),
-        (lambda d: d.update(is_fisheye=True, p1=0.1), "OPENCV_FISHEYE has k1 to k4 alone"),
-        (lambda d: (d.pop("fl_x"), d.pop("fl_y")), "no focal length"),
-        (lambda d: (d.pop("fl_y"), d.update(y_fov=180)), "no focal length"),
-        (lambda d: d.update(fl_y=0), "no focal length"),
-        *(
-            (lambda d, key=key, value=value: d.update({key: value}), f"{key}: {REFUSED[key]}")
+            (lambda d, key=key: d.update({key: [0.0, 0.5]}), f"{key}: {REFUSED[key]}")
             for key in REFUSED
-            for value in ([0.0, 0.5],)
         ),
-        (
-            lambda d: d["frames"][2].update(rolling_shutter=[0, 0, 0.1, 0]),
-            r"rolling_shutter \(frame 2\): ",
-        ),
-        (
-            lambda d: d.update(train_filenames=["images/1.png"], test_filenames=["images/9.png"]),
-            "held-out filenames",
-        ),
-        (
-            lambda d: d.update(train_filenames=["images/1.png"], val_filenames=["images/1.png"]),
-            "trained and tested on",
-        ),
-        (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=4.0)), "no focal length"),
-        (lambda d: (d.pop("fl_x"), d.update(camera_angle_x=0)), "no focal length"),
-        (lambda d: d.update(fl_x=0), "no focal length"),
-        (lambda d: d.update(h=0), "w and h must be whole numbers"),
-        (lambda d: d.update(w=40.5), "w and h must be whole numbers"),
-        (lambda d: d.update(fl_x="50"), "fl_x is '50'"),
-        (lambda d: d["frames"][1].update(file_path="../secret.png"), "lies outside the folder"),
-        (lambda d: d["frames"][1].update(file_path="/etc/passwd"), "lies outside the folder"),
-        (lambda d: d.update(ply_file_path="/etc/passwd"), "lies outside the folder"),
-        (lambda d: d.update(ply_file_path="p.ply"), "names p.ply, which is not there"),
-        (
-            lambda d: d["frames"][1].update(file_path="images/0.png"),
-            r"images/0\.png is there twice",
-        ),
+        *((lambda d, edit=edit: edit(d["frames"][1]), said) for edit, said in WRONG_FRAMES),
     ],
 )
 def test_what_cannot_be_understood_is_one_line_that_names_the_file(
     tmp_path: Path, change, said
 ) -> None:
-    folder = write(tmp_path / "in")
-    document = json.loads((folder / "transforms.json").read_text())
-    change(document)
-    (folder / "transforms.json").write_text(json.dumps(document))
+    folder = write(tmp_path / "in", change)
     with pytest.raises(InputError, match=said) as caught:
         read_transforms(folder)
     assert str(folder / "transforms.json") in str(caught.value)
@@ -338,19 +298,14 @@ def test_a_line_of_pixels_is_a_picture(tmp_path: Path) -> None:
         assert {(camera.width, camera.height) for camera, *_ in images.values()} == {(40, 30)}
 
 
-def test_no_file_and_a_name_without_a_decision(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"neither transforms\.json nor transforms_train\.json is here"
-    ):
+def test_a_missing_file_and_a_name_that_fits_two_images_are_refused(tmp_path: Path) -> None:
+    nothing = r"neither transforms\.json nor transforms_train\.json is here"
+    with pytest.raises(InputError, match=nothing):
         read_transforms(tmp_path)
-    folder = write(tmp_path / "in")
+    folder = write(tmp_path / "in", lambda d: d["frames"][0].update(file_path="images/0"))
     Image.new("RGB", (40, 30)).save(folder / "images" / "0.jpg")
-    document = json.loads((folder / "transforms.json").read_text())
-    document["frames"][0]["file_path"] = "images/0"
-    (folder / "transforms.json").write_text(json.dumps(document))
-    with pytest.raises(
-        InputError, match=r"images/0 may be images/0\.jpg or images/0\.png: keep one"
-    ):
+    two = r"images/0 may be images/0\.jpg or images/0\.png: keep one"
+    with pytest.raises(InputError, match=two):
         read_transforms(folder)
 
 
@@ -364,14 +319,9 @@ def test_images_without_a_file_are_left_out(
 
 
 def test_the_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = CaptureSource(
-        SceneConfig(name="t", kind="transforms", path=str(write(tmp_path / "in")))
-    )
     read, files = transforms.read_bytes, []
     monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
-    assert source.step is not None
-    source.step.build(tmp_path / "made")
-    source.read(tmp_path / "made")
+    capture_of(write(tmp_path / "in"), tmp_path / "made")
     assert files == [tmp_path / "in" / "transforms.json"]
 
 
@@ -401,13 +351,8 @@ def focal(side: float, degrees: float) -> float:
 def test_every_way_to_give_a_field_of_view(
     tmp_path: Path, said, focal_x, focal_y, of_each_frame: bool
 ) -> None:
-    folder = write(
-        tmp_path / "in", **({"fl_x": None, "fl_y": None} | ({} if of_each_frame else said))
-    )
-    if of_each_frame:
-        document = json.loads((folder / "transforms.json").read_text())
-        document["frames"] = [frame | said for frame in document["frames"]]
-        (folder / "transforms.json").write_text(json.dumps(document))
+    edit = in_each_frame(**said) if of_each_frame else lambda document: document.update(said)
+    folder = write(tmp_path / "in", edit, fl_x=None, fl_y=None)
     for camera, *_ in read_transforms(folder).images.values():
         assert camera.params[:2] == pytest.approx((focal_x, focal_y))
 
@@ -423,13 +368,11 @@ def test_higher_coefficients_distort_as_in_opencv(tmp_path: Path, said: dict[str
     k = {key: said.get(key, 0.0) for key in ("k3", "k4", "k6")}
     for x, y in ((0.3, -0.2), (-0.6, 0.5)):
         r2 = x * x + y * y
-        factor = (1 + 0.1 * r2 - 0.02 * r2**2 + k["k3"] * r2**3) / (
-            1 + k["k4"] * r2 + k["k6"] * r2**3
-        )
+        factor = 1 + 0.1 * r2 - 0.02 * r2**2 + k["k3"] * r2**3
+        factor /= 1 + k["k4"] * r2 + k["k6"] * r2**3
+        wanted = [19.5 + 50 * x * factor, 15.5 + 51 * y * factor]
         seen = next(iter(model.cameras.values())).img_from_cam(np.array([x, y, 1.0]))
-        np.testing.assert_allclose(
-            seen, [19.5 + 50 * x * factor, 15.5 + 51 * y * factor], atol=1e-9
-        )
+        np.testing.assert_allclose(seen, wanted, atol=1e-9)
 
 
 @pytest.mark.parametrize("key", sorted(HARMLESS | set(REFUSED)))
@@ -438,19 +381,14 @@ def test_what_says_nothing_changes_nothing_in_silence(tmp_path: Path, key: str, 
     values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
     for value in (*values, *([1.5, "text", [1.0]] if key in HARMLESS else [])):
         found = read_transforms(write(tmp_path / "in", **{key: value})).images
-        assert [camera for camera, *_ in found.values()] == [
-            camera for camera, *_ in wanted.values()
-        ]
+        assert {name: found[name][0] for name in found} == {
+            name: wanted[name][0] for name in wanted
+        }
     assert not caplog.text
 
 
 def test_unknown_keys_are_named_in_one_line(tmp_path: Path, caplog) -> None:
-    folder = write(tmp_path / "in", exporter="x", fl_X=3.0)
-    document = json.loads((folder / "transforms.json").read_text())
-    for frame in document["frames"]:
-        frame["lens"] = "wide"
-    (folder / "transforms.json").write_text(json.dumps(document))
-    read_transforms(folder)
+    read_transforms(write(tmp_path / "in", in_each_frame(lens="wide"), exporter="x", fl_X=3.0))
     (record,) = caplog.records
     assert record.getMessage().endswith("3 keys are not known and not used: exporter, fl_X, lens")
 
@@ -458,23 +396,21 @@ def test_unknown_keys_are_named_in_one_line(tmp_path: Path, caplog) -> None:
 @pytest.mark.parametrize(
     ("lists", "train", "test"),
     [
-        (
-            {"train_filenames": [0, 1, 2], "val_filenames": [3], "test_filenames": [4, 5]},
-            (0, 1, 2),
-            (4, 5),
-        ),
-        ({"train_filenames": [0, 1, 2], "val_filenames": [3]}, (0, 1, 2), (3,)),
-        ({"test_filenames": [4]}, (0, 1, 2, 3, 5), (4,)),
+        ({"train": [0, 1, 2], "val": [3], "test": [4, 5]}, (0, 1, 2), (4, 5)),
+        ({"train": [0, 1, 2], "val": [3]}, (0, 1, 2), (3,)),
+        ({"test": [4]}, (0, 1, 2, 3, 5), (4,)),
     ],
 )
 def test_nerfstudios_lists_of_names_are_the_split(
     tmp_path: Path, lists, train, test, caplog
 ) -> None:
-    named = {key: [f"./images/{k}.png" for k in numbers] for key, numbers in lists.items()}
+    def names(numbers) -> tuple[str, ...]:
+        return tuple(f"images/{k}.png" for k in numbers)
+
+    named = {f"{part}_filenames": names(numbers) for part, numbers in lists.items()}
     folder = write(tmp_path / "in", **named)
     capture = capture_of(folder, tmp_path / "made", split="list")
-    assert capture.train_names == tuple(f"images/{k}.png" for k in train)
-    assert capture.test_names == tuple(f"images/{k}.png" for k in test)
+    assert (capture.train_names, capture.test_names) == (names(train), names(test))
     assert not caplog.text
     assert len(capture_of(folder, tmp_path / "other").image_names) == 6
     assert "a split of its own, which scene.split=list takes" in caplog.text
@@ -482,21 +418,18 @@ def test_nerfstudios_lists_of_names_are_the_split(
 
 @pytest.mark.parametrize("written", ["images/4.JPG", "images/4", "IMAGES/4.PNG", "images\\4.jpeg"])
 def test_a_file_is_found_whatever_its_extension_and_capitals(tmp_path: Path, written: str) -> None:
-    folder = write(tmp_path / "in")
-    document = json.loads((folder / "transforms.json").read_text())
-    document["frames"][4]["file_path"] = written
-    (folder / "transforms.json").write_text(json.dumps(document))
+    folder = write(tmp_path / "in", lambda d: d["frames"][4].update(file_path=written))
     assert sorted(read_transforms(folder).images) == [f"images/{k}.png" for k in range(6)]
 
 
-def test_byte_order_marks(tmp_path: Path) -> None:
+def test_a_mark_of_utf8_is_passed_over_and_other_encodings_are_named(tmp_path: Path) -> None:
     folder = write(tmp_path / "in")
-    text = (folder / "transforms.json").read_text()
-    (folder / "transforms.json").write_text(text, encoding="utf-8-sig")
+    file = folder / "transforms.json"
+    text = file.read_text()
+    file.write_text(text, encoding="utf-8-sig")
     assert len(read_transforms(folder).images) == 6
+    said = r"json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"
     for encoding in ("utf-16", "utf-32"):
-        (folder / "transforms.json").write_text(text, encoding=encoding)
-        with pytest.raises(
-            InputError, match=r"json cannot be read: it is UTF-16 or UTF-32: save it as UTF-8"
-        ):
+        file.write_text(text, encoding=encoding)
+        with pytest.raises(InputError, match=said):
             read_transforms(folder)

@@ -13,8 +13,10 @@ from gsbench.system.device import free_bytes, select_device
 
 @pytest.fixture
 def rounding() -> Iterator[None]:
-    """TF32 allowed, as torch allows it to convolutions by default; the process's settings come back
-    afterwards."""
+    """TF32 allowed, as torch allows it to convolutions by default.
+
+    The process's settings come back afterwards.
+    """
     backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
     before = [backend.allow_tf32 for backend in backends]
     for backend in backends:

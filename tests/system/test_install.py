@@ -78,8 +78,10 @@ def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 def test_the_image_is_built_by_commands_that_there_are() -> None:
-    """Docker builds what the README's two commands build: every ``make`` of the Dockerfile is a
-    target."""
+    """Docker builds what the README's two commands build.
+
+    Every ``make`` of the Dockerfile is a target.
+    """
     targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
     assert {"demo", "test"} < set(targets)
     for target in targets:

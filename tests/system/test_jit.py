@@ -1,5 +1,4 @@
-"""Machine code that is kept on disk belongs to the sources that it was made of, wherever these
-lie."""
+"""Machine code that is kept on disk belongs to the sources that it was made of."""
 
 from __future__ import annotations
 
@@ -33,8 +32,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def functions_of(value: Any, seen: set[int]) -> Iterator[FunctionType]:
-    """The Python function behind a compiled one, and those that it calls, as Python itself resolves
-    their names."""
+    """The Python function behind a compiled one, and those that it calls."""
     function = getattr(value, "py_func", value)
     if not isinstance(function, FunctionType) or id(function) in seen:
         return
@@ -98,8 +96,10 @@ def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -
 
 
 def test_the_table_has_all_that_kernels_import() -> None:
-    """But for what sets the kernels' calls up: memory, threads, cameras as numbers, files and
-    words."""
+    """But for what sets the kernels' calls up.
+
+    Memory, threads, cameras as numbers, files and words.
+    """
     known = {path.relative_to(PACKAGE).as_posix() for path in sources(PACKAGE)}
     around = {
         "logs.py",

@@ -1,5 +1,7 @@
-"""No process outlives the function that started it, however it was started: daemons included, on
-Linux."""
+"""No process outlives the function that started it, however it was started.
+
+Daemons included, on Linux.
+"""
 
 from __future__ import annotations
 

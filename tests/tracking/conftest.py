@@ -15,7 +15,7 @@ from tests.tracking.helpers import free_port
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory) -> Path:
     """A runs folder with a database; making one takes MLflow seconds."""
     folder = tmp_path_factory.mktemp("runs")
     ensure_experiment(connect(None, folder), "tracked", folder)
@@ -23,7 +23,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def postgresql(tmp_path: Path) -> Iterator[str]:
+def postgresql(tmp_path) -> Iterator[str]:
     """The address of an empty database in a PostgreSQL server of our own; the test is skipped where
     there is none."""
     pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
@@ -52,7 +52,7 @@ def postgresql(tmp_path: Path) -> Iterator[str]:
             folder.chmod(folder.stat().st_mode | 0o011)
     port = free_port()
 
-    def run(*words: str) -> None:
+    def run(*words):
         command = [*prefix, *words]
         subprocess.run(command, check=True, capture_output=True, timeout=300)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -22,9 +21,7 @@ from tests.tracking.helpers import (
 )
 
 
-def test_the_address_is_the_configured_one_then_the_environments_then_ours(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_address_is_the_configured_one_then_the_environments_then_ours(tmp_path, monkeypatch):
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     assert tracker_uri(None, tmp_path) == default_uri(tmp_path) == f"sqlite:///{tmp_path}/mlflow.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
@@ -32,9 +29,7 @@ def test_the_address_is_the_configured_one_then_the_environments_then_ours(
     assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
 
 
-def test_an_address_counts_where_it_is_typed_or_of_the_environment(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
     assert untyped_address({"uri": None}) is None
     assert untyped_address({"uri": "http://a"}) == "http://a"
@@ -47,9 +42,7 @@ def test_an_address_counts_where_it_is_typed_or_of_the_environment(
 
 @pytest.mark.parametrize("kind", ["sqlite", "http"])
 @pytest.mark.slow
-def test_sync_leaves_a_strange_tracker_alone(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_sync_leaves_a_strange_tracker_alone(kind, tmp_path, monkeypatch, capfd):
     runs, target = tmp_path / "runs", tmp_path / "elsewhere" / "theirs.db"
     target.parent.mkdir()
     address = f"sqlite:///{target}" if kind == "sqlite" else f"http://127.0.0.1:{free_port()}"
@@ -70,8 +63,8 @@ def test_sync_leaves_a_strange_tracker_alone(
 
 @pytest.mark.parametrize("lacking", ["scene", "densify", "tracking"])
 def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
-    lacking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+    lacking, tmp_path, monkeypatch, capfd
+):
     values = trial_values(tmp_path, name="theirs")
     folder = begin_trial(values)
     write_trial(folder, values)
@@ -89,9 +82,7 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     "place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"]
 )
 @pytest.mark.slow
-def test_artifacts_go_nowhere_else_than_our_own_folder(
-    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_artifacts_go_nowhere_else_than_our_own_folder(place, tmp_path, monkeypatch, capfd):
     runs, outside = tmp_path / "runs", tmp_path / "outside"
     outside.mkdir()
     values = trial_values(runs, name="theirs")
@@ -105,7 +96,7 @@ def test_artifacts_go_nowhere_else_than_our_own_folder(
     assert not list(outside.iterdir())
 
 
-def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
+def test_no_link_among_the_artifacts_is_written_through(tmp_path):
     runs, private = tmp_path / "runs", tmp_path / "private"
     private.write_text("secret")
     values = trial_values(runs, name="theirs")
@@ -125,10 +116,7 @@ def test_no_link_among_the_artifacts_is_written_through(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])
-def test_an_address_that_is_a_folder_is_refused_in_one_line(
-    address: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["scene=courtyard", f"tracking.uri={address}", "--dry-run"]) == 2
-    said = capsys.readouterr().err.splitlines()
+def test_an_address_that_is_a_folder_is_refused_in_one_line(address, refused):
+    said = refused("scene=courtyard", f"tracking.uri={address}", "--dry-run").splitlines()
     assert len(said) == 1
     assert "tracking.uri must be an address such as http://HOST:PORT" in said[0]

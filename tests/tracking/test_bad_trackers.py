@@ -54,7 +54,7 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("bad-trackers")
 
 
@@ -93,7 +93,7 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
 @pytest.mark.parametrize(
     "kind", ["refuses", "never answers", "answers after a minute", "hangs up", "postgresql"]
 )
-def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
+def test_a_bad_tracker_costs_a_trial_one_line(kind, runs):
     with ExitStack() as stack:
         port = free_port()
         if kind in ("never answers", "postgresql"):
@@ -115,9 +115,7 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind: str, runs: Path) -> None:
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(
-    signum: int, runs: Path
-) -> None:
+def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum, runs):
     name = f"ended_by_{signum}"
     with Listener() as tracker:
         program = start(
@@ -139,7 +137,7 @@ def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(
     assert "Traceback" not in errors
 
 
-def test_sync_can_be_stopped_while_the_tracker_hangs(runs: Path) -> None:
+def test_sync_can_be_stopped_while_the_tracker_hangs(runs):
     values = trial_values(runs, name="synced")
     with Listener() as tracker:
         address = f"postgresql+psycopg2://x@127.0.0.1:{tracker.port}/x"
@@ -185,9 +183,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(params=["http", "postgresql"])
-def tracker(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[Gate, str]]:
+def tracker(request, tmp_path_factory) -> Iterator[tuple[Gate, str]]:
     """A tracker that works, behind a gate, and its address there."""
     with ExitStack() as stack:
         if request.param == "http":
@@ -204,9 +200,7 @@ def tracker(
         yield gate, uri
 
 
-def test_a_tracker_may_go_at_any_moment(
-    tracker: tuple[Gate, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tracker_may_go_at_any_moment(tracker, tmp_path, monkeypatch):
     """It is taken away early, late and in between; each time ``sync`` completes one run, with each
     value once.
 

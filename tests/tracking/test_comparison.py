@@ -67,9 +67,7 @@ def unpacked(tag: str) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_the_files_alone_make_the_page_again(
-    kind: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_the_files_alone_make_the_page_again(kind, tmp_path, request):
     uri = None if kind == "sqlite" else request.getfixturevalue("postgresql")
     folders = write_sweep(tmp_path / "runs")
     assert list(sync(folders, uri))[-1] == "8 trials mirrored now, 0 before"
@@ -90,7 +88,7 @@ def test_the_files_alone_make_the_page_again(
     )
 
 
-def test_a_description_of_somebody_else_stays(runs: Path) -> None:
+def test_a_description_of_somebody_else_stays(runs):
     write_sweep(runs, name="described")
     publish(runs / "described", None)
     client = connect(None, runs)
@@ -101,7 +99,13 @@ def test_a_description_of_somebody_else_stays(runs: Path) -> None:
     assert tags_of(client, "described")[NOTE] == "my own words"
 
 
-def test_a_long_description_is_cut_at_a_line(tmp_path: Path) -> None:
+def test_a_description_without_a_verdict_begins_with_what_is_missing(tmp_path):
+    write_sweep(tmp_path)
+    text = description(read_experiment(tmp_path / "swept"))
+    assert text.startswith("**No verdict: it needs a declared metric (eval.primary), two arms")
+
+
+def test_a_long_description_is_cut_at_a_line(tmp_path):
     write_sweep(tmp_path, tuple(f"arm{number:02}_{'x' * 40}" for number in range(20)))
     text = description(read_experiment(tmp_path / "swept"))
     assert len(text) <= 5000
@@ -109,17 +113,15 @@ def test_a_long_description_is_cut_at_a_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["2.22.0", "3.1.0", "3.170.0", "4.0.0"])
-def test_other_versions_of_mlflow_get_the_plain_page(version: str) -> None:
+def test_other_versions_of_mlflow_get_the_plain_page(version):
     assert addresses("http://a/", "7", version) == {"experiment": "http://a/#/experiments/7"}
 
 
 @pytest.mark.parametrize("limit", [500, 250])
-def test_a_server_that_refuses_long_parameters_gets_the_rest(
-    limit: int, runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_refuses_long_parameters_gets_the_rest(limit, runs, monkeypatch):
     send = mlflow.MlflowClient.log_batch
 
-    def strict(self: Any, run_id: str, **sent: Any) -> None:
+    def strict(self, run_id, **sent):
         if any(len(param.value) > limit for param in sent.get("params", ())):
             raise MlflowException(f"Param value exceeded length {limit}")
         send(self, run_id, **sent)
@@ -136,7 +138,7 @@ def test_a_server_that_refuses_long_parameters_gets_the_rest(
 
 
 @pytest.mark.slow
-def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs: Path) -> None:
+def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs):
     values = trial_values(runs, seed=2000)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
@@ -161,9 +163,7 @@ def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_a_browser_shows_the_arms_as_groups_and_a_chart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path, monkeypatch):
     runs, port = tmp_path / "runs", free_port()
     list(sync(write_sweep(runs), None))
     page = addresses(f"http://127.0.0.1:{port}", publish(runs / "swept", None), mlflow.__version__)[
@@ -187,7 +187,7 @@ def test_a_browser_shows_the_arms_as_groups_and_a_chart(
             time.sleep(0.5)
         with Browser(page, tmp_path / "profile", (1500, 1000)) as browser:
 
-            def evaluated(script: str) -> Any:
+            def evaluated(script):
                 return browser.call("Runtime.evaluate", expression=script, returnByValue=True)[
                     "result"
                 ].get("value")

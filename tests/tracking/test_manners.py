@@ -48,9 +48,7 @@ def artifacts(client: Any, run: Any) -> set[str]:
     return {item.path for item in client.list_artifacts(run.info.run_id)}
 
 
-def test_a_trial_goes_where_the_environment_says(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trial_goes_where_the_environment_says(runs, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
     values = trial_values(tmp_path, seed=20)
     folder = begin_trial(values)
@@ -62,7 +60,7 @@ def test_a_trial_goes_where_the_environment_says(
     assert run.data.tags["mlflow.user"] == getpass.getuser()
 
 
-def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
+def test_a_failed_run_holds_its_reason_until_it_is_mended(runs):
     values = trial_values(runs, seed=22)
     folder = begin_trial(values)
     (folder / "log.txt").write_text("what happened\n")
@@ -84,16 +82,14 @@ def test_a_failed_run_holds_its_reason_until_it_is_mended(runs: Path) -> None:
     assert "error" not in run.data.tags
 
 
-def test_the_model_is_an_artifact_if_asked_for(runs: Path) -> None:
+def test_the_model_is_an_artifact_if_asked_for(runs):
     client, run = mirrored(runs, seed=23)
     assert "point_cloud.ply" not in artifacts(client, run)
     client, run = mirrored(runs, seed=24, model=True)
     assert "point_cloud.ply" in artifacts(client, run)
 
 
-def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(
-    runs: Path, tmp_path: Path
-) -> None:
+def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(runs, tmp_path):
     """MLflow keeps absolute addresses, so that the old database would fill the old place."""
     mirrored(runs, seed=26)
     moved = tmp_path / "moved"
@@ -116,7 +112,7 @@ def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(
     assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
 
 
-def test_a_run_that_was_deleted_is_mirrored_anew(runs: Path) -> None:
+def test_a_run_that_was_deleted_is_mirrored_anew(runs):
     client, run = mirrored(runs, seed=28)
     client.delete_run(run.info.run_id)
     values = trial_values(runs, seed=28)

@@ -62,11 +62,11 @@ def check_jobs(client: Any) -> None:
     assert found_runs(client, "Default") == []
 
 
-def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path: Path) -> None:
+def test_eight_jobs_at_once_on_a_new_sqlite_database(tmp_path):
     run_jobs(tmp_path, None)
     check_jobs(connect(None, tmp_path))
 
 
-def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path: Path, postgresql: str) -> None:
+def test_eight_jobs_at_once_on_a_new_postgresql_database(tmp_path, postgresql):
     run_jobs(tmp_path, postgresql)
     check_jobs(connect(postgresql, tmp_path))

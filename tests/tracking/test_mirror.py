@@ -39,7 +39,7 @@ SECONDS = 240  # within which what never comes is told from a slow machine
 
 
 @pytest.mark.slow
-def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
+def test_all_that_the_files_say_is_mirrored_once(runs):
     values = trial_values(runs, seed=1)
     folder = begin_trial(values)
     with following(options(), folder):
@@ -60,7 +60,7 @@ def test_all_that_the_files_say_is_mirrored_once(runs: Path) -> None:
     }
 
 
-def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> None:
+def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs):
     values = trial_values(runs, seed=2)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
@@ -76,7 +76,7 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs: Path) -> No
     assert len(history(client, run.info.run_id, "eval/psnr_dB")) == 1
 
 
-def test_results_that_changed_replace_the_run(runs: Path) -> None:
+def test_results_that_changed_replace_the_run(runs):
     values = trial_values(runs, seed=3)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
@@ -99,7 +99,7 @@ def wait_for_run(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) -> None:
+def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs):
     values = trial_values(runs, seed=4)
     folder = begin_trial(values)
     client = connect(None, runs)
@@ -119,7 +119,7 @@ def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs: Path) ->
 
 
 @pytest.mark.slow
-def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Path) -> None:
+def test_curves_of_a_training_in_progress_are_followed(runs, tmp_path):
     values = trial_values(runs, seed=5)
     folder = begin_trial(values)
     client = connect(None, runs)
@@ -141,9 +141,7 @@ def test_curves_of_a_training_in_progress_are_followed(runs: Path, tmp_path: Pat
 
 @pytest.mark.parametrize("uri", ["down", "not a database", "no such place", "nonsense"])
 @pytest.mark.slow
-def test_a_broken_tracker_harms_no_trial(
-    uri: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_broken_tracker_harms_no_trial(uri, tmp_path, caplog):
     (tmp_path / "broken.db").write_text("this is no database" * 100)
     address = {
         "down": f"http://127.0.0.1:{free_port()}",
@@ -163,7 +161,7 @@ def test_a_broken_tracker_harms_no_trial(
     assert (folder / "results.json").exists()
 
 
-def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_slow_tracker_is_not_waited_for(tmp_path, caplog):
     others, threads = psutil.Process().children(), threading.active_count()
     values = trial_values(tmp_path)
     with Listener() as tracker:
@@ -180,7 +178,7 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCapt
     assert set(psutil.Process().children()) <= set(others)
 
 
-def test_one_process_mirrors_all_trials_of_a_sweep(runs: Path) -> None:
+def test_one_process_mirrors_all_trials_of_a_sweep(runs):
     """MLflow is loaded once, and nobody waits for it between trials."""
     others = set(psutil.Process().children())
     with Mirror() as mirror:
@@ -199,9 +197,7 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
-    runs: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(runs, caplog):
     for seed in (6, 7):
         values = trial_values(runs, seed)
         folder = begin_trial(values)
@@ -220,15 +216,14 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(
 
 
 @pytest.mark.slow
-def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
+def test_the_trials_process_loads_no_mlflow(runs):
     """No part of it can then take the process down, and it takes no memory beside a training."""
     values = trial_values(runs, seed=8)
     folder = begin_trial(values)
     code = (
-        "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
-        "options, folder = json.loads(sys.argv[1])\n"
-        "with Mirror() as mirror: mirror.follow(Path(folder), options)\nsys.exit('mlflow' in "
-        "sys.modules)"
+        "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\noptions, "
+        "folder = json.loads(sys.argv[1])\nwith Mirror() as mirror: mirror.follow(Path(folder), "
+        "options)\nsys.exit('mlflow' in sys.modules)"
     )
     words = json.dumps([options(), str(folder)])
     done = subprocess.run(
@@ -242,7 +237,7 @@ def test_the_trials_process_loads_no_mlflow(runs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
+def test_a_database_is_whole_or_absent(tmp_path):
     """Killed while it makes the tables, a process leaves nothing that stops the next one."""
     code = (
         "import sys; from pathlib import Path; from gsbench.tracking import connect; "
@@ -260,7 +255,7 @@ def test_a_database_is_whole_or_absent(tmp_path: Path) -> None:
     assert (tmp_path / "mlflow.db").exists()
 
 
-def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
+def test_switched_off_means_no_mlflow(tmp_path):
     code = (
         "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
         "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"
@@ -274,7 +269,7 @@ def test_switched_off_means_no_mlflow(tmp_path: Path) -> None:
     )
 
 
-def test_deleted_experiment_is_restored(runs: Path) -> None:
+def test_deleted_experiment_is_restored(runs):
     client = connect(None, runs)
     first = ensure_experiment(client, "gone", runs)
     client.delete_experiment(first)

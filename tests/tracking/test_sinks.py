@@ -50,9 +50,7 @@ def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
     return folder, values
 
 
-def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictures(
-    runs: Path,
-) -> None:
+def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictures(runs):
     folder, values = finished_trial(runs, seed=1)
     mirror_trial(options(), folder, values)
     client = connect(None, runs)
@@ -74,7 +72,7 @@ def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictur
     )
 
 
-def test_the_summary_of_a_trial(tmp_path: Path) -> None:
+def test_the_summary_of_a_trial(tmp_path):
     folder, values = finished_trial(tmp_path, seed=3)
     trial = TrackedTrial(TrialFolder(folder), values)
     results = trial.folder.sound_record()
@@ -104,9 +102,7 @@ def test_the_summary_of_a_trial(tmp_path: Path) -> None:
     }
 
 
-def test_weights_and_biases_gets_all_of_a_trial_in_one_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path, monkeypatch):
     """With a stand-in for its client, which notes what it is told."""
     wandb = MagicMock()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
@@ -142,7 +138,7 @@ def test_weights_and_biases_gets_all_of_a_trial_in_one_run(
     run.finish.assert_called_with(1)
 
 
-def test_experiments_open_as_machine_learning(runs: Path) -> None:
+def test_experiments_open_as_machine_learning(runs):
     client = connect(None, runs)
     tag = "mlflow.experimentKind"
     assert (
@@ -159,9 +155,7 @@ def test_experiments_open_as_machine_learning(runs: Path) -> None:
     assert client.get_experiment(chosen).tags[tag] == "regression"  # what somebody chose stays
 
 
-def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
@@ -171,7 +165,7 @@ def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(
     check_trackers([compose_one(["tracking=none"])])
 
 
-def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
+def test_tensorboard_shows_the_same_numbers_once(tmp_path):
     accumulator = pytest.importorskip(
         "tensorboard.backend.event_processing.event_accumulator", reason="needs tensorboard"
     )
@@ -179,7 +173,7 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
     there = tmp_path / "tensorboard" / folder.relative_to(tmp_path)
     sink = options() | {"sink": "tensorboard"}
 
-    def shown() -> Any:
+    def shown():
         events = accumulator.EventAccumulator(str(there), size_guidance={"scalars": 0, "images": 0})
         return events.Reload()
 
@@ -199,9 +193,7 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path: Path) -> None:
     assert not (folder / STATE).exists()
 
 
-def test_weights_and_biases_takes_a_trial_without_a_network(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_and_biases_takes_a_trial_without_a_network(tmp_path, monkeypatch):
     pytest.importorskip("wandb", reason="needs wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     folder, values = finished_trial(tmp_path, seed=1)

@@ -1,5 +1,7 @@
-"""Losses from a device that is behind are the same losses, one that is not finite passes no
-checkpoint; and volumes."""
+"""Losses from a device that is behind are the same; one that is not finite is never saved.
+
+And histograms of volumes.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""A loss with a mask: what is ignored adds nothing to it and has no gradient; what counts weighs
-what it did."""
+"""A loss with a mask: what is ignored adds nothing to it and has no gradient.
+
+What counts weighs what it did.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,9 @@ from gsbench.train.loss import PhotometricLoss
 from gsbench.train.views import SceneViews, Targets
 
 HEIGHT, WIDTH = 37, 53
+CAMERA = Camera(
+    WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2, np.eye(3), np.array([0.0, 0.0, 3.0])
+)
 
 
 @pytest.fixture
@@ -29,8 +34,10 @@ def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def test_the_loss_with_a_mask_is_its_definition(picture) -> None:
-    """L1 summed over what counts; SSIM by scikit-image, of pictures that are equal under the mask;
-    over all pixels."""
+    """L1 summed over what counts.
+
+    SSIM by scikit-image, of pictures that are equal under the mask; over all pixels.
+    """
     image, target, mask = picture
     loss, l1, ssim = PhotometricLoss(0.2, threads=1)(replace_ignored(image, target, mask), target)
     truth, counts = target.numpy() / 255.0, mask.numpy()[..., 0]
@@ -70,10 +77,9 @@ def test_no_gradient_and_no_value_comes_from_under_the_mask(picture, dtype: torc
 
 
 def test_far_from_the_mask_a_pixel_pulls_as_without_one(picture) -> None:
-    """So thresholds on gradients mean the same: the loss is divided by all pixels, not by those
-    that count.
+    """So thresholds on gradients mean the same.
 
-    Far: 11 px, a window on a window.
+    The loss is divided by all pixels, not by those that count. Far: 11 px, a window on a window.
     """
     image, target, _ = picture
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
@@ -91,10 +97,7 @@ def test_densifiers_see_no_error_under_a_mask(picture) -> None:
     from gsbench.gaussians.initial import gaussians_from_cloud
 
     _, target, mask = picture
-    camera = Camera(
-        WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2, np.eye(3), np.array([0.0, 0.0, 3.0])
-    )
-    views = [View("a", camera, target.numpy(), mask.numpy()[..., 0])]
+    views = [View("a", CAMERA, target.numpy(), mask.numpy()[..., 0])]
     rng = np.random.default_rng(0)
     cloud = rng.normal(size=(40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8)
     device = torch.device("cpu")
@@ -121,12 +124,9 @@ def test_masks_shrink_with_the_pictures(picture) -> None:
     from gsbench.train.resolution import ScaledViews
 
     _, target, mask = picture
-    camera = Camera(
-        WIDTH, HEIGHT, 50.0, 50.0, WIDTH / 2, HEIGHT / 2, np.eye(3), np.array([0.0, 0.0, 3.0])
-    )
     views = [
-        View("a", camera, target.numpy(), mask.numpy()[..., 0]),
-        View("b", camera, target.numpy()),
+        View("a", CAMERA, target.numpy(), mask.numpy()[..., 0]),
+        View("b", CAMERA, target.numpy()),
     ]
     device = torch.device("cpu")
     pictures = ScaledViews(views, Targets(views, device), device, None)
@@ -134,11 +134,8 @@ def test_masks_shrink_with_the_pictures(picture) -> None:
         cameras, targets = pictures.at(scale)
         small = targets.mask(0)
         assert small is not None
-        assert (
-            small.shape
-            == (cameras[0].height, cameras[0].width, 1)
-            == (*targets.get(0).shape[:2], 1)
-        )
+        assert small.shape == (cameras[0].height, cameras[0].width, 1)
+        assert small.shape[:2] == targets.get(0).shape[:2]
         assert targets.mask(1) is None
         assert small.float().mean() <= mask.float().mean() + 0.02
         assert small.any()

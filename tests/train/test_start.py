@@ -1,5 +1,4 @@
-"""What is said of initial points before a training, for a scene whose points and colours are
-known."""
+"""What is said of initial points of a scene whose points and colours are known."""
 
 from __future__ import annotations
 
@@ -118,10 +117,8 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
         for view in scene.train:
             x, y, z = view.camera.rotation @ point + view.camera.translation
             if z > 0.2:
-                column, row = (
-                    view.camera.fx * x / z + view.camera.cx,
-                    view.camera.fy * y / z + view.camera.cy,
-                )
+                column = view.camera.fx * x / z + view.camera.cx
+                row = view.camera.fy * y / z + view.camera.cy
                 seen += 0 <= column < view.camera.width and 0 <= row < view.camera.height
         shares.append(seen >= 2)
     return float(np.mean(shares))

@@ -1,5 +1,4 @@
-"""Training images stay on the device where there is room, and are the same images where there is
-none."""
+"""Training images stay on the device where there is room; they are the same where not."""
 
 from __future__ import annotations
 

@@ -54,18 +54,14 @@ ENDS = [(0, "fail", 0), (1, "pass", 1), (2, "pass", 2), (3, "fail", 3), (3, "pas
 
 
 @pytest.mark.parametrize(("code", "undecided", "expected"), ENDS)
-def test_the_step_ends_as_the_gate_does(
-    tmp_path: Path, code: int, undecided: str, expected: int
-) -> None:
+def test_the_step_ends_as_the_gate_does(tmp_path, code, undecided, expected):
     found, words = ended(tmp_path, code, UNDECIDED=undecided)
     assert found == expected
     assert words == ["gate", "a b.zip", "x=1", "y=$(id)", "z=*", "--metric", "psnr"]
     assert "    passed" in (tmp_path / "s.md").read_text()
 
 
-def test_options_are_given_where_they_are_set_and_inputs_are_no_part_of_a_script(
-    tmp_path: Path,
-) -> None:
+def test_options_are_given_where_they_are_set_and_inputs_are_no_part_of_a_script(tmp_path):
     _, words = ended(tmp_path, 0, LEAST="10%", SEEDS="4")
     assert words[-4:] == ["--least", "10%", "--seeds", "4"]
     assert not [step for step in steps() if "${{" in step["run"]]

@@ -12,14 +12,14 @@ from tests.analysis.synthetic import Plan, write_runs
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> Path:
+def runs(tmp_path) -> Path:
     write_runs(tmp_path, Plan(scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2))
     write_runs(tmp_path, Plan(experiment="one", scenes=("a",), trial_noise=0.3))
     write_runs(tmp_path, Plan(experiment="alone", densifiers=("adc",)))
     return tmp_path
 
 
-def test_it_names_designs_that_suffice(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_names_designs_that_suffice(runs, capsys):
     assert plan(["exp", "--metric", "psnr", "--difference", "0.2"], runs) == 0
     out = capsys.readouterr().out
     assert "sfm-volumetric against sfm-adc" in out
@@ -27,7 +27,7 @@ def test_it_names_designs_that_suffice(runs: Path, capsys: pytest.CaptureFixture
     assert "scenes like these (from 6 scenes on)" in out
 
 
-def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_scene_does_not_speak_of_others(runs, capsys):
     assert plan(["one"], runs) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
 
@@ -42,6 +42,6 @@ def test_one_scene_does_not_speak_of_others(runs: Path, capsys: pytest.CaptureFi
         (["nothing"], "no experiment"),
     ],
 )
-def test_bad_input_is_refused(runs: Path, words: list[str], message: str) -> None:
+def test_bad_input_is_refused(runs, words, message):
     with pytest.raises(InputError, match=message):
         plan(words, runs)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from gsbench.errors import InputError
@@ -11,9 +9,7 @@ from gsbench.verbs.results import explain, explain_cell
 from tests.analysis.synthetic import Plan, write_runs
 
 
-def test_a_cell_names_its_trials_hashes_and_versions(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cell_names_its_trials_hashes_and_versions(tmp_path, capsys):
     paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     assert explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
     text = capsys.readouterr().out
@@ -31,7 +27,7 @@ def test_a_cell_names_its_trials_hashes_and_versions(
         assert expected in text
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
+def test_what_is_missing_is_said(tmp_path):
     paths = write_runs(tmp_path, Plan(scenes=("garden",)))
     (paths[0] / "results.json").unlink()
     text = explain_cell("exp:garden:psnr:adc", tmp_path)
@@ -56,7 +52,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         ("exp:garden:quality:sfm-adc", "unknown metric 'quality'"),
     ],
 )
-def test_bad_addresses_are_explained(tmp_path: Path, address: str, words: str) -> None:
+def test_bad_addresses_are_explained(tmp_path, address, words):
     write_runs(tmp_path, Plan(scenes=("garden",), inits=("sfm", "dim")))
     with pytest.raises(InputError, match=words):
         explain_cell(address, tmp_path)

@@ -7,7 +7,6 @@ import importlib.metadata
 import importlib.util
 import tomllib
 from collections.abc import Iterable
-from pathlib import Path
 
 import pytest
 import torch
@@ -28,14 +27,14 @@ def of_devices(topic: str) -> list[Finding]:
 
 
 @pytest.fixture
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_gpu(monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setattr(machine, "installed_gpus", list)
 
 
 @pytest.fixture
-def gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+def gpus(monkeypatch) -> None:
     """Two GPUs, as torch tells of them."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
@@ -45,7 +44,7 @@ def gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.version, "hip", None)
 
 
-def test_gpus_with_their_memory(gpus: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpus_with_their_memory(gpus, monkeypatch):
     assert said(of_devices("gpu")) == [("ok", f"GPU {name}, 20 GB of 24 GB free") for name in "AB"]
     monkeypatch.setattr(torch.version, "hip", "7.0")
     assert all(
@@ -53,13 +52,13 @@ def test_gpus_with_their_memory(gpus: None, monkeypatch: pytest.MonkeyPatch) -> 
     )
 
 
-def test_every_extra_is_known() -> None:
+def test_every_extra_is_known():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = set(project["optional-dependencies"]) - {"dev", "docs"}
     assert {extra for _, extra in machine.OPTIONAL.values()} == extras
 
 
-def test_no_gpu_and_why(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_gpu_and_why(no_gpu, monkeypatch):
     assert said(of_devices("gpu")) == [
         ("note", "none (this torch is a build for CPUs): raster=auto uses the CPU")
     ]
@@ -71,14 +70,14 @@ def test_no_gpu_and_why(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "no usable NVIDIA driver" in said(of_devices("gpu"))[0][1]
 
 
-def test_rasterizers(no_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rasterizers(no_gpu, monkeypatch):
     texts = dict(text.split(" ", 1) for _, text in said(of_devices("rasterizer")))
     assert texts["raster=auto"] == "is cpu on cpu"
     assert texts["raster=cpu"].startswith("on cpu: compiled")
     assert texts["raster=gsplat"].startswith("runs on device=cuda, not on cpu; ")
 
 
-def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rasterizers_on_a_gpu(gpus, monkeypatch):
     from gsbench.raster import executors
 
     monkeypatch.setattr(
@@ -91,9 +90,7 @@ def test_rasterizers_on_a_gpu(gpus: None, monkeypatch: pytest.MonkeyPatch) -> No
     assert texts["raster=gsplat"].startswith("needs gsplat: ")
 
 
-def test_the_whole_of_it_on_this_machine(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_whole_of_it_on_this_machine(tmp_path, capsys):
     machine.doctor([], tmp_path / "runs")
     lines = capsys.readouterr().out.splitlines()
     topics = {line.split()[1] for line in lines}

@@ -11,7 +11,6 @@ import sys
 import time
 import urllib.request
 from contextlib import suppress
-from pathlib import Path
 
 import psutil
 import pytest
@@ -23,9 +22,7 @@ SECONDS = 120
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(
-    tmp_path: Path, signum: int
-) -> None:
+def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(tmp_path, signum):
     (tmp_path / "runs").mkdir()
     connect(None, tmp_path / "runs")
     (tmp_path / "yaml.py").write_text(f"open({str(tmp_path / 'exploded')!r}, 'w')\n")

@@ -72,9 +72,7 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainings: Trainings)
     )
 
 
-def test_the_commit_is_found_and_nothing_is_trained_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commit_is_found_and_nothing_is_trained_twice(tmp_path, monkeypatch):
     trainings = Trainings()
     search = begun(tmp_path, monkeypatch, trainings)
     found = first_worse(2, search.result)
@@ -99,9 +97,7 @@ def test_the_commit_is_found_and_nothing_is_trained_twice(
     )
 
 
-def test_a_commit_that_does_not_train_is_passed_over_but_not_the_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_commit_that_does_not_train_is_passed_over_but_not_the_last(tmp_path, monkeypatch):
     search = begun(tmp_path, monkeypatch, Trainings(fails="b"))
     assert search.table()[1].endswith("not tried")
     assert first_worse(2, search.result) == (0, 2)

@@ -1,5 +1,7 @@
-"""Table cells (a mean with its deviation) and data frames from trials. Unlike trials are never
-averaged."""
+"""Table cells (a mean with its deviation) and data frames from trials.
+
+Unlike trials are never averaged.
+"""
 
 from __future__ import annotations
 
@@ -66,28 +68,25 @@ class Cell:
 
 
 def field_value(trial: TrialResult, name: str) -> str:
-    """A field of a trial, or a dotted key of its configuration, as text; a missing key counts as
-    unset (null)."""
+    """A field of a trial, or a dotted key of its configuration, as text; null if missing."""
     if name in TRIAL_FIELDS:
         return str(getattr(trial.record, name))
     return str(_settings_with(trial, name).get(name))
 
 
 def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
-    """The settings that may contain ``name``; those that change no result are read from the trial's
-    own file."""
+    """The settings that may contain ``name``; in the trial's own file if no result changes."""
     is_hashed = name in trial.config or not name.startswith(NOT_HASHED)
     return trial.config if is_hashed else trial.whole_config
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
-    """Raise ``InputError`` for the first name that is neither a field nor a setting of any
-    trial."""
+    """Raise ``InputError`` for the first name that is no field or setting of any trial."""
     trials = list(trials)
     for name in names:
-        if name not in TRIAL_FIELDS and not any(
-            name in _settings_with(trial, name) for trial in trials
-        ):
+        if name in TRIAL_FIELDS:
+            continue
+        if not any(name in _settings_with(trial, name) for trial in trials):
             raise InputError(
                 f"no trial has a setting {name!r}; use {', '.join(TRIAL_FIELDS)} or a key of a "
                 "trial's config.yaml"
@@ -96,49 +95,37 @@ def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
     """The trials whose fields have the given values; raises ``InputError`` if there are none."""
-    trials = list(trials)
-    check_fields(trials, where)
-    kept = [
-        trial
-        for trial in trials
-        if all(field_value(trial, key) == value for key, value in where.items())
-    ]
+    kept = list(trials)
+    check_fields(kept, where)
+    for key, value in where.items():
+        kept = [trial for trial in kept if field_value(trial, key) == value]
     if not kept:
-        raise InputError(
-            f"no trial has {', '.join(f'{key}={value}' for key, value in where.items())}"
-        )
+        asked = ", ".join(f"{key}={value}" for key, value in where.items())
+        raise InputError(f"no trial has {asked}")
     return kept
 
 
 def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
-    """Raise ``InputError`` that names the differing keys, unless each scene's trials repeat one
-    configuration."""
+    """Raise ``InputError`` with the differing keys unless each scene's trials are repetitions."""
     if code := differing_code(trials):
-        listed, experiment = (
-            "; ".join(describe_code(*part) for part in code.items()),
-            trials[0].experiment,
-        )
+        listed = "; ".join(describe_code(*part) for part in code.items())
+        status = f"gsbench status {trials[0].experiment}"
         raise InputError(
             f"the table cell {where} would average trials made by different versions of {listed}: "
-            "`gsbench status "
-            f"{experiment}` names the superseded ones, `gsbench status {experiment} "
-            "--forget-superseded` removes them"
+            f"`{status}` names the superseded ones, `{status} --forget-superseded` removes them"
         )
     by_scene = group_by(trials, lambda trial: trial.scene)
     for scene, group in by_scene.items():
-        keys = differing_conditions(group) or differing_settings(group)
-        if keys:
-            raise _refusal(
-                f"{where}, scene {scene}" if "scene=" not in where else where, keys, group
-            )
-        seeds = [trial.seed for trial in group]
-        twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
-        if twice:
-            paths = ", ".join(trial.label for trial in group if trial.seed == twice[0])
-            raise InputError(
-                f"the table cell {where} has seed {twice[0]} twice: {paths}; remove one of the "
-                "folders"
-            )
+        if keys := differing_conditions(group) or differing_settings(group):
+            place = where if "scene=" in where else f"{where}, scene {scene}"
+            raise _refusal(place, keys, group)
+        for seed, own in sorted(group_by(group, lambda trial: trial.seed).items()):
+            if len(own) > 1:
+                paths = ", ".join(trial.label for trial in own)
+                raise InputError(
+                    f"the table cell {where} has seed {seed} twice: {paths}; remove one of the "
+                    "folders"
+                )
     across = differing_conditions([group[0] for group in by_scene.values()])
     for key in ("resolution", "data"):  # each scene has its own
         across.pop(key, None)
@@ -147,29 +134,27 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
 
 
 def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
-    """The settings in which trials of one scene, initialiser and densifier differ, without
-    `IGNORED_SETTINGS`."""
+    """The settings in which trials of one scene and arm differ, without `IGNORED_SETTINGS`."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
-    return sorted({key for group in groups for key in differing_settings(group)})
+    return sorted(set().union(*map(differing_settings, groups)))
 
 
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
-    """The trials, each with its values of the swept settings as ``variant``: different values are
-    different arms."""
+    """The trials with their values of the swept settings as ``variant``, so as different arms."""
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
-    return [
-        replace(trial, variant=tuple((key, str(trial.config.get(key))) for key in swept))
-        for trial in trials
-    ]
+
+    def variant(trial: TrialResult) -> tuple[tuple[str, str], ...]:
+        return tuple((key, str(trial.config.get(key))) for key in swept)
+
+    return [replace(trial, variant=variant(trial)) for trial in trials]
 
 
 def make_cell(
     trials: Sequence[TrialResult], quantity: Quantity, scenes: Sequence[str], expected: int
 ) -> Cell:
-    """The cell of trials that passed `check_averageable`; each of ``scenes`` should have
-    ``expected`` trials."""
+    """The cell of averageable trials; each of ``scenes`` should have ``expected`` of them."""
     values: dict[str, dict[int, float]] = {scene: {} for scene in scenes}
     for trial in trials:
         value = quantity.read(trial)
@@ -177,40 +162,35 @@ def make_cell(
             values[trial.scene][trial.seed] = value
     count = min((len(group) for group in values.values()), default=0)
     if count == 0:
-        reasons = [
-            trial.unavailable[quantity.key] for trial in trials if quantity.key in trial.unavailable
-        ]
-        reason = short_reason(reasons[0]) if reasons else "no value" if trials else "no trial"
-        return Cell(None, None, 0, expected, len(values), tuple(trials), reason)
-    mean = statistics.fmean(statistics.fmean(group.values()) for group in values.values())
-    shared_seeds = set.intersection(*(set(group) for group in values.values()))
-    per_seed = [
-        statistics.fmean(group[seed] for group in values.values()) for seed in sorted(shared_seeds)
-    ]
+        given = (trial.unavailable.get(quantity.key) for trial in trials)
+        reason = next(filter(None, given), "no value" if trials else "no trial")
+        return Cell(None, None, 0, expected, len(values), tuple(trials), short_reason(reason))
+    groups = values.values()
+    mean = statistics.fmean(statistics.fmean(group.values()) for group in groups)
+    shared_seeds = sorted(set.intersection(*map(set, groups)))
+    per_seed = [statistics.fmean(group[seed] for group in groups) for seed in shared_seeds]
     std = statistics.stdev(per_seed) if len(per_seed) > 1 else None
     return Cell(mean, std, count, expected, len(values), tuple(trials))
 
 
 def short_reason(reason: str) -> str:
-    """The reason why a metric is missing; missing weights in one line, of which results.json has
-    the full text."""
+    """The reason why a metric is missing, in a line; of weights results.json has the full text."""
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason
 
 
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means after rounding to the quantity's decimals; empty if all are
-    equal."""
-    means = {
-        key: round(cell.mean, quantity.decimals)
+    """The keys of the best means, rounded to the quantity's decimals; none if all are equal."""
+    merits = {
+        key: quantity.direction * round(cell.mean, quantity.decimals)
         for key, cell in cells.items()
         if cell.mean is not None
     }
-    if quantity.cost or quantity.direction == 0 or len(set(means.values())) < 2:
+    if quantity.cost or len(set(merits.values())) < 2:  # all merits are 0 without a direction
         return set()
-    best = max(means.values()) if quantity.direction == 1 else min(means.values())
-    return {key for key, mean in means.items() if mean == best}
+    best = max(merits.values())
+    return {key for key, merit in merits.items() if merit == best}
 
 
 def _refusal(
@@ -220,14 +200,13 @@ def _refusal(
     first = next(iter(keys))
     return InputError(
         f"the table cell {where} would average trials that differ in {listed} (such as "
-        f"{trials[0].label} and "
-        f"{trials[-1].label}): choose one with --where {first}=…, or show it with --rows …,{first}"
+        f"{trials[0].label} and {trials[-1].label}): choose one with --where {first}=…, or show "
+        f"it with --rows …,{first}"
     )
 
 
 def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
-    """The complete trials of an experiment, or the given trials, as a data frame with one row per
-    trial.
+    """An experiment's complete trials, or the given ones, as a data frame of a row each.
 
     It has these columns:
 
@@ -257,14 +236,11 @@ def to_frame(trials: Experiment | Sequence[TrialResult]) -> pd.DataFrame:
         row: dict[str, Any] = {name: getattr(record, name) for name in IDENTITY}
         row |= {key: trial.config.get(key) for key in swept}
         row |= {name: getattr(record, name) for name in CONDITIONS}
-        row |= dict(zip(("width", "height"), record.resolution or (None, None), strict=True))
+        row["width"], row["height"] = record.resolution or (None, None)
         row |= {key: trial.metrics.get(key) for key in metrics}
         row |= {name: getattr(record, name) for name in MEASUREMENTS}
-        for prefix, group in (
-            ("seconds", record.seconds),
-            ("event", record.events),
-            ("hash", record.hashes),
-        ):
-            row |= {f"{prefix}_{key}": value for key, value in group.items()}
+        row |= {f"seconds_{stage}": value for stage, value in record.seconds.items()}
+        row |= {f"event_{cause}": count for cause, count in record.events.items()}
+        row |= {f"hash_{name}": sha for name, sha in record.hashes.items()}
         rows.append(row | {"folder": str(trial.path)})
     return pd.DataFrame(rows).convert_dtypes(convert_string=False, convert_floating=False)

@@ -4,6 +4,7 @@ The sheet and the sentences are made from the trials' records, so they leave out
 recorded.
 """
 
+import itertools
 import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -41,8 +42,7 @@ VIEWS = "validation views"  # every search judges its points on them
 
 
 def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Sentences on unequal counts, on more than one differing ingredient, and on unequal tuning; ""
-    if none applies."""
+    """Sentences on unequal counts, several differing ingredients, and unequal tuning, or ""."""
     names = ingredients_between(trials, first, second)
     mixed = ingredients_sentence(names, first, second) if is_mixed(names) else ""
     counts = counts_sentence(trials, first, second)
@@ -50,8 +50,7 @@ def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
 
 
 def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Say how many more Gaussians the second arm has, over the scenes that both have; "" if counts
-    are equal."""
+    """Say how many more Gaussians the second arm has over common scenes; "" if counts are equal."""
     baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
     change = relative_change(baseline, other, COSTS["gaussians"][1])
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
@@ -72,14 +71,12 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     """
     pairs = pair_trials(trials, first, second)
     one, other = pairs[0] if pairs else representatives(trials, first, second)
-    compared = [trial for pair in pairs for trial in pair] or trials
+    compared = list(itertools.chain(*pairs)) or trials
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
-    rows = [_row(what, [show(group) for group in groups]) for what, show in MEASURED.items()]
+    rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
     for index, key in enumerate(differing_keys(one.config, other.config)):
-        values = [
-            _shown(trial.config[key]) if key in trial.config else NONE for trial in (one, other)
-        ]
-        rows.append(_row(key, values, rule_above=index == 0))
+        shown = [_shown(own[key]) if key in own else NONE for own in (one.config, other.config)]
+        rows.append(_row(key, shown, rule_above=index == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
@@ -100,8 +97,7 @@ def _shown(value: Any) -> str:
 
 
 def _span(read: Reader) -> Callable[[Sequence[TrialResult]], str]:
-    """A function that shows a number over trials: one value, or the smallest, the largest and the
-    mean."""
+    """A function that shows a number over trials: one value, or smallest, largest and mean."""
 
     def show(trials: Sequence[TrialResult]) -> str:
         values = [value for trial in trials if (value := read(trial)) is not None]
@@ -130,8 +126,7 @@ def _start(trial: TrialResult, fact: str, form: str) -> str | None:
 
 
 def budget_words(trial: TrialResult) -> str | None:
-    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None if the budget is not
-    recorded."""
+    """``15,000 Gaussians (governor), 600 s``; "none" without limits, None if unrecorded."""
     budget = trial.record.budget
     if budget is None:
         return None
@@ -185,8 +180,7 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
 
 
 def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
-    """List, for each arm of a pair, the searches for its settings, and the settings that these
-    trials vary.
+    """List, for each arm of a pair, its searches, and the settings that these trials vary.
 
     These trials are measured on the test views, so varying settings among them is tuning on the
     verdict's own views.
@@ -200,8 +194,7 @@ def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str
 
 
 def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
-    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed on validation
-    views.``
+    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed …``
 
     "" if both arms had the same tuning budget. A search counts if its best point has exactly the
     arm's settings. Settings that were all run as arms are no search, since each has its own
@@ -215,8 +208,7 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
 
 
 def _tuning_budget(trial: TrialResult) -> str:
-    """``6 points of 2 seeds on validation views``: the largest search whose best point the trial
-    has; or ``none``."""
+    """``6 points of 2 seeds on validation views``: the largest search it gains from, or none."""
     searches = [search for search in _searches(trial).values() if _has_settings(trial, search.best)]
     if not searches:
         return "none"
@@ -228,8 +220,9 @@ def _tuning_budget(trial: TrialResult) -> str:
 
 
 def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
-    """The searches of a trial's arm in its runs folder, by experiment: those for its own sweep, and
-    those that tried exactly the trial's settings.
+    """The searches of a trial's arm in its runs folder, by experiment.
+
+    Those for its own sweep, and those that tried exactly the trial's settings.
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
     searches = {}
@@ -243,8 +236,7 @@ def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
 
 
 def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> str:
-    """Say what a search tried and chose for an arm, and whether the arm's trials ``own`` came later
-    and use it."""
+    """Say what a search tried and chose, and whether its arm's trials ``own`` came later."""
     best = search.best
     if best is None:
         return f"{search.arm}: the search {experiment} found nothing."
@@ -257,18 +249,15 @@ def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningReco
     more = len(search.points) - MAX_VALUES
     line = (
         f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by "
-        f"{search.metric} of {VIEWS} "
-        f"({listed(search.scenes)}; seed {', '.join(map(str, search.seeds))}; the search "
-        f"{experiment}), "
-        f"{_when(own, experiment)}. "
+        f"{search.metric} of {VIEWS} ({listed(search.scenes)}; seed "
+        f"{', '.join(map(str, search.seeds))}; the search {experiment}), {_when(own, experiment)}. "
         f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
     )
     return line if _has_settings(own[0], best) else f"{line} These trials have other values."
 
 
 def _when(own: Sequence[TrialResult], experiment: str) -> str:
-    """Say whether the search ended before these trials: a search that ends later may be guided by
-    their results."""
+    """Say whether the search ended before these trials, so that no result guided it."""
     times = [
         trial.measured for trial in read_experiment(own[0].path.parents[3] / experiment).trials
     ]
@@ -283,8 +272,7 @@ def _when(own: Sequence[TrialResult], experiment: str) -> str:
 
 
 def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
-    """Name the settings that were varied among the experiment's arms with one initialiser and
-    densifier class."""
+    """Name the settings that vary among arms with one initialiser and densifier class."""
     target = own.config.get("densify._target_")
     same_class = [
         t
@@ -297,8 +285,7 @@ def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[st
         return []
     return [
         f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here. They differ "
-        f"in {listed(keys)}, "
-        "and all were measured on the test views that the verdict uses."
+        f"in {listed(keys)}, and all were measured on the test views that the verdict uses."
     ]
 
 

@@ -28,8 +28,7 @@ Pixels = NDArray[np.uint8]  # [H, W, 3]
 
 
 def texture_energy(image: Pixels) -> Array:
-    """Local mean of the squared luminance gradient (8-bit levels squared), [H, W], of an image [H,
-    W, 3] uint8."""
+    """Local mean of the squared luminance gradient (8-bit levels²), [H, W], of [H, W, 3] uint8."""
     from skimage.filters import gaussian  # here, since it is slow to import
 
     luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
@@ -38,8 +37,7 @@ def texture_energy(image: Pixels) -> Array:
 
 
 def read_counted(trial: TrialResult, view: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] of a test view that count: all of the ``shape``, unless a mask ignores
-    some."""
+    """The pixels [H, W] of a test view that count: all of the ``shape``, or those of a mask."""
     path = trial.path / MASKS / f"{view}.png"
     return read_mask(path) if path.is_file() else np.ones(shape, dtype=bool)
 
@@ -57,8 +55,7 @@ class PixelMeasures(Record):
 
 
 def textured_error(trial: TrialResult) -> float:
-    """Mean absolute error (8-bit levels) over the most textured fifth of each test photograph, mean
-    over views.
+    """Mean error (8-bit levels) over each test photograph's most textured fifth, over views.
 
     This fifth shows grass, foliage, fabric or gravel. Raises InputError if neither renders nor
     their stored measure exist.
@@ -93,8 +90,7 @@ def view_names(trial: TrialResult) -> list[str]:
 
 @dataclass(frozen=True)
 class ViewComparison:
-    """One test view of two arms: data URIs of photograph, renders and difference, and the mean
-    errors (8-bit levels).
+    """One test view of two arms: data URIs of its pictures, mean errors in 8-bit levels.
 
     The difference is blue where the second arm is nearer to the photograph, red where the first arm
     is.
@@ -113,8 +109,7 @@ class ViewComparison:
 
 
 def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list[str]]:
-    """The views with the least, the median and the largest gain, and messages on what could not be
-    read.
+    """The views with the least, the median and the largest gain, and messages on faults.
 
     A view's gain is the first arm's mean error minus the second arm's. Of each scene, one seed is
     used: the first whose pictures can be read.
@@ -144,8 +139,7 @@ def choose_views(pairs: Sequence[TrialPair]) -> tuple[list[ViewComparison], list
 def _worst_median_best(
     views: Sequence[tuple[float, TrialPair, str]],
 ) -> list[tuple[str, TrialPair, str]]:
-    """From (gain, pair, view), the views with the least, the median and the largest gain, each
-    once."""
+    """From (gain, pair, view), those with the least, median and largest gain, each once."""
     ordered = sorted(views, key=lambda view: (view[0], view[1][0].label, view[2]))
     if len(ordered) < 2:
         return [("the only view", pair, view) for _, pair, view in ordered]
@@ -158,8 +152,10 @@ def _worst_median_best(
 
 
 def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
-    """A test view of a pair of trials as the report shows it; raises InputError if its pictures
-    differ in size."""
+    """A test view of a pair of trials as the report shows it.
+
+    Raises InputError if its pictures differ in size.
+    """
     first, second, truth = read_compared(*pair, view)
     errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
     gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[
@@ -202,8 +198,7 @@ def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
 
 
 def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
-    """Both renders and the photograph, with stripes over ignored pixels: equal stripes show no
-    error."""
+    """Both renders and the photograph; equal stripes over ignored pixels show no error."""
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")

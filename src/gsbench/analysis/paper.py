@@ -1,5 +1,4 @@
-"""Printed numbers of papers, Tables 1 and 2 of the method's paper from measured trials, and the
-differences."""
+"""Printed numbers of papers, the method's Tables 1 and 2 as measured, and the differences."""
 
 import math
 from collections import Counter
@@ -42,8 +41,7 @@ FindPrinted = Callable[[str, Arm, str], "PrintedNumber | None"]  # by scene, arm
 
 @dataclass(frozen=True)
 class PrintedNumber:
-    """A printed number; it stands for the ``range`` of values within half a unit of its last
-    digit."""
+    """A printed number: ``range`` is half a unit of its last digit on both sides."""
 
     text: str
 
@@ -63,8 +61,10 @@ class PrintedNumber:
 
 @dataclass(frozen=True)
 class Paper:
-    """The paper of the method: its ``tables`` by name, where it contradicts itself (one sentence
-    each), and what it says on settings (``setup``, by topic).
+    """The paper of the method.
+
+    Its ``tables`` by name, where it contradicts itself (one sentence each), and what it says on
+    settings (``setup``, by topic).
     """
 
     tables: Mapping[str, Mapping[Key, PrintedNumber]]
@@ -78,8 +78,7 @@ class Paper:
 
 @dataclass(frozen=True)
 class Published:
-    """Another paper's numbers; ``scenes`` has the printed text of each of ``quantities`` for its
-    method."""
+    """Another paper's numbers: ``scenes`` has the printed text of its method's ``quantities``."""
 
     title: str
     source: str  # where the numbers were read
@@ -92,26 +91,23 @@ class Published:
     @property
     def printed(self) -> dict[tuple[str, str], PrintedNumber]:
         """The printed numbers by scene and quantity."""
-        rows = (
-            (scene, zip(self.quantities, texts, strict=True))
-            for scene, texts in self.scenes.items()
-        )
-        return {(scene, key): PrintedNumber(text) for scene, row in rows for key, text in row}
+        printed = {}
+        for scene, texts in self.scenes.items():
+            for key, text in zip(self.quantities, texts, strict=True):
+                printed[scene, key] = PrintedNumber(text)
+        return printed
 
 
 @cache
 def load_paper() -> Paper:
     """The method's paper, from the file that ships with gsbench."""
     content = _read("paper.yaml")
-    tables = {
-        name: {
-            (scene, *arm, key): PrintedNumber(text)
-            for scene, rows in content[name]["scenes"].items()
-            for key, texts in zip(QUANTITIES[name], rows, strict=True)
-            for arm, text in zip(ARMS[name], texts, strict=True)
-        }
-        for name in PAPER_TABLES
-    }
+    tables: dict[str, dict[Key, PrintedNumber]] = {name: {} for name in PAPER_TABLES}
+    for name, table in tables.items():
+        for scene, rows in content[name]["scenes"].items():
+            for key, texts in zip(QUANTITIES[name], rows, strict=True):
+                for (init, densify), text in zip(ARMS[name], texts, strict=True):
+                    table[scene, init, densify, key] = PrintedNumber(text)
     return Paper(tables, tuple(content["contradictions"]), content["setup"])
 
 
@@ -125,8 +121,7 @@ def published_names() -> list[str]:
 
 @cache
 def load_published(name: str) -> Published:
-    """The numbers of the paper ``name``; for an unknown name raises InputError that lists the known
-    ones."""
+    """The numbers of the paper ``name``; raises InputError with the known names for another."""
     names = published_names()
     if name not in names:
         raise InputError(
@@ -141,8 +136,7 @@ def _read(name: str) -> Any:
 
 
 def layout_of(name: str) -> str | None:
-    """The paper's table that the experiment ``name`` repeats, or None: ``table1`` for ``table1``
-    and ``table1_own``."""
+    """The paper's table that the experiment repeats: ``table1`` for ``table1_own``; or None."""
     table = name.removesuffix(OWN)
     return table if table in PAPER_TABLES else None
 
@@ -153,8 +147,7 @@ def paper_tables(
     trials: Sequence[TrialResult] | None = None,
     metrics: Sequence[str] | None = None,
 ) -> list[Table]:
-    """The measured table in the paper's layout, and the table of differences from the printed
-    numbers.
+    """The measured table in the paper's layout, and that of differences from its numbers.
 
     ``name`` is ``table1`` or ``table2``. If only one initialiser was run and it is not DIM, it
     replaces DIM in Table 1.
@@ -211,16 +204,14 @@ def paper_tables(
 
 
 def _run_as(init: str, inits: set[str]) -> str:
-    """Our initialiser for the paper's ``init``: the one of this name, or if it was not run, one
-    that repeats it."""
+    """Our initialiser for the paper's ``init``: that of this name, or one that repeats it."""
     if init in inits:
         return init
     return next((own for own in sorted(inits) if STAND_FOR.get(own) == init), init)
 
 
 def published_table(trials: Sequence[TrialResult], name: str) -> Table:
-    """The measured arms on the scenes of the paper ``name``, its printed numbers, and the
-    differences.
+    """The measured arms on the paper's scenes, its printed numbers, and the differences.
 
     Raises InputError if no trial is of a scene of the paper, or if a cell would average unlike
     trials.
@@ -232,14 +223,12 @@ def published_table(trials: Sequence[TrialResult], name: str) -> Table:
         raise InputError(
             f"{name} has the scenes {', '.join(scenes)}, and no trial here is of one of them"
         )
-    method = (
-        f"The printed numbers are of densify={paper.densify}; other arms are shown for orientation."
-    )
     notes = [
         f"{paper.title}.",
         f"Read from {paper.source}.",
         f"Conventions: {paper.conventions}.",
-        method,
+        f"The printed numbers are of densify={paper.densify}; other arms are shown for "
+        "orientation.",
     ]
 
     def find(scene: str, arm: Arm, key: str) -> PrintedNumber | None:
@@ -260,8 +249,7 @@ def _differences(
     notes: Sequence[str],
     setup: Mapping[str, str],
 ) -> Table:
-    """A table with a row per scene and arm: what the ``paper`` printed, and the measured minus the
-    printed value."""
+    """A table with a row per scene and arm: the printed number, and measured minus printed."""
     shown = [quantity(key, trials) for key in keys]
     expected = len({trial.seed for trial in trials})
     marks: Counter[str] = Counter()
@@ -272,25 +260,19 @@ def _differences(
         entries: list[TableEntry] = []
         for one in shown:
             cell, printed = make_cell(group, one, [scene], expected), find(scene, arm, one.key)
-            entries += [
-                TableEntry(printed.text if printed else ""),
-                _difference(cell, printed, one, marks),
-            ]
+            entries.append(TableEntry(printed.text if printed else ""))
+            entries.append(_difference(cell, printed, one, marks))
         rows.append(Row((scene, arm.init, str(replace(arm, init=""))), tuple(entries)))
-    columns = [
-        Column(one.name, *heads)
-        for one in shown
-        for heads in ((paper, (one.key, paper)), ("Δ", (one.key, "delta")))
-    ]
+    columns = []
+    for one in shown:
+        columns.append(Column(one.name, paper, (one.key, paper)))
+        columns.append(Column(one.name, "Δ", (one.key, "delta")))
     setup_notes = [f"The paper on {topic}: it {words}." for topic, words in setup.items()]
     legend = (
         f"Δ is measured minus printed. Of {marks.total()} cells {marks[ROUNDING]} are within "
-        f"rounding ({ROUNDING}), "
-        f"{marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the mean ({INTERVAL}), "
-        f"{marks[DIFFERS]} differ "
-        f"({DIFFERS}). The paper prints no deviation, so the spread of its own trials is not "
-        "taken into account; a "
-        "single trial has no interval."
+        f"rounding ({ROUNDING}), {marks[INTERVAL]} within our {CONFIDENCE:.0%} t interval of the "
+        f"mean ({INTERVAL}), {marks[DIFFERS]} differ ({DIFFERS}). The paper prints no deviation, "
+        "so the spread of its own trials is not taken into account; a single trial has no interval."
     )
     headings = ("scene", "init", "densify")
     return Table(title, headings, tuple(columns), tuple(rows), (legend, *notes, *setup_notes))
@@ -309,8 +291,10 @@ def _difference(
 
 
 def agreement(cell: Cell, printed: PrintedNumber) -> str:
-    """The mark of a measured cell: ``=`` if its mean is in the printed number's range, ``≈`` if its
-    interval overlaps the range, else ``≠``. A single trial has no interval.
+    """The mark of a measured cell: ``=``, ``≈`` or ``≠``.
+
+    ``=`` if its mean is in the printed number's range, ``≈`` if its interval overlaps the range,
+    else ``≠``. A single trial has no interval.
     """
     from gsbench.analysis.statistics import StudentT  # here, since SciPy is slow to import
 
@@ -320,7 +304,6 @@ def agreement(cell: Cell, printed: PrintedNumber) -> str:
         return ROUNDING
     if cell.std is None:
         return DIFFERS
-    own = StudentT(cell.mean, cell.std / math.sqrt(cell.count), cell.count - 1).interval(
-        1 - CONFIDENCE
-    )
+    error = cell.std / math.sqrt(cell.count)
+    own = StudentT(cell.mean, error, cell.count - 1).interval(1 - CONFIDENCE)
     return INTERVAL if own.low <= high and own.high >= low else DIFFERS

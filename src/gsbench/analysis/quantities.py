@@ -76,8 +76,7 @@ AT = "@"  # psnr@7000 is the PSNR at iteration 7000 (eval.at)
 
 @dataclass(frozen=True)
 class Change:
-    """The relative change of a cost over ``scenes`` scenes: as a ratio of totals, and as the mean
-    of scenes' ratios."""
+    """The relative change of a cost over ``scenes`` scenes: of totals, and mean of ratios."""
 
     of_totals: float
     of_scenes: float
@@ -93,8 +92,7 @@ class Change:
 def relative_change(
     baseline: Iterable[TrialResult], other: Iterable[TrialResult], read: Reader
 ) -> Change | None:
-    """The change of a cost over the scenes on which both arms have a value above 0; None without
-    such a scene."""
+    """The change of a cost over scenes where both arms have a value above 0; else None."""
     one, two = (_means(own, read) for own in (baseline, other))
     scenes = sorted(one.keys() & two.keys())
     if not scenes:
@@ -112,8 +110,7 @@ def _means(trials: Iterable[TrialResult], read: Reader) -> dict[str, float]:
 def choose_quantities(
     trials: Iterable[TrialResult], names: Iterable[str] | None = None
 ) -> list[Quantity]:
-    """The named quantities; by default all metrics of any trial, the LPIPS that was asked for, and
-    the main costs."""
+    """The named quantities; by default all metrics, the LPIPS asked for, and the main costs."""
     trials = list(trials)
     if names is None:
         wanted = {key for trial in trials for key in _lpips_asked_for(trial)}
@@ -122,8 +119,9 @@ def choose_quantities(
 
 
 def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
-    """The quantity ``name`` (a metric, a cost or an alias) for tables; raises ``InputError`` for an
-    unknown name.
+    """The quantity ``name`` (a metric, a cost or an alias) for tables.
+
+    Raises ``InputError`` for an unknown name.
 
     Counts and times have a unit that suits the trials, unless the name fixes the unit
     (`FIXED_UNITS`).
@@ -156,8 +154,7 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
-    """The number that a question about ``key`` compares: a metric at the end of training, or a cost
-    in its own unit.
+    """The number that a question about ``key`` compares: a metric at the end, or a cost.
 
     If ``key`` is a user's metric that no trial has, the quantity has default facts.
     """
@@ -183,16 +180,17 @@ def value_of(asked: Quantity, trial: TrialResult) -> float:
 
 
 def metric_keys(trials: Iterable[TrialResult], wanted: Container[str] = ()) -> list[str]:
-    """The metrics of any trial and those ``wanted``, in the order of tables; a user's own come
-    last."""
+    """The metrics of any trial and those ``wanted``, in order; a user's own come last."""
     present = {key for trial in trials for key in trial.metrics}
     own = sorted(key for key in present if find_metric(key) is None)
     return [key for key in known_keys() if key in present or key in wanted] + own
 
 
 def _metric(key: str, step: str, trials: Sequence[TrialResult]) -> Quantity:
-    """A metric at the end, or at iteration ``step`` unless it is "". Trials record the facts of a
-    user's metric."""
+    """A metric at the end, or at iteration ``step`` unless it is "".
+
+    Trials record the facts of a user's metric.
+    """
     records = [trial.record.metric_facts.get(key) for trial in trials if key in trial.metrics]
     facts = find_metric(key) or from_record(key, records[0] if records else None)
     name, read = facts.name, lambda trial: trial.metrics.get(key)
@@ -226,8 +224,7 @@ def _protocol_lpips(trial: TrialResult) -> str:
 
 
 def _lpips_asked_for(trial: TrialResult) -> list[str]:
-    """The key of the protocol's LPIPS variant, or those of ``eval.lpips`` if it asks only for other
-    variants."""
+    """The key of the protocol's LPIPS, or those of ``eval.lpips`` if it asks only for others."""
     by_protocol, setting = _protocol_lpips(trial), trial.config.get("eval.lpips")
     asked = [f"{LPIPS}{variant}" for variant in setting] if isinstance(setting, list) else []
     return asked if asked and by_protocol not in asked else [by_protocol]

@@ -20,8 +20,7 @@ from gsbench.errors import InputError
 
 @dataclass(frozen=True)
 class Ranking:
-    """The mean ranks of ``arms`` over ``scenes`` in a metric, 1 for the best; the arms are in the
-    order of their ranks.
+    """Mean ranks of ``arms`` over ``scenes`` in a metric, 1 for the best, which comes first.
 
     Two arms differ (5 %, all pairs together) if their mean ranks differ by ``critical`` or more.
     ``p`` is that of Friedman's test that no arm differs; None for two arms, for which it is not
@@ -50,8 +49,7 @@ class Ranking:
 
 
 def rank_arms(trials: Sequence[TrialResult], quantity: Quantity) -> Ranking | None:
-    """The ranking of all arms of ``trials``; None if fewer than `MIN_SCENES` scenes have comparable
-    trials of each."""
+    """The ranking of all arms; None below `MIN_SCENES` scenes with comparable trials of each."""
     arms = sorted({trial.arm for trial in trials})
     means: dict[str, list[float]] = {}
     for scene, own in group_by(trials, lambda trial: trial.scene).items():
@@ -79,8 +77,10 @@ def rank_arms(trials: Sequence[TrialResult], quantity: Quantity) -> Ranking | No
 
 
 def _means(trials: Sequence[TrialResult], arms: Sequence[Arm], quantity: Quantity) -> list[float]:
-    """The mean of each arm on the scene of ``trials``; raises InputError if one is missing or
-    cannot be compared."""
+    """The mean of each arm on the scene of ``trials``.
+
+    Raises InputError if one is missing or cannot be compared.
+    """
     if differing_conditions(trials):
         raise InputError("the arms differ in their conditions")
     by_arm = group_by(trials, lambda trial: trial.arm)
@@ -96,8 +96,7 @@ def _means(trials: Sequence[TrialResult], arms: Sequence[Arm], quantity: Quantit
 
 
 def critical_difference(arms: int, scenes: int, level: float = ALPHA) -> float:
-    """The difference of mean ranks from which on two of ``arms`` differ: ``q sqrt(k (k + 1) / 6
-    N)``.
+    """The least difference of mean ranks of different ``arms``: ``q sqrt(k (k + 1) / 6 N)``.
 
     q is the upper quantile of the studentized range for infinite degrees of freedom, divided by the
     root of 2.

@@ -1,5 +1,4 @@
-"""Reading the results of an experiment: complete and sound trials, and a warning for every other
-folder.
+"""Reading an experiment's results: sound complete trials, and warnings on other folders.
 
 A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>/``. Its
 ``results.json`` is written last: a folder that has it is complete. Nothing here needs torch, so
@@ -36,8 +35,9 @@ TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 
 
 class Configurations:
-    """The settings that determine results, of all trials of an experiment. Each file is read once
-    for all seeds.
+    """The settings that determine results, of all trials of an experiment.
+
+    Each file is read once for all seeds.
 
     ``trial`` is the key that the seeds of a trial share (`TrialResult.key`). ``known`` has, by this
     key, the settings of trials that have not run and thus have no file.
@@ -47,15 +47,13 @@ class Configurations:
         self._known: dict[str, Mapping[str, Any]] = dict(known or {})
 
     def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
-        """The settings of a trial, read from ``folder`` or from another seed before; {} if they
-        cannot be read."""
+        """A trial's settings, read from ``folder`` or from an earlier seed; {} if unreadable."""
         if trial not in self._known:
             self.read(trial, [folder])
         return self._known[trial]
 
     def read(self, trial: str, folders: Iterable[Path]) -> str:
-        """Read the settings of a trial from its first readable folder; return "", or the last
-        folder's fault."""
+        """Read a trial's settings from its first readable folder; return "", or the last fault."""
         fault = ""
         for folder in folders:
             try:
@@ -77,8 +75,10 @@ class Configurations:
 
 
 def load_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys; raises FileNotFoundError and
-    DamagedError."""
+    """The configuration of the trial in ``folder`` with dotted keys.
+
+    Raises FileNotFoundError and DamagedError.
+    """
     values = TrialFolder(folder).settings()
     if not isinstance(values, dict) or not all(
         isinstance(values.get(group), dict) for group in GROUPS
@@ -153,8 +153,7 @@ class TrialResult:
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """The settings that determine the result, with dotted keys; empty if they are missing or
-        cannot be read.
+        """The settings that determine the result, with dotted keys; empty if unreadable.
 
         They are read once for all trials that share them; `whole_config` is read from the trial's
         own file.
@@ -163,8 +162,7 @@ class TrialResult:
 
     @cached_property
     def key(self) -> str:
-        """The trial's folder within its experiment without the seed,
-        ``<scene>/<init>-<densify>/<hash8>``.
+        """The folder in the experiment without the seed, ``<scene>/<init>-<densify>/<hash8>``.
 
         Trials that differ only in their seeds share it.
         """
@@ -172,8 +170,7 @@ class TrialResult:
 
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:
-        """Every setting of the trial with dotted keys, also those that do not change the result; as
-        `config`."""
+        """Every setting with dotted keys, also those that change no result; as `config`."""
         try:
             return load_flat_config(self.path)
         except (FileNotFoundError, DamagedError):
@@ -198,8 +195,7 @@ class TrialResult:
 
     @cached_property
     def rooms(self) -> dict[str, str]:
-        """The rooms (parts of gsbench's code) that made the trial, with their states then
-        (`gsbench.runs.keys`)."""
+        """The rooms (parts of gsbench) that made the trial, with their states then."""
         return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
 
     @property
@@ -217,21 +213,18 @@ class TrialResult:
 
     @property
     def cloud(self) -> str:
-        """The hash of the initial model's files (cameras, poses, points); "" if it was not
-        recorded."""
+        """The hash of the initial model's files (cameras, poses, points); "" if unrecorded."""
         return self.record.hashes.get("cloud", "")
 
     @property
     def measured(self) -> float:
-        """The Unix time at which the metrics were measured; if it is not recorded, that of the
-        file."""
+        """The Unix time of measuring the metrics; if unrecorded, that of the file."""
         moment = unix_time(self.record.measured)
         return self.finished if moment is None else moment
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:
-        """The recorded conditions that trials must share before their numbers may be averaged, as
-        comparable text."""
+        """The conditions that trials must share before they are averaged, as text."""
         conditions = {
             "protocol": self.record.protocol,
             "resolution": "x".join(map(str, self.record.resolution or (None,))),
@@ -251,16 +244,14 @@ class TrialResult:
 
     @cached_property
     def split(self) -> str:
-        """The rule that holds views out, as short text; "" if neither the record nor the
-        configuration has it."""
+        """The rule that holds views out, as short text; "" if nothing tells it."""
         if self.record.split:
             return self.record.split
         return split_text(self.config) if self.config.get("scene.split") else ""
 
     @cached_property
     def question(self) -> str:
-        """The question that the held-out views ask, interpolation or extrapolation; "" for a list
-        of views."""
+        """The question of the held-out views, interpolation or extrapolation; "" for a list."""
         kind = re.split("[ ,]", self.split, maxsplit=1)[0]
         return QUESTIONS.get(kind, "")
 
@@ -271,8 +262,7 @@ class TrialResult:
 
     @property
     def made_elsewhere(self) -> bool:
-        """Return whether a training outside gsbench made the model or the renders: its time and
-        budget are unknown."""
+        """Return whether model or renders come from elsewhere: no time or budget is known."""
         return self.record.evaluated_from is not None and not self.program
 
     @property
@@ -287,8 +277,7 @@ class TrialResult:
 
     @property
     def budget_acted(self) -> bool:
-        """Return whether the budget may have changed the trial: a cap that blocks or steers growth,
-        or a time limit."""
+        """Return whether a cap that blocks or steers, or a time limit, may have changed it."""
         if self.made_elsewhere or self.program:
             return False
         budget, events = self.record.budget, self.record.events
@@ -369,8 +358,7 @@ def read_experiment(folder: Path) -> Experiment:
 
 
 def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> dict[str, str]:
-    """Read the settings that are needed; return what is wrong with each, "" for nothing, by the
-    trials' `key`.
+    """Read the settings that are needed; return what is wrong ("": nothing) by trials' `key`.
 
     Settings are needed only if trials of one scene, initialiser and densifier have different ones.
     Other trials' files are not opened here, which saves time.
@@ -387,8 +375,9 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
 
 
 def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
-    """The metrics of every test view, ``{view: {metric: value}}``; raises ``InputError`` if the
-    file is damaged.
+    """The metrics of every test view, ``{view: {metric: value}}``.
+
+    Raises ``InputError`` if the file is damaged.
 
     Its values must average to the trial's metrics, so a truncated file is detected.
     """

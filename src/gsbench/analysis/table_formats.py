@@ -15,8 +15,7 @@ TEMPLATES = "gsbench.analysis.report"
 
 @dataclass(frozen=True)
 class TableEntry:
-    """A table cell as shown: ``text`` without markup, and the ``cell`` behind it if it shows a
-    number."""
+    """A table cell: its ``text`` without markup, and the ``cell`` behind it if it is a number."""
 
     text: str
     bold: bool = False
@@ -25,8 +24,7 @@ class TableEntry:
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its group (the quantity, shared by neighbours), its heading, and both for machines
-    (``key``)."""
+    """A column: group (the quantity), heading, and both for machines (``key``)."""
 
     group: str
     heading: str
@@ -42,8 +40,10 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table with notes below it. The cells of a ``wrapped`` table may need several
-    lines."""
+    """A titled table with notes below it.
+
+    The cells of a ``wrapped`` table may need several lines.
+    """
 
     title: str
     row_headings: tuple[str, ...]
@@ -60,8 +60,10 @@ class Table:
 
 
 def fill(template: str, package: str = TEMPLATES, **values: Any) -> str:
-    """Fill a jinja2 template of ``package``, or else of the report, with ``values``. Values are
-    escaped for HTML."""
+    """Fill a jinja2 template of ``package``, or else of the report, with ``values``.
+
+    Values are escaped for HTML.
+    """
     return _environment(package).get_template(template).render(**values)
 
 
@@ -99,8 +101,7 @@ def to_markdown(table: Table) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """CSV with one line per cell: its values in full precision, its text, and the folders of its
-    trials."""
+    """CSV with one line per cell: values in full precision, text, and trials' folders."""
     import pandas as pd  # here, since it is slow to import
 
     heads = [
@@ -155,10 +156,8 @@ def to_latex(table: Table) -> str:
     ).replace("\\begin{table}\n", "\\begin{table}\n\\centering\n")
     if table.notes:
         notes = "\\\\\n".join(escape_latex(note) for note in table.notes)
-        below = (
-            "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize\n"
-            f"{notes}\n\\end{{minipage}}\n"
-        )
+        start = "\\par\\smallskip\\begin{minipage}{\\linewidth}\\footnotesize"
+        below = f"{start}\n{notes}\n\\end{{minipage}}\n"
         text = text.replace("\\end{table}", f"{below}\\end{{table}}")
     return f"% needs \\usepackage{{booktabs{',array' if table.wrapped else ''}}}\n{text}"
 

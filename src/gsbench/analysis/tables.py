@@ -78,9 +78,8 @@ def build_table(
     check_fields(trials, fields)
     groups = group_by(trials, lambda trial: tuple(field_value(trial, name) for name in fields))
     for key, group in groups.items():
-        check_averageable(
-            group, " ".join(f"{name}={value}" for name, value in zip(fields, key, strict=True))
-        )
+        named = zip(fields, key, strict=True)
+        check_averageable(group, " ".join(f"{name}={value}" for name, value in named))
     expected = 1 if "seed" in fields else len({trial.seed for trial in trials})
     row_labels, column_labels = order or (
         sorted({key[: len(rows)] for key in groups}, key=_natural),
@@ -97,37 +96,22 @@ def build_table(
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
     if "scene" in rows and len(scenes) > 1:
-        means = _means(
-            groups,
-            list(rows).index("scene"),
-            row_labels,
-            column_labels,
-            quantities,
-            scenes,
-            expected,
-        )
+        place = list(rows).index("scene")
+        means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
         best = set() if notes else _best(means, quantities, None)[0]
         shown += _rows(means, best, quantities, ruled=True)
-    headings = [
-        Column(
-            one.heading if columns else "",
-            " + ".join(names.get(value, value) for value in column) if columns else one.heading,
-            (one.key, "+".join(column)),
-        )
-        for one in quantities
-        for column in column_labels
-    ]
+    headings = []
+    for one, column in itertools.product(quantities, column_labels):
+        above, text = "", one.heading
+        if columns:
+            above, text = text, " + ".join(names.get(value, value) for value in column)
+        headings.append(Column(above, text, (one.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
     notes += trials_notes(experiment, trials)
     if left_out := experiment.warnings:
         notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")
-    return Table(
-        title or f"Experiment {experiment.name}",
-        tuple(rows),
-        tuple(headings),
-        tuple(shown),
-        tuple(notes),
-    )
+    heading = title or f"Experiment {experiment.name}"
+    return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(notes))
 
 
 LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
@@ -189,16 +173,17 @@ def _best(
             (position for position in cells if position[2] == quantity.key), scene_and_split
         )
         for (scene, _), positions in rivals.items():
-            shown = [trial for position in positions for trial in cells[position].trials]
-            by_scene = group_by(shown, lambda trial: trial.scene)
-            differing = {key for group in by_scene.values() for key in differing_conditions(group)}
+            own = {position: cells[position] for position in positions}
+            shown = itertools.chain(*(cell.trials for cell in own.values()))
+            by_scene = group_by(shown, lambda trial: trial.scene).values()
+            differing = sorted(set().union(*map(differing_conditions, by_scene)))
             if differing:
+                place = scene or "arms"
                 notes.append(
-                    f"{scene or 'arms'}: not compared, no best marked: "
-                    f"{', '.join(sorted(differing))} differ."
+                    f"{place}: not compared, no best marked: {', '.join(differing)} differ."
                 )
             else:
-                bold |= best_cells({position: cells[position] for position in positions}, quantity)
+                bold |= best_cells(own, quantity)
     return bold, list(dict.fromkeys(notes))
 
 
@@ -223,25 +208,27 @@ def _means(
     def trials(row: Labels, column: Labels, scene: str) -> Sequence[TrialResult]:
         return groups.get((*row[:scene_index], scene, *row[scene_index:], *column), [])
 
-    def has_value(quantity: Quantity, scene: str) -> bool:
-        """Return whether every arm has a value on the scene."""
-        arms = itertools.product(mean_rows, column_labels)
-        return all(
-            any(quantity.read(trial) is not None for trial in trials(*arm, scene)) for arm in arms
-        )
+    def shared(quantity: Quantity) -> list[str]:
+        """The scenes on which every arm has a value."""
+        left = list(scenes)
+        for row, column in itertools.product(mean_rows, column_labels):
+            for scene in list(left):
+                values = map(quantity.read, trials(row, column, scene))
+                if all(value is None for value in values):
+                    left.remove(scene)
+        return left
 
-    shared_scenes = {
-        one.key: [scene for scene in scenes if has_value(one, scene)] for one in quantities
-    }
+    shared_scenes = {one.key: shared(one) for one in quantities}
     most_scenes = max(map(len, shared_scenes.values()))
     if most_scenes == 0:
         return {}
     label = f"mean of {counted(most_scenes, 'scene')}"
     cells: dict[Position, Cell] = {}
     for row, one, column in itertools.product(mean_rows, quantities, column_labels):
-        own = [trial for scene in shared_scenes[one.key] for trial in trials(row, column, scene)]
+        own_scenes = shared_scenes[one.key]
+        own = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
         labels = (*row[:scene_index], label, *row[scene_index:])
-        cells[labels, column, one.key] = make_cell(own, one, shared_scenes[one.key], expected)
+        cells[labels, column, one.key] = make_cell(own, one, own_scenes, expected)
     return cells
 
 
@@ -257,7 +244,8 @@ def _reading_notes(
     notes.append("Bold: best mean of a scene after rounding; this is not a test.")
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
         notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
-    protocols = {trial.record.protocol for cell in cells.values() for trial in cell.trials}
+    trials = itertools.chain(*(cell.trials for cell in cells.values()))
+    protocols = {trial.record.protocol for trial in trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
     for one in quantities:
         own = [cell for position, cell in cells.items() if position[2] == one.key]
@@ -301,15 +289,13 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
         if line := trial.record.learnt_nothing:
             notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
         notes += [f"{line}." for line in trial.record.raster_passed_over]
-    folders, downscales = (
-        {trial.config.get(key) for trial in trials if trial.config}
-        for key in ("scene.images", "scene.downscale")
-    )
+    known = [trial.config for trial in trials if trial.config]
+    folders = {config.get("scene.images") for config in known}
+    downscales = {config.get("scene.downscale") for config in known}
     if len(folders) > 1 and len(downscales) > 1:
         notes.append(
             "Pictures of scene.images and of scene.downscale were made by different filters: "
-            "results on them differ "
-            "by about 0.3 to 0.45 dB."
+            "results on them differ by about 0.3 to 0.45 dB."
         )
     for trial in trials:
         twins = trial.record.twins or TwinViews()
@@ -331,8 +317,7 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on the arms that gsbench did not train: who did, and whether a model or renders were
-    measured."""
+    """Lines on arms that gsbench did not train: who did, and what was measured."""
     notes = []
     not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
     for trained_here, measured, what in ORIGINS:
@@ -357,8 +342,7 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: the declared verdict, arms that are equal to the last bit, and
-    caveats.
+    """Lines on the compared arms: declared verdict, equality to the last bit, and caveats.
 
     They are about the whole experiment, so choosing the trials that a table shows cannot change a
     verdict.
@@ -415,8 +399,7 @@ AGREEMENT = {
 
 
 def with_agreement(tables: Sequence[Table]) -> list[Table]:
-    """The tables, of which the first says how weakly its metrics agree with people, if a study
-    measured any of them."""
+    """The tables; the first says how weakly its metrics agree with people, if that is known."""
     shown = {column.key[0] for table in tables for column in table.columns}
     found = [
         f"{value} for {facts.label}"
@@ -443,14 +426,12 @@ def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
     rest = f"; not recorded: {unknown}" if unknown else ""
     return [
         f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings "
-        "give other last digits "
-        "and, after thousands of iterations, other results."
+        "give other last digits and, after thousands of iterations, other results."
     ]
 
 
 def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each scene and initialiser whose trials have the same settings but started from
-    several clouds."""
+    """A line for each scene and initialiser with equal settings but several clouds."""
     notes = []
     groups = group_by(
         trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init"))
@@ -467,8 +448,7 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each way in which views were held out; it names the scenes if there are several
-    ways and scenes."""
+    """A line for each way of holding views out, with its scenes if there are several ways."""
     notes = []
     recorded = [trial for trial in trials if trial.record.held_out]
     splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
@@ -490,8 +470,7 @@ def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
 
 
 def points_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each initialiser on the views that made its points; none for points that no
-    photographs made."""
+    """A line for each initialiser on the views that made its points, if photographs did."""
     notes = []
     for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
         if choice == "all":

@@ -1,5 +1,4 @@
-"""Rounds of votes in words, for the terminal and the report, with the views where people and LPIPS
-disagree."""
+"""Rounds of votes in words, and the views where people and LPIPS disagree."""
 
 import logging
 from collections.abc import Sequence
@@ -26,8 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def load_rounds(home: Path) -> list[RoundVerdict]:
-    """The verdicts of all rounds of the experiment in ``home``, the oldest first; a damaged round
-    gives a warning."""
+    """The verdicts of all rounds in ``home``, oldest first; a damaged round gives a warning."""
     verdicts = []
     for folder in (home / VOTES).glob("*/"):
         try:
@@ -47,8 +45,7 @@ def people_words(count: int) -> str:
 
 
 def describe_round(verdict: RoundVerdict) -> list[str]:
-    """The lines of a round: how many voted, the verdict on each arm, the ranking, and who was left
-    out."""
+    """A round's lines: how many voted, verdicts on arms, ranking, and who was left out."""
     key = verdict.key
     when = f"{key.time[:16].replace('T', ' ')} UTC"
     voted = f"{counted(verdict.votes, 'vote')} of {people_words(len(verdict.counted))}"
@@ -68,23 +65,20 @@ def describe_round(verdict: RoundVerdict) -> list[str]:
     if verdict.counted:
         lines.append(
             f"{100 * verdict.consistent:.0f} % of the pairs shown again, swapped, had the same "
-            "answer; "
-            f"{100 * verdict.left:.0f} % of the votes were for the left side."
+            f"answer; {100 * verdict.left:.0f} % of the votes were for the left side."
         )
     return lines + [f"Left out: {person} {reason}." for person, reason in verdict.left_out.items()]
 
 
 def _describe_pair(pair: PairVotes, final: bool) -> list[str]:
-    """The votes on an arm against the baseline, and the statements about people and about
-    scenes."""
+    """The votes on an arm against the baseline, and what they say of people and of scenes."""
     parts = ""
     for how in ("most different", "random"):
         means = [mean for showing, mean in pair.views if showing.chosen == how]
         parts += f", {50 + 50 * sum(means) / len(means):.0f} % of the {how} views" if means else ""
     return [
         f"{pair.arm} against {pair.baseline}: {_share(pair)} ({pair.wins} for it, {pair.losses} "
-        "against it, "
-        f"{pair.ties} without a difference{parts}).",
+        f"against it, {pair.ties} without a difference{parts}).",
         f"People like these, on these views: {_statement(pair.people, 'people', final)}.",
         f"Scenes like these, for these people: {_statement(pair.scenes, 'scenes', final)}.",
     ]
@@ -115,8 +109,7 @@ def _share(pair: PairVotes) -> str:
 def vote_table(
     pair: PairVotes, final: bool, trials: Sequence[TrialResult], judged: Sequence[PairVerdicts]
 ) -> Table:
-    """People's verdict beside those of metrics on the same arms, and how often a metric prefers
-    what people prefer."""
+    """People's verdict beside those of metrics, and how often a metric prefers as people do."""
     rows = [
         Row(
             (f"{units} like these",),
@@ -160,8 +153,7 @@ def _metrics(pair: PairVotes, trials: Sequence[TrialResult]) -> list[Quantity]:
 
 
 def disagreements(pair: PairVotes, trials: Sequence[TrialResult]) -> list[ViewComparison]:
-    """Pictures of at most `MAX_SHOWN` views where people and LPIPS prefer different arms, the
-    clearest votes first.
+    """Pictures of `MAX_SHOWN` views or fewer where people and LPIPS disagree, clearest first.
 
     LPIPS is the first variant that both trials of the view have.
     """

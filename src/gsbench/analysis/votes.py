@@ -1,5 +1,4 @@
-"""People's votes on which of two renders is nearer to the photograph, and what a round of them
-shows.
+"""People's votes on which of two renders is nearer to the photograph, and what they show.
 
 `gsbench.claims.vote_page` makes a round: pairs of renders (each with the photograph), some of them
 a second time with the sides swapped, and traps, which show the photograph beside a blurred one.
@@ -38,8 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PairVotes:
-    """The votes on ``arm`` against ``baseline``, with the two statements; each is None below six
-    units.
+    """The votes on ``arm`` against ``baseline`` with two statements, None below six units.
 
     ``views`` have the mean vote on each view, from -1 (all for the baseline) to 1.
     """
@@ -87,8 +85,7 @@ class RoundVerdict:
 
 
 def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
-    """The verdict of a round: first traps, then at most the declared number of people in the order
-    of finishing."""
+    """A round's verdict: traps first, then at most the declared people in finishing order."""
     left_out: dict[str, str] = {}
     counted = list[Ballot]()
     traps = [one for one in key.showings if one.kind == "trap"]
@@ -128,8 +125,7 @@ def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
 
 
 def _preference(showing: Showing, ballot: Ballot, side: str) -> int:
-    """1 if the ballot prefers ``side`` (an arm, or of a trap the photograph), -1 the other, 0 for
-    no difference."""
+    """1 if the ballot prefers ``side`` (an arm, or a trap's photograph), -1 the other, else 0."""
     answer = ballot.answers[showing.id]
     if answer == SAME:
         return 0
@@ -192,8 +188,7 @@ def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[tuple[Arm, floa
 
 
 def rank_wins(wins: Array) -> tuple[Array, Array, Array]:
-    """The `bradley_terry` chances [A] and both ends [A] of their intervals of 95 %, from ``wins``
-    [K, S, A, A].
+    """The `bradley_terry` chances [A] with ends of 95 % intervals, of ``wins`` [K, S, A, A].
 
     The standard errors of the log-odds come from drawing people and scenes anew, both with
     replacement (Owen 2007, Ann. Appl. Stat. 1, 386). Percentiles of so few units would be too
@@ -219,8 +214,7 @@ def rank_wins(wins: Array) -> tuple[Array, Array, Array]:
 
 
 def bradley_terry(wins: Array) -> Array:
-    """The chance [D, A] of each arm to win against the average arm, from the ``wins`` [D, A, A] of
-    row against column.
+    """The chance [D, A] of each arm to win against the average one, by ``wins`` [D, A, A].
 
     The model is that of Bradley and Terry (1952), fitted by the iteration of Hunter (2004, Ann.
     Stat. 32, 384). Half a vote more for each arm against each other keeps an arm that never lost at

@@ -6,6 +6,7 @@ Before Hydra runs, the whole configuration is composed and checked (`gsbench.con
 decided.
 """
 
+import itertools
 import logging
 import sys
 from collections.abc import Mapping, Sequence
@@ -53,8 +54,7 @@ log = logging.getLogger(__name__)
 
 
 def launch(argv: list[str]) -> int:
-    """Run the trials of the command line ``argv``; returns 0 if all are done (or left to Slurm), 1
-    if some failed.
+    """Run the trials of a command line; returns 0 if all are done (or in Slurm), 1 if some failed.
 
     Raises InputError for a wrong configuration, and for a single trial's bad input.
     """
@@ -96,14 +96,12 @@ def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict
 
 
 def run_trials(trials: Sequence[Trial]) -> int:
-    """Run those ``trials`` that are not done, by the launcher that they name; returns the exit
-    code."""
+    """Run the ``trials`` that are not done, by their launcher; returns the exit code."""
     return summarize(run_batch(trials), trials)
 
 
 def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
-    """Run ``task`` for the trials of a command line: one, or many with ``multirun`` or an
-    experiment that is a sweep.
+    """Run ``task`` for a command line's trials: one, or many (``multirun``, an experiment).
 
     Raises InputError, one line, for a wrong configuration.
     """
@@ -230,8 +228,7 @@ def prepare_other_sweeper(
     task.objective = Objective(sign, tuple(seeds))
     log.info(
         "hydra/sweeper=%s gets %s%s of test views, %s; gsbench's own sweeper would tune on "
-        "validation views and "
-        "can stop by looks",
+        "validation views and can stop by looks",
         name,
         "-" if sign != direction else "",
         metric,
@@ -242,8 +239,7 @@ def prepare_other_sweeper(
 
 
 def _maximizes(sweeper: DictConfig) -> bool:
-    """Return whether a sweeper was told (as Optuna's, Nevergrad's or Ax's is) to look for the
-    largest value."""
+    """Return whether a sweeper (Optuna, Nevergrad, Ax) was told to look for the largest value."""
     direction = sweeper.get("direction")
     name = str(getattr(direction, "name", direction)).lower()
     nevergrad, ax = (
@@ -254,8 +250,7 @@ def _maximizes(sweeper: DictConfig) -> bool:
 
 
 def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
-    """The words by which Hydra writes its own files as in any app, if one of its folders or logs
-    was asked for.
+    """The words by which Hydra writes its own files as in any app, if one of them was asked for.
 
     Otherwise Hydra writes nothing, since each trial's folder has its configuration and log.
     """
@@ -296,8 +291,7 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
-    """Refuse settings of a sweep without a sweep, parameters that are no mapping, and a second
-    launcher."""
+    """Refuse a sweep's settings without a sweep, unmapped parameters, and a second launcher."""
     sweeper = config.hydra.sweeper
     params = sweeper.get("params")
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
@@ -325,8 +319,7 @@ def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
 
 
 def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
-    """Report how the trials ended; returns 0 if all are done, 1 if some failed, 2 if all failed for
-    bad input.
+    """Report how trials ended: 0 if all are done, 1 if some failed, 2 if all had bad input.
 
     A single trial's failure is raised, so that the program prints this one line only.
     """
@@ -355,8 +348,7 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
 def run_sweep(
     sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]
 ) -> None:
-    """Run all points that the ``words`` and ``params`` (``hydra.sweeper.params``) of the sweep
-    span.
+    """Run all points that ``words`` and ``params`` (``hydra.sweeper.params``) span.
 
     ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first
     (`gsbench.app.tuning`).
@@ -387,8 +379,9 @@ def run_sweep(
 
 
 def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
-    """Run the trials in the looks that the sequential test plans. Decided pairs of arms get no
-    further trials.
+    """Run the trials in the looks that the sequential test plans.
+
+    Decided pairs of arms get no further trials.
 
     Raises InputError for a sweep that cannot be tested so.
     """
@@ -437,8 +430,10 @@ def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
 
 
 def checked_grids(grids: Any) -> list[dict[str, str]]:
-    """The grids of the configuration, with values as texts. Raises InputError unless they are a
-    list of mappings."""
+    """The grids of the configuration, with values as texts.
+
+    Raises InputError unless they are a list of mappings.
+    """
     if not isinstance(grids, list) or not all(isinstance(grid, dict) and grid for grid in grids):
         raise InputError(
             f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}"
@@ -449,25 +444,19 @@ def checked_grids(grids: Any) -> list[dict[str, str]]:
 def words_of_grids(
     params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
 ) -> list[list[str]]:
-    """The words of each grid: its own, the shared ``params``, and the words ``given`` that are for
-    it.
+    """The words of each grid: its own, the shared ``params``, and those ``given`` for it.
 
     If two set one key, the later counts. Trials are in the order of the grids; the shared settings
     vary fastest.
     """
-    listed = {bare_key(key) for grid in grids for key in grid}
-    return [
-        [
-            *(f"{key}={value}" for key, value in grid.items()),
-            *(
-                f"{key}={value}"
-                for key, value in params.items()
-                if bare_key(key) not in map(bare_key, grid)
-            ),
-            *(word for word in given if key_of(word) not in listed - set(map(bare_key, grid))),
-        ]
-        for grid in grids or [{}]
-    ]
+    listed = set(map(bare_key, itertools.chain(*grids)))
+    jobs = []
+    for grid in grids or [{}]:
+        own = set(map(bare_key, grid))
+        shared = {key: value for key, value in params.items() if bare_key(key) not in own}
+        words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
+        jobs.append([*words, *(word for word in given if key_of(word) not in listed - own)])
+    return jobs
 
 
 def _text(key: object, value: object) -> str:

@@ -1,5 +1,4 @@
-"""A sweep that Hydra has started, and the task that runs a trial: what search and grids have in
-common.
+"""A sweep that Hydra has started, and the task that runs a trial: for searches and grids.
 
 Hydra's task function is `TrialTask`. gsbench's own sweeper hands all trials to it as one batch.
 Another launcher calls it for each job, perhaps in another process. Another sweeper proposes the
@@ -54,8 +53,10 @@ class Objective:
     seeds: tuple[str, ...] = ()
 
     def value(self, trials: Sequence[Trial]) -> float:
-        """The value of a job's ``trials``, which are done. Raises GsbenchError if one lacks the
-        metric."""
+        """The value of a job's ``trials``, which are done.
+
+        Raises GsbenchError if one lacks the metric.
+        """
         metric, direction = metric_of(trials[0].values)
         records = [trial.files.sound_record() for trial in trials]
         values = [record.metrics.get(metric) for record in records if record is not None]
@@ -66,8 +67,7 @@ class Objective:
 
 
 def metric_of(values: Mapping[str, Any]) -> tuple[str, int]:
-    """The metric that judges a trial (``eval.primary``, else PSNR), and 1 if more of it is better,
-    else -1."""
+    """The metric that judges a trial (``eval.primary``, else PSNR); 1 if more is better, or -1."""
     metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
     direction = facts_for(metric, values).direction
     if not direction:
@@ -108,8 +108,9 @@ class TrialTask:
         )
 
     def __call__(self, config: DictConfig) -> float | None:
-        """Run one job. Called by Hydra or by another launcher, perhaps in another process; raises
-        if it failed.
+        """Run one job.
+
+        Called by Hydra or by another launcher, perhaps in another process; raises if it failed.
 
         Returns the job's value for another sweeper, else None.
         """
@@ -161,8 +162,7 @@ class TrialTask:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that Hydra has started: its configuration, its task, Hydra's context and the
-    launcher."""
+    """A sweep that Hydra has started: its configuration, task, context and launcher."""
 
     config: DictConfig
     task: TrialTask
@@ -194,8 +194,10 @@ class Sweep:
         return compose.compose_jobs(self.context.config_loader, self.config, jobs)
 
     def launch(self, trials: Sequence[Trial]) -> None:
-        """Run trials by the launcher. For another launcher than gsbench's, all trials are checked
-        before the first."""
+        """Run trials by the launcher.
+
+        For another launcher than gsbench's, all trials are checked before the first.
+        """
         name = self.config.hydra.runtime.choices["hydra/launcher"]
         if name == OWN or self.task.look_only:
             self.task.launch(trials)

@@ -1,5 +1,4 @@
-"""Tuning parity: before a sweep's trials, each arm gets the same number of search points, on
-validation views.
+"""Tuning parity: before a sweep, each arm gets equally many search points, on validation views.
 
 Intervals among the words of the sweep or in its grids say what is tuned, and for which arms. An arm
 without intervals is not tuned. Each arm has its own search, whose points are trained in an
@@ -14,6 +13,7 @@ their folders.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import logging
 import math
 import statistics
@@ -66,8 +66,9 @@ DIGITS = 4  # significant digits of a value, so that people can type it
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of a tuning. ``points`` is the number for each arm; 0: nothing is tuned, and
-    intervals are left out.
+    """Settings of a tuning.
+
+    ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out.
 
     ``seed`` lists the seeds of a point's trials. The sweep may have none of them.
     """
@@ -104,9 +105,9 @@ class ArmSearch:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         sampler = optuna.samplers.TPESampler(seed=0, constant_liar=self.at_once > 1)
-        direction: Literal["maximize", "minimize"] = (
-            "maximize" if self.record.direction > 0 else "minimize"
-        )
+        direction: Literal["maximize", "minimize"] = "minimize"
+        if self.record.direction > 0:
+            direction = "maximize"
         study = optuna.create_study(direction=direction, sampler=sampler)
         if self.first is not None:
             study.enqueue_trial(dict(self.first))
@@ -125,7 +126,8 @@ class ArmSearch:
             "eval.primary=null",
             *words_of_values(values),
         ]
-        return [[*job, *own, f"{SEED}={seed}"] for job in self.jobs for seed in self.record.seeds]
+        seeds = [f"{SEED}={seed}" for seed in self.record.seeds]
+        return [[*job, *own, seed] for job, seed in itertools.product(self.jobs, seeds)]
 
     def value_of(self, trial: Trial) -> float | None:
         """The metric of a trial, read from its files; None if it has none."""
@@ -133,18 +135,18 @@ class ArmSearch:
         return None if record is None else record.metrics.get(self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
-        """Judge a point by the mean of its trials. It has failed if one of them lacks the
-        metric."""
+        """Judge a point by the mean of its trials.
+
+        It has failed if one of them lacks the metric.
+        """
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
         mean = statistics.fmean(values) if len(values) == len(trials) else None
-        self.study.tell(
-            proposal, mean, state=TrialState.FAIL if mean is None else TrialState.COMPLETE
-        )
-        point = SearchPoint(
-            settings={key: _rounded(value) for key, value in proposal.params.items()}, value=mean
-        )
+        state = TrialState.FAIL if mean is None else TrialState.COMPLETE
+        self.study.tell(proposal, mean, state=state)
+        settings = {key: _rounded(value) for key, value in proposal.params.items()}
+        point = SearchPoint(settings=settings, value=mean)
         self.record.points.append(point)
         return point
 
@@ -180,10 +182,8 @@ def tuned_jobs(
         sweep.task.handle = lambda trials: []  # trials with other values are not listed
         return untuned
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
-    return [
-        [*job, *best_words.get(trial.folder.parent.name, ())]
-        for job, trial in zip(jobs, trials, strict=True)
-    ]
+    arms = (trial.folder.parent.name for trial in trials)
+    return [[*job, *best_words.get(arm, ())] for job, arm in zip(jobs, arms, strict=True)]
 
 
 def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
@@ -192,32 +192,30 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
     A dry run judges only points whose trials are done already; it returns False at the first that
     is not.
     """
-    while proposals := [(search, proposal) for search in searches for proposal in search.propose()]:
-        jobs_by_point = [search.jobs_of(proposal.params) for search, proposal in proposals]
+    while True:
+        points: list[tuple[ArmSearch, Proposal, list[list[str]]]] = []
+        for search in searches:
+            points += [(search, one, search.jobs_of(one.params)) for one in search.propose()]
+        if not points:
+            break
         # Composed together, because `compose_jobs` composes only once what trials share.
-        trials = iter(sweep.trials([job for jobs in jobs_by_point for job in jobs]))
-        points = [
-            (search, proposal, [next(trials) for _ in jobs])
-            for (search, proposal), jobs in zip(proposals, jobs_by_point, strict=True)
-        ]
-        missing = [
-            trial for search, _, own in points for trial in own if search.value_of(trial) is None
-        ]
+        composed = iter(sweep.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
+        trials = [list(itertools.islice(composed, len(jobs))) for _, _, jobs in points]
+        missing: list[Trial] = []
+        for (search, _, _), own in zip(points, trials, strict=True):
+            missing += [trial for trial in own if search.value_of(trial) is None]
         if missing and sweep.task.look_only:
             return False
         if missing:
             _write(searches)  # before training, so that the ranges were on record before any result
             sweep.task.launch(missing)
-        for search, proposal, own in points:
-            point = search.judge(proposal, own)
+        for (search, proposal, _), own in zip(points, trials, strict=True):
+            point, record = search.judge(proposal, own), search.record
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
-                settings, number = (
-                    ", ".join(words_of_values(point.settings)),
-                    len(search.record.points),
-                )
-                title = f"{search.home.name}: point {number} of {search.record.wanted}"
-                log.info("%s: %s: %s %s", title, settings, search.record.metric, value)
+                title = f"{search.home.name}: point {len(record.points)} of {record.wanted}"
+                settings = ", ".join(words_of_values(point.settings))
+                log.info("%s: %s: %s %s", title, settings, record.metric, value)
     if not sweep.task.look_only:
         _write(searches)
     return True
@@ -265,9 +263,8 @@ def _describe(searches: Sequence[ArmSearch]) -> str:
     untuned = [search.record.arm for search in searches if not search.ranges]
     return (
         f"a search tunes first: {counted(first.wanted, 'point')} each for {listed(list(trials))}, "
-        f"by {first.metric} "
-        f"of validation views on {listed(first.scenes)} with {counted(len(first.seeds), 'seed')}, "
-        f"{sum(trials.values()) * first.wanted} trainings"
+        f"by {first.metric} of validation views on {listed(first.scenes)} with "
+        f"{counted(len(first.seeds), 'seed')}, {sum(trials.values()) * first.wanted} trainings"
         + (f"; not tuned: {listed(untuned)}" if untuned else "")
     )
 
@@ -303,13 +300,13 @@ def _plan(
     searches = []
     for arm in dict.fromkeys(arms):
         indices = [index for index, name in enumerate(arms) if name == arm]
-        arm_intervals = dict(
-            sorted((key, interval) for i in indices for key, interval in intervals[i].items())
-        )
-        arm_jobs = [
-            tuple(word for word in jobs[i] if key_of(word) not in REPLACED) for i in indices
-        ]
-        fixed = {key_of(word) for job in arm_jobs for word in job}
+        found: dict[str, Override] = {}
+        arm_jobs = []
+        for i in indices:
+            found |= intervals[i]
+            arm_jobs.append(tuple(word for word in jobs[i] if key_of(word) not in REPLACED))
+        arm_intervals = {key: found[key] for key in sorted(found)}
+        fixed = set(map(key_of, itertools.chain(*arm_jobs)))
         if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
             raise InputError(
                 f"{both} of {arm} is searched in one grid and given in another: leave one of them "
@@ -378,8 +375,10 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """The range of an interval, for Optuna. Raises InputError for a wrong interval or a setting
-    that arms share."""
+    """The range of an interval, for Optuna.
+
+    Raises InputError for a wrong interval or a setting that arms share.
+    """
     from optuna.distributions import FloatDistribution, IntDistribution
 
     check_makes_trials(override)
@@ -405,8 +404,7 @@ def distribution(override: Override) -> BaseDistribution:
 def _own_values(
     values: Mapping[str, Any], ranges: Mapping[str, BaseDistribution]
 ) -> dict[str, Any] | None:
-    """The arm's own values of the searched settings; None if one lies outside its range, or nothing
-    is searched."""
+    """The arm's own values of the searched settings; None if outside the ranges, or if none."""
     settings = flatten(values)
     own = {key: settings.get(bare_key(key)) for key in ranges}
     return (
@@ -415,8 +413,7 @@ def _own_values(
 
 
 def _is_in(value: Any, searched: Any) -> bool:
-    """Return whether the range ``searched`` contains a value that rounding to `DIGITS` leaves as it
-    is."""
+    """Return whether ``searched`` contains a value that rounding to `DIGITS` does not change."""
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)

@@ -1,5 +1,7 @@
-"""Comparison of rasterizers: training steps in parts, whole training steps, and frames as in a
-viewer."""
+"""Comparison of rasterizers.
+
+Training steps in parts, whole training steps, and frames as in a viewer.
+"""
 
 import itertools
 import statistics
@@ -60,8 +62,7 @@ class Setting:
 
 
 class Stepper:
-    """A training of ``setting`` with the rasterizer ``raster``, an executor's name or the import
-    path of a class."""
+    """A training of ``setting`` with ``raster``, an executor's name or a class's import path."""
 
     def __init__(self, raster: str, setting: Setting) -> None:
         self.threads = setting.threads or torch.get_num_threads()
@@ -108,8 +109,10 @@ class Stepper:
         }
 
     def steps_per_second(self) -> float:
-        """The speed of whole training steps: view, render, loss, backward, statistics, Adam, losses
-        read at times."""
+        """The speed of whole training steps.
+
+        View, render, loss, backward, statistics, Adam, losses read at times.
+        """
         steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
         for _ in range(steps):
@@ -127,8 +130,7 @@ class Stepper:
         return frames / (self._now() - begin)
 
     def profiled_steps(self) -> dict[str, dict[str, float]]:
-        """The kernels of whole training steps, and the host's waits for them, as `per_step`
-        describes them."""
+        """The kernels of whole training steps and the host's waits, as `per_step` has them."""
         steps = STEPS_AT_ONCE[self.device.type]
         gpu = [ProfilerActivity.CUDA] if self.device.type == "cuda" else []
         self._now()
@@ -172,8 +174,10 @@ def per_step(
 
 
 def device_of(raster: str) -> torch.device:
-    """The device for timing ``raster``: a GPU if it needs one, or if it is a user's class and there
-    is a GPU."""
+    """The device for timing ``raster``.
+
+    A GPU if it needs one, or if it is a user's class and there is a GPU.
+    """
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device("cpu" if find_executor(raster).runs_on("cpu") else "cuda")
@@ -183,8 +187,10 @@ def device_of(raster: str) -> torch.device:
 
 
 def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasterizer:
-    """Make the executor called ``raster``, or the class at that import path, which the user has
-    typed and so trusts."""
+    """Make the executor called ``raster``, or the class at that import path.
+
+    The user has typed the path, and so trusts it.
+    """
     own = (
         build_own_rasterizer({"_target_": raster}, [raster.partition(".")[0]])
         if "." in raster
@@ -229,12 +235,11 @@ def run_bench(
     scene: str = "trained",
     kernels: bool = False,
 ) -> list[dict[str, Any]]:
-    """Time the training step with each of ``rasters`` for each image size (width, height) and count
-    of Gaussians.
+    """Time the training step with each of ``rasters`` for each size and count.
 
-    The rasterizers take turns, step by step. Times are medians over ``repeats``, in ms. With
-    ``ply``, that model is timed instead of ``counts``. Raises InputError for a rasterizer that
-    cannot run here. Columns:
+    A size is (width, height), a count is that of Gaussians. The rasterizers take turns, step by
+    step. Times are medians over ``repeats``, in ms. With ``ply``, that model is timed instead of
+    ``counts``. Raises InputError for a rasterizer that cannot run here. Columns:
 
     - ``step_ms``: the whole step, which consists of ``forward_ms`` (render), ``loss_ms``,
       ``backward_ms`` (of loss and render) and ``adam_ms``;

@@ -1,5 +1,7 @@
-"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model; and a
-camera for them."""
+"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model.
+
+It has a camera for them, too.
+"""
 
 import math
 from pathlib import Path
@@ -32,23 +34,19 @@ INITIAL_OPACITY = 0.1  # 3DGS
 
 
 def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make ``count`` Gaussians like those of a trained model: many small and flat, few large, with
-    varied opacities.
+    """Make ``count`` Gaussians like those of a trained model.
 
-    They fill the view of `frontal_camera` and a margin around it.
+    Many small and flat, few large, with varied opacities. They fill the view of `frontal_camera`
+    and a margin around it.
     """
     generator = _generator(count, seed)
-    depth = FIRST_DEPTH * torch.exp(
-        torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)
-    )  # [N]
-    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * torch.tensor(
-        [1.4, 1.05]
-    )  # [N, 2] x/z, y/z
+    depth = FIRST_DEPTH * (torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)).exp()
+    fields = torch.tensor([1.4, 1.05])
+    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * fields  # [N, 2] x/z, y/z
     spread = torch.exp(SIGMA_SPREAD * torch.randn(count, generator=generator))
     sigma = MEDIAN_SIGMA * (100_000 / count) ** SIGMA_EXPONENT * spread * depth
-    shape = 0.5 * torch.randn(count, 3, generator=generator) - torch.tensor(
-        [0.0, 0.0, 1.5]
-    )  # [N, 3] flat
+    flat = torch.tensor([0.0, 0.0, 1.5])
+    shape = 0.5 * torch.randn(count, 3, generator=generator) - flat  # [N, 3]
     return Gaussians(
         means=torch.cat([slopes * depth[:, None], depth[:, None]], 1),
         log_scales=sigma.log()[:, None] + shape,
@@ -60,8 +58,10 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make ``count`` Gaussians like those at the start of a training: faint spheres of equal size
-    in a box in front of `frontal_camera`. Their size is the distance to their neighbours.
+    """Make ``count`` Gaussians like those at the start of a training.
+
+    Faint spheres of equal size in a box in front of `frontal_camera`. Their size is the distance to
+    their neighbours.
     """
     generator = _generator(count, seed)
     means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
@@ -77,18 +77,16 @@ def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
 
 
 def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
-    """Make `trained_like_gaussians`, but move half of them to a few spots of the image, most to the
-    first ones, like detail in photographs.
+    """Make `trained_like_gaussians`, but move half of them to a few spots of the image.
 
-    The longest list of a tile is eight to nine times the mean; without the spots it is 1.3 times
-    the mean.
+    Most go to the first spots, like detail in photographs. The longest list of a tile is eight to
+    nine times the mean; without the spots it is 1.3 times the mean.
     """
     gaussians = trained_like_gaussians(count, seed)
     generator = _generator(count, seed + 1)
     weights = 1 / torch.arange(1, SPOTS + 1)  # Zipf's
-    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * torch.tensor(
-        [1.0, 0.7]
-    )  # [S, 2] x/z, y/z
+    fields = torch.tensor([1.0, 0.7])
+    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * fields  # [S, 2] x/z, y/z
     chosen = torch.multinomial(weights, count, replacement=True, generator=generator)  # [N]
     slopes = spots[chosen] + SPOT_RADIUS * torch.randn(count, 2, generator=generator)  # [N, 2]
     moved = torch.rand(count, generator=generator) < SPOT_SHARE  # [N]
@@ -103,8 +101,10 @@ SCENES = {"trained": trained_like_gaussians, "random": random_gaussians, "skewed
 def make_scene(
     kind: str, width: int, height: int, count: int, ply: Path | None = None
 ) -> tuple[Gaussians, Scene]:
-    """Make Gaussians, from the model ``ply`` or of a ``kind`` in `SCENES`, and a scene of noise
-    images for them."""
+    """Make Gaussians and a scene of noise images for them.
+
+    They are from the model ``ply``, or of a ``kind`` in `SCENES`.
+    """
     if ply is not None:
         gaussians = read_ply(ply)
         camera = camera_before(gaussians, width, height)
@@ -125,8 +125,10 @@ def frontal_camera(width: int, height: int) -> Camera:
 
 
 def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
-    """A camera that looks along z at the middle of ``scene`` from twice the median distance of its
-    Gaussians."""
+    """A camera that looks along z at the middle of ``scene``.
+
+    It stands at twice the median distance of the Gaussians.
+    """
     center: Tensor = scene.means.median(0).values  # [3]
     distance = (scene.means - center).norm(dim=-1).median().item()
     return _along_z(width, height, -center.double().numpy() + np.array([0.0, 0.0, 2 * distance]))

@@ -1,2 +1,1 @@
-"""Claims and their verdicts: questions declared first, seeds added until they are decided, results
-of many pooled."""
+"""Claims and their verdicts: declared questions, seeds until they are decided, pooled results."""

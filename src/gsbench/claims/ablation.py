@@ -1,5 +1,4 @@
-"""Ablation of a densifier: its switches, the runs of all their combinations, and the verdicts on
-them.
+"""Ablation of a densifier: its switches, the runs of all combinations, and the verdicts on them.
 
 A switch turns one part of the densifier off by its ``off`` settings; as configured, all switches
 are on. The class (``SWITCHES``), the YAML file (``switches``) or the command line declares it. A
@@ -21,15 +20,15 @@ from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 
 MAX_SWITCHES = 8
-_ABSENT = object()  # differs from any value
 
 Run = frozenset[str]  # the switches that are on
 TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the seed
 
 
 def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
-    """The switches of a densifier's class (``own``) and of its settings, without those whose
-    ``off`` settings hold already.
+    """The switches of a densifier's class (``own``) and of its settings.
+
+    Those whose ``off`` settings hold already are left out.
 
     Raises InputError for a malformed switch.
     """
@@ -44,10 +43,11 @@ def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> d
         if not isinstance(entry, Mapping) or "off" not in entry:
             raise InputError(f"{where} must be {{off: {{KEY: VALUE}}}}, got {entry!r}")
         switches[str(name)] = Switch(**check_values(Switch, dict(entry), where))
+    present = dict(values)
     return {
         name: switch
         for name, switch in switches.items()
-        if any(values.get(key, _ABSENT) != value for key, value in switch.off.items())
+        if present | dict(switch.off) != present  # else it is off already
     }
 
 
@@ -62,8 +62,7 @@ def choose_switches(
         if name not in declared:
             raise InputError(
                 f"{name!r} is not a switch of densify={densify}{did_you_mean(name, declared)} "
-                "(there are "
-                f"{', '.join(declared) or 'none'})"
+                f"(there are {', '.join(declared) or 'none'})"
             )
     if not declared:
         raise InputError(
@@ -80,8 +79,7 @@ def choose_switches(
 
 
 def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
-    """The run without the switches that have no effect in it, because the switch that they depend
-    on is off."""
+    """The run without the switches that have no effect in it: the switch that they need is off."""
 
     def acts(name: str) -> bool:
         within = switches[name].within
@@ -91,8 +89,10 @@ def effective_run(run: Run, switches: Mapping[str, Switch]) -> Run:
 
 
 def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
-    """All different runs, the one with all switches on first; raises InputError if switches depend
-    on each other."""
+    """All different runs, the one with all switches on first.
+
+    Raises InputError if switches depend on each other.
+    """
     for name in switches:
         chain, outer = [name], switches[name].within
         while outer in switches:
@@ -101,11 +101,10 @@ def runs_to_train(switches: Mapping[str, Switch]) -> list[Run]:
                     f"the switches {', '.join(chain)} form a circle: each is within the next"
                 )
             chain, outer = [*chain, outer], switches[outer].within
-    sizes = range(len(switches) + 1)
-    combinations = [
-        Run(chosen) for size in sizes for chosen in itertools.combinations(switches, size)
-    ]
-    runs = dict.fromkeys(effective_run(run, switches) for run in combinations)
+    runs: set[Run] = set()
+    for size in range(len(switches) + 1):
+        combinations = map(Run, itertools.combinations(switches, size))
+        runs |= {effective_run(run, switches) for run in combinations}
     return sorted(runs, key=lambda run: (-len(run), sorted(run)))
 
 
@@ -127,12 +126,14 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
 def judge_runs(
     trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
 ) -> list[Verdict]:
-    """The verdicts on all runs against the run with all switches on, as one family, in the order of
-    ``runs``."""
+    """The verdicts on all ``runs`` against that with all switches on, in order, as one family."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
-    questions = [
-        Question(
+    questions = []
+    for run, keys in runs.items():
+        if run == full:
+            continue
+        question = Question(
             metric=metric,
             sign=quantity.direction or 1,
             least=quantity.worthwhile,
@@ -140,9 +141,7 @@ def judge_runs(
             arm=Arm("", run_name(run, sorted(full))),
             scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
         )
-        for run, keys in runs.items()
-        if run != full
-    ]
+        questions.append(question)
     return judge(trials, Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions)))
 
 

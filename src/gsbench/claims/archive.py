@@ -7,6 +7,7 @@ It holds:
   seeds;
 - ``per_view.csv``: the metrics of every test view;
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
+- ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
 - ``pictures/``: renders and photographs of test views by trial, only if they were asked for;
 - ``archive.json``: the version of this format and the sha256 of the files above;
@@ -20,12 +21,13 @@ bit.
 import csv
 import hashlib
 import io
+import itertools
 import json
 import re
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from lzma import LZMAError
 from pathlib import Path, PurePath
@@ -46,6 +48,7 @@ from gsbench.runs.layout import (
     DECLARED,
     FROM_PIXELS,
     GROUND_TRUTH,
+    LEDGER,
     PER_VIEW,
     RENDERS,
     RESULTS,
@@ -53,6 +56,7 @@ from gsbench.runs.layout import (
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders
 
+RECORDS = (DECLARED, LEDGER)  # files of the experiment, kept as they are
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
@@ -81,13 +85,13 @@ FILES = {  # media types and descriptions
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
+    LEDGER: ("application/jsonl", "The ideas in the order of their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
 }
 
 
 def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> list[str]:
-    """Write the experiment's results to the file ``out``; return a line for each trial that is left
-    out, with why.
+    """Write the experiment's results to ``out``; return a line for each trial left out.
 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
@@ -100,15 +104,12 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
             continue
-        rows += [
-            {"trial": _folder(trial), "view": view} | metrics
-            for view, metrics in sorted(views.items())
-        ]
-        configurations.setdefault(configuration, []).append((_folder(trial), trial.seed))
+        place = _folder(trial)
+        rows += [{"trial": place, "view": view} | views[view] for view in sorted(views)]
+        configurations.setdefault(configuration, []).append((place, trial.seed))
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
-    declared = experiment.folder / DECLARED
     contents = {
         TRIALS: _json_lines(
             {"folder": _folder(trial), "results": _results(trial)} for trial in kept
@@ -118,19 +119,13 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
-    } | ({DECLARED: read_bytes(declared)} if declared.is_file() else {})
-    if any(
-        q.metric == TEXTURED.key
-        for one in read_declarations(experiment.folder)
-        for q in one.questions
-    ):
-        contents[PIXELS] = _json_lines(_pixel_measures(kept))
+        **_declared(experiment.folder, kept),
+    }
     for trial in kept if pictures else ():
         for kind in PICTURES:
+            place = f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}"
             for path in trial.folder.pictures(kind):
-                contents[f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}/{path.name}"] = read_bytes(
-                    path
-                )
+                contents[f"{place}/{path.name}"] = read_bytes(path)
     _check_size(sum(map(len, contents.values())))
     manifest = {
         "format": FORMAT,
@@ -139,31 +134,40 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         "gsbench": __version__,
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     }
-    contents[MANIFEST] = (json.dumps(manifest, indent=1) + "\n").encode()
-    crate = crate_metadata(
-        experiment.name, kept, {name: len(content) for name, content in contents.items()}
-    )
-    contents[CRATE] = (json.dumps(crate, indent=1) + "\n").encode()
+    contents[MANIFEST] = _page(manifest)
+    sizes = {name: len(content) for name, content in contents.items()}
+    # The description of the crate comes first, where other programs look for it.
+    contents = {CRATE: _page(crate_metadata(experiment.name, kept, sizes))} | contents
     with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name in (CRATE, *(name for name in contents if name != CRATE)):
+        for name, content in contents.items():
             info = zipfile.ZipInfo(name, FIXED_DATE)
-            archive.writestr(info, contents[name], zipfile.ZIP_DEFLATED, compresslevel=9)
+            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
     return left_out
 
 
-def _pixel_measures(trials: Sequence[TrialResult]) -> Iterator[dict[str, Any]]:
-    """The folder and the measures of each trial whose pictures can be read."""
-    for trial in trials:
-        with suppress(InputError):
-            yield {
-                "folder": _folder(trial),
-                "measures": PixelMeasures(error_textured=textured_error(trial)).to_json(),
-            }
+def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
+    """The declarations, the ledger, and what declared questions ask of pictures.
+
+    The pictures themselves are mostly not in the archive.
+    """
+    contents = {name: read_bytes(home / name) for name in RECORDS if (home / name).is_file()}
+    asked = itertools.chain(*(one.questions for one in read_declarations(home)))
+    if TEXTURED.key in {question.metric for question in asked}:
+        measured = []
+        for trial in trials:
+            with suppress(InputError):  # a trial whose pictures cannot be read
+                measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
+                measured.append({"folder": _folder(trial), "measures": measures})
+        contents[PIXELS] = _json_lines(measured)
+    return contents
+
+
+def _page(content: Mapping[str, Any]) -> bytes:
+    return (json.dumps(content, indent=1) + "\n").encode()
 
 
 def unpack_archive(file: Path, runs: Path) -> Experiment:
-    """Unpack the trials of an archive into the empty runs folder ``runs``, and read them as an
-    experiment.
+    """Unpack an archive's trials into the empty runs folder ``runs``; read them as an experiment.
 
     Raises InputError, one line that names the file, if it is no archive, or is cut, edited or of
     another version.
@@ -201,14 +205,11 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
 def _check_configuration(
     folder: str, values: Mapping[str, Any], results: Mapping[str, Any]
 ) -> None:
-    """Raise InputError if the configuration ``values`` contradicts the ``results`` of the trial in
-    ``folder``."""
+    """Raise InputError if the configuration ``values`` contradicts ``results`` in ``folder``."""
     names = {SEED_KEY: values[SEED_KEY]}
-    names |= {
-        group: values[group].get("name")
-        for group in NAMED_GROUPS
-        if isinstance(values.get(group), dict)
-    }
+    for group in NAMED_GROUPS:
+        if isinstance(own := values.get(group), dict):
+            names[group] = own.get("name")
     for key, value in names.items():
         if value != results[key]:
             raise InputError(
@@ -233,8 +234,8 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
             if manifest.get("version") != VERSION:
                 raise InputError(
                     f"it is of version {manifest.get('version')} of the archive (gsbench "
-                    f"{manifest.get('gsbench')}), "
-                    f"and this gsbench reads {VERSION}: use one gsbench for both"
+                    f"{manifest.get('gsbench')}), and this gsbench reads {VERSION}: use one "
+                    "gsbench for both"
                 )
             _check_size(sum(info.file_size for info in archive.infolist()))
             contents = {str(name): _member(archive, str(name)) for name in manifest["sha256"]}
@@ -323,13 +324,16 @@ def _unpack(
     for name in contents:
         if name.startswith(f"{PICTURES_FOLDER}/"):
             _unpack_picture(home, name, contents[name])
-    if DECLARED in contents:
-        (home / DECLARED).write_bytes(contents[DECLARED])
+    for name in RECORDS:
+        if name in contents:
+            (home / name).write_bytes(contents[name])
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:
-    """Write a picture of a test view into its trial's folder; raises InputError for a name that
-    leads elsewhere."""
+    """Write a picture of a test view into its trial's folder.
+
+    Raises InputError for a name that leads elsewhere.
+    """
     folder, kind, file = name.removeprefix(f"{PICTURES_FOLDER}/").rsplit("/", 2)
     if (
         kind not in PICTURES
@@ -347,8 +351,10 @@ def _folder(trial: TrialResult) -> str:
 
 
 def _checked_folder(folder: object) -> str:
-    """A trial's folder within its experiment; raises InputError for a path that could lead out of
-    the runs folder."""
+    """A trial's folder within its experiment.
+
+    Raises InputError for a path that could lead out of the runs folder.
+    """
     parts = str(folder).split("/")
     if len(parts) != 3 or not all(map(is_folder_name, parts)):
         raise InputError(f"{folder!r} cannot be the folder of a trial")
@@ -356,19 +362,18 @@ def _checked_folder(folder: object) -> str:
 
 
 def _configuration(trial: TrialResult) -> str:
-    """The trial's ``config.yaml`` as JSON, without paths of this machine; raises InputError if it
-    is damaged."""
+    """The trial's ``config.yaml`` as JSON, without paths of this machine.
+
+    Raises InputError if it is damaged.
+    """
     try:
         values = read_yaml(trial.path / CONFIG)
     except FileNotFoundError:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
-    return json.dumps(
-        without_paths(
-            {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
-        )
-    )
+    kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
+    return json.dumps(without_paths(kept))
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:
@@ -380,8 +385,7 @@ def _results(trial: TrialResult) -> dict[str, Any]:
 
 
 def without_paths(value: Any) -> Any:
-    """Plain values in which only the last name of each path on this machine is kept, and no URL has
-    a password."""
+    """Plain values with only the last name of each path on this machine, no password in a URL."""
     if isinstance(value, Mapping):
         return {key: without_paths(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -403,10 +407,8 @@ def _lines(content: bytes) -> list[dict[str, Any]]:
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(
-        text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n"
-    )
+    text, columns = io.StringIO(), dict.fromkeys(itertools.chain(*rows))
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue().encode()
@@ -425,8 +427,7 @@ def crate_metadata(
         "@type": "Dataset",
         "name": f"{name}: results of gsbench",
         "description": f"{len(trials)} trainings of 3D Gaussian Splatting: {', '.join(arms)} on "
-        f"{', '.join(scenes)}, "
-        f"measured by {', '.join(protocols)}. No models.",
+        f"{', '.join(scenes)}, measured by {', '.join(protocols)}. No models.",
         "datePublished": day,
         "hasPart": [{"@id": file} for file in sizes],
     }

@@ -1,11 +1,12 @@
-"""Checks of a file of claims: what can be tested here, the trials that are needed, the verdicts,
-and their page.
+"""Checks of a file of claims: what can be tested here, which trials it needs, verdicts, page.
 
 The trials are ordinary trials of one experiment. So a check that was killed continues where it
 stopped and ends with the same verdicts. A published archive gives the same verdicts without any
 training.
 """
 
+import itertools
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -74,30 +75,23 @@ class ClaimVerdict:
         if verdict.untestable:
             return verdict.untestable
         if verdict.outcome == TOO_SMALL or (verdict.outcome == SUPPORTED and not claim.sign):
-            has_sign = (
-                verdict.mean is not None
-                and verdict.interval is not None
-                and verdict.interval.excludes_zero()
-            )
-            side = f"; it is {'higher' if (verdict.mean or 0) > 0 else 'lower'}" if has_sign else ""
-            return f"any effect is smaller than the least that matters ({least}){side}"
+            small = f"any effect is smaller than the least that matters ({least})"
+            if verdict.interval is None or not verdict.interval.excludes_zero():
+                return small
+            return f"{small}; it is {'higher' if verdict.interval.low > 0 else 'lower'}"
         if verdict.outcome == SUPPORTED:
             return f"it is {claim.direction}{self._by_least()}"
+        if verdict.outcome == "refuted" and claim.sign:
+            return f"it is the opposite of {claim.direction}"
         if verdict.outcome == "refuted":
-            return (
-                f"it is the opposite of {claim.direction}"
-                if claim.sign
-                else f"it differs by more than {least}"
-            )
-        if verdict.rests_on_outlying and verdict.final:
+            return f"it differs by more than {least}"
+        if not verdict.final:
+            failed = f"; failed: {some_of(list(self.failed))}" if self.failed else ""
+            return f"trials are missing: the next look waits for them{failed}"
+        if verdict.rests_on_outlying:
             return "it depends on trials far outside the others"
-        if verdict.final:
-            return (
-                f"all {verdict.pairs.seeds} seeds show neither a difference nor that it is "
-                f"below {least}"
-            )
-        waits = "trials are missing: the next look waits for them"
-        return waits + (f"; failed: {some_of(list(self.failed))}" if self.failed else "")
+        seeds = verdict.pairs.seeds
+        return f"all {seeds} seeds show neither a difference nor that it is below {least}"
 
     def _by_least(self) -> str:
         verdict = self.verdict
@@ -129,9 +123,8 @@ class Check:
 
     def trials(self, seeds: int) -> list[Trial]:
         """The trials of the first ``seeds`` seeds of every claim."""
-        return self.to_run(
-            trials_of_look(self.declaration, range(len(self.declaration.questions)), seeds)
-        )
+        questions = range(len(self.declaration.questions))
+        return self.to_run(trials_of_look(self.declaration, questions, seeds))
 
     def judged(self) -> list[Verdict]:
         """The verdicts on the declared questions from the trials that are done."""
@@ -144,21 +137,23 @@ class Check:
 
     def _failures(self, verdict: Verdict) -> list[str]:
         """The reasons why trials of an undecided question failed, each once."""
-        keys = [key for both in verdict.question.scenes.values() for key in both]
-        folders = [
-            self.home / f"{key}{SEED}{seed}" for key in keys for seed in verdict.question.seeds
-        ]
-        failures = [
-            read_if_sound(folder / FAILED, Failure) for folder in ([] if verdict.final else folders)
-        ]
-        return list(dict.fromkeys(failure.reason for failure in failures if failure is not None))
+        if verdict.final:
+            return []
+        keys = itertools.chain(*verdict.question.scenes.values())
+        reasons = []
+        for key, seed in itertools.product(keys, verdict.question.seeds):
+            failure = read_if_sound(self.home / f"{key}{SEED}{seed}" / FAILED, Failure)
+            if failure is not None:
+                reasons.append(failure.reason)
+        return list(dict.fromkeys(reasons))
 
 
 def prepare(
     file: ClaimsFile, runs: Path, find_missing: FindMissing, permissions: Sequence[str] = ()
 ) -> Check:
-    """Compose the first trial of each scene and arm of each claim; scenes with something missing
-    are not tested.
+    """Compose the first trial of each scene and arm of each claim.
+
+    Scenes with something missing are not tested.
 
     ``permissions`` are words such as ``allow_targets=[mine]`` from the command line: a file of
     claims cannot give permissions. Raises InputError that names claim, scene and arm for settings
@@ -173,20 +168,14 @@ def prepare(
         for scene in () if claim.not_testable else claim.scenes or file.scenes:
             trials = []
             for arm in (claim.baseline, claim.arm):
-                words = (
-                    *file.words(claim, scene, arm),
-                    f"name={file.name}",
-                    "seed=0",
-                    *permissions,
-                )
+                own = file.words(claim, scene, arm)
+                words = (*own, f"name={file.name}", "seed=0", *permissions)
                 if words not in composed:
-                    composed[words] = _compose(
-                        words, runs, f"claim {claim.id}, scene {scene}, arm {arm}"
-                    )
+                    where = f"claim {claim.id}, scene {scene}, arm {arm}"
+                    composed[words] = _compose(words, runs, where)
                 trials.append(composed[words])
-            reason = next((line for trial in trials for line in find_missing([trial])), "")
-            if reason:
-                reasons.setdefault(reason, []).append(scene)
+            if lacking := [*find_missing(trials[:1]), *find_missing(trials[1:])]:
+                reasons.setdefault(lacking[0], []).append(scene)
                 continue
             baseline, arm_key = (trial.files.key for trial in trials)
             if baseline == arm_key:
@@ -202,9 +191,8 @@ def prepare(
             missing[claim.id] = [
                 without_folders(f"{some_of(names)}: {reason}") for reason, names in reasons.items()
             ]
-    asked = tuple(questions)
     declaration = declared_now(
-        questions=asked, error_rate=file.error_rate, looks=file.looks, missing=missing
+        questions=tuple(questions), error_rate=file.error_rate, looks=file.looks, missing=missing
     )
     return Check(file, runs, declaration, first_trials)
 
@@ -212,8 +200,7 @@ def prepare(
 def claim_verdicts(
     file: ClaimsFile, declaration: Declaration, judged: Sequence[Verdict]
 ) -> list[ClaimVerdict]:
-    """Every claim of the file with its verdict among ``judged``, or with the reason why it could
-    not be tested."""
+    """Every claim of the file with its verdict in ``judged``, or why it is not tested."""
     by_name = {verdict.question.name: verdict for verdict in judged}
     verdicts = []
     for claim in file.claims:
@@ -231,8 +218,7 @@ def claim_verdicts(
 def recheck(
     file: ClaimsFile, archive: Path, folder: Path
 ) -> tuple[list[ClaimVerdict], Declaration, list[Declaration]]:
-    """Judge the claims of ``file`` by the trials in ``archive`` alone, unpacked into the empty
-    folder ``folder``.
+    """Judge the claims of ``file`` by the trials in ``archive``, unpacked into ``folder``, empty.
 
     Returns the verdicts, the declaration that they follow, and all declarations of claims. Raises
     InputError, one line, for an archive that is damaged, of another experiment or without declared
@@ -248,16 +234,12 @@ def recheck(
         )
     declaration = latest_declaration(declarations)
     _check_same_claims(file, declaration)
-    return (
-        claim_verdicts(file, declaration, judge(experiment.trials, declaration)),
-        declaration,
-        declarations,
-    )
+    verdicts = claim_verdicts(file, declaration, judge(experiment.trials, declaration))
+    return verdicts, declaration, declarations
 
 
 def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
-    """Raise InputError if a claim's question differs from the one that was declared before the
-    trials ran."""
+    """Raise InputError if a claim's question differs from that declared before the trials ran."""
     declared = {question.name: question for question in declaration.questions}
     for claim in file.claims:
         in_file, before = file.question(claim, {}), declared.get(claim.id)
@@ -267,9 +249,8 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
             if getattr(in_file, what) != getattr(before, what):
                 raise InputError(
                     f"claim {claim.id}: its {what} was {getattr(before, what)} when it was "
-                    "declared "
-                    f"({declaration.when}), and is {getattr(in_file, what)} in the file: use the "
-                    "file as it was then"
+                    f"declared ({declaration.when}), and is {getattr(in_file, what)} in the file: "
+                    "use the file as it was then"
                 )
         arms = [arm.densify for arm in (before.baseline, before.arm) if arm is not None]
         if arms != [claim.baseline, claim.arm]:
@@ -324,28 +305,25 @@ def make_page(
     ``declared`` is the declaration that the verdicts follow, ``declarations`` are all under the
     experiment's name.
     """
-    counts = {word: sum(verdict.word == word for verdict in verdicts) for word in SYMBOLS}
-    tested = sum(one.word != NOT_TESTABLE for one in verdicts)
-    lines = [
-        f"{file.paper}. "
-        + ", ".join(f"{count} {word}" for word, count in counts.items() if count)
-        + "."
-    ]
-    if tested:
+    counts = Counter(verdict.word for verdict in verdicts)
+    shown = ", ".join(f"{counts[word]} {word}" for word in SYMBOLS if counts[word])
+    lines = [f"{file.paper}. {shown}."]
+    if tested := len(verdicts) - counts[NOT_TESTABLE]:
         which = "the verdict" if tested == 1 else f"any of the {tested} verdicts"
         lines.append(
             f"The chance that {which} is false is at most {100 * file.error_rate:g} %, over all "
-            "looks, if trainings "
-            "differ about normally (docs/verdict.md). A verdict is about these scenes at this "
-            "size. From six scenes on "
-            "there is also a statement about scenes like these, with its own error rate."
+            "looks, if trainings differ about normally (docs/verdict.md). A verdict is about these "
+            "scenes at this size. From six scenes on there is also a statement about scenes like "
+            "these, with its own error rate."
         )
     lines.append(_declared_line(declared, declarations))
-    judged = list(
-        {trial.path: trial for one in verdicts for trial in one.verdict.pairs.trials}.values()
-    )
+    # Claims may share trials.
+    judged: dict[Path, TrialResult] = {}
+    for one in verdicts:
+        judged |= {trial.path: trial for trial in one.verdict.pairs.trials}
+    trials = list(judged.values())
     lines += [f"The paper: {file.size}."] if file.size else []
-    lines += [*machine_notes(judged), *cloud_notes(judged)]
+    lines += [*machine_notes(trials), *cloud_notes(trials)]
     return Page(f"{file.name}: claims and verdicts", tuple(lines), tuple(map(_section, verdicts)))
 
 
@@ -371,8 +349,7 @@ def _section(one: ClaimVerdict) -> ClaimSection:
     if answer is not None and answer.interval is not None:
         headline = (
             f"{verdict.quantity.name} of {claim.arm} against {claim.baseline}: "
-            f"{verdict.shown(answer.mean)} "
-            f"({100 * (1 - answer.level):.3g} % interval "
+            f"{verdict.shown(answer.mean)} ({100 * (1 - answer.level):.3g} % interval "
             f"{verdict.shown_interval(answer.interval)}); {one.reason}"
         )
         evidence += [
@@ -419,8 +396,7 @@ def _late_words(one: ClaimVerdict) -> str:
         return ""
     return (
         f"{counted(one.verdict.late, 'trial')} had been measured before this was declared. So the "
-        "metric shares the "
-        "error rate with all metrics that could have been chosen"
+        "metric shares the error rate with all metrics that could have been chosen"
     )
 
 
@@ -440,10 +416,8 @@ def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -
         f"The claims were declared {declared.when}. A claim says so if trials had been "
         "measured before."
     )
-    earlier = {
-        one.hash for one in declarations if one.kind == "claims" and one.moment < declared.moment
-    }
-    if earlier:
+    claims = [one for one in declarations if one.kind == "claims"]
+    if earlier := {one.hash for one in claims if one.moment < declared.moment}:
         line += f" Earlier declarations under this name: {len(earlier)}."
     return line
 

@@ -1,5 +1,6 @@
-"""The file of claims: what a paper says, and how it is tested here. It is checked before any trial
-runs.
+"""The file of claims: what a paper says, and how it is tested here.
+
+It is checked before any trial runs.
 
     name: check_volumetric
     paper: Refining Gaussian Splatting (arXiv 2508.05187)
@@ -59,8 +60,7 @@ Settings = dict[str, Any]
 
 @dataclass(frozen=True)
 class LeastEffect:
-    """The least effect that matters: a difference of the metric, or (``relative``) a fraction of
-    the baseline."""
+    """The least effect that matters: a difference, or (``relative``) a fraction of the baseline."""
 
     size: float
     relative: bool
@@ -120,8 +120,7 @@ class ClaimsFile:
     size: str = ""
 
     def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
-        """The settings of a claim's trials with this scene and arm, as command-line words without
-        seed and name."""
+        """The settings of a claim's trials with this scene and arm, in words but seed and name."""
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
         return [f"{key}={value_text(value)}" for key, value in chosen.items()]
 
@@ -131,8 +130,7 @@ class ClaimsFile:
         return plan_looks(self.seeds)
 
     def question(self, claim: Claim, scenes: Mapping[str, tuple[str, str]]) -> Question:
-        """The claim as a question; ``scenes`` has the keys of baseline's and arm's trials by
-        scene."""
+        """The claim as a question; ``scenes`` has the trial keys of baseline and arm by scene."""
         return Question(
             metric=claim.metric,
             sign=claim.sign,
@@ -152,8 +150,10 @@ class ClaimsFile:
 
 
 def read_claims(path: Path) -> ClaimsFile:
-    """Read and check a file of claims; raises InputError, one line that says where the fault is and
-    how to fix it."""
+    """Read and check a file of claims.
+
+    Raises InputError, one line that says where the fault is and how to fix it.
+    """
     try:
         content = read_yaml(resolved(path))
     except FileNotFoundError:
@@ -190,8 +190,10 @@ def parse_claims(content: object) -> ClaimsFile:
 
 
 def read_least(value: float | str, where: str) -> LeastEffect:
-    """Read ``0.005``, or ``10%`` of the baseline's value; raises InputError unless it is a number
-    above 0."""
+    """Read ``0.005``, or ``10%`` of the baseline's value.
+
+    Raises InputError unless it is a number above 0.
+    """
     text = str(value).strip()
     relative = text.endswith("%")
     try:
@@ -225,8 +227,10 @@ def _require(cls: type, values: Iterable[str], where: str) -> None:
 
 
 def _named_settings(groups: Mapping[str, Any], where: str, group: str) -> dict[str, Settings]:
-    """The settings of scenes or arms by name. A name without settings is a choice of the settings
-    group ``group``."""
+    """The settings of scenes or arms by name.
+
+    A name without settings is a choice of the settings group ``group``.
+    """
     if not groups:
         raise InputError(f"{where} must name at least one, as {where}: {{courtyard: {{}}}}")
     by_name = {}
@@ -288,9 +292,8 @@ def _check_metric(claim: Claim, file: ClaimsFile) -> None:
         key.lstrip("+").startswith(own) for key in file.settings
     ):
         raise InputError(
-            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} "
-            f"(choose {', '.join(names)}; "
-            f"one of your own by settings: {{{own}_target_: mine.MyMetric}})"
+            f"{where}: {claim.metric!r} is not a metric{did_you_mean(claim.metric, names)} (choose "
+            f"{', '.join(names)}; one of your own by settings: {{{own}_target_: mine.MyMetric}})"
         )
     effect = claim.effect
     if asked_quantity(claim.metric).cost and not effect.relative:

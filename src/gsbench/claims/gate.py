@@ -14,7 +14,7 @@ from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import FIRST_LOOK, REFUTED, SUPPORTED, TOO_SMALL, plan_looks
-from gsbench.claims.file import read_least
+from gsbench.claims.file import LeastEffect, read_least
 from gsbench.claims.stopping import facts_for
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
@@ -58,30 +58,10 @@ def declare_gate(
     """The declaration of a gate about ``metric`` on ``scenes``, each with the names of both arms,
     such as ``sfm-adc``.
 
-    ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
-    Seeds are added in the order of ``seeds``. ``values`` is a trial's configuration, which may
-    define the user's own metrics. Raises InputError, one line, for a metric that cannot be judged,
-    and for too few seeds.
+    Seeds are added in the order of ``seeds``. Raises InputError, one line, for a metric that cannot
+    be judged (`asked_difference`), and for too few seeds.
     """
-    own = values["eval"].get("extra") or {}
-    metrics = (*known_keys(), *COSTS, *own)
-    if metric not in metrics:
-        raise InputError(
-            f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}"
-        )
-    sign, usual = -1, None  # less is better of counts and times
-    if metric not in COSTS:
-        facts = facts_for(metric, values)
-        sign, usual = facts.direction, facts.worthwhile
-    if not sign:
-        raise InputError(f"--metric {metric}: nobody said whether more or less of it is better")
-    if least is None and usual is None:
-        raise InputError(
-            f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
-        )
-    size = read_least(str(usual) if least is None else least, "--least")
-    if metric in COSTS and not size.relative:
-        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
+    sign, size = asked_difference(metric, least, values)
     if len(seeds) < FIRST_LOOK:
         raise InputError(
             f"a gate needs at least {FIRST_LOOK} seeds, and there is {len(seeds)}: allow more"
@@ -102,6 +82,37 @@ def declare_gate(
         name="gate",
     )
     return declared_now(questions=(question,), looks=plan_looks(len(seeds)), error_rate=error_rate)
+
+
+def asked_difference(
+    metric: str, least: str | None, values: Mapping[str, Any]
+) -> tuple[int, LeastEffect]:
+    """The direction of ``metric`` (1: more is better) and the least difference that matters.
+
+    ``least`` is text such as ``0.1`` or ``10%``; None takes the metric's usual least difference.
+    ``values`` is a trial's configuration, which may define the user's own metrics. Raises
+    InputError, one line, for a metric that cannot be judged.
+    """
+    own = values["eval"].get("extra") or {}
+    metrics = (*known_keys(), *COSTS, *own)
+    if metric not in metrics:
+        raise InputError(
+            f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}"
+        )
+    sign, usual = -1, None  # less is better of counts and times
+    if metric not in COSTS:
+        facts = facts_for(metric, values)
+        sign, usual = facts.direction, facts.worthwhile
+    if not sign:
+        raise InputError(f"--metric {metric}: nobody said whether more or less of it is better")
+    if least is None and usual is None:
+        raise InputError(
+            f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"
+        )
+    size = read_least(str(usual) if least is None else least, "--least")
+    if metric in COSTS and not size.relative:
+        raise InputError(f"--least of {metric} must be a part, such as 10%, got {size}")
+    return sign, size
 
 
 def result_of(verdict: Verdict) -> str:

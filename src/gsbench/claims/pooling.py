@@ -1,5 +1,4 @@
-"""Pooling results of many laboratories: the mean of their effects, with an interval whose error
-rate is known.
+"""Pooling results of many laboratories: their mean, with an interval of a known error rate.
 
 A study is one archive's mean difference of two arms in one metric, over its pairs of trials
 (docs/verdict.md). Student's t tests the mean of studies, each with the same weight. Weights from
@@ -19,7 +18,7 @@ import numpy as np
 
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.fairness import budget_words
-from gsbench.analysis.pairing import Pairs, pair
+from gsbench.analysis.pairing import Pairs, ScenePairs, pair
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
@@ -32,8 +31,7 @@ MIN_STUDIES = 2
 
 @dataclass(frozen=True)
 class Study:
-    """One archive's difference of two arms in one metric, with its ``interval`` (None for a single
-    pair).
+    """One archive's difference of two arms in a metric; ``interval`` is None for a single pair.
 
     Only studies with the same ``protocol`` are pooled. ``budget`` says what limited the growth of
     its arms; "" if that is unknown.
@@ -108,8 +106,7 @@ def describe(pooled: Pooled) -> list[str]:
     interval, further = test.interval(), pooled.prediction
     lines = [
         f"mean {test.mean:+.4g} (95 % interval {interval.low:+.4g} to {interval.high:+.4g}, p "
-        f"{test.p:.3g}) "
-        f"of {len(pooled.studies)} studies, each with the same weight",
+        f"{test.p:.3g}) of {len(pooled.studies)} studies, each with the same weight",
         f"studies differ by a deviation of {pooled.deviation:.3g}; a further one would lie between "
         f"{further.low:+.4g} and {further.high:+.4g}",
     ]
@@ -119,16 +116,14 @@ def describe(pooled: Pooled) -> list[str]:
         )
         lines.append(
             f"caution: the budgets differ ({budgets}): a difference at equal counts and one at "
-            "free counts answer two "
-            "questions, and this mean answers neither"
+            "free counts answer two questions, and this mean answers neither"
         )
     return lines
 
 
 @dataclass(frozen=True)
 class PooledQuestion:
-    """The question to pool: the names that ``arm`` and ``baseline`` may have in the archives, and
-    the metric's key.
+    """The question to pool: names of ``arm`` and ``baseline`` in the archives, the metric's key.
 
     Only trials whose settings have the values of ``where`` count.
     """
@@ -142,8 +137,9 @@ class PooledQuestion:
 def pool_sources(
     sources: Sequence[Path], wanted: PooledQuestion, protocol: str | None = None
 ) -> tuple[Pooled, list[str], list[str]]:
-    """Pool all studies in ``sources``: (their mean, notes on them, a line for each source or study
-    that is left out).
+    """Pool all studies in ``sources``.
+
+    Returns their mean, notes on them, and a line for each source or study that is left out.
 
     Raises InputError if no study is left.
     """
@@ -182,8 +178,7 @@ def pool_sources(
 def read_studies(
     path: Path, question: PooledQuestion, name: str
 ) -> tuple[list[Study], list[str], set[str]]:
-    """The studies in the archive ``path``, one or more for each protocol; their labels begin with
-    ``name``.
+    """The studies in the archive ``path``, by protocol; their labels begin with ``name``.
 
     Also returns notes on them, and a mark of each trial (`_mark`), so that none is counted twice.
     Raises InputError, one line, if there is no study.
@@ -196,43 +191,38 @@ def read_studies(
         for protocol, own in by_protocol:
             groups = _group_into_studies(own, _arm_pairs(own, question, path))
             for arms in groups:
-                qualifiers = [protocol] * (len(by_protocol) > 1) + [arms[0][0].init] * (
-                    len(groups) > 1
-                )
+                qualifiers = [protocol] if len(by_protocol) > 1 else []
+                qualifiers += [arms[0][0].init] if len(groups) > 1 else []
                 label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
-                questions = [
-                    Question(metric=question.metric, baseline=one, arm=other) for one, other in arms
-                ]
-                pairs_by_arms = [pair(own, asked) for asked in questions]
-                together = Pairs(tuple(row for pairs in pairs_by_arms for row in pairs.rows))
-                if not together.rows:
-                    reason = next(
-                        (f" ({line})" for pairs in pairs_by_arms for line in pairs.left_out), ""
-                    )
-                    raise InputError(
-                        f"{path}: no trials can be paired in {question.metric}{reason}"
-                    )
-                test = t_test(together.differences)
-                mean, interval = (
-                    float(together.differences.mean()),
-                    None if test is None else test.interval(),
-                )
-                studies.append(Study(label, mean, interval, protocol, _budgets(own, arms)))
-                for (baseline, arm), pairs in zip(arms, pairs_by_arms, strict=True):
+                rows: list[ScenePairs] = []
+                left_out: list[str] = []
+                for baseline, arm in arms:
+                    pairs = pair(own, Question(metric=question.metric, baseline=baseline, arm=arm))
                     count = sum(len(row.seeds) for row in pairs.rows)
                     notes.append(
                         f"{label}: {arm} against {baseline}, {count} pairs of trials on "
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
+                    rows += pairs.rows
+                    left_out += pairs.left_out
+                if not rows:
+                    reason = f" ({left_out[0]})" if left_out else ""
+                    raise InputError(
+                        f"{path}: no trials can be paired in {question.metric}{reason}"
+                    )
+                differences = Pairs(tuple(rows)).differences
+                test = t_test(differences)
+                interval = None if test is None else test.interval()
+                budgets = _budgets(own, arms)
+                studies.append(Study(label, float(differences.mean()), interval, protocol, budgets))
         return studies, notes, set(map(_mark, trials))
 
 
 def _group_into_studies(
     trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]
 ) -> list[list[tuple[Arm, Arm]]]:
-    """All pairs of arms as one study if each scene has one initialiser; else each pair as its own
-    study."""
+    """All pairs of arms as one study if each scene has one initialiser, else each as its own."""
     scenes = [{trial.scene for trial in trials if trial.arm in pair} for pair in pairs]
     disjoint = sum(map(len, scenes)) == len(set().union(*scenes))
     return [list(pairs)] if disjoint else [[pair] for pair in pairs]
@@ -260,34 +250,28 @@ def _arm_pairs(
             several = baselines if len(baselines) > 1 else others
             raise InputError(
                 f"{path}: the name fits {' and '.join(map(str, several))}: choose trials with "
-                "--where "
-                "KEY=VALUE, or give the whole name of one"
+                "--where KEY=VALUE, or give the whole name of one"
             )
         if baselines and others:
             pairs.append((baselines[0], others[0]))
     if not pairs:
         raise InputError(
             f"{path} has no pair of {' or '.join(question.arm)} and "
-            f"{' or '.join(question.baseline)} (there are "
-            f"{', '.join(map(str, arms))})"
+            f"{' or '.join(question.baseline)} (there are {', '.join(map(str, arms))})"
         )
     return pairs
 
 
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
     """``20,000 Gaussians (governor)``: the limits on growth in these pairs of arms."""
-    arms = {arm for pair in pairs for arm in pair}
-    return " or ".join(
-        sorted({budget_words(trial) or "not known" for trial in trials if trial.arm in arms})
-    )
+    own = [trial for trial in trials if any(trial.arm in pair for pair in pairs)]
+    return " or ".join(sorted({budget_words(trial) or "not known" for trial in own}))
 
 
 def _size(trials: Sequence[TrialResult]) -> str:
-    """The iterations, view sizes and gsbench versions, in which pooled trials may differ, for the
-    reader to judge."""
-    sizes = sorted(
-        {f"{size[0]}×{size[1]}" for trial in trials if (size := trial.record.resolution)}
-    )
+    """Iterations, view sizes and versions, in which pooled trials may differ, for the reader."""
+    known = {trial.record.resolution for trial in trials} - {None}
+    sizes = sorted("{}×{}".format(*size) for size in known if size)
     steps = sorted({f"{trial.record.iterations:,}" for trial in trials})
     versions = sorted({trial.record.versions.get("gsbench", "?") for trial in trials})
     return (
@@ -296,9 +280,7 @@ def _size(trials: Sequence[TrialResult]) -> str:
 
 
 def _mark(trial: TrialResult) -> str:
-    """A hash that distinguishes a trial from all others, even from a repetition: that takes other
-    seconds."""
+    """A hash that distinguishes a trial even from its repetition, which takes other seconds."""
     record = trial.record
-    return sha256_of(
-        [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
-    )
+    facts = [trial.config_hash, trial.seed, record.hashes, record.seconds, dict(trial.metrics)]
+    return sha256_of(facts)

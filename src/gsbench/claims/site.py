@@ -1,5 +1,4 @@
-"""A static site from archives of results: a first page with all verdicts, and a report of each
-archive.
+"""A static site from archives: a first page with all verdicts, and a report of each archive.
 
 Archives may come from strangers: their texts are escaped in pages, and never used in names of
 files.
@@ -33,8 +32,7 @@ INDEX, REPORTS = "index.html", "reports"
 
 
 def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -> list[str]:
-    """Write the site into the folder ``out``; return a line for each archive that is left out, with
-    the reason.
+    """Write the site into ``out``; return a line with the reason for each archive left out.
 
     Archives are unpacked into the empty folder ``scratch``. Raises InputError if no archive can be
     shown.
@@ -113,8 +111,7 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
 
 
 def _claims(experiment: Experiment) -> list[Verdict]:
-    """The verdicts on declared claims, as `gsbench check --from` gives them, without those of
-    gates."""
+    """The verdicts on declared claims, as `gsbench check --from` gives them, without gates."""
     declared = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
     if not declared:
         return []

@@ -1,9 +1,9 @@
-"""Adding seeds in planned looks until every question is decided, for checks and for sweeps that
-stop when decided.
+"""Adding seeds in planned looks until every question is decided, for checks and for sweeps.
 
 In such a sweep, each compared pair of arms is a question about ``eval.primary``.
 """
 
+import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,19 +28,11 @@ from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
 
 NO_RESULTS: dict[str, Any] = {
-    "raster": "",
-    "protocol": "",
-    "iterations": 0,
-    "num_init_points": None,
+    **dict.fromkeys(("raster", "protocol"), ""),
+    **dict.fromkeys(("iterations", "num_gaussians"), 0),
+    **dict.fromkeys(("num_init_points", "peak_memory_mb")),
+    **{name: {} for name in ("metrics", "unavailable", "seconds", "hashes", "versions")},
 }
-NO_RESULTS |= {
-    "num_gaussians": 0,
-    "peak_memory_mb": None,
-    "metrics": {},
-    "unavailable": {},
-    "seconds": {},
-}
-NO_RESULTS |= {"hashes": {}, "versions": {}}
 
 log = logging.getLogger(__name__)
 
@@ -51,19 +43,15 @@ KeyAndSeed = tuple[str, int]
 def trials_of_look(
     declaration: Declaration, indices: Sequence[int], seeds: int
 ) -> list[KeyAndSeed]:
-    """The trials that the questions at ``indices`` need for their first ``seeds`` seeds, in the
-    order of seeds."""
+    """The trials of the questions at ``indices`` for their first ``seeds`` seeds, seed by seed."""
     questions = [declaration.questions[k] for k in indices]
-    needed = [
-        (question.seeds[rank], rank, key)
-        for question in questions
-        for rank in range(min(seeds, len(question.seeds)))
-        for both in question.scenes.values()
-        for key in both
-    ]
-    return list(
-        dict.fromkeys((key, seed) for seed, _, key in sorted(needed, key=lambda one: one[1]))
-    )
+    needed: dict[KeyAndSeed, None] = {}  # in order, each once
+    for rank in range(seeds):
+        for question in questions:
+            if rank < len(question.seeds):
+                keys = itertools.chain(*question.scenes.values())
+                needed |= {(key, question.seeds[rank]): None for key in keys}
+    return list(needed)
 
 
 def run_looks(
@@ -109,21 +97,20 @@ class SweepInLooks:
         """A line about the looks for a dry run."""
         questions, looks = self.declaration.questions, self.declaration.looks
         indices = range(len(questions))
-        first, most = (
-            len(trials_of_look(self.declaration, indices, seeds)) for seeds in (looks[0], looks[-1])
-        )
+        first = len(trials_of_look(self.declaration, indices, looks[0]))
+        most = len(trials_of_look(self.declaration, indices, looks[-1]))
         return (
             f"stops when decided, by {questions[0].metric} and a least difference of "
-            f"{questions[0].least:g}: "
-            f"{counted(len(questions), 'pair')} of arms, looks at {', '.join(map(str, looks))} "
-            "seeds, "
-            f"{first} trials until the first, {most} at most"
+            f"{questions[0].least:g}: {counted(len(questions), 'pair')} of arms, looks at "
+            f"{', '.join(map(str, looks))} seeds, {first} trials until the first, {most} at most"
         )
 
 
 def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
-    """Plan the looks of a sweep's trials; raises InputError, one line, if the sweep cannot be run
-    in looks."""
+    """Plan the looks of a sweep's trials.
+
+    Raises InputError, one line, if the sweep cannot be run in looks.
+    """
     homes = {trial.files.home for trial in trials}
     metrics = {trial.values["eval"].get("primary") for trial in trials}
     if len(homes) > 1 or len(metrics) > 1:
@@ -157,12 +144,11 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
             raise InputError(
                 f"launch.stop_when_decided: {arm} and {baseline} have no scene in common"
             )
-        sign, least = facts.direction, float(least)
         questions.append(
             Question(
                 metric=metric,
-                sign=sign,
-                least=least,
+                sign=facts.direction,
+                least=float(least),
                 baseline=baseline,
                 arm=arm,
                 scenes=scenes,
@@ -174,9 +160,23 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     return SweepInLooks(declaration, home, by_key)
 
 
+def finished_trials(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
+    """The results of those ``trials`` that are done. Results of earlier code do not count as
+    done."""
+    by_folder = {trial.folder: trial for trial in trials}
+
+    def is_done(result: TrialResult) -> bool:
+        trial, awaited = by_folder.get(result.path), result.record.awaited
+        # A metric whose weights are missing does not make a trial unfinished.
+        return trial is not None and not trial.files.why_not_done(
+            trial.values, lambda options: awaited
+        )
+
+    return list(filter(is_done, read_experiment(home).trials))
+
+
 def headline(verdict: Verdict) -> str:
-    """A pair's verdict in a sentence: ``better in PSNR on this scene: +0.120 (…), with 2 of at most
-    6 seeds``"""
+    """A pair's verdict: ``better in PSNR on this scene: +0.120 (…), with 2 of at most 6 seeds``"""
     question = verdict.question
     against = f"{question.arm} against {question.baseline}"
     if verdict.interval is None:
@@ -187,27 +187,25 @@ def headline(verdict: Verdict) -> str:
 
 
 def _expected(trial: Trial) -> TrialResult:
-    """A trial that has not run as a `TrialResult` without results, so that arms can be paired
-    beforehand."""
+    """A `TrialResult` without results for a trial that has not run, to pair arms beforehand."""
     values, folder = trial.values, trial.folder
     record = TrialRecord(
         status="complete",  # the only status that the type allows; no file has this record
         experiment=values["name"],
-        scene=values["scene"]["name"],
-        init=values["init"]["name"],
-        densify=values["densify"]["name"],
+        **{group: values[group]["name"] for group in ("scene", "init", "densify")},
         seed=values["seed"],
         **NO_RESULTS,
     )
     result = TrialResult(folder, folder.name.partition(SEED)[0], record)
-    return replace(
-        result, settings=Configurations({result.key: flatten(yaml.safe_load(trial.yaml))})
-    )
+    settings = Configurations({result.key: flatten(yaml.safe_load(trial.yaml))})
+    return replace(result, settings=settings)
 
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
-    """The facts of a metric of trials with the configuration ``values``; raises InputError for an
-    unknown metric."""
+    """The facts of a metric of trials with the configuration ``values``.
+
+    Raises InputError for an unknown metric.
+    """
     shipped = find_metric(metric)
     if shipped is not None:
         return shipped
@@ -218,14 +216,14 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
 
 
 def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
-    """The seeds of all scenes and arms, in the order of the sweep; raises InputError if they
-    differ."""
-    groups = group_by(trials, lambda trial: (trial.scene, trial.arm))
-    seeds = {
-        key: tuple(dict.fromkeys(trial.seed for trial in group)) for key, group in groups.items()
-    }
-    first = next(iter(seeds.values()))
-    for (scene, arm), own in seeds.items():
+    """The seeds of all scenes and arms, in the order of the sweep.
+
+    Raises InputError if they differ.
+    """
+    first: tuple[int, ...] = ()
+    for (scene, arm), group in group_by(trials, lambda trial: (trial.scene, trial.arm)).items():
+        own = tuple(dict.fromkeys(trial.seed for trial in group))
+        first = first or own
         if own != first:
             raise InputError(
                 f"launch.stop_when_decided needs the same seeds everywhere: {arm} on {scene} has "
@@ -243,9 +241,8 @@ def _scenes(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> dict[str,
     """The keys of both arms' trials on each scene that has both."""
     scenes = {}
     for scene, group in group_by(trials, lambda trial: trial.scene).items():
-        baseline_keys, arm_keys = (
-            {trial.key for trial in group if trial.arm == side} for side in (baseline, arm)
-        )
+        baseline_keys = {trial.key for trial in group if trial.arm == baseline}
+        arm_keys = {trial.key for trial in group if trial.arm == arm}
         if len(baseline_keys) == len(arm_keys) == 1:
             scenes[scene] = baseline_keys.pop(), arm_keys.pop()
     return scenes

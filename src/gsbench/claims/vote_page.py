@@ -1,5 +1,4 @@
-"""The page on which people compare renders blindly: which views it shows, its pictures, and its
-key.
+"""The page where people compare renders blindly: its views, its pictures, and its key.
 
 The page is a folder of one HTML file and pictures. It works from a file, sends nothing, and has no
 names of arms.
@@ -38,8 +37,7 @@ MIN_BLUR = 2.0  # px
 
 @dataclass(frozen=True)
 class Candidate:
-    """A view of two arms that may be shown, with the mean difference (8-bit levels) of its
-    renders."""
+    """A view of two arms that may be shown; ``difference`` of its renders: mean 8-bit levels."""
 
     trials: TrialPair
     view: str
@@ -49,8 +47,7 @@ class Candidate:
 def find_candidates(
     trials: Sequence[TrialResult], one: Arm, other: Arm
 ) -> dict[str, list[Candidate]]:
-    """Every test view of two arms by scene, for one seed of each view; seeds take turns over the
-    views.
+    """Every test view of two arms by scene, for one seed each; seeds take turns over the views.
 
     Raises InputError if the arms have no pair of trials with pictures.
     """

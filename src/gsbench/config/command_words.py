@@ -1,5 +1,4 @@
-"""The words of a command line, checked before Hydra composes anything: a wrong word is refused with
-a reason."""
+"""The words of a command line, checked before Hydra composes anything: wrong ones are refused."""
 
 import re
 import shlex
@@ -56,8 +55,7 @@ KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
-    """The overrides, whether to expand lists (``-m``), and whether to only list the trials
-    (``--dry-run``)."""
+    """The overrides, whether lists expand (``-m``), and whether trials are only listed."""
     overrides: list[str] = []
     folders: list[Path] = []
     multirun = dry_run = False
@@ -74,8 +72,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
             name = "NAME" if "-cp" in word or "path" in word else name
             raise InputError(
                 f"{word}: gsbench's main configuration is its own: write yours to "
-                f"FOLDER/experiment/{name}.yaml, and "
-                f"give --config-dir FOLDER +experiment={name}"
+                f"FOLDER/experiment/{name}.yaml, and give --config-dir FOLDER +experiment={name}"
             )
         elif word.startswith("-"):
             group = word.lstrip("-").partition("=")[0]
@@ -95,8 +92,7 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
 
 
 def search_path(folders: Sequence[Path], overrides: Sequence[str]) -> list[str]:
-    """The word ``hydra.searchpath=…`` that ``--config-dir`` stands for, in a list; empty without
-    folders."""
+    """The word ``hydra.searchpath=…`` for ``--config-dir``, in a list; empty without folders."""
     if not folders:
         return []
     if len(folders) > 1 or any(word.startswith("hydra.searchpath=") for word in overrides):
@@ -163,8 +159,7 @@ def check_text(word: str) -> None:
 
 
 def check_removal(override: Override) -> None:
-    """Raise InputError for a word that removes anything but an option of a class, which may have
-    other options."""
+    """Raise InputError for removing anything but an option of a class, which may have others."""
     group, dot, _ = bare_key(override.get_key_element()).partition(".")
     if not dot or group not in (*COMPONENTS, "raster"):
         raise InputError(
@@ -173,8 +168,7 @@ def check_removal(override: Override) -> None:
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
-    """The names that a command line allows by ``allow_targets=[…]``; if given twice, the last
-    counts."""
+    """The names that a command line allows by ``allow_targets=[…]``; the last one counts."""
     allowed: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)
@@ -263,8 +257,7 @@ def value_text(value: object) -> str:
 
 
 def hint_for(word: str) -> str:
-    """A hint for a word that is no setting: ``; did you mean scene=photos?`` for a choice, or how
-    to choose in a group.
+    """A hint for a word that is no setting: the nearest choice, or how to choose in a group.
 
     Empty for any other word.
     """
@@ -276,8 +269,7 @@ def hint_for(word: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A hint that quotes the word's value, for a value with characters that mean something to
-    Hydra."""
+    """A hint to quote the word's value, for characters that mean something to Hydra."""
     key, _, value = word.partition("=")
     if not KEY.fullmatch(key):
         return ""
@@ -295,8 +287,7 @@ def _quoted(word: str) -> str:
 
 
 def check_single(words: Sequence[str], advice: str) -> None:
-    """`check_words`, and raise InputError with the ``advice`` for a word that lists several
-    values."""
+    """`check_words`, and raise InputError with ``advice`` for a word with several values."""
     check_words(words)
     if swept := [word for word in words if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: {advice}")
@@ -308,8 +299,7 @@ def is_sweep(word: str) -> bool:
 
 
 def check_sweep(override: Override) -> None:
-    """Raise InputError for a sweep that has no list of values, or whose values would all give the
-    same trial."""
+    """Raise InputError for a sweep without a list of values, or with one for equal trials."""
     if not override.is_discrete_sweep():
         key = bare_key(override.get_key_element())
         raise InputError(
@@ -320,8 +310,10 @@ def check_sweep(override: Override) -> None:
 
 
 def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
-    """The words of every point of the grid that ``overrides`` span. If two set one key, the later
-    counts."""
+    """The words of every point of the grid that ``overrides`` span.
+
+    If two set one key, the later counts.
+    """
     choices: dict[str, list[str]] = {}
     for override in overrides:
         key = override.get_key_element()
@@ -344,8 +336,7 @@ def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
 
 
 def is_interval(override: Override) -> bool:
-    """Return whether a word gives an interval in which a value is searched, instead of a list of
-    values."""
+    """Return whether a word gives an interval for a search instead of a list of values."""
     return override.is_sweep_override() and not override.is_discrete_sweep()
 
 
@@ -398,6 +389,5 @@ def _check_experiment_word(word: str, override: Override) -> None:
 
 
 def _is_choice(override: Override) -> bool:
-    """Return whether the value can choose in a group: a name, a list of names, or the group's
-    settings ({a: 1})."""
+    """Return whether the value can choose in a group: a name, names, or settings ({a: 1})."""
     return override.is_sweep_override() or isinstance(override.value(), str | int | float | dict)

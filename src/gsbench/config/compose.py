@@ -1,5 +1,4 @@
-"""Hydra's part: the configuration of a command line, checked as a whole, and the trials that it
-describes.
+"""Hydra's part: the configuration of a command line, checked, and the trials it describes.
 
 Also gsbench as an app of Hydra's, and Hydra's errors in one line.
 """
@@ -69,8 +68,7 @@ HYDRAS_LINE = "Error executing job with overrides"
 
 @dataclass(frozen=True)
 class Trial:
-    """A requested trial: its resolved values, the overrides that gave them, and the folder of its
-    files.
+    """A requested trial: its resolved values, the overrides behind them, and its folder.
 
     A trial that is read from its own ``config.yaml`` has no overrides. Raises InputError for values
     that would run code or programs that their ``allow_targets`` does not name.
@@ -99,8 +97,7 @@ class Trial:
 
 
 def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfig:
-    """Compose the configuration of ``words``, Hydra's node ``hydra`` included, and check what it
-    may run.
+    """Compose the configuration of ``words`` with Hydra's node, and check what it may run.
 
     Words that list several values are left out. From here on Python finds the modules that
     ``words`` allow in the folder ``modules`` (default: the current one). Raises InputError, one
@@ -147,8 +144,10 @@ def check_files(folders: Sequence[Path]) -> None:
 
 
 def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
-    """The number of values in a YAML node after each alias is replaced by what it names. ``sizes``
-    are those known."""
+    """The number of values in a YAML node after each alias is replaced by what it names.
+
+    ``sizes`` are those known.
+    """
     if id(node) not in sizes:
         sizes[id(node)] = 1  # counts where an alias stands for a mapping or list that contains it
         children = node.value if isinstance(node, yaml.CollectionNode) else []
@@ -160,8 +159,7 @@ def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
 
 
 def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfig:
-    """Refuse a composed configuration that would run what is not ``allowed``, and set its
-    ``allow_targets`` to that.
+    """Refuse a configuration that would run what is not ``allowed``, and set ``allow_targets``.
 
     Setting it discards what a file says of ``allow_targets``.
     """
@@ -184,8 +182,9 @@ def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
 
 @cache
 def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
-    """Hydra's node for the choices ``words``, from installed packages only; choices from a user's
-    folder are left out.
+    """Hydra's node for the choices ``words``, from installed packages only.
+
+    Choices from a user's folder are left out.
 
     It also has what gsbench's own ``conf/config.yaml`` sets.
     """
@@ -258,8 +257,7 @@ READS_HYDRA = re.compile(r"\$\{\s*hydra\b")
 def compose_jobs(
     loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
 ) -> list[Trial]:
-    """The trials of ``jobs``, each the list of its words; ``sweep`` is the configuration of the
-    whole sweep.
+    """The trials of ``jobs``, lists of their words; ``sweep`` is the whole configuration.
 
     ``first`` is the number of the first job, for ``${hydra:job.num}``.
     """
@@ -303,8 +301,7 @@ def compose_jobs(
 
 
 def resolve_times(sweep: DictConfig) -> None:
-    """Resolve the settings of a sweep once, so that ``${now:…}`` is the same time for all its
-    trials."""
+    """Resolve a sweep's settings once, so that ``${now:…}`` is the same for all its trials."""
     for key in [str(key) for key in sweep if key != "hydra"]:
         with suppress(OmegaConfBaseException):  # such as a setting that only the words of a job set
             if OmegaConf.is_config(sweep[key]):
@@ -318,8 +315,10 @@ def typed_words(overrides: DictConfig) -> tuple[list[str], list[str]]:
 
 
 def with_seed(trial: Trial, seed: int) -> Trial:
-    """The same trial with another seed. Only for a trial whose other settings do not read the
-    seed."""
+    """The same trial with another seed.
+
+    Only for a trial whose other settings do not read the seed.
+    """
     seed = check_values(Config, {"seed": seed}, "")["seed"]
     words = tuple(f"seed={seed}" if word.startswith("seed=") else word for word in trial.overrides)
     return replace(trial, values=trial.values | {"seed": seed}, overrides=words)
@@ -371,8 +370,9 @@ def hydra_ready() -> Iterator[None]:
 def run_main(
     task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
 ) -> None:
-    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what ``task``
-    raises.
+    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``.
+
+    Raises what ``task`` raises.
 
     Hydra may instantiate its own callbacks, and of the checked ``config`` the allowed ones and the
     chosen plug-ins.
@@ -408,8 +408,7 @@ def plugins_of(config: DictConfig) -> dict[str, Any]:
 
 
 class _WithoutHydrasLine:
-    """Standard error without the line that Hydra writes before it raises a job's error. gsbench
-    prints that error."""
+    """Standard error without Hydra's line before it raises a job's error, which gsbench prints."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -497,8 +496,10 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
 
 
 def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence[str]) -> str:
-    """The error for an unknown key ``bad``. ``given`` is the command line's whole key; None for a
-    key in a file."""
+    """The error for an unknown key ``bad``.
+
+    ``given`` is the command line's whole key; None for a key in a file.
+    """
     if given and given.startswith("hydra.sweeper.params."):
         return (
             f"{given}: params are for files of experiments; type "
@@ -540,8 +541,7 @@ def _groups_with(key: str) -> str:
 
 
 def _belongs_to(group: str, key: str) -> str:
-    """``; it belongs to densify=volumetric`` if other choices of a group have the setting; else
-    nothing."""
+    """``; it belongs to densify=volumetric`` if other choices have the setting, else ""."""
     if group not in GROUPS:
         return ""
     key_line = re.compile(rf"^{re.escape(key)}:", re.M)
@@ -564,8 +564,7 @@ def _chain(error: BaseException | None) -> list[str]:
 
 
 def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
-    """The settings below ``parent``, with the group choices among ``overrides`` if these
-    compose."""
+    """The settings below ``parent``, with the group choices of ``overrides`` if they compose."""
     groups = (*GROUPS, "hydra/launcher", "hydra/sweeper")
     choices = [
         word

@@ -56,8 +56,10 @@ DeviceName = Annotated[
 
 @dataclass
 class ComponentConfig:
-    """The keys that ``init`` and ``densify`` have in common. Their other keys are the options of
-    the class."""
+    """The keys that ``init`` and ``densify`` have in common.
+
+    Their other keys are the options of the class.
+    """
 
     name: FolderName
     _target_: TargetName
@@ -133,8 +135,10 @@ class LaunchConfig:
 
 @dataclass
 class Config:
-    """The root. ``init`` and ``densify`` take any keys, because a user's own class has its own
-    options."""
+    """The root.
+
+    ``init`` and ``densify`` take any keys, because a user's own class has its own options.
+    """
 
     name: ExperimentName = "default"
     seed: Annotated[int, Interval(ge=0, le=MAX_INTEGER)] = 0
@@ -163,8 +167,10 @@ COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 
 @cache
 def register_schemas() -> None:
-    """Register the schemas with Hydra. Those of groups go under ``schema/``, so that they are no
-    choices."""
+    """Register the schemas with Hydra.
+
+    Those of groups go under ``schema/``, so that they are no choices.
+    """
     store = ConfigStore.instance()
     store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
@@ -173,8 +179,7 @@ def register_schemas() -> None:
 
 @cache
 def _names_and_defaults(schema: type) -> type:
-    """A dataclass for Hydra with the fields of ``schema`` but no types, since `checked_values`
-    checks the values."""
+    """An untyped dataclass for Hydra with the fields of ``schema``: `checked_values` checks."""
     fields: list[tuple[str, Any, Any]] = []
     for entry in dataclasses.fields(schema):
         factory: Any = entry.default_factory
@@ -187,8 +192,7 @@ def _names_and_defaults(schema: type) -> type:
 
 
 def checked_values(config: DictConfig) -> dict[str, Any]:
-    """The resolved values of a composed configuration without Hydra's node, converted (``1e3``) and
-    checked.
+    """The resolved values of a configuration without Hydra's node, converted (``1e3``), checked.
 
     The classes that ``init`` and ``densify`` name check their options themselves, when they are
     made. Raises InputError naming the key.

@@ -110,16 +110,14 @@ NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
 
 
 def is_allowed(target: str, allowed: Sequence[str]) -> bool:
-    """Return whether ``target``, the import path of a class, is one of ``allowed`` or lies below
-    one."""
+    """Return whether ``target``, a class's import path, is one of ``allowed`` or below one."""
     return any(
         target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in allowed
     )
 
 
 def permission_advice(missing: Sequence[str], allowed: Sequence[str]) -> str:
-    """Advice for an error: the word ``allow_targets=[…]`` that allows ``missing`` beside what is
-    ``allowed``."""
+    """Advice for an error: the ``allow_targets=[…]`` that allows ``missing`` and ``allowed``."""
     names = [
         name if UNQUOTED.fullmatch(name) else repr(name)
         for name in dict.fromkeys([*allowed, *missing])
@@ -130,8 +128,7 @@ def permission_advice(missing: Sequence[str], allowed: Sequence[str]) -> str:
 def check_target(
     target: str | None, group: str, allowed: Sequence[str], own: Sequence[str] = (PACKAGE,)
 ) -> None:
-    """Refuse a ``_target_`` outside ``own`` and what the user ``allowed``, since importing it would
-    run its code."""
+    """Refuse a ``_target_`` outside ``own`` and ``allowed``: importing it would run its code."""
     if not target:
         raise InputError(f"{group} names no _target_: the class to use")
     if is_allowed(target, (*own, *allowed)) and target != PACKAGE:
@@ -147,8 +144,10 @@ def check_target(
 
 
 def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
-    """Load the class at the import path ``target``. Raises InputError unless it is gsbench's or
-    ``allowed``."""
+    """Load the class at the import path ``target``.
+
+    Raises InputError unless it is gsbench's or ``allowed``.
+    """
     check_target(target, group, allowed)
     module_name, _, name = target.rpartition(".")
     missing = object()
@@ -175,8 +174,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
 
 
 def _import_advice(error: BaseException) -> str:
-    """Advice for a missing module that lies in another folder, or in the folder of an allowed one;
-    else nothing."""
+    """Advice for a missing module that lies elsewhere, or beside an allowed one; else ""."""
     if not isinstance(error, ModuleNotFoundError):
         return ""
     name, folders = (error.name or "").split(".")[0], allowed_modules()
@@ -194,8 +192,7 @@ def _import_advice(error: BaseException) -> str:
 
 
 def check_permissions(values: Mapping[str, Any]) -> None:
-    """Refuse the resolved configuration of a trial that would run what its ``allow_targets`` does
-    not name.
+    """Refuse a trial's resolved configuration that would run what its ``allow_targets`` lacks.
 
     This is the last check, of plain values, from any file or command line. Raises InputError.
     """
@@ -210,8 +207,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
 
 
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
-    """The packages of gsbench whose classes a place of the configuration may name without
-    permission."""
+    """The packages of gsbench whose classes may stand at a place without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
         own = f"{PACKAGE}.{place[0]}"
         return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
@@ -246,8 +242,7 @@ def check_composed(
 
 
 def _differing(given: Any, installed: Any) -> Any:
-    """What differs in ``given`` from ``installed``: of mappings the differing entries, else
-    ``given`` itself."""
+    """What differs in ``given`` from ``installed``: entries of mappings, else ``given`` itself."""
     if not isinstance(given, dict) or not isinstance(installed, dict):
         return given
     differing = {
@@ -279,8 +274,10 @@ def _check_interpolation(place: tuple[str, ...], key: str, value: str) -> None:
 
 
 def _resolvers(tree: Any) -> Iterator[str]:
-    """The names of the resolvers in a parsed text. A name that is itself an interpolation is
-    yielded as written."""
+    """The names of the resolvers in a parsed text.
+
+    A name that is itself an interpolation is yielded as written.
+    """
     if type(tree).__name__ == "ResolverNameContext":
         yield tree.getText()
     for child in getattr(tree, "children", None) or []:
@@ -305,8 +302,10 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) ->
 
 
 def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse Hydra's own settings that would start code. Of `MADE_NODES`, ``hydra`` has what no
-    package wrote."""
+    """Refuse Hydra's own settings that would start code.
+
+    Of `MADE_NODES`, ``hydra`` has what no package wrote.
+    """
     # A variable can name a file that Python, a library or a program loads, and no list of harmless
     # ones is complete.
     if hydra["job"].get("env_set"):
@@ -324,9 +323,8 @@ def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
             for text in (key, value):
                 if isinstance(text, str) and NOT_SWEPT.match(text):
                     raise InputError(
-                        f"{'.'.join(place)}: {text} cannot differ from job to job, and no file "
-                        "can allow it: "
-                        "type it on the command line"
+                        f"{'.'.join(place)}: {text} cannot differ from job to job, and no file can "
+                        "allow it: type it on the command line"
                     )
         elif isinstance(value, str) and "${" in value:
             # may become a class
@@ -336,8 +334,7 @@ def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
 
 
 def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[str]) -> None:
-    """Refuse a ``text`` that no package wrote, if a plug-in or a logger could take it for code or a
-    file."""
+    """Refuse a ``text`` of no package that a plug-in or logger could take for code or a file."""
     is_logging = node.endswith("_logging")
     if key in CLASS_KEYS:
         if not is_allowed(text, allowed):
@@ -365,8 +362,10 @@ def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[st
 
 
 def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
-    """Import the callback classes that ``hydra.callbacks`` names. Raises InputError for what is no
-    such class."""
+    """Import the callback classes that ``hydra.callbacks`` names.
+
+    Raises InputError for what is no such class.
+    """
     from hydra.experimental.callback import Callback
 
     for name, callback in (callbacks or {}).items():
@@ -384,14 +383,15 @@ def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:
-    """Return whether these settings are another program's. The class is built under the names
-    `EXTERNAL` only."""
+    """Return whether these settings are another program's.
+
+    The class is built under the names `EXTERNAL` only.
+    """
     return densify.get(TARGET) in EXTERNAL
 
 
 def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse a program as trainer if the user did not allow the programs it starts and the
-    variables it sets."""
+    """Refuse a program as trainer unless the user allowed its programs and variables."""
     # A YAML file may call any program of this machine a trainer, or load code into one by a
     # variable.
     options = settings.get("options") or {}
@@ -413,8 +413,7 @@ def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
 
 
 def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:
-    """The ``variables`` that a configuration may not set: not free, not allowed, and not set to
-    this value already."""
+    """The ``variables`` that may not be set: not free, not allowed, nor at this value already."""
     return {
         name: value
         for name, value in variables.items()

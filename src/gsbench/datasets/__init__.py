@@ -1,2 +1,1 @@
-"""Public data sets: the catalogue, and fetching the wanted parts of their archives. Loads no
-torch."""
+"""Public data sets: the catalogue, and fetching parts of their archives. Loads no torch."""

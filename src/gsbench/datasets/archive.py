@@ -1,5 +1,4 @@
-"""Fetching scenes from zip archives, local or on a server: selecting the wanted members and
-checking each.
+"""Fetching scenes from zip archives: selecting the wanted members and checking each.
 
 From an archive on a server only the directory and the wanted members are read, each with its own
 request (remotezip). The missing folders of a scene appear in the data folder once all of them are
@@ -23,6 +22,9 @@ from gsbench.errors import InputError
 from gsbench.files import CHUNK, MAX_NAME_BYTES, atomic, require_regular
 from gsbench.logs import Progress
 from gsbench.words import counted, readable_bytes
+
+# raised by zipfile for a file that is no archive, or only its beginning
+NO_ARCHIVE = (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error)
 
 
 class DamagedMemberError(Exception):
@@ -74,7 +76,7 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
     with requests.Session() as session:
         try:
             archive = with_retries(once, url, policy)
-        except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+        except NO_ARCHIVE as error:
             if isinstance(error, InputError):
                 raise
             raise _no_archive(url, error) from error
@@ -83,11 +85,10 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
 
 
 def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
-    """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is no archive or
-    is truncated."""
+    """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is none."""
     try:
         return zipfile.ZipFile(file)
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+    except NO_ARCHIVE as error:
         raise _no_archive(where, error) from error
 
 
@@ -116,6 +117,7 @@ def wanted_members(
             raise InputError(
                 f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
             )
+        # A surrogate is what a damaged name decodes to.
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
             raise InputError(
                 f"{where}: the member {name!r:.80} has a name that no file can have: give another "
@@ -123,12 +125,11 @@ def wanted_members(
             )
         members[name] = info
     for name in members:
-        if folder_of := next(
-            (str(above) for above in PurePosixPath(name).parents if str(above) in members), None
-        ):
-            raise InputError(
-                f"{where}: {folder_of} is a file and a folder in one: give another --mirror"
-            )
+        for above in map(str, PurePosixPath(name).parents):
+            if above in members:
+                raise InputError(
+                    f"{where}: {above} is a file and a folder in one: give another --mirror"
+                )
     for part in wanted:
         if not any(name.startswith(f"{part}/") for name in members):
             raise InputError(
@@ -155,8 +156,7 @@ def is_complete(path: Path, size: int, crc: int) -> bool:
 def extract(
     archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, advance: Callable[[int], None]
 ) -> None:
-    """Write the member to ``target``, which appears only if size and CRC-32 are right; ``advance``
-    gets byte counts.
+    """Write the member to ``target``, whole or not at all; ``advance`` gets byte counts.
 
     Raises `DamagedMemberError`, `InputError` for an unknown compression, and errors of the network.
     """
@@ -194,8 +194,7 @@ DAMAGE = (
 
 
 def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
-    """The error that `extract` raises for ``error``: an error of gsbench for a known cause, else
-    the error itself."""
+    """The error that `extract` raises: one of gsbench for a known cause, else ``error`` itself."""
     from remotezip import RemoteIOError, RemoteZipError
 
     if isinstance(error, InputError | DamagedMemberError):
@@ -205,9 +204,8 @@ def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
         return cause if isinstance(cause, Exception) else error
     # An OSError with EINVAL is a seek before the start of the file; bzip2 raises one without a
     # number.
-    if isinstance(error, (*DAMAGE, RemoteZipError)) or (
-        isinstance(error, OSError) and error.errno in (None, EINVAL)
-    ):
+    bad_seek = isinstance(error, OSError) and error.errno in (None, EINVAL)
+    if bad_seek or isinstance(error, (*DAMAGE, RemoteZipError)):
         return DamagedMemberError(str(error) or type(error).__name__)
     if isinstance(error, NotImplementedError | RuntimeError):
         return InputError(
@@ -220,8 +218,7 @@ STAGING = ".fetch"  # folder below the data folder for unfinished scenes
 
 
 def missing_parts(data: Path, files: SceneFiles) -> tuple[str, ...]:
-    """The folders of a scene that are not in the folder ``data``. An existing folder is
-    complete."""
+    """The folders of a scene that are not in ``data``. An existing folder is complete."""
     return tuple(part for part in files.parts if not (data / files.folder / part).exists())
 
 
@@ -234,8 +231,7 @@ def fetch_scene(
     policy: RetryPolicy,
     say: Progress,
 ) -> str:
-    """Fetch the missing folders of a scene from ``folder`` of its ``archive``; returns a line about
-    them.
+    """Fetch the missing folders of a scene from its ``archive``; returns a line about them.
 
     ``where`` is the archive's address, for errors; ``say`` gets byte counts. The caller holds the
     lock of ``data``.
@@ -245,11 +241,12 @@ def fetch_scene(
     for path in [path for path in staging.rglob("*") if path.is_file()]:
         if path.relative_to(staging).as_posix() not in members:
             path.unlink()  # from an earlier fetch of other folders
+    # members that an interrupted fetch completed are not fetched again
     missing = {
         name: info
         for name, info in members.items()
         if not is_complete(staging / name, info.file_size, info.CRC)
-    }  # members that an interrupted fetch completed are not fetched again
+    }
     total, done = sum(info.file_size for info in missing.values()), 0
 
     def advance(count: int) -> None:
@@ -267,8 +264,7 @@ def fetch_scene(
                 if is_last_try:
                     raise FetchError(
                         f"{where}: {info.filename} arrives damaged ({error}): try again later, or "
-                        "give another address "
-                        "with --mirror"
+                        "give another address with --mirror"
                     ) from error
     for part in parts:  # each by one rename, so that no folder of images is ever incomplete
         (data / files.folder / part).parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,4 @@
-"""The catalogue of public data sets (``catalog.yaml``): archives of scenes, and the files of a
-scene to fetch."""
+"""The catalogue of public data sets (``catalog.yaml``), and the files that a scene needs."""
 
 import os
 import re
@@ -16,6 +15,7 @@ from gsbench.errors import InputError
 from gsbench.system.install import conf_dir
 
 DATA_VARIABLE = "GSBENCH_DATA"
+# the place of the data, as the YAML files of public scenes write it
 SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")
 CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 
@@ -25,8 +25,8 @@ class Archive:
     """One zip file of scenes."""
 
     url: str
-    size: str  # approximate, in words; "" if unknown
     scenes: Mapping[str, str]  # the folder of each scene in the archive
+    size: str = ""  # approximate, in words; "" if unknown
 
     @property
     def name(self) -> str:
@@ -51,8 +51,7 @@ class PublicDataset:
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder``, which is below the data
-    folder."""
+    """Folders that conf/scene/<scene>.yaml needs: ``parts`` in ``folder`` below the data folder."""
 
     scene: str
     folder: str
@@ -76,10 +75,10 @@ def read_catalog() -> dict[str, PublicDataset]:
     content: dict[str, Any] = yaml.safe_load(CATALOG_FILE.read_text(encoding="utf-8"))
     datasets = {}
     for name, entry in content.items():
-        archives = tuple(
-            Archive(one["url"], one.get("size", ""), one["scenes"]) for one in entry.pop("archives")
-        )
-        datasets[name] = PublicDataset(name=name, archives=archives, **entry)
+        archives = []
+        for one in entry.pop("archives"):
+            archives.append(Archive(one["url"], one["scenes"], one.get("size", "")))
+        datasets[name] = PublicDataset(name=name, archives=tuple(archives), **entry)
     return datasets
 
 
@@ -91,17 +90,16 @@ def data_dir() -> Path:
 @cache
 def _catalogued_scenes() -> dict[str, tuple[str, str]]:
     """The data set and the folder of each scene in the catalogue."""
-    return {
-        scene: (dataset.name, folder)
-        for dataset in read_catalog().values()
-        for archive in dataset.archives
-        for scene, folder in archive.scenes.items()
-    }
+    found = {}
+    for dataset in read_catalog().values():
+        for archive in dataset.archives:
+            for scene, folder in archive.scenes.items():
+                found[scene] = (dataset.name, folder)
+    return found
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
-    """Advice for missing scenes, given as (scene, folder): the commands that fetch those in the
-    catalogue."""
+    """Advice for missing (scene, folder): the commands that fetch those in the catalogue."""
     wanted = defaultdict(list)
     for scene, folder in scenes:
         dataset, catalogued = _catalogued_scenes().get(scene, ("", ""))

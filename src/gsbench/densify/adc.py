@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsbench.densify.base import NEVER, Refinement, Rule, Statistic, revised_logits
 from gsbench.densify.budget import Budgeted, admit
+from gsbench.densify.scores import draw
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
@@ -36,8 +37,7 @@ class Grown(NamedTuple):
 
 @dataclass
 class ADC(Budgeted):
-    """Clone small Gaussians, split large ones, and prune faint and huge ones (Kerbl et al. 2023,
-    section 5).
+    """Clone small, split large, prune faint and huge Gaussians (Kerbl et al. 2023, section 5).
 
     A Gaussian grows if its gradient in NDC units, averaged over the iterations in which it was
     visible, reaches ``gradient_threshold``. Sizes are fractions of the scene extent.
@@ -119,28 +119,32 @@ class ADC(Budgeted):
             rules += [*self.governing(), self.grow_by_gradient, self.prune, self.reset_statistics]
         # As in 3DGS: with a white background, opacities are also reset once at the start of the
         # window.
-        periodic = step % self.opacity_reset_interval == 0
-        if step < self.stop and (
-            periodic or (self.context.white_background and step == self.start)
-        ):
+        first = self.context.white_background and step == self.start
+        if step < self.stop and (first or step % self.opacity_reset_interval == 0):
             rules.append(self.reset_opacity)
         return rules
 
     def mean_gradient(self) -> Tensor:
-        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if it never
-        was."""
+        """Mean gradient [N] NDC over the iterations in which a Gaussian was visible.
+
+        It is 0 if it never was.
+        """
         return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
-        """Two masks [N]: Gaussians whose mean gradient reaches the threshold; Gaussians to split
-        rather than clone."""
+        """Two masks [N]: Gaussians whose mean gradient reaches the threshold.
+
+        The other has the Gaussians to split rather than clone.
+        """
         log_scales = refinement.gaussians.values.log_scales
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
         return self.reaches(self.mean_gradient(), self.gradient_threshold), large
 
     def reaches(self, mean: Tensor, threshold: float) -> Tensor:
-        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold``
-        times ``strictness``."""
+        """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold``.
+
+        The threshold is multiplied by ``strictness``.
+        """
         limit = threshold * self.strictness
         return mean >= limit if self.threshold_inclusive else mean > limit
 
@@ -169,8 +173,7 @@ class ADC(Budgeted):
         return int(grown.number[~pruned].sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Clone small Gaussians and split large ones if their mean gradient reaches the
-        threshold."""
+        """Clone small and split large Gaussians whose mean gradient reaches the threshold."""
         gaussians, event = refinement.gaussians, refinement.event
         over, large = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, self.split_children - 1)
@@ -196,8 +199,10 @@ class ADC(Budgeted):
         return opacity_logits.sigmoid() < self.prune_opacity * self.cull
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Mask [N] of the Gaussians to prune by size: none until the first opacity reset has
-        passed."""
+        """Mask [N] of the Gaussians to prune by size.
+
+        There are none until the first opacity reset has passed.
+        """
         if not self.prunes_by_size or step <= self.opacity_reset_interval:
             return log_scales.new_zeros(len(log_scales), dtype=torch.bool)
         huge = log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
@@ -206,22 +211,33 @@ class ADC(Budgeted):
         return huge
 
     def may_cull(self, step: int) -> bool:
-        """Return False in the first rounds after an opacity reset: then nearly all opacities are
-        low."""
+        """Return False in the first rounds after an opacity reset.
+
+        Then nearly all opacities are low.
+        """
         since_reset = step % self.opacity_reset_interval
         return (
             step <= self.opacity_reset_interval
             or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
         )
 
-    def prune(self, refinement: Refinement) -> None:
-        """Remove faint Gaussians and, after the first opacity reset, huge ones."""
+    def to_prune(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        """Masks [N] of the faint and, after the first opacity reset, of the huge Gaussians."""
         values = refinement.gaussians.values
-        faint, huge = (
-            self.faint(values.opacity_logits),
-            self.huge(refinement.step, values.log_scales),
-        )
-        self.remove(refinement, faint, huge)
+        return self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+
+    def prune(self, refinement: Refinement) -> None:
+        """Remove the Gaussians ``to_prune``."""
+        self.remove(refinement, *self.to_prune(refinement))
+
+    def prune_drawn(self, refinement: Refinement, known: Tensor, weights: Tensor) -> None:
+        """Remove those ``to_prune`` that are among half as many draws from the mask ``known`` [N].
+
+        The draws are in proportion to ``weights`` [N].
+        """
+        faint, huge = self.to_prune(refinement)
+        drawn = draw(known, weights, int((faint | huge).sum()) // 2, refinement.rng)
+        self.remove(refinement, faint & drawn, huge & drawn)
 
     def reset_opacity(self, refinement: Refinement) -> None:
         """Lower all opacities: those of needed Gaussians rise again, the others are pruned."""
@@ -229,8 +245,10 @@ class ADC(Budgeted):
         refinement.event.opacity_reset = True
 
     def limit_opacity(self, refinement: Refinement, ceiling: float) -> None:
-        """Lower all opacities above ``ceiling`` to it. The moments of all opacities become zero, as
-        in 3DGS."""
+        """Lower all opacities above ``ceiling`` to it.
+
+        The moments of all opacities become zero, as in 3DGS.
+        """
         limit = math.log(ceiling / (1 - ceiling))
         logits = refinement.gaussians.values.opacity_logits.detach().clamp_max(limit)
         refinement.gaussians.overwrite("opacity_logits", logits)

@@ -30,13 +30,13 @@ from gsbench.settings import OpenFraction, Switch
 
 @dataclass
 class AbsGS(ADC):
-    """ADC with two gradients and a ceiling on opacities, as in the code of Ye et al. (arXiv
-    2404.10484).
+    """ADC with two gradients and a ceiling on opacities (Ye et al., arXiv 2404.10484).
 
-    Small Gaussians are cloned if their signed mean gradient reaches ``gradient_threshold``. Large
-    ones are split if their absolute mean gradient, in which the pixels of a Gaussian do not cancel,
-    reaches ``split_threshold``. Every ``ceiling_interval`` iterations, all opacities above
-    ``opacity_ceiling`` are lowered to it, so that no Gaussian hides all that is behind it.
+    It follows the authors' code. Small Gaussians are cloned if their signed mean gradient reaches
+    ``gradient_threshold``. Large ones are split if their absolute mean gradient, in which the
+    pixels of a Gaussian do not cancel, reaches ``split_threshold``. Every ``ceiling_interval``
+    iterations, all opacities above ``opacity_ceiling`` are lowered to it, so that no Gaussian hides
+    all that is behind it.
     """
 
     # NDC, since the last refinement
@@ -65,8 +65,10 @@ class AbsGS(ADC):
             )
 
     def mean_absolute_gradient(self) -> Tensor:
-        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible; 0 if
-        it never was."""
+        """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible.
+
+        It is 0 if it never was.
+        """
         return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
@@ -78,17 +80,15 @@ class AbsGS(ADC):
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         over, large = super().candidates(refinement)
-        return torch.where(
-            large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over
-        ), large
+        split = self.reaches(self.mean_absolute_gradient(), self.split_threshold)
+        return torch.where(large, split, over), large
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         """Choose the candidates farthest above the threshold that applies to them."""
         _, large = self.candidates(refinement)
         signed = self.mean_gradient() / self.gradient_threshold
-        excess = torch.where(
-            large, self.mean_absolute_gradient() / self.split_threshold, signed
-        )  # [N]
+        absolute = self.mean_absolute_gradient() / self.split_threshold
+        excess = torch.where(large, absolute, signed)  # [N]
         return admit(candidates, excess, gain, self.allowance(refinement))
 
     def lower_opacity(self, refinement: Refinement) -> None:
@@ -136,15 +136,16 @@ class PixelGS(ADC):
         return (depths / (self.near_fraction * self.context.extent)).square().clamp_max(1)
 
     def mean_gradient(self) -> Tensor:
-        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels; 0
-        without pixels."""
+        """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels.
+
+        It is 0 without pixels.
+        """
         return self.statistics["weighted_gradient_sum"] / self.statistics["pixel_sum"].clamp_min(1)
 
 
 @dataclass
 class QuantileADC(ADC):
-    """ADC with a growth rate, after the AdaptiveStrategy proposed for gsplat (its pull request
-    941).
+    """ADC with a growth rate, after the AdaptiveStrategy of gsplat's pull request 941.
 
     In each round the Gaussians with the largest mean gradients grow, as many as raise the count by
     ``growth_rate``. Gaussians that no view has seen do not grow. The ``prune_share`` with the
@@ -166,13 +167,9 @@ class QuantileADC(ADC):
         # The opacity threshold is a quantile over all Gaussians after growth, so each child needs
         # its own entry.
         grown = self.grown(refinement)
-        index = torch.arange(len(grown.number), device=grown.number.device).repeat_interleave(
-            grown.number
-        )
-        pruned = (
-            self.faint(grown.opacity_logits[index])
-            | self.huge(refinement.step, grown.log_scales)[index]
-        )
+        index = torch.repeat_interleave(grown.number)  # [after growth] each child's parent
+        faint = self.faint(grown.opacity_logits[index])
+        pruned = faint | self.huge(refinement.step, grown.log_scales)[index]
         return len(index) - int(pruned.sum())
 
     def faint(self, opacity_logits: Tensor) -> Tensor:
@@ -193,14 +190,13 @@ class Saddles(NamedTuple):
 
 @dataclass
 class SteepGS(ADC):
-    """ADC that splits a candidate only where a split lowers the loss (Wang et al., CVPR 2025, arXiv
-    2505.05587).
+    """ADC that splits only where a split lowers the loss (SteepGS, arXiv 2505.05587).
 
-    Replace a Gaussian by two halves at small offsets +-d. To second order the loss changes by d S d
-    / 2, where S is the splitting matrix: the sum over pixels of (d loss / d s) times the second
-    derivative of s by the mean, with s the opacity times the density at the pixel. So a split
-    lowers the loss only if S has a negative eigenvalue, and most along the eigenvector of the least
-    eigenvalue. Halves of equal weight are best.
+    By Wang et al., CVPR 2025. Replace a Gaussian by two halves at small offsets +-d. To second
+    order the loss changes by d S d / 2, where S is the splitting matrix: the sum over pixels of (d
+    loss / d s) times the second derivative of s by the mean, with s the opacity times the density
+    at the pixel. So a split lowers the loss only if S has a negative eigenvalue, and most along the
+    eigenvector of the least eigenvalue. Halves of equal weight are best.
 
     A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in
     which it was visible, is below ``eigenvalue_threshold``, in units of the loss per squared scene
@@ -235,11 +231,10 @@ class SteepGS(ADC):
             self.statistics["splitting_sum"] += render.require_splitting_matrix()
 
     def steepest(self, where: Tensor) -> tuple[Tensor, Tensor]:
-        """The least eigenvalue [S] of the mean splitting matrix of the S Gaussians at the mask
-        ``where`` [N], and its eigenvector [S, 3].
+        """The least eigenvalue [S] and its eigenvector [S, 3] of the mean splitting matrices.
 
-        Eigenvalues are in units of the loss per squared extent. The largest component of each
-        eigenvector is positive.
+        They are those of the S Gaussians at the mask ``where`` [N]. Eigenvalues are in units of the
+        loss per squared extent. The largest component of each eigenvector is positive.
         """
         seen = self.statistics["visible_count"][where].clamp_min(1)  # [S]
         mean = self.statistics["splitting_sum"][where].double() / seen[:, None, None]  # [S, 3, 3]
@@ -280,23 +275,18 @@ class SteepGS(ADC):
         selected, blocked = admit(
             saddles.candidates, -saddles.values, 1, self.allowance(refinement)
         )
-        indices = selected.nonzero().squeeze(-1)  # [S]
-        parents, is_large = (
-            gaussians.values.detach().select(indices),
-            saddles.large[indices].unsqueeze(-1),
-        )
-        direction = saddles.directions[indices].to(parents.means)  # [S, 3]
+        parents = gaussians.values.detach().select(selected)
+        is_large = saddles.large[selected].unsqueeze(-1)  # [S, 1]
+        direction = saddles.directions[selected].to(parents.means)  # [S, 3]
         noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
         lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
         lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
         children = Gaussians.concatenate([parents, parents])
         children.means = children.means + lengths * torch.cat([direction, -direction])
-        children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(
-            2, 1
-        )
+        shrink = math.log(self.split_shrink) * is_large  # [S, 1]
+        children.log_scales = children.log_scales - shrink.repeat(2, 1)
         children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
-        self.edit(refinement, ~selected, children, indices.repeat(2), Cause.SPLIT_GRADIENT)
-        refinement.event.split_gradient += len(parents)
+        self.split_in_halves(refinement, selected, children)
         refinement.event.blocked_by_cap += blocked
 
 
@@ -356,9 +346,8 @@ class ResGS(ADC):
 
     def iteration_at(self, fraction: float) -> int:
         """The iteration of the round nearest to the given fraction of the window."""
-        return (
-            self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
-        )
+        rounds = round(fraction * (self.stop - self.start) / self.interval)
+        return self.start + rounds * self.interval
 
     def warming_up(self, step: int) -> bool:
         """Return whether ``step`` is in the pause after the end of a phase."""
@@ -383,10 +372,8 @@ class ResGS(ADC):
             super().observe(step, render)
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        step, rules = (
-            refinement.step,
-            [rule for rule in super().rules(refinement) if rule != self.reset_opacity],
-        )
+        step = refinement.step
+        rules = [rule for rule in super().rules(refinement) if rule != self.reset_opacity]
         if self.warming_up(step):
             rules = []
         fading = self.iteration_at(self.fade_start) <= step < self.fade_stop
@@ -402,12 +389,10 @@ class ResGS(ADC):
         return self.reaches(mean, self.gradient_threshold), large
 
     def forecast(self, refinement: Refinement) -> int:
-        values = refinement.gaussians.values
+        logits = refinement.gaussians.values.opacity_logits
         over, _ = self.candidates(refinement)
-        parents = torch.where(
-            over, faded(values.opacity_logits, self.parent_opacity), values.opacity_logits
-        )
-        children = over & ~self.faint(values.opacity_logits)
+        parents = torch.where(over, faded(logits, self.parent_opacity), logits)
+        children = over & ~self.faint(logits)
         return int((~self.faint(parents)).sum()) + int(children.sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
@@ -439,7 +424,9 @@ class ResGS(ADC):
         self.statistics["level"] = levels
 
     def fade_all(self, refinement: Refinement) -> None:
-        """Multiply all opacities by ``fade``: Gaussians that are not needed become faint and are
-        pruned."""
+        """Multiply all opacities by ``fade``.
+
+        Gaussians that are not needed become faint and are pruned.
+        """
         logits = refinement.gaussians.values.opacity_logits.detach()
         refinement.gaussians.overwrite("opacity_logits", faded(logits, self.fade))

@@ -1,6 +1,8 @@
-"""The contract of a densifier: its hyper-parameters, its saved state, the lineage of every
-Gaussian, and a record of each refinement. At the end stand functions that several densifiers
-share."""
+"""The contract of a densifier.
+
+Its hyper-parameters, its saved state, the lineage of every Gaussian, and a record of each
+refinement. At the end stand functions that several densifiers share.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,11 @@ from gsbench.settings import Switch, check_settings
 
 
 class Lineage:
-    """Identity, parent and cause of every Gaussian that ever existed in a training; always on the
-    CPU.
+    """Identity, parent and cause of every Gaussian that ever existed in a training.
 
-    ``ids`` [N] are the identities of the present Gaussians. ``parents``, ``causes`` and ``steps``
-    [T] are the history of all T Gaussians, indexed by identity; the parent of an initial Gaussian
-    is -1.
+    Always on the CPU. ``ids`` [N] are the identities of the present Gaussians. ``parents``,
+    ``causes`` and ``steps`` [T] are the history of all T Gaussians, indexed by identity; the parent
+    of an initial Gaussian is -1.
     """
 
     def __init__(self, num_gaussians: int) -> None:
@@ -38,8 +39,7 @@ class Lineage:
 
     @staticmethod
     def _entries(parents: Tensor, cause: Cause, step: int) -> dict[str, Tensor]:
-        """The history of Gaussians that were born together, given the identities [A] of their
-        parents."""
+        """The history of Gaussians born together, with the identities [A] of their parents."""
         causes = torch.full_like(parents, int(cause), dtype=torch.uint8)
         return {
             "parents": parents,
@@ -48,8 +48,7 @@ class Lineage:
         }
 
     def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
-        """Keep the Gaussians at the mask ``keep`` [N], then append a child of each of ``parents``
-        [A].
+        """Keep those at the mask ``keep`` [N], then append a child of each of ``parents`` [A].
 
         ``parents`` are indices from before the edit.
         """
@@ -66,8 +65,10 @@ class Lineage:
         return {cause.key: int(counts[cause]) for cause in Cause}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors; ``lineage.npz`` of a
-        trial holds the same."""
+        """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors.
+
+        ``lineage.npz`` of a trial holds the same.
+        """
         return {"ids": self.ids} | {
             name: torch.cat([entries[name] for entries in self._history])
             for name in self._history[0]
@@ -111,8 +112,10 @@ class DensifyContext:
 
 @dataclass
 class Refinement:
-    """One refinement in progress: what its rules read and change, and the event that counts their
-    edits."""
+    """One refinement in progress.
+
+    What its rules read and change, and the event that counts their edits.
+    """
 
     step: int
     gaussians: TrainableGaussians
@@ -124,8 +127,10 @@ Rule = Callable[[Refinement], None]
 
 
 class Statistic(NamedTuple):
-    """A statistic with several numbers per Gaussian: ``Statistic(torch.float32, (3, 3))`` is [N, 3,
-    3]."""
+    """A statistic with several numbers per Gaussian.
+
+    ``Statistic(torch.float32, (3, 3))`` is [N, 3, 3].
+    """
 
     dtype: torch.dtype
     shape: tuple[int, ...] = ()
@@ -196,14 +201,18 @@ class Densifier:
         cls.STATISTICS = {name: dtype for table in tables for name, dtype in table.items()}
 
     def __post_init__(self) -> None:
-        """Check each hyper-parameter against its annotation. A subclass adds checks that involve
-        several of them."""
+        """Check each hyper-parameter against its annotation.
+
+        A subclass adds checks that involve several of them.
+        """
         check_settings(self, "densify")
 
     @property
     def most_gaussians(self) -> int | None:
-        """The largest count during training: ``max_gaussians`` if the class has it; None: no
-        limit."""
+        """The largest count during training: ``max_gaussians`` if the class has it.
+
+        None means no limit.
+        """
         return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
@@ -224,16 +233,20 @@ class Densifier:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Return the rules that are due at ``refinement.step``, in order; an empty list if no rule
-        is due."""
+        """Return the rules that are due at ``refinement.step``, in order.
+
+        It is empty if no rule is due.
+        """
         return []
 
     @torch.no_grad()
     def refine(
         self, step: int, gaussians: TrainableGaussians, rng: torch.Generator
     ) -> RefineEvent | None:
-        """Apply the rules that are due. Return the record of what they did, or None if no rule was
-        due."""
+        """Apply the rules that are due.
+
+        Return the record of what they did, or None if no rule was due.
+        """
         refinement = Refinement(step, gaussians, rng, RefineEvent(step=step, before=len(gaussians)))
         rules = self.rules(refinement)
         if not rules:
@@ -244,8 +257,7 @@ class Densifier:
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        """Act after the optimiser step of iteration ``step``, for example by adding noise to the
-        means."""
+        """Act after the optimiser step of iteration ``step``, such as by noise on the means."""
 
     def edit(
         self,
@@ -255,8 +267,7 @@ class Densifier:
         parents: Tensor | None = None,
         cause: Cause = Cause.INITIAL,
     ) -> None:
-        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append the Gaussians
-        ``append`` [A].
+        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append ``append`` [A].
 
         Optimiser state, lineage and statistics are edited alike. ``parents`` [A] are the indices,
         from before the edit, of the parents of ``append``.
@@ -301,12 +312,11 @@ class Densifier:
         keep_parent: bool = False,
         sampled: bool = True,
     ) -> int:
-        """Replace each Gaussian at the mask ``selected`` [N] by ``children`` new ones; return by
-        how many the count grew.
+        """Replace each Gaussian at the mask ``selected`` [N] by ``children`` new ones.
 
-        ``child_log_scales`` [S, 3] has one row per selected Gaussian. With ``keep_parent``, parents
-        stay beside their children. The means of children are drawn from the density of their parent
-        (``sampled``), or equal its mean.
+        Return by how many the count grew. ``child_log_scales`` [S, 3] has one row per selected
+        Gaussian. With ``keep_parent``, parents stay beside their children. The means of children
+        are drawn from the density of their parent (``sampled``), or equal its mean.
         """
         parents = selected.nonzero().squeeze(-1)  # [S]
         new = Gaussians.concatenate(
@@ -322,6 +332,17 @@ class Densifier:
         keep = None if keep_parent else ~selected
         self.edit(refinement, keep=keep, append=new, parents=parents.repeat(children), cause=cause)
         return len(new) - (0 if keep_parent else len(parents))
+
+    def split_in_halves(
+        self, refinement: Refinement, selected: Tensor, children: Gaussians
+    ) -> None:
+        """Replace each Gaussian at the mask ``selected`` [N] by two ``children`` [2 S].
+
+        The first halves of all come first, then the second ones. They count as splits.
+        """
+        parents = selected.nonzero().squeeze(-1)  # [S]
+        self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
+        refinement.event.split_gradient += len(parents)
 
     def remove(self, refinement: Refinement, faint: Tensor, others: Tensor | None = None) -> None:
         """Remove the Gaussians at the masks ``faint`` [N] and ``others`` [N].
@@ -357,13 +378,11 @@ class Densifier:
         }
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        kinds = {
-            n: Statistic(k) if isinstance(k, torch.dtype) else k for n, k in self.STATISTICS.items()
-        }
-        return {
-            name: torch.zeros(count, *kind.shape, dtype=kind.dtype, device=device)
-            for name, kind in kinds.items()
-        }
+        zeros = {}
+        for name, kind in self.STATISTICS.items():
+            dtype, shape = (kind, ()) if isinstance(kind, torch.dtype) else kind
+            zeros[name] = torch.zeros(count, *shape, dtype=dtype, device=device)
+        return zeros
 
 
 class NoDensifier(Densifier):
@@ -371,12 +390,11 @@ class NoDensifier(Densifier):
 
 
 def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
-    """Draw normal numbers of ``shape``, with the dtype and on the device of ``like``, determined by
-    the CPU generator ``rng``.
+    """Draw normal numbers of ``shape`` with the CPU generator ``rng``.
 
-    On another device, a temporary generator there draws the numbers, seeded by ``rng``. So no
-    numbers are uploaded, and the state of ``rng`` is all that a checkpoint must save. The same seed
-    gives other numbers there than on the CPU.
+    They have the dtype and the device of ``like``. On another device, a temporary generator there
+    draws the numbers, seeded by ``rng``. So no numbers are uploaded, and the state of ``rng`` is
+    all that a checkpoint must save. The same seed gives other numbers there than on the CPU.
     """
     if like.device.type == "cpu":
         return torch.randn(shape, generator=rng, dtype=like.dtype)
@@ -389,10 +407,10 @@ MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
 
 
 def revised_logits(opacity_logits: Tensor) -> Tensor:
-    """Logits of 1 - sqrt(1 - o): two such children, one behind the other, are as opaque as the
-    parent.
+    """Logits of 1 - sqrt(1 - o).
 
-    From Revising Densification (arXiv 2404.06109).
+    Two such children, one behind the other, are as opaque as the parent. From Revising
+    Densification (arXiv 2404.06109).
     """
     transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
     return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))
@@ -404,8 +422,10 @@ def faded(opacity_logits: Tensor, factor: float) -> Tensor:
 
 
 def quantile(ordered: Tensor, q: float) -> float:
-    """The ``q``-quantile of sorted values [N], interpolated linearly (torch.quantile refuses more
-    than 16 M values)."""
+    """The ``q``-quantile of sorted values [N], interpolated linearly.
+
+    torch.quantile refuses more than 16 M values.
+    """
     position = q * (len(ordered) - 1)
     low = math.floor(position)
     high = min(low + 1, len(ordered) - 1)

@@ -1,5 +1,7 @@
-"""Caps on the number of Gaussians: their arithmetic, and the base class of densifiers that have
-one."""
+"""Caps on the number of Gaussians.
+
+Their arithmetic, and the base class of densifiers that have one.
+"""
 
 import math
 from collections.abc import Callable
@@ -33,10 +35,10 @@ def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> in
 
 
 def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> tuple[Tensor, int]:
-    """Choose the candidates that the allowance admits, best ``score`` first (ties by index); count
-    those refused.
+    """Choose the candidates that the allowance admits, best ``score`` first (ties by index).
 
-    ``candidates`` is a mask [N], ``score`` is [N]; each candidate adds ``gain`` Gaussians.
+    Count those refused. ``candidates`` is a mask [N], ``score`` is [N]; each candidate adds
+    ``gain`` Gaussians.
     """
     count = int(candidates.sum())
     if allowed is None or count * gain <= allowed:
@@ -50,8 +52,7 @@ def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> 
 
 
 def find_factor(count: Callable[[float], int], target: int, low: float, high: float) -> float:
-    """Find the factor in [``low``, ``high``] for which ``count`` is nearest to ``target`` without
-    exceeding it.
+    """Find the factor in [``low``, ``high``] with the largest ``count`` up to ``target``.
 
     ``count`` must fall as the factor rises. Returns ``high`` if ``count`` exceeds ``target``
     everywhere.
@@ -80,8 +81,7 @@ DEADBAND = 0.01
 
 @dataclass
 class Budgeted(Densifier):
-    """Base of densifiers that have rounds of growth and pruning, and a cap on the number of
-    Gaussians.
+    """Base of densifiers with rounds of growth and pruning, and a cap on the count.
 
     ``cap`` says how ``max_gaussians`` is enforced:
 
@@ -179,8 +179,7 @@ class Budgeted(Densifier):
         return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round with the present ``strictness`` and ``cull``, if no cap limited
-        growth."""
+        """The count after a round with the present ``strictness`` and ``cull``, without a cap."""
         raise NotImplementedError
 
     def frozen(self, refinement: Refinement) -> bool:
@@ -196,16 +195,14 @@ class Budgeted(Densifier):
         """The only rule of a frozen round: record how many Gaussians it would have added."""
         # With infinite strictness nothing grows: the difference is growth alone, without the effect
         # of pruning.
-        refinement.event.blocked_by_cap += self._forecast_at(refinement) - self._forecast_at(
-            refinement, math.inf
-        )
+        without_growth = self._forecast_at(refinement, math.inf)
+        refinement.event.blocked_by_cap += self._forecast_at(refinement) - without_growth
 
     def govern(self, refinement: Refinement) -> None:
-        """The first rule of a governed round: set ``strictness`` and ``cull`` so that the round
-        ends at the target.
+        """The first rule of a governed round.
 
-        From Bisht and Kolb, "Smart Target Point Control for Gaussian Splatting Methods" (arXiv
-        2605.16158):
+        Set ``strictness`` and ``cull`` so that the round ends at the target. From Bisht and Kolb,
+        "Smart Target Point Control for Gaussian Splatting Methods" (arXiv 2605.16158):
 
         - the target is n0 + (n - n0) (2x - x^2) (their eq. 3 to 5);
         - only the growth thresholds and the opacity for pruning are adjusted;
@@ -251,8 +248,10 @@ class Budgeted(Densifier):
         return count + round((self.max_gaussians - count) * (1 - (left_after / left_before) ** 2))
 
     def may_cull(self, step: int) -> bool:
-        """Return whether the governor may raise ``cull`` now; False soon after opacities were
-        reset."""
+        """Return whether the governor may raise ``cull`` now.
+
+        It is False soon after opacities were reset.
+        """
         return True
 
     def _forecast_at(

@@ -1,5 +1,7 @@
-"""Improved-GS and GNS: long-axis splits of candidates drawn by the edges that they cover, and
-natural selection."""
+"""Improved-GS and GNS.
+
+Long-axis splits of candidates drawn by the edges that they cover, and natural selection.
+"""
 
 import logging
 import math
@@ -16,7 +18,6 @@ from torch import Tensor
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
 from gsbench.densify.base import DensifyContext, Refinement, Rule, faded, quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
-from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction, Switch
@@ -26,14 +27,13 @@ REACH = 3.0  # standard deviations at which a Gaussian is taken to end
 
 @dataclass
 class LongAxis(ADC):
-    """ADC that splits all candidates along their longest axis and clones none (Deng et al., arXiv
-    2508.12313).
+    """ADC that splits all candidates along their longest axis (Deng et al., arXiv 2508.12313).
 
-    With d = ``split_distance`` and s the longest semi-axis, two children replace the parent. They
-    lie at 3 d s on either side of it along that axis. Their longest semi-axis is (1 - d) s, their
-    other axes are the parent's times sqrt(1 - d^2), and their opacity is the parent's times
-    ``opacity_factor``. The split is not random. The options ``split_size``, ``split_children``,
-    ``split_shrink`` and ``revised_opacity`` of ADC have no effect.
+    It clones none. With d = ``split_distance`` and s the longest semi-axis, two children replace
+    the parent. They lie at 3 d s on either side of it along that axis. Their longest semi-axis is
+    (1 - d) s, their other axes are the parent's times sqrt(1 - d^2), and their opacity is the
+    parent's times ``opacity_factor``. The split is not random. The options ``split_size``,
+    ``split_children``, ``split_shrink`` and ``revised_opacity`` of ADC have no effect.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -59,13 +59,10 @@ class LongAxis(ADC):
         """Split the Gaussians whose mean gradient reaches the threshold."""
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
-        parents = selected.nonzero().squeeze(-1)  # [S]
-        parent_values = refinement.gaussians.values.detach().select(parents)
-        children = halves(
-            parent_values, REACH * self.split_distance, *self._factors, self.opacity_factor
-        )
-        self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
-        refinement.event.split_gradient += len(parents)
+        parents = refinement.gaussians.values.detach().select(selected)
+        offset = REACH * self.split_distance
+        children = halves(parents, offset, *self._factors, self.opacity_factor)
+        self.split_in_halves(refinement, selected, children)
         refinement.event.blocked_by_cap += blocked
 
     @property
@@ -77,11 +74,11 @@ class LongAxis(ADC):
 def halves(
     parents: Gaussians, offset: float, longest: float, across: float, opacity: float
 ) -> Gaussians:
-    """Two children of each of ``parents`` [S], [2 S]: first all children on one side, then all on
-    the other.
+    """Two children of each of ``parents`` [S], [2 S].
 
-    They lie ``offset`` standard deviations from the parent along its longest axis. ``longest``
-    multiplies the scale of that axis, ``across`` the other scales, and ``opacity`` the opacity.
+    First all children on one side, then all on the other. They lie ``offset`` standard deviations
+    from the parent along its longest axis. ``longest`` multiplies the scale of that axis,
+    ``across`` the other scales, and ``opacity`` the opacity.
     """
     axis = parents.log_scales.argmax(-1)  # [S]
     directions = parents.rotations[torch.arange(len(axis), device=axis.device), :, axis]  # [S, 3]
@@ -94,8 +91,10 @@ def halves(
 
 
 def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
-    """``log_scales`` [N, 3] with the scale of the longest axis times ``longest`` and the others
-    times ``across``."""
+    """``log_scales`` [N, 3], changed by factors on the scales.
+
+    The longest axis gets ``longest``, the others ``across``.
+    """
     index = log_scales.argmax(-1, keepdim=True)
     is_longest = torch.zeros_like(log_scales, dtype=torch.bool).scatter(-1, index, True)
     # torch.where with two Python numbers would compute in float32; a tensor keeps float64.
@@ -117,8 +116,7 @@ RESETS = 3  # RECOVERY and ALL_VIEWS apply until this opacity reset
 
 @dataclass
 class EdgeAware(LongAxis):
-    """The long-axis split, of candidates drawn by the edge-aware score of Deng et al. (arXiv
-    2508.12313).
+    """The long-axis split of candidates drawn by edges (Deng et al., arXiv 2508.12313).
 
     Each round draws ``score_views`` training views. The score of a Gaussian in a view is the sum
     over pixels of (edge strength of the photograph) alpha T, divided by the mean of this sum over
@@ -173,8 +171,10 @@ class EdgeAware(LongAxis):
         return rules
 
     def rounds_after_reset(self, step: int) -> float:
-        """Rounds since the last opacity reset (or the start of training); infinity from the last
-        counted reset on."""
+        """Rounds since the last opacity reset (or the start of training).
+
+        It is infinite from the last counted reset on.
+        """
         if step >= RESETS * self.opacity_reset_interval:
             return math.inf
         return step % self.opacity_reset_interval / self.interval
@@ -217,8 +217,10 @@ class EdgeAware(LongAxis):
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
     def prune_unrecovered(self, refinement: Refinement) -> None:
-        """Remove the ``recovery_share`` with the lowest opacities, which did not recover from the
-        opacity reset."""
+        """Remove the ``recovery_share`` with the lowest opacities.
+
+        They did not recover from the opacity reset.
+        """
         opacities = refinement.gaussians.values.opacities.detach()
         if len(opacities):
             self.prune_below(refinement, quantile(opacities.sort().values, self.recovery_share))
@@ -246,14 +248,13 @@ SELECTION = ("step", "weight", "aim", "met_at")  # the attributes of `GNS` that 
 
 @dataclass
 class GNS(EdgeAware):
-    """Improved-GS up to ``overgrowth`` times the budget, then natural selection (Deng et al., arXiv
-    2511.16980).
+    """Improved-GS, then natural selection (Deng et al., arXiv 2511.16980).
 
-    The pressure lasts ``pressure_length`` of the window's length, from the end of the window. Every
-    half interval, a term in the loss lowers all opacity logits l (opacity o): w (mean of (l + 20) /
-    max(.05, 1 - o))^2 in the first eighth of that time, then 3 w (mean l + 20)^2. The photometric
-    loss counteracts it for Gaussians that the pictures need. After the first eighth, Gaussians
-    below ``selected_opacity`` are pruned.
+    Improved-GS grows up to ``overgrowth`` times the budget. The pressure lasts ``pressure_length``
+    of the window's length, from the end of the window. Every half interval, a term in the loss
+    lowers all opacity logits l (opacity o): w (mean of (l + 20) / max(.05, 1 - o))^2 in the first
+    eighth of that time, then 3 w (mean l + 20)^2. The photometric loss counteracts it for Gaussians
+    that the pictures need. After the first eighth, Gaussians below ``selected_opacity`` are pruned.
 
     The weight w starts at ``pressure``. It is adjusted so that the opacity of the last Gaussian
     within the budget follows an aim, which falls from .8 of its initial value to 0 in seven eighths
@@ -314,20 +315,14 @@ class GNS(EdgeAware):
         self.adjust_weight(step, gaussians.opacities.detach())
         logits = gaussians.opacity_logits + LOWEST_LOGIT
         if self.in_first_part(step):
-            return (
-                self.weight
-                * (logits / (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)).mean().square()
-            )
+            transparency = (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)
+            return self.weight * (logits / transparency).mean().square()
         return HARD_FACTOR * self.weight * logits.mean().square()
 
     def adjust_weight(self, step: int, opacities: Tensor) -> None:
-        """Adjust the weight of the pressure by the opacity of the last Gaussian within the
-        budget."""
-        last = (
-            opacities.sort(descending=True)
-            .values[min(self.max_gaussians, len(opacities)) - 1]
-            .item()
-        )
+        """Adjust the pressure by the opacity of the last Gaussian within the budget."""
+        place = min(self.max_gaussians, len(opacities)) - 1
+        last = opacities.sort(descending=True).values[place].item()
         if self.aim is None:
             self.aim = FIRST_AIM * last
         elif (step - 1) % (2 * self.pressure_interval) == 0:
@@ -356,12 +351,8 @@ class GNS(EdgeAware):
     def meet_budget(self, refinement: Refinement) -> None:
         """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
         opacities = refinement.gaussians.values.opacities.detach()
-        kept = draw(
-            torch.ones_like(opacities, dtype=torch.bool),
-            opacities,
-            self.max_gaussians,
-            refinement.rng,
-        )
+        everybody = torch.ones_like(opacities, dtype=torch.bool)
+        kept = draw(everybody, opacities, self.max_gaussians, refinement.rng)
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
                 "the opacity pressure was too short: it ended with %d Gaussians, and %d of them "

@@ -26,8 +26,7 @@ GATE_STEEPNESS = 100.0  # of the sigmoid that suppresses noise on opaque Gaussia
 
 @dataclass
 class MCMC(Budgeted):
-    """Each refinement moves dead Gaussians onto living ones and adds a few copies, up to
-    ``max_gaussians``.
+    """Each round moves dead Gaussians onto living ones and adds copies, up to ``max_gaussians``.
 
     A dead Gaussian has an opacity of at most ``min_opacity``. A Gaussian and its copies get a
     common opacity and scale, so that the picture stays the same (eq. 9 of the paper). After each
@@ -57,17 +56,17 @@ class MCMC(Budgeted):
         return spread_out(gaussians, self.initial_opacity, self.initial_scale)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor:
-        return (
-            self.opacity_weight * gaussians.opacities.mean()
-            + self.scale_weight * gaussians.scales.mean()
-        )
+        opacity, scale = gaussians.opacities.mean(), gaussians.scales.mean()
+        return self.opacity_weight * opacity + self.scale_weight * scale
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         return [*self.governing(), self.relocate, self.add] if self.due(refinement.step) else []
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round without the cap: ``strictness`` divides the share that is
-        added."""
+        """The count after a round without the cap.
+
+        ``strictness`` divides the share that is added.
+        """
         return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
 
     def may_cull(self, step: int) -> bool:
@@ -77,9 +76,8 @@ class MCMC(Budgeted):
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
         values = gaussians.values
-        gate = torch.sigmoid(
-            -GATE_STEEPNESS * (values.opacities - self.min_opacity)
-        )  # [N], near 0 if opaque
+        # [N], near 0 if opaque
+        gate = torch.sigmoid(-GATE_STEEPNESS * (values.opacities - self.min_opacity))
         noise = standard_normal((len(gaussians), 3), rng, values.means)
         axes = values.rotations * values.scales.unsqueeze(-2)  # [N, 3, 3]
         covariance = axes @ axes.mT
@@ -98,8 +96,10 @@ class MCMC(Budgeted):
         refinement.event.relocated = count
 
     def add(self, refinement: Refinement) -> None:
-        """Add copies of living Gaussians, drawn by opacity: a share ``growth`` of the count, up to
-        the cap."""
+        """Add copies of living Gaussians, drawn by opacity.
+
+        A share ``growth`` of the count, up to the cap.
+        """
         gaussians, event = refinement.gaussians, refinement.event
         if event.relocated == 0 and (gaussians.values.opacities <= self.min_opacity).all():
             return  # all are dead
@@ -113,8 +113,10 @@ class MCMC(Budgeted):
     def _copy(
         self, refinement: Refinement, weights: Tensor, count: int, keep: Tensor | None, cause: Cause
     ) -> None:
-        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N], which share
-        their opacity; of the others, keep those at the mask ``keep``."""
+        """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N].
+
+        They share their opacity. Of the others, keep those at the mask ``keep``.
+        """
         gaussians, sources = refinement.gaussians, _draw(weights, count, refinement.rng)  # [A]
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N], the Gaussian included
         touched = copies > 1
@@ -133,8 +135,7 @@ class MCMC(Budgeted):
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity o' and factor s'/s on the scale of each of n = ``copies`` that together look like one
-    Gaussian of opacity o.
+    """Opacity o' and factor s'/s for n = ``copies`` that look like one Gaussian of opacity o.
 
     o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) /
     sqrt(k+1), eq. 9 of the paper; all [M].
@@ -150,25 +151,20 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """Draw ``count`` indices with replacement, in proportion to ``weights`` [N]; on the CPU, so
-    that a seed gives the same draw on every device."""
+    """Draw ``count`` indices with replacement, in proportion to ``weights`` [N].
+
+    On the CPU, so that a seed gives the same draw on every device.
+    """
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
-    return (
-        torch.searchsorted(cumulative, draws, right=True)
-        .clamp_max(len(weights) - 1)
-        .to(weights.device)
-    )
+    index = torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1)
+    return index.to(weights.device)
 
 
 def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
     """``gaussians`` with the same ``opacity`` for all, and their scales multiplied by ``scale``."""
-    changed = {
-        "opacity_logits": torch.full_like(
-            gaussians.opacity_logits, math.log(opacity / (1 - opacity))
-        ),
-        "log_scales": gaussians.log_scales + math.log(scale),
-    }
+    logits = torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity)))
+    changed = {"opacity_logits": logits, "log_scales": gaussians.log_scales + math.log(scale)}
     return Gaussians(**(gaussians.tensors() | changed))
 
 
@@ -180,21 +176,20 @@ MIN_SCALE = 1e-10  # world units; smaller Gaussians are pruned
 BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis that bound the scene
 NOISE_POWER = 150.0  # noise is proportional to (1 - opacity) to this power
 SPLIT_OFFSET = 0.5  # standard deviations
-# factors on the children's scales and opacity
-SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.85, 0.6
+# factors on the children's longest scale, their other scales, and their opacity
+SPLIT_FACTORS = 0.5, 0.85, 0.6
 MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 
 @dataclass
 class MRNF(Budgeted):
-    """Each round replaces pruned Gaussians and adds a small share by long-axis splits; opacities
-    and scales decay.
+    """Each round replaces pruned Gaussians and adds a small share by long-axis splits.
 
-    The refine weight of a Gaussian is the largest sum over pixels of e alpha T in ``score_views``
-    training views, drawn in each round, where e = max(0, 1 - SSIM) divided by its mean in the view.
-    Candidates are the Gaussians seen since the last round whose weight is above
-    ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and those too small, too
-    large or too far away. Then it splits:
+    Opacities and scales decay. The refine weight of a Gaussian is the largest sum over pixels of e
+    alpha T in ``score_views`` training views, drawn in each round, where e = max(0, 1 - SSIM)
+    divided by its mean in the view. Candidates are the Gaussians seen since the last round whose
+    weight is above ``growth_threshold``. A round prunes Gaussians below ``prune_opacity`` and those
+    too small, too large or too far away. Then it splits:
 
     1. as many Gaussians as it pruned, drawn by opacity;
     2. until iteration ``grow_until``, further candidates, drawn by refine weight, so that the two
@@ -242,8 +237,7 @@ class MRNF(Budgeted):
         return [self.refill_and_grow, self.decay, self.reset_statistics]
 
     def refill_and_grow(self, refinement: Refinement) -> None:
-        """Prune, split as many Gaussians to replace the pruned ones, then split a share of the
-        candidates."""
+        """Prune, split as many to replace them, then split a share of the candidates."""
         step, rng, event = refinement.step, refinement.rng, refinement.event
         values, seen = refinement.gaussians.values, self.statistics["seen"]
         pruned = self.to_prune(values)  # [N]
@@ -260,20 +254,13 @@ class MRNF(Budgeted):
         replacing = draw(seen & ~pruned, opacity_scores, num_pruned, rng)
         remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
         eligible = candidates & ~pruned & ~replacing
-        growing = draw(
-            eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng
-        )
+        allowed = min(remaining, room - int(replacing.sum()))
+        growing = draw(eligible, weights * edge_factor, allowed, rng)
         event.blocked_by_cap += max(0, min(remaining, int(eligible.sum())) - int(growing.sum()))
         event.pruned_opacity += num_pruned
         parents = (replacing | growing).nonzero().squeeze(-1)  # [S]
         event.split_gradient += len(parents)
-        children = halves(
-            values.detach().select(parents),
-            SPLIT_OFFSET,
-            SPLIT_LONGEST,
-            SPLIT_ACROSS,
-            SPLIT_OPACITY,
-        )
+        children = halves(values.detach().select(parents), SPLIT_OFFSET, *SPLIT_FACTORS)
         kept = ~(pruned | replacing | growing)
         self.edit(refinement, kept, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
@@ -281,19 +268,19 @@ class MRNF(Budgeted):
         """The refine weights [N] over the training views at the indices ``views``."""
         training, largest = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
         for index in views:
-            error = training.dissimilarity(
-                index, training.render(index, gaussians, step).image.detach()
-            )  # [H, W]
-            error = (error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)).unsqueeze(-1)
-            sums, _ = blended_sums(
-                training, index, gaussians, step, error.expand(-1, -1, 3).contiguous()
-            )
+            image = training.render(index, gaussians, step).image.detach()
+            error = training.dissimilarity(index, image)  # [H, W]
+            error = error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)
+            weights = error.unsqueeze(-1).expand(-1, -1, 3).contiguous()
+            sums, _ = blended_sums(training, index, gaussians, step, weights)
             largest = torch.maximum(largest, sums[:, 0])
         return largest
 
     def to_prune(self, gaussians: Gaussians) -> Tensor:
-        """Mask [N] of the Gaussians to prune: transparent, too small, too large, or too far
-        away."""
+        """Mask [N] of the Gaussians to prune.
+
+        Transparent, too small, too large, or too far away.
+        """
         center, half, _ = bounds(gaussians.means.detach())
         limit = REACH * half
         scales = gaussians.log_scales
@@ -303,18 +290,14 @@ class MRNF(Budgeted):
 
     def decay(self, refinement: Refinement) -> None:
         """Lower all opacities and scales a little. Adam's moments stay."""
-        values, remaining = (
-            refinement.gaussians.values,
-            max(0.0, 1 - refinement.step / self.decay_until),
-        )
+        values = refinement.gaussians.values
+        remaining = max(0.0, 1 - refinement.step / self.decay_until)
         opacities = values.opacities - self.opacity_decay * remaining
-        margin = max(
-            MIN_DECAYED, torch.finfo(opacities.dtype).eps
-        )  # in float32, 1 - 1e-12 would be 1: an infinite logit
+        # in float32, 1 - 1e-12 would be 1: an infinite logit
+        margin = max(MIN_DECAYED, torch.finfo(opacities.dtype).eps)
         values.opacity_logits.copy_(torch.logit(opacities.clamp(MIN_DECAYED, 1 - margin)))
-        values.log_scales.add_(math.log(1 - self.scale_decay * remaining)).clamp_min_(
-            math.log(MIN_DECAYED)
-        )
+        shrink = math.log(1 - self.scale_decay * remaining)
+        values.log_scales.add_(shrink).clamp_min_(math.log(MIN_DECAYED))
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
@@ -322,9 +305,8 @@ class MRNF(Budgeted):
             return
         values, seen = gaussians.values, self.statistics["seen"]
         _, _, size = bounds(values.means)
-        weight = (1 - values.opacities).pow(NOISE_POWER) * (
-            self.noise_rate * gaussians.position_rate
-        )  # [N]
+        rate = self.noise_rate * gaussians.position_rate
+        weight = (1 - values.opacities).pow(NOISE_POWER) * rate  # [N]
         noise = standard_normal((len(gaussians), 3), rng, values.means) * weight.unsqueeze(-1)
         values.means += torch.where(seen.unsqueeze(-1), noise.clamp(-size, size), 0.0)
 

@@ -28,8 +28,7 @@ MIN_DIVISOR = 1e-6
 
 @dataclass
 class FastGS(AbsGS):
-    """AbsGS whose candidates grow only if they cover badly rendered pixels (Ren et al., arXiv
-    2511.04283).
+    """AbsGS that grows only on badly rendered pixels (Ren et al., arXiv 2511.04283).
 
     Each round draws ``score_views`` training views. A pixel is bad if its L1 error, shifted and
     scaled to [0, 1] in its view, is above ``error_threshold``. A Gaussian's count is the number of
@@ -58,8 +57,10 @@ class FastGS(AbsGS):
     final_score: Fraction = 0.9
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """The rules of ADC, with scores before growth and the ceiling after pruning; then the final
-        prunings."""
+        """The rules of ADC, with scores before growth and the ceiling after pruning.
+
+        Then the final prunings.
+        """
         step = refinement.step
         rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
         if self.grow_by_gradient in rules:
@@ -73,16 +74,13 @@ class FastGS(AbsGS):
         """Compute the count and the pruning score of every Gaussian."""
         values, views = refinement.gaussians.values, self.context.training_views
         indices = draw_views(views, self.score_views, refinement.rng)
-        total, weighted = (
-            torch.zeros_like(values.opacity_logits),
-            torch.zeros_like(values.opacity_logits),
-        )
+        total = torch.zeros_like(values.opacity_logits)
+        weighted = torch.zeros_like(values.opacity_logits)
         for index in indices:
             render = views.render(index, values, refinement.step)
             bad = error_map(render.image, views.image(index)) > self.error_threshold
-            counts = render.require_footprint(
-                bad.to(render.image)
-            ).values  # [N] bad pixels that each is blended into
+            # [N] bad pixels that each is blended into
+            counts = render.require_footprint(bad.to(render.image)).values
             total += counts
             weighted += views.loss(index, render.image) * counts
         self.statistics["count"] = (total / len(indices)).floor().float()
@@ -94,21 +92,12 @@ class FastGS(AbsGS):
 
     def prune(self, refinement: Refinement) -> None:
         """Remove some of the faint and huge Gaussians, more likely those with high scores."""
-        values, score = refinement.gaussians.values, self.statistics["score"]
-        faint, huge = (
-            self.faint(values.opacity_logits),
-            self.huge(refinement.step, values.log_scales),
-        )
+        score, event = self.statistics["score"], refinement.event
         # Only Gaussians from before the round have a score. They come first, without the removed
         # split parents.
-        split_parents = refinement.event.split_gradient // (self.split_children - 1)
-        scored = (
-            torch.arange(len(score), device=score.device) < refinement.event.before - split_parents
-        )
-        drawn = draw(
-            scored, 1 / (MIN_DIVISOR + 1 - score), int((faint | huge).sum()) // 2, refinement.rng
-        )
-        self.remove(refinement, faint & drawn, huge & drawn)
+        known = event.before - event.split_gradient // (self.split_children - 1)
+        scored = torch.arange(len(score), device=score.device) < known
+        self.prune_drawn(refinement, scored, 1 / (MIN_DIVISOR + 1 - score))
 
     def prune_finally(self, refinement: Refinement) -> None:
         """Remove Gaussians below ``final_opacity`` or above ``final_score``."""
@@ -210,11 +199,5 @@ class Taming(ADC):
         """Remove some of the faint and huge Gaussians, more likely those with low scores."""
         if refinement.step // self.interval - self.start // self.interval > self.prune_rounds:
             return
-        values, score = refinement.gaussians.values, self.statistics["score"]
-        faint, huge = (
-            self.faint(values.opacity_logits),
-            self.huge(refinement.step, values.log_scales),
-        )
-        budget = int((faint | huge).sum()) // 2
-        drawn = draw(score > 0, 1 / score, budget, refinement.rng)
-        self.remove(refinement, faint & drawn, huge & drawn)
+        score = self.statistics["score"]
+        self.prune_drawn(refinement, score > 0, 1 / score)

@@ -1,7 +1,7 @@
-"""Scores of Gaussians, which are sums over the pixels of training views, and random draws by
-score."""
+"""Scores of Gaussians, sums over pixels of training views; and random draws by score."""
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Protocol
 
 import torch
@@ -30,8 +30,10 @@ class TrainingViews(Protocol):
         ...
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
-        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and its photograph, [H, W]; SSIM is
-        the mean over channels."""
+        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and its photograph, [H, W].
+
+        SSIM is the mean over channels.
+        """
         ...
 
     def loss(self, index: int, image: Tensor) -> Tensor:
@@ -48,13 +50,12 @@ def draw_views(views: TrainingViews, count: int, rng: torch.Generator) -> list[i
 def blended_sums(
     views: TrainingViews, index: int, gaussians: Gaussians, step: int, weights: Tensor
 ) -> tuple[Tensor, RenderOutput]:
-    """Return the sum over pixels of w alpha T for each Gaussian and three weights w [H, W, 3], as
-    [N, 3]; and the render of the view.
+    """The sum over pixels of w alpha T for each Gaussian, [N, 3], and the render of the view.
 
-    alpha T is the derivative of a pixel with respect to the colour of the Gaussian. So the sum is
-    the gradient of ``(image * weights).sum()`` with respect to that colour, which any rasterizer
-    computes. All colours are set to grey, so that no rasterizer clamps them (a clamped colour has
-    no gradient).
+    There are three weights w [H, W, 3]. alpha T is the derivative of a pixel with respect to the
+    colour of the Gaussian. So the sum is the gradient of ``(image * weights).sum()`` with respect
+    to that colour, which any rasterizer computes. All colours are set to grey, so that no
+    rasterizer clamps them (a clamped colour has no gradient).
     """
     probe = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.tensors().items()})
     probe.sh_dc = torch.zeros_like(probe.sh_dc, requires_grad=True)
@@ -66,30 +67,29 @@ def blended_sums(
 
 
 def edge_map(image: Tensor) -> Tensor:
-    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32 in [0, 1] (all 0 without
-    edges).
+    """The strength of edges in ``image`` [H, W, 3] uint8.
 
-    Eight times the luminance of a pixel minus the sum over its eight neighbours, clipped to 8 bits,
-    then shifted and scaled to [0, 1]. This is Pillow's FIND_EDGES, except that the outermost pixels
-    are 0 here.
+    [H, W] float32 in [0, 1] (all 0 without edges). Eight times the luminance of a pixel minus the
+    sum over its eight neighbours, clipped to 8 bits, then shifted and scaled to [0, 1]. This is
+    Pillow's FIND_EDGES, except that the outermost pixels are 0 here.
     """
     rgb = image.to(torch.int32)
-    luma = (
-        rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF
-    ) >> SHIFT
+    red, green, blue = LUMINANCE
+    sums = rgb[..., 0] * red + rgb[..., 1] * green + rgb[..., 2] * blue
+    luma = (sums + HALF) >> SHIFT
     edges = torch.zeros_like(luma)
     height, width = luma.shape
-    # 3 x 3 pixels
-    block = sum(luma[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))
+    block = torch.zeros_like(luma[1:-1, 1:-1])  # sums of 3 x 3 pixels
+    for y, x in product(range(3), repeat=2):
+        block += luma[y : height - 2 + y, x : width - 2 + x]
     edges[1:-1, 1:-1] = (9 * luma[1:-1, 1:-1] - block).clamp(0, 255)
     return to_unit_range(edges.float())
 
 
 def error_map(image: Tensor, photograph: Tensor) -> Tensor:
-    """The absolute error of ``image`` [H, W, 3], mean over channels, [H, W], shifted and scaled to
-    [0, 1].
+    """The absolute error of ``image`` [H, W, 3], mean over channels, [H, W], in [0, 1].
 
-    ``photograph`` is [H, W, 3] uint8.
+    It is shifted and scaled. ``photograph`` is [H, W, 3] uint8.
     """
     return to_unit_range((image - photograph.to(image) / 255).abs().mean(-1))
 
@@ -101,14 +101,18 @@ def to_unit_range(values: Tensor) -> Tensor:
 
 
 def by_median(values: Tensor) -> Tensor:
-    """``values`` [N] divided by the (lower) median of the positive ones; values that are not
-    positive become 0."""
+    """``values`` [N] divided by the (lower) median of the positive ones.
+
+    Values that are not positive become 0.
+    """
     return _normalized(values, torch.median)
 
 
 def by_mean(values: Tensor) -> Tensor:
-    """``values`` [N] divided by the mean of the positive ones; values that are not positive become
-    0."""
+    """``values`` [N] divided by the mean of the positive ones.
+
+    Values that are not positive become 0.
+    """
     return _normalized(values, torch.mean)
 
 
@@ -148,10 +152,8 @@ def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -
     device.
     """
     index = candidates.nonzero().squeeze(-1).cpu()  # [C]
-    keys = (
-        torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)
-        / scores.detach().cpu()[index]
-    )
+    times = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)
+    keys = times / scores.detach().cpu()[index]
     drawn = torch.zeros(len(candidates), dtype=torch.bool)
     drawn[index[torch.sort(keys, stable=True).indices[: max(count, 0)]]] = True
     return drawn.to(candidates.device)

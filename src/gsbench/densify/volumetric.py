@@ -26,14 +26,18 @@ LOG_SPHERE = math.log(4 * math.pi / 3)
 
 
 def log_volume(log_scales: Tensor) -> Tensor:
-    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3]; world units^3, never
-    underflows."""
+    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3].
+
+    World units^3, never underflows.
+    """
     return LOG_SPHERE + log_scales.sum(-1)
 
 
 def log_condition(log_scales: Tensor) -> Tensor:
-    """log kappa = 2 (log s_max - log s_min) (eq. 6: the ratio of the eigenvalues s^2), [N] from [N,
-    3], at least 0."""
+    """log kappa = 2 (log s_max - log s_min) >= 0, [N] from [N, 3].
+
+    Eq. 6: kappa is the ratio of the eigenvalues s^2.
+    """
     return 2 * (log_scales.amax(-1) - log_scales.amin(-1))
 
 
@@ -45,10 +49,9 @@ VANISHING_SIZE = 1e-4
 
 @dataclass
 class Volumetric(ADC):
-    """ADC, then a split of every Gaussian with V > V_th (eq. 5 to 7, Fig. 4), then the pruning of
-    ADC.
+    """ADC that also splits every Gaussian with V > V_th (eq. 5 to 7, Fig. 4).
 
-    ``threshold_mode`` determines V_th:
+    The split comes before the pruning of ADC. ``threshold_mode`` determines V_th:
 
     - ``absolute``: ``volume_threshold``, in cubed units of the COLMAP model (the paper);
     - ``extent_relative``: ``volume_threshold`` times the cubed scene extent;
@@ -163,10 +166,8 @@ class Volumetric(ADC):
         if self.volume_order == "before_adc":
             before = refinement.gaussians.values.log_scales
             large = self.selected_by_volume(before)
-            number, log_scales = (
-                torch.where(large, 1, number),
-                torch.where(large.unsqueeze(-1), before, log_scales),
-            )
+            number = torch.where(large, 1, number)
+            log_scales = torch.where(large.unsqueeze(-1), before, log_scales)
         else:
             large = self.selected_by_volume(log_scales)
         number = torch.where(large, (1 + self.volume_gain) * number, number)
@@ -185,9 +186,7 @@ class Volumetric(ADC):
         children = self.child_log_scales(log_scales)  # [N, 3]
         candidates = self.selected_by_volume(log_scales)
         selected, blocked = admit(candidates, volumes, self.volume_gain, self.allowance(refinement))
-        split_again = (
-            log_volume(children) > threshold
-        )  # [N] the next round would select the children, too
+        split_again = log_volume(children) > threshold  # [N] the next round would take them, too
         vanishing = children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent)  # [N]
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
@@ -205,9 +204,8 @@ class Volumetric(ADC):
 
     def log_threshold(self, volumes: Tensor) -> float:
         """log V_th for Gaussians with log volumes [N], ``strictness`` of the governor included."""
-        return self._ungoverned_log_threshold(volumes) + self.governor_dimension * math.log(
-            self.strictness
-        )
+        governed = self.governor_dimension * math.log(self.strictness)
+        return self._ungoverned_log_threshold(volumes) + governed
 
     def _ungoverned_log_threshold(self, volumes: Tensor) -> float:
         if self.threshold_mode == "absolute":

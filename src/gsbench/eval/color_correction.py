@@ -1,9 +1,8 @@
-"""Metrics after an affine correction of a render's colours, for captures whose exposure or white
-balance changes.
+"""Metrics after an affine correction of a render's colours.
 
-A phone chooses exposure anew for each photograph, and no renderer can know that of a test view.
-Mip-NeRF 360 (Barron et al. 2022) and gsplat therefore also report metrics after a map of the
-render's colours to those of the photograph.
+It is for captures whose exposure or white balance changes. A phone chooses exposure anew for each
+photograph, and no renderer can know that of a test view. Mip-NeRF 360 (Barron et al. 2022) and
+gsplat therefore also report metrics after a map of the render's colours to those of the photograph.
 """
 
 import torch
@@ -18,23 +17,17 @@ CLIPPED = 0.5 / 255  # a value so near to 0 or 1 is the end of the range of 8 bi
 
 
 def color_corrected(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """``image`` [H, W, 3] with its colours mapped to those of ``truth``, both in [0, 1]; in double
-    precision.
+    """``image`` [H, W, 3] with its colours mapped to those of ``truth``, both in [0, 1].
 
-    The map is affine, with a row a_c of four numbers for each channel c. It minimises the sum over
-    pixels of (a_c . (r, g, b, 1) - truth_c)^2. The result is clipped to [0, 1]. A pixel counts for
-    a channel if ``mask`` [H, W] counts it, if no channel of the render is clipped, and if the
-    photograph's channel is not. This is done five times, each on the last result.
+    In double precision. The map is affine, with a row a_c of four numbers for each channel c. It
+    minimises the sum over pixels of (a_c . (r, g, b, 1) - truth_c)^2. The result is clipped to [0,
+    1]. A pixel counts for a channel if ``mask`` [H, W] counts it, if no channel of the render is
+    clipped, and if the photograph's channel is not. This is done five times, each on the last
+    result.
     """
-    corrected, goal = (
-        in_double_precision(image).reshape(-1, 3),
-        in_double_precision(truth).reshape(-1, 3),
-    )  # [P, 3]
-    counted = (
-        torch.ones(len(goal), dtype=torch.bool, device=goal.device)
-        if mask is None
-        else mask.reshape(-1)
-    )
+    corrected = in_double_precision(image).reshape(-1, 3)  # [P, 3]
+    goal = in_double_precision(truth).reshape(-1, 3)  # [P, 3]
+    counted = torch.ones_like(goal[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
     for _ in range(ROUNDS):
         inputs = torch.cat([corrected, torch.ones_like(corrected[:, :1])], dim=1)  # [P, 4]
         is_inside = counted & _unclipped(corrected).all(dim=1)
@@ -57,8 +50,10 @@ def _unclipped(values: Tensor) -> Tensor:
 
 
 class Corrected:
-    """The metric ``inner`` after `color_corrected`. With ``gain``, how much larger it is than
-    without."""
+    """The metric ``inner`` after `color_corrected`.
+
+    With ``gain``, how much larger it is than without.
+    """
 
     def __init__(self, inner: Metric, gain: bool = False) -> None:
         self._inner, self._gain = inner, gain

@@ -1,5 +1,4 @@
-"""The evaluator, which applies the metrics of a protocol and the user's own metrics to pairs of
-images."""
+"""The evaluator applies a protocol's metrics and the user's own to pairs of images."""
 
 import importlib.util
 import math
@@ -29,7 +28,7 @@ from gsbench.eval.facts import (
     further_keys,
     lpips_variants,
 )
-from gsbench.eval.images import as_unit_range, in_double_precision, replace_ignored
+from gsbench.eval.images import as_batch, as_unit_range, in_double_precision, replace_ignored
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.metrics import flip, flip_map, psnr
@@ -46,9 +45,8 @@ class MetricContext:
     device: torch.device
     weights: Path | None = None
     download: bool = True
-    networks: dict[str, Lpips | MissingWeightsError] = field(
-        default_factory=dict, repr=False
-    )  # LPIPS, each loaded once
+    # LPIPS, each loaded once
+    networks: dict[str, Lpips | MissingWeightsError] = field(default_factory=dict, repr=False)
 
     def network(self, net: str) -> Lpips:
         """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
@@ -64,8 +62,10 @@ class MetricContext:
 
 
 class Psnr:
-    """Peak signal-to-noise ratio in dB, at most the protocol's cap (identical images have an
-    infinite PSNR)."""
+    """Peak signal-to-noise ratio in dB, at most the protocol's cap.
+
+    Identical images have an infinite PSNR.
+    """
 
     def __init__(self, context: MetricContext) -> None:
         self._cap = context.protocol.psnr_cap
@@ -99,9 +99,7 @@ class LpipsMetric:
 
     def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
         _require_size(image, self._network.backbone.min_size)
-        first, second = (
-            x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth)
-        )  # [1, 3, H, W] each
+        first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
         if not self._raw:
             first, second = 2 * first - 1, 2 * second - 1
         return float(self._network(first, second, mask))
@@ -126,8 +124,10 @@ class Flip:
 
 
 class StructuralMetric:
-    """A metric of structure without weights, which no protocol changes: its authors' definition
-    holds."""
+    """A metric of structure without weights, which no protocol changes.
+
+    Its authors' definition holds.
+    """
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor], min_side: int) -> None:
         self._function, self._min_side = function, min_side  # px
@@ -216,11 +216,8 @@ class Evaluator:
         self.more = tuple(sorted(more))
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
-        wanted |= (
-            {facts.key for facts in METRICS if not facts.setting}
-            | ({"flip"} if flip else set())
-            | set(more)
-        )
+        wanted |= {facts.key for facts in METRICS if not facts.setting}
+        wanted |= {*more, *(["flip"] if flip else [])}
         context = MetricContext(protocol, self.device, weights, download)
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
@@ -319,20 +316,20 @@ class Evaluator:
 
 
 def quantize(image: Tensor) -> Tensor:
-    """Round a floating point image in [0, 1] to uint8, as for a PNG: ``floor(clamp(255 x + 0.5, 0,
-    255))``."""
+    """Round a floating point image in [0, 1] to uint8, as for a PNG.
+
+    ``floor(clamp(255 x + 0.5, 0, 255))``.
+    """
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 def summarize(
     per_view: Mapping[str, Mapping[str, float]], unavailable: Mapping[str, str]
 ) -> dict[str, float]:
-    """The mean over views of every metric that all views have and that is not in
-    ``unavailable``."""
+    """The mean over views of every metric that all views have, without ``unavailable``."""
     if not per_view:
         return {}
     views = list(per_view.values())
-    shared = [
-        key for key in views[0] if key not in unavailable and all(key in view for view in views)
-    ]
+    everywhere = [key for key in views[0] if all(key in view for view in views)]
+    shared = [key for key in everywhere if key not in unavailable]
     return {key: float(np.mean([view[key] for view in views])) for key in shared}

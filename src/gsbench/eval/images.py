@@ -20,10 +20,10 @@ def in_double_precision(image: Tensor) -> Tensor:
 
 
 def replace_ignored(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """``image`` [H, W, 3] with the pixels of ``target`` (uint8 or floating) where ``mask`` [H, W,
-    1] is False.
+    """``image`` [H, W, 3] with ``target``'s pixels where ``mask`` [H, W, 1] is False.
 
-    The replaced pixels have no error and no gradient. With ``mask`` None all pixels count.
+    ``target`` is uint8 or floating. The replaced pixels have no error and no gradient. With
+    ``mask`` None all pixels count.
     """
     return image if mask is None else torch.where(mask, image, as_unit_range(target, image.dtype))
 
@@ -34,8 +34,10 @@ def as_batch(image: Tensor) -> Tensor:
 
 
 def check_pair(image: Tensor, target: Tensor) -> None:
-    """Raise ValueError unless both are floating point and have the same shape, [H, W, 3] or [B, 3,
-    H, W]."""
+    """Raise ValueError unless both are floating point with the same shape.
+
+    It is [H, W, 3] or [B, 3, H, W].
+    """
     if image.shape != target.shape:
         raise ValueError(
             f"the images have different shapes: {tuple(image.shape)} and {tuple(target.shape)}"
@@ -66,8 +68,10 @@ def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
 
 
 def halved(images: Tensor, padding: str) -> Tensor:
-    """Means [B, C, H / 2, W / 2] of 2x2 px of [B, C, H, W]; odd sides are padded in torch's mode
-    ``padding``."""
+    """Means [B, C, H / 2, W / 2] of 2x2 px of [B, C, H, W].
+
+    Odd sides are padded in torch's mode ``padding``.
+    """
     height, width = images.shape[-2:]
     padded = torch.nn.functional.pad(images, [0, width % 2, 0, height % 2], mode=padding)
     return torch.nn.functional.avg_pool2d(padded, 2)
@@ -83,9 +87,8 @@ def gradient_magnitude(images: Tensor, smoothing: tuple[float, float, float]) ->
 
     Gradients are central differences, smoothed in the other direction by three weights.
     """
-    horizontal = images.new_tensor(smoothing).unsqueeze(1) * images.new_tensor(
-        [-1.0, 0.0, 1.0]
-    )  # [3, 3]
+    difference = images.new_tensor([-1.0, 0.0, 1.0])
+    horizontal = images.new_tensor(smoothing).unsqueeze(1) * difference  # [3, 3]
     kernels = torch.stack([horizontal, horizontal.T]).unsqueeze(1)  # [2, 1, 3, 3]
     gradient = torch.nn.functional.conv2d(images, kernels, padding=1)  # [B, 2, H, W]
     return gradient.square().sum(dim=1, keepdim=True).sqrt()

@@ -1,5 +1,7 @@
-"""Contract of a metric, a class that compares an image with its photograph. docs/metric.md has an
-example."""
+"""The contract of a metric, a class that compares an image with its photograph.
+
+docs/metric.md has an example.
+"""
 
 from typing import Protocol, runtime_checkable
 
@@ -44,17 +46,18 @@ class MaskedMetric(Metric, Protocol):
     """
 
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
-        """The value of one view over the pixels that count: ``mask`` [H, W] bool, and the images of
-        `measure`."""
+        """The value of one view over the pixels that count.
+
+        ``mask`` [H, W] bool, and the images of `measure`.
+        """
         ...
 
 
 class UnavailableError(Exception):
-    """Raised for a metric that cannot be computed; its message, one line, is the reason in results
-    and tables.
+    """Raised for a metric that cannot be computed.
 
-    ``awaited`` (gsbench's own metrics only) says that the metric can be computed after an
-    installation or a download.
+    Its message, one line, is the reason in results and tables. ``awaited`` (gsbench's own metrics
+    only) says that the metric can be computed after an installation or a download.
     """
 
     def __init__(self, reason: str, awaited: bool = False) -> None:

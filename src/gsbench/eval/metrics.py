@@ -23,8 +23,7 @@ from gsbench.eval.protocol import FLIP_PPD
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in dB, from the mean squared error over all pixels and channels of
-    an image.
+    """Peak signal-to-noise ratio in dB, of the mean squared error over pixels and channels.
 
     Identical images give infinity, which a protocol replaces in reports.
     """
@@ -35,26 +34,24 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
 
 def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
-    """Mean FLIP error of sRGB images (0 identical, 1 worst) for a viewer who sees ``ppd`` pixels
-    per degree.
+    """Mean FLIP error of sRGB images: 0 identical, 1 worst.
 
-    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images", computed by
-    NVIDIA's library ``flip-evaluator``. Raises ModuleNotFoundError if it is not installed.
+    The viewer sees ``ppd`` pixels per degree. Andersson et al. 2020, "FLIP: a difference evaluator
+    for alternating images", computed by NVIDIA's library ``flip-evaluator``. Raises
+    ModuleNotFoundError if it is not installed.
     """
     check_pair(image, target)
     pairs = zip(*(as_batch(x).permute(0, 2, 3, 1) for x in (image, target)), strict=True)
-    values = torch.tensor(
-        [_mean_and_errors(x, y, ppd)[0] for x, y in pairs], device=image.device
-    )  # [B]
+    means = [_mean_and_errors(x, y, ppd)[0] for x, y in pairs]
+    values = torch.tensor(means, device=image.device)  # [B]
     return values[0] if image.ndim == 3 else values
 
 
 def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     """The FLIP error of every pixel, [H, W], of images [H, W, 3]; otherwise as `flip`."""
     check_pair(image, target)
-    return torch.as_tensor(_mean_and_errors(image, target, ppd)[1], device=image.device).reshape(
-        image.shape[:2]
-    )
+    _, errors = _mean_and_errors(image, target, ppd)
+    return torch.as_tensor(errors, device=image.device).reshape(image.shape[:2])
 
 
 def _mean_and_errors(image: Tensor, target: Tensor, ppd: float) -> tuple[float, Any]:
@@ -73,13 +70,12 @@ GMSD_MIN_SIZE = 2  # px: one block of 2x2
 
 
 def gmsd(image: Tensor, target: Tensor) -> Tensor:
-    """Gradient magnitude similarity deviation of the luminance: 0 for identical images, less is
-    better.
+    """Gradient magnitude similarity deviation of the luminance.
 
-    Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude similarity deviation: a highly efficient
-    perceptual image quality index", section II. Images are averaged over 2x2 px (odd sides padded
-    with zeros), Prewitt's filter gives the gradients, and the value is the standard deviation of
-    their similarity over pixels.
+    0 is for identical images, less is better. Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude
+    similarity deviation: a highly efficient perceptual image quality index", section II. Images are
+    averaged over 2x2 px (odd sides padded with zeros), Prewitt's filter gives the gradients, and
+    the value is the standard deviation of their similarity over pixels.
     """
     check_pair(image, target)
     check_size(as_batch(image), GMSD_MIN_SIZE, "GMSD")

@@ -1,5 +1,7 @@
-"""The settings of an evaluation: the protocol, the metrics, and the declared metric of the
-verdict."""
+"""The settings of an evaluation.
+
+The protocol, the metrics, and the declared metric of the verdict.
+"""
 
 import re
 from collections.abc import Mapping
@@ -101,8 +103,7 @@ class EvalConfig:
                 self._check_primary(metric)
 
     def _check_primary(self, key: str) -> None:
-        """Raise InputError unless one of gsbench's own metrics, which these settings ask for, has
-        this key."""
+        """Raise InputError unless these settings ask for a metric of gsbench with this key."""
         facts = find_metric(key)
         if facts is None:
             known = [*known_keys(), *self.extra]

@@ -1,5 +1,4 @@
-"""Matching the pictures that a program rendered with photographs by name, without guesses, and
-measuring them."""
+"""Rendered pictures are matched with photographs by name, without guesses, and measured."""
 
 import re
 from collections import defaultdict
@@ -116,8 +115,10 @@ def _folded(words: Mapping[str, str]) -> dict[str, str]:
 
 
 def _stripped(words: Mapping[str, str]) -> dict[str, str]:
-    """The words without the start and the end that all of them share, which never contain digits
-    next to the rest."""
+    """The words without the start and the end that all of them share.
+
+    These never contain digits next to the rest.
+    """
     if len(words) < 2:
         return dict(words)
     texts = list(words.values())
@@ -174,8 +175,7 @@ _RULES: dict[str, KeyFunction] = {
 
 @dataclass(frozen=True)
 class PicturePair:
-    """A view with the files of its photograph, of the picture rendered for it, and of its mask, if
-    it has one."""
+    """A view with the files of its photograph, its rendered picture and its mask, if any."""
 
     view: str
     photograph: Path
@@ -184,13 +184,13 @@ class PicturePair:
 
 
 def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
-    """Raise `InputError` for a picture whose size differs from its photograph's: pictures are never
-    resized."""
+    """Raise `InputError` for a picture whose size differs from its photograph's.
+
+    Pictures are never resized.
+    """
     for pair in pairs:
-        (width, height), (wanted_width, wanted_height) = (
-            image_size(pair.picture),
-            image_size(pair.photograph),
-        )
+        (width, height) = image_size(pair.picture)
+        (wanted_width, wanted_height) = image_size(pair.photograph)
         if (width, height) != (wanted_width, wanted_height):
             raise InputError(
                 f"{pair.picture} is {width}x{height} px, but its photograph {pair.photograph} "
@@ -202,8 +202,10 @@ def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
 def measure(
     pairs: Sequence[PicturePair], evaluator: Evaluator, report: Progress = no_progress
 ) -> dict[str, dict[str, float]]:
-    """The metrics of every view, in the pairs' order. Raises `InputError` for damaged files and
-    unequal sizes."""
+    """The metrics of every view, in the pairs' order.
+
+    Raises `InputError` for damaged files and unequal sizes.
+    """
     check_picture_sizes(pairs)
     per_view = {}
     for done, pair in enumerate(pairs, 1):

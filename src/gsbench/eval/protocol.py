@@ -58,6 +58,8 @@ def get_protocol(name: str) -> Protocol:
 
 
 def protocol_of(identifier: str) -> Protocol | None:
-    """The protocol of an identifier such as ``paper-1``, ignoring the version; None for an unknown
-    name."""
+    """The protocol of an identifier such as ``paper-1``, ignoring the version.
+
+    It is None for an unknown name.
+    """
     return PROTOCOLS.get(identifier.rpartition("-")[0])

@@ -22,8 +22,10 @@ C2 = 0.03**2
 
 
 def window() -> Tensor:
-    """The one-dimensional Gaussian window, [11] float64 of sum 1; its outer product with itself is
-    the 2D window."""
+    """The one-dimensional Gaussian window, [11] float64 of sum 1.
+
+    Its outer product with itself is the 2D window.
+    """
     offsets = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
     weights = torch.exp(-0.5 * (offsets / WINDOW_SIGMA) ** 2)
     return weights / weights.sum()
@@ -59,8 +61,10 @@ def ssim(
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1], padded with
-    zeros."""
+    """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1].
+
+    They are padded with zeros.
+    """
     luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")
     return (luminance * structure)[0]
 
@@ -68,11 +72,10 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 def ssim_parts(
     x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Two factors of SSIM for images [B, C, H, W] with values from 0 to ``data_range``, [B, C, H',
-    W'] each.
+    """Two factors of SSIM for images [B, C, H, W], [B, C, H', W'] each.
 
-    The first is luminance (eq. 6), the second contrast times structure (eq. 9 times eq. 10, with C3
-    = C2 / 2).
+    Values are from 0 to ``data_range``. The first is luminance (eq. 6), the second contrast times
+    structure (eq. 9 times eq. 10, with C3 = C2 / 2).
     """
     moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), padding)  # [5B, C, H', W']
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5)  # [B, C, H', W'] each

@@ -39,13 +39,13 @@ FLAT = 1e-15  # smaller variances count as 0
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Multi-scale structural similarity, the mean over the three channels; 1 for identical images,
-    at least 0.
+    """Multi-scale structural similarity, the mean over the three channels.
 
-    Wang, Simoncelli and Bovik 2003, "Multiscale structural similarity for image quality
-    assessment", eq. 7: contrast and structure at five scales, and luminance at the coarsest scale
-    alone. Between scales, images are averaged over 2x2 px; the last line of an odd side is
-    repeated. A negative mean of a scale counts as 0. Raises ValueError for a side below 161 px.
+    1 is for identical images; at least 0. Wang, Simoncelli and Bovik 2003, "Multiscale structural
+    similarity for image quality assessment", eq. 7: contrast and structure at five scales, and
+    luminance at the coarsest scale alone. Between scales, images are averaged over 2x2 px; the last
+    line of an odd side is repeated. A negative mean of a scale counts as 0. Raises ValueError for a
+    side below 161 px.
     """
     check_pair(image, target)
     x, y = as_batch(image), as_batch(target)  # [B, 3, H, W] each
@@ -99,8 +99,10 @@ def _iw_ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def _laplacian_pyramid(image: Tensor) -> list[Tensor]:
-    """Four bands of [1, 1, H, W] from the finest, then the low-pass rest; each is half as large as
-    the one before."""
+    """Four bands of [1, 1, H, W] from the finest, then the low-pass rest.
+
+    Each is half as large as the one before.
+    """
     kernel = image.new_tensor(BINOMIAL) * math.sqrt(2)  # [5]
     bands = []
     for _ in range(SCALES - 1):
@@ -141,9 +143,8 @@ def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Te
     moments = F.avg_pool2d(
         torch.cat([band, target_band, band**2, target_band**2, band * target_band]), BLOCK, 1
     )
-    mean, target_mean, square, target_square, product = (
-        moments[:, 0].flatten(1).unsqueeze(-1)
-    )  # [P, 1] each
+    # [P, 1] each
+    mean, target_mean, square, target_square, product = moments[:, 0].flatten(1).unsqueeze(-1)
     variance = (square - mean**2).clamp_min(0)
     target_variance = (target_square - target_mean**2).clamp_min(0)
     covariance = product - mean * target_mean
@@ -151,16 +152,17 @@ def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Te
     gain = torch.where(flat | target_flat, 0.0, covariance / target_variance.clamp_min(FLAT))
     noise = torch.where(target_flat, variance, variance - gain * covariance)
     noise = torch.where(flat, 0.0, noise)
-    signal = (noise + (1 + gain**2) * EYE_NOISE) * factor * variances[
-        kept
-    ] + EYE_NOISE * noise  # [P, K']
+    # [P, K']
+    signal = (noise + (1 + gain**2) * EYE_NOISE) * factor * variances[kept] + EYE_NOISE * noise
     height, width = target_band.shape[-2] - BLOCK + 1, target_band.shape[-1] - BLOCK + 1
     return torch.log2(1 + signal / EYE_NOISE**2).sum(dim=1).view(height, width)
 
 
 def _enlarged(band: Tensor) -> Tensor:
-    """[1, 1, h, w] enlarged twice: bilinear to 4h - 3 by 4w - 3, one line added on each side, every
-    other line kept."""
+    """[1, 1, h, w] enlarged twice.
+
+    Bilinear to 4h - 3 by 4w - 3, one line added on each side, every other line kept.
+    """
     height, width = band.shape[-2:]
     fine = F.interpolate(
         band, (4 * height - 3, 4 * width - 3), mode="bilinear", align_corners=False
@@ -208,10 +210,7 @@ def fsim(image: Tensor, target: Tensor) -> Tensor:
     check_size(x, FSIM_MIN_SIZE, "FSIM")
     shrink = max(1, math.floor(min(x.shape[-2:]) / SIDE + 0.5))
     x, y = F.avg_pool2d(x, shrink), F.avg_pool2d(y, shrink)
-    light_x, light_y = (
-        mix_channels(x, LUMA),
-        mix_channels(y, LUMA),
-    )  # [B, 1, h, w], as all maps below
+    light_x, light_y = mix_channels(x, LUMA), mix_channels(y, LUMA)  # [B, 1, h, w], as all below
     phase_x, phase_y = phase_congruency(light_x), phase_congruency(light_y)
     contrast = similarity(
         gradient_magnitude(light_x, SCHARR), gradient_magnitude(light_y, SCHARR), T_GRADIENT
@@ -229,8 +228,10 @@ def fsim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def phase_congruency(luminance: Tensor) -> Tensor:
-    """The phase congruency of each pixel of [B, 1, H, W] (0 to 255), in [0, 1]: 1 at an ideal edge
-    or line."""
+    """The phase congruency of each pixel of [B, 1, H, W] (0 to 255), in [0, 1].
+
+    It is 1 at an ideal edge or line.
+    """
     filters = _log_gabor_filters(luminance)  # [O, S, H, W]
     spectrum = torch.fft.fft2(luminance).unsqueeze(1)  # [B, 1, 1, H, W]
     responses = torch.fft.ifft2(spectrum * filters)  # [B, O, S, H, W], real: even, imaginary: odd
@@ -244,11 +245,9 @@ def phase_congruency(luminance: Tensor) -> Tensor:
 
 
 def _noise(finest: Tensor, filters: Tensor) -> Tensor:
-    """The energy [B, O, 1, 1] that noise alone would reach, from the responses [B, O, H, W] of the
-    finest scale."""
-    median = (
-        finest.abs().square().flatten(2).median(dim=2).values
-    )  # [B, O]; chi-squared with 2 degrees of freedom
+    """The energy [B, O, 1, 1] of noise alone, from the finest responses [B, O, H, W]."""
+    # [B, O]; chi-squared with 2 degrees of freedom
+    median = finest.abs().square().flatten(2).median(dim=2).values
     power = median / math.log(2) / filters[:, 0].square().sum(dim=(1, 2))
     even = torch.fft.ifft2(filters.sum(dim=1)).real  # [O, H, W], the filters in space
     area = even.shape[1] * even.shape[2]
@@ -259,8 +258,10 @@ def _noise(finest: Tensor, filters: Tensor) -> Tensor:
 
 
 def _log_gabor_filters(images: Tensor) -> Tensor:
-    """Spectra [O, S, H, W] for [B, 1, H, W]: a log-Gaussian over the frequency times a Gaussian
-    over the angle."""
+    """Spectra [O, S, H, W] for [B, 1, H, W].
+
+    A log-Gaussian over the frequency times a Gaussian over the angle.
+    """
     along = [_frequencies(size, images) for size in images.shape[-2:]]
     down, across = torch.meshgrid(along, indexing="ij")  # [H, W] each
     radius = torch.hypot(down, across)
@@ -270,10 +271,8 @@ def _log_gabor_filters(images: Tensor) -> Tensor:
     radial = []
     for scale in range(WAVES):
         frequency = 1 / (SHORTEST_WAVE * WAVE_STEP**scale)
-        passed = (
-            torch.exp(-((radius / frequency).log() ** 2) / (2 * math.log(BANDWIDTH) ** 2))
-            * low_pass
-        )
+        octaves = (radius / frequency).log() ** 2
+        passed = torch.exp(-octaves / (2 * math.log(BANDWIDTH) ** 2)) * low_pass
         passed[0, 0] = 0
         radial.append(passed)
     angular = []
@@ -285,7 +284,9 @@ def _log_gabor_filters(images: Tensor) -> Tensor:
 
 
 def _frequencies(size: int, like: Tensor) -> Tensor:
-    """Frequencies of a Fourier transform in cycles per px; an odd size is reduced by 1, so that
-    both ends are 0.5."""
+    """Frequencies of a Fourier transform in cycles per px.
+
+    An odd size is reduced by 1, so that both ends are 0.5.
+    """
     steps = torch.arange(size, dtype=like.dtype, device=like.device) - size // 2  # [size]
     return torch.fft.ifftshift(steps / (size - size % 2))

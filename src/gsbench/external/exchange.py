@@ -30,8 +30,7 @@ FAST_PNG = 1  # zlib level; the files are deleted after the training
 def write_training_views(
     folder: Path, views: Sequence[View], cloud: PointCloud, normalization: Normalization = IDENTITY
 ) -> None:
-    """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras of their size, and ``cloud``
-    as its points.
+    """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras, and ``cloud`` as points.
 
     ``normalization`` is undone: programs get the coordinates in which the scene was given.
 
@@ -40,9 +39,8 @@ def write_training_views(
     check_picture_names([view.name for view in views], folder / IMAGES)
     (folder / IMAGES).mkdir(parents=True)
     for view in views:
-        Image.fromarray(view.image).save(
-            folder / IMAGES / png_name(view.name), compress_level=FAST_PNG
-        )
+        target = folder / IMAGES / png_name(view.name)
+        Image.fromarray(view.image).save(target, compress_level=FAST_PNG)
     points = cloud.points if normalization.is_identity else normalization.undo(cloud.points)
     write_model(folder / MODEL_FOLDER, _cameras(views, normalization), cloud=(points, cloud.colors))
 
@@ -50,17 +48,14 @@ def write_training_views(
 def write_test_cameras(
     folder: Path, views: Sequence[View], normalization: Normalization = IDENTITY
 ) -> None:
-    """Write the cameras of ``views``, without images, as a COLMAP model and as nerfstudio's
-    ``transforms.json``.
+    """Write the cameras of ``views`` as a COLMAP model and nerfstudio's ``transforms.json``.
 
     Renders are expected under the names in these files.
     """
     cameras = _cameras(views, normalization)
     write_model(folder / MODEL_FOLDER, cameras)
-    write_json(
-        folder / TRANSFORMS,
-        {"camera_model": "OPENCV", "frames": [_frame(*item) for item in cameras.items()]},
-    )
+    frames = [_frame(name, camera) for name, camera in cameras.items()]
+    write_json(folder / TRANSFORMS, {"camera_model": "OPENCV", "frames": frames})
 
 
 def _cameras(views: Sequence[View], normalization: Normalization) -> dict[str, Camera]:
@@ -70,20 +65,27 @@ def _cameras(views: Sequence[View], normalization: Normalization) -> dict[str, C
 def _frame(name: str, camera: Camera) -> dict[str, Any]:
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3], world_from_camera[:3, 3] = camera.rotation.T, camera.center
-    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-    pose = {"transform_matrix": (world_from_camera @ OPENGL).tolist()}
-    return {"file_path": name} | intrinsics | {"cx": camera.cx, "cy": camera.cy} | pose
+    return {
+        "file_path": name,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "transform_matrix": (world_from_camera @ OPENGL).tolist(),
+    }
 
 
 def collect_model(
     output: Path, pattern: str, target: Path, normalization: Normalization = IDENTITY
 ) -> Gaussians:
-    """Copy the one file below ``output`` that fits ``pattern`` to ``target``, normalised; return
-    its Gaussians.
+    """Copy the one file that fits ``pattern`` to ``target``, normalised; return its Gaussians.
 
     Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
     files = _files(output, pattern)
+    # A program may leave a model for each checkpoint; a guess would measure the wrong one.
     if len(files) > 1:
         raise TrainingError(
             f"{counted(len(files), 'file')} fit densify.result ({_named(files, output)}): it must "
@@ -103,8 +105,7 @@ def collect_model(
 def collect_renders(
     output: Path, pattern: str, by_order: bool, views: Sequence[View], target: Path
 ) -> None:
-    """Write the pictures below ``output`` that fit ``pattern`` to ``target``, as PNG files named
-    after ``views``.
+    """Write the pictures that fit ``pattern`` to ``target``, as PNG files named after ``views``.
 
     Raises `TrainingError` if a view has no or several pictures, or if a picture is damaged or has
     another size.
@@ -114,19 +115,17 @@ def collect_renders(
     wanted = [png_name(view.name) for view in views]
     target.mkdir()
     try:
-        matching = (
-            match_by_order(wanted, names)
-            if by_order
-            else match_pictures(wanted, names, "densify.by_order=true")
-        )
+        if by_order:
+            matching = match_by_order(wanted, names)
+        else:
+            matching = match_pictures(wanted, names, "densify.by_order=true")
         for name, view in zip(wanted, views, strict=True):
             picture = read_image(output / matching.pairs[name])  # [H, W, 3]
             (height, width), camera = picture.shape[:2], view.camera
             if (width, height) != (camera.width, camera.height):
                 raise InputError(
                     f"{output / matching.pairs[name]} is {width}x{height} px and the view "
-                    f"{camera.width}x"
-                    f"{camera.height}: sizes are never changed here"
+                    f"{camera.width}x{camera.height}: sizes are never changed here"
                 )
             Image.fromarray(picture).save(target / name)
     except InputError as error:
@@ -134,8 +133,7 @@ def collect_renders(
 
 
 def _files(output: Path, pattern: str) -> list[Path]:
-    """The files that fit ``pattern``, sorted; raises `TrainingError` if there are none, naming the
-    existing files."""
+    """The files that fit ``pattern``, sorted; raises `TrainingError` naming others if none."""
     files = sorted(path for path in output.glob(pattern) if path.is_file())
     if not files:
         existing = sorted(path for path in output.rglob("*") if path.is_file())

@@ -1,5 +1,4 @@
-"""Running another program until it ends or its time limit passes, without leaving processes
-behind."""
+"""Running another program to its end or time limit, without leaving processes behind."""
 
 import subprocess
 import time
@@ -37,8 +36,7 @@ def run_program(
     environment: Mapping[str, str],
     limit: float | None,
 ) -> ProgramResult:
-    """Run ``command`` in ``folder`` with ``environment``, its output in the file ``log``; ``limit``
-    is in seconds.
+    """Run ``command`` in ``folder`` for at most ``limit`` seconds, its output in the file ``log``.
 
     All processes that it started end with it, at the limit, and when gsbench ends for any reason;
     on Linux this includes daemons. Raises `TrainingError`, with the last lines of the log, unless
@@ -69,6 +67,8 @@ def watch(
     """
     started = time.monotonic()
     program = subprocess.Popen(command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL)
+    # The operating system tells a peak of single processes only, and programs have children: the
+    # sum is looked at again and again.
     pause, peak = FIRST_LOOK, 0.0
     while limit is None or time.monotonic() - started < limit:
         peak = max(peak, resident_memory_mb(program.pid))

@@ -41,16 +41,12 @@ Command = str | Sequence[str]  # one text is split as a shell would, but no shel
 
 
 def split_command(command: Command, key: str) -> list[str]:
-    """A command's words. Raises InputError, naming the setting ``key``, for an empty command or
-    open quotes."""
+    """A command's words. Raises InputError, naming the setting ``key``, if empty or not closed."""
     try:
-        words = (
-            shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
-        )
+        words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
     except ValueError as error:
-        raise InputError(
-            f"{key} cannot be split into words ({error}): write it as a list"
-        ) from error
+        what = f"{key} cannot be split into words ({error})"
+        raise InputError(f"{what}: write it as a list") from error
     if not words or not words[0]:
         raise InputError(f"{key} is empty: name the program to run")
     return words
@@ -69,8 +65,7 @@ def placeholders_in(texts: Iterable[str]) -> set[str]:
 
 
 def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
-    """Replace every placeholder in ``text`` once. Raises InputError, naming ``key``, for an unknown
-    placeholder."""
+    """Replace each placeholder in ``text`` once. Raises InputError, naming ``key``, if unknown."""
 
     def value(match: re.Match[str]) -> str:
         name = match[1]
@@ -111,8 +106,7 @@ def check_pattern(pattern: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class External:
-    """A program that trains on a folder of training views and writes a model, or renders of the
-    test views.
+    """A program that trains on a folder of views and writes a model, or renders of the test views.
 
     ``command`` runs without a shell. ``{data}``, ``{output}``, the other `PLACEHOLDERS` and the
     names of ``options`` are replaced in ``command``, ``result`` and ``environment``. ``result`` is
@@ -153,23 +147,16 @@ class External:
         for name, value in self.options.items():
             if value == MISSING:
                 raise InputError(f"densify.options.{name} is not set: give it a value")
-            if (
-                not str(name).isidentifier()
-                or name in PLACEHOLDERS
-                or isinstance(value, Mapping | list)
-            ):
+            own_name = str(name).isidentifier() and name not in PLACEHOLDERS
+            if not own_name or isinstance(value, Mapping | list):
                 raise InputError(
                     f"densify.options.{name}: an option is one value with a name of its own, none "
-                    "of "
-                    f"{', '.join(PLACEHOLDERS)}"
+                    f"of {', '.join(PLACEHOLDERS)}"
                 )
-        check_pattern(
-            fill_placeholders(
-                self.result,
-                dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/") | self.options,
-                "densify.result",
-            )
-        )
+        # An option's value may make a pattern lead out of the folder: it is checked as filled in.
+        examples = dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/")
+        pattern = fill_placeholders(self.result, examples | self.options, "densify.result")
+        check_pattern(pattern)
         known = dict.fromkeys((*PLACEHOLDERS, *self.options))
         for key, text in [("command", word) for word in self.words] + [("result", self.result)]:
             fill_placeholders(text, known, f"densify.{key}")
@@ -204,7 +191,6 @@ class External:
         if program_path is None:
             raise InputError(
                 f"densify.command: this machine has no program {self.program!r}: install it "
-                "(docs/other_trainers.md "
-                "says how), or give its path"
+                "(docs/other_trainers.md says how), or give its path"
             )
         return str(Path(program_path).absolute())

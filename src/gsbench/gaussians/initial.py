@@ -17,8 +17,7 @@ INITIAL_OPACITY = 0.1
 def gaussians_from_cloud(
     points: NDArray[np.float64], colors: NDArray[np.uint8], device: torch.device | str = "cpu"
 ) -> Gaussians:
-    """Make one isotropic Gaussian at each of ``points`` [P, 3] with ``colors`` [P, 3] (0 to 255),
-    float32.
+    """Make one isotropic Gaussian at each of ``points`` [P, 3] of ``colors`` [P, 3] (0 to 255).
 
     The standard deviation is the root of the mean *squared* distance to the 3 nearest other points
     (simple-knn of 3DGS). Raises InputError if there are fewer than 4 points or points that are not
@@ -32,9 +31,8 @@ def gaussians_from_cloud(
         raise InputError(
             "the initial cloud has points that are not finite; rebuild it or clean the COLMAP model"
         )
-    distances, _ = cKDTree(points).query(
-        points, k=NEIGHBOURS + 1
-    )  # [P, 4], the first is the point itself
+    # [P, 4], the first neighbour is the point itself
+    distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
     squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), MIN_SQUARED_DISTANCE)  # [P]
     n = len(points)
     log_scales = torch.from_numpy(0.5 * np.log(squared)).float()

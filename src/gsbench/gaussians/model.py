@@ -15,8 +15,7 @@ NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel beside
 
 @dataclass
 class Gaussians:
-    """N Gaussians as raw parameters (before activation), all of one dtype (float32 or float64) and
-    on one device.
+    """N Gaussians as raw parameters (before activation), of one dtype and on one device.
 
     | field          | shape      | activation                                   |
     |----------------|------------|----------------------------------------------|
@@ -46,11 +45,9 @@ class Gaussians:
             "sh_rest": (n, NUM_SH_REST, 3),
         }
         for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(
-                    f"gaussians: {name} has shape {tuple(getattr(self, name).shape)}, expected "
-                    f"{shape}"
-                )
+            given = tuple(getattr(self, name).shape)
+            if given != shape:
+                raise ValueError(f"gaussians: {name} has shape {given}, expected {shape}")
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -65,8 +62,7 @@ class Gaussians:
 
     @property
     def rotations(self) -> Tensor:
-        """Rotation matrices of the normalised quaternions, [N, 3, 3]; the columns are the axes of
-        the ellipsoids."""
+        """Rotation matrices, [N, 3, 3]; the columns are the axes of the ellipsoids."""
         return quaternion_to_matrix(self.quaternions)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -86,15 +82,12 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        names = [field.name for field in fields(Gaussians)]
-        return Gaussians(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        )
+        columns = zip(*(part.tensors().values() for part in parts), strict=True)
+        return Gaussians(*map(torch.cat, columns))
 
 
 def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), which need not be
-    normalised."""
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any length."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)  # each [N]
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -104,29 +97,29 @@ def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
-C0 = math.sqrt(1 / (4 * math.pi))  # 0.28209479177387814
-C1 = math.sqrt(3 / (4 * math.pi))
-C2 = (  # xy, yz, 3z^2 - 1, xz, x^2 - y^2
-    math.sqrt(15 / (4 * math.pi)),
-    -math.sqrt(15 / (4 * math.pi)),
-    math.sqrt(5 / (16 * math.pi)),
-    -math.sqrt(15 / (4 * math.pi)),
-    math.sqrt(15 / (16 * math.pi)),
-)
+def _factor(numerator: int, denominator: int) -> float:
+    """A factor of the real spherical harmonics: the root of a fraction over pi."""
+    return math.sqrt(numerator / (denominator * math.pi))
+
+
+C0 = _factor(1, 4)  # 0.28209479177387814
+C1 = _factor(3, 4)
+# of xy, yz, 3z^2 - 1, xz, x^2 - y^2
+C2 = (_factor(15, 4), -_factor(15, 4), _factor(5, 16), -_factor(15, 4), _factor(15, 16))
 C3 = (
-    -math.sqrt(35 / (32 * math.pi)),
-    math.sqrt(105 / (4 * math.pi)),
-    -math.sqrt(21 / (32 * math.pi)),
-    math.sqrt(7 / (16 * math.pi)),
-    -math.sqrt(21 / (32 * math.pi)),
-    math.sqrt(105 / (16 * math.pi)),
-    -math.sqrt(35 / (32 * math.pi)),
+    -_factor(35, 32),
+    _factor(105, 4),
+    -_factor(21, 32),
+    _factor(7, 16),
+    -_factor(21, 32),
+    _factor(105, 16),
+    -_factor(35, 32),
 )
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics up to ``degree`` at unit ``directions`` [N, 3], as [N, (degree +
-    1)^2]."""
+    """Real spherical harmonics to ``degree`` at unit ``directions`` [N, 3]: [N, (degree + 1)^2]."""
+    # Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2, with the signs of 3DGS's code
     x, y, z = directions.unbind(-1)  # each [N]
     terms = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -153,8 +146,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh_dc: Tensor, sh_rest: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """RGB [N, 3], at least 0, of coefficients [N, 3] and [N, 15, 3] in view ``directions`` [N, 3]
-    of unit length."""
+    """RGB [N, 3] >= 0 of coefficients [N, 3] and [N, 15, 3] in unit ``directions`` [N, 3]."""
     values = basis(directions, degree)  # [N, K]
     rgb = values[:, :1] * sh_dc
     if degree > 0:

@@ -1,5 +1,4 @@
-"""Values from papers and their code that several packages use as defaults. Does not import
-torch."""
+"""Values from papers and their code that several packages share. Does not import torch."""
 
 import math
 from dataclasses import dataclass
@@ -11,8 +10,7 @@ VOLUME_THRESHOLD = 0.03  # V_th of the paper, in the units of its COLMAP models,
 
 @dataclass
 class LearningRates:
-    """Adam's learning rates; the defaults are those of the 2023 code of 3DGS (late-2024 code: 0.025
-    for opacity)."""
+    """Adam's learning rates, those of 3DGS's code of 2023 (late 2024: 0.025 for opacity)."""
 
     position_initial: PositiveFloat = 1.6e-4  # times the scene extent
     position_final: PositiveFloat = 1.6e-6  # times the scene extent
@@ -25,8 +23,7 @@ class LearningRates:
     rotation: PositiveFloat = 1e-3
 
     def position(self, step: float) -> float:
-        """The learning rate of the means at iteration ``step``, before multiplication by the scene
-        extent."""
+        """The learning rate of the means at iteration ``step``, for a scene extent of 1."""
         t = min(max(step / self.position_steps, 0.0), 1.0)
         return math.exp(
             (1 - t) * math.log(self.position_initial) + t * math.log(self.position_final)

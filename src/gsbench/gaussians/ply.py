@@ -33,6 +33,8 @@ COLUMNS = (
     + [f"rot_{i}" for i in range(4)]
 )
 
+# raised by plyfile and numpy for a damaged file; OverflowError is no ValueError
+DAMAGE = (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError)
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 # The logit that stands for an opacity of 1, and with a minus for 0: float32's nearest to 1 that
@@ -40,22 +42,20 @@ REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGRE
 MAX_LOGIT = 23 * math.log(2)  # 1 - 2^-23
 TYPICAL_SCALE = 0.02  # of a model's size: the median of Gaussians trained here is .009 to .035
 MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
+# bytes of PLY's types; all others have 1
 SIZES = {
-    "short": 2,
-    "ushort": 2,
-    "int16": 2,
-    "uint16": 2,
-    "int": 4,
-    "uint": 4,
-    "int32": 4,
-    "uint32": 4,
+    name: size
+    for size, names in {
+        2: "short ushort int16 uint16",
+        4: "int uint int32 uint32 float float32",
+        8: "double float64",
+    }.items()
+    for name in names.split()
 }
-SIZES |= {"float": 4, "float32": 4, "double": 8, "float64": 8}  # bytes; all other types have 1
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:
-    """Write raw parameters as binary little-endian float32 in 3DGS's column order, with zero
-    normals; atomic.
+    """Write raw parameters as binary float32 in 3DGS's column order, with zero normals; atomic.
 
     ``normalization`` is undone. Positions far from the origin are written as float64, because
     float32 has steps of half a unit at UTM coordinates. Others stay float32, which every viewer
@@ -74,16 +74,12 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
         ],
         dim=1,
     ).numpy()  # [N, 62]
-    vertices = (
-        np.ascontiguousarray(table, dtype="<f4")
-        .view([(name, "<f4") for name in COLUMNS])
-        .reshape(len(raw))
-    )
+    types = dict.fromkeys(COLUMNS, "<f4")
+    vertices = np.ascontiguousarray(table, dtype="<f4").view(list(types.items())).reshape(len(raw))
     if not normalization.is_identity:
-        position_type = "<f8" if normalization.is_far else "<f4"
-        vertices = vertices.astype(
-            [(name, position_type if name in POSITION else "<f4") for name in COLUMNS]
-        )
+        if normalization.is_far:
+            types |= dict.fromkeys(POSITION, "<f8")
+        vertices = vertices.astype(list(types.items()))
         own = normalization.undo(raw.means.numpy())  # [N, 3]
         for axis, name in enumerate(POSITION):
             vertices[name] = own[:, axis]
@@ -92,28 +88,18 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
 
 
 def check_ply(path: Path) -> None:
-    """Raise InputError if a file cannot be a PLY of Gaussians, judged only by its header and
-    length."""
+    """Raise InputError if header and length say that a file is no PLY of Gaussians."""
     with _checked(path):
         pass
 
 
 @contextmanager
 def _checked(path: Path) -> Iterator[None]:
-    """Check the length of a file; turn every error that damage can cause into an InputError that
-    names the file."""
+    """Check a file's length; turn every error from damage into an InputError that names it."""
     try:
         _check_length(path)
         yield
-    except (
-        OSError,
-        LookupError,
-        PlyParseError,
-        ValueError,
-        TypeError,
-        OverflowError,
-        MemoryError,
-    ) as error:
+    except DAMAGE as error:
         raise InputError(f"{path}: not a readable PLY of Gaussians ({error})") from error
 
 
@@ -138,8 +124,7 @@ def _check_length(path: Path) -> None:
 
 
 def _with_finite_opacities(vertices: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Replace infinite logits, which are opacities of exactly 0 and 1 in other programs, by
-    `MAX_LOGIT`."""
+    """Replace infinite logits, other programs' opacities of exactly 0 and 1, by `MAX_LOGIT`."""
     logits = vertices["opacity"]
     infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
     if not infinite.any():
@@ -164,8 +149,7 @@ def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
     if len(bad):
         raise InputError(
             f"{path}: {name} is not a finite number everywhere: it is {column[bad[0]]} in row "
-            f"{bad[0]} and in "
-            f"{len(bad) - 1} more: export the model again"
+            f"{bad[0]} and in {len(bad) - 1} more: export the model again"
         )
 
 
@@ -217,14 +201,14 @@ def read_ply(
     present = set(vertices.dtype.names or ())
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]
-    required = [name for name in COLUMNS if not name.startswith(("f_rest_", "n"))]
+    required = [name for name in COLUMNS if not name.startswith((REST, "n"))]
     missing = [name for name in required if name not in present]
-    if present_rest != set(rest) or len(rest) not in REST_COUNTS:
+    odd = present_rest - set(rest)
+    if odd or len(rest) not in REST_COUNTS:
+        example = f", with {min(odd)}" if odd else ""
         raise InputError(
             f"{path}: not a 3DGS PLY; its harmonics must be f_rest_0 to 8, to 23 or to 44 (degree "
-            "1 to 3), or none; "
-            f"it has {len(rest)}"
-            + (f", with {min(present_rest - set(rest))}" if present_rest != set(rest) else "")
+            f"1 to 3), or none; it has {len(rest)}{example}"
         )
     if missing or len(vertices) == 0:
         listed = ", ".join(missing) or "all, since it is empty"
@@ -242,9 +226,8 @@ def read_ply(
     _warn_of_activated(vertices, path)
 
     def columns(names: list[str]) -> torch.Tensor:
-        return torch.from_numpy(
-            np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
-        ).to(device)
+        table = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)
+        return torch.from_numpy(table).to(device)
 
     positions = np.stack([vertices[name] for name in POSITION], axis=1)  # [N, 3]
     n, stored = len(vertices), len(rest) // 3  # coefficients per channel

@@ -1,5 +1,4 @@
-"""Opening PLY files as other programs write them, and naming the formats of Gaussians that are no
-plain PLY."""
+"""Opening PLY files of other programs, and naming formats of Gaussians that are no plain PLY."""
 
 import codecs
 import io
@@ -20,8 +19,7 @@ SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": "SPZ", ".sog": "SOG"
 
 
 def read_header(path: Path) -> bytes:
-    """The header of a PLY file without its last line; raises ValueError, naming the format, for any
-    other file."""
+    """The header of a PLY without its last line; raises ValueError naming another format."""
     with path.open("rb") as stream:
         start = stream.read(MAX_HEADER)
     start = start.removeprefix(codecs.BOM_UTF8)

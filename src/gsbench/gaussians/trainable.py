@@ -19,8 +19,7 @@ ADAM_EPSILON = 1e-15  # 3DGS
 
 @dataclass
 class AdamState:
-    """Adam's state of one parameter: learning rate, number of steps, and both moments in the
-    parameter's shape."""
+    """Adam's state of one parameter: rate, number of steps, and both moments in its shape."""
 
     rate: float
     step: Tensor  # [] float32: torch's fused kernel needs a tensor
@@ -52,15 +51,11 @@ class TrainableGaussians:
             "sh_dc": rates.sh_dc,
             "sh_rest": rates.sh_rest,
         }
-        self.adam = {
-            name: AdamState(
-                initial[name],
-                torch.zeros((), dtype=torch.float32, device=tensor.device),
-                torch.zeros_like(tensor, requires_grad=False),
-                torch.zeros_like(tensor, requires_grad=False),
-            )
-            for name, tensor in self.values.tensors().items()
-        }
+        self.adam = {}
+        for name, tensor in self.values.tensors().items():
+            step = torch.zeros((), dtype=torch.float32, device=tensor.device)
+            first, second = torch.zeros_like(tensor.detach()), torch.zeros_like(tensor.detach())
+            self.adam[name] = AdamState(initial[name], step, first, second)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -79,8 +74,7 @@ class TrainableGaussians:
         self.adam["means"].rate = self.rates.position(step) * self.spatial_scale
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Set the learning rate of the parameter ``name``. For the means, `set_step` replaces it in
-        each iteration."""
+        """Set the learning rate of ``name``. For the means, `set_step` replaces it each time."""
         self.adam[name].rate = rate
 
     @torch.no_grad()
@@ -107,16 +101,17 @@ class TrainableGaussians:
 
     @torch.no_grad()
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
-        """Keep the Gaussians at the boolean mask ``keep`` [N] (None: all), then append new ones
-        with zero moments."""
+        """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append new ones.
+
+        The moments of the new ones are zero.
+        """
         for name, old in self.values.tensors().items():
             added = None if append is None else getattr(append, name).detach()
             self._replace(name, _edited(old.detach(), keep, added), keep, added)
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor, where: Tensor | None = None) -> None:
-        """Set the parameter ``name`` to ``values`` of the same shape. Zero its moments at the mask
-        ``where`` [N] (None: all)."""
+        """Set ``name`` to ``values``, and its moments to zero ``where`` [N] (None: all)."""
         parameter = getattr(self.values, name)
         if values.shape != parameter.shape:
             raise ValueError(
@@ -130,19 +125,15 @@ class TrainableGaussians:
     def _replace(
         self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None
     ) -> None:
-        """Replace the parameter ``name`` by ``values``, and edit its moments alike; the step count
-        stays."""
+        """Replace the parameter ``name``, and edit its moments alike; the step count stays."""
         state = self.adam[name]
         zeros = None if added is None else torch.zeros_like(added)
-        state.first, state.second = (
-            _edited(state.first, keep, zeros),
-            _edited(state.second, keep, zeros),
-        )
+        state.first = _edited(state.first, keep, zeros)
+        state.second = _edited(state.second, keep, zeros)
         setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:
-        """Return the state for a checkpoint. It shares memory with this object: save it before the
-        next step."""
+        """Return the state for a checkpoint, with shared memory: save it before the next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
             "adam": {name: vars(state).copy() for name, state in self.adam.items()},
@@ -156,8 +147,7 @@ class TrainableGaussians:
         spatial_scale: float,
         device: torch.device | None = None,
     ) -> TrainableGaussians:
-        """Make an object from a copy of ``state_dict``, on ``device`` (None: the device of the
-        state)."""
+        """Make an object from a copy of ``state_dict``, on ``device`` (None: that of the state)."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
         trainable = cls(gaussians, rates, spatial_scale)
         for name, saved in state["adam"].items():
@@ -170,8 +160,7 @@ class TrainableGaussians:
 
 
 def _step_all(parameter: Tensor, state: AdamState) -> None:
-    """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel on CPU and
-    CUDA."""
+    """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel."""
     assert parameter.grad is not None
     adam(
         [parameter],
@@ -197,6 +186,8 @@ def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
     beta1, beta2 = ADAM_BETAS
     state.step += 1
     step, gradient = float(state.step), parameter.grad[index]
+    # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
+    # m' = m / (1 - b1^step), v' = v / (1 - b2^step); eps outside the root, as torch has it
     first = state.first[index].lerp_(gradient, 1 - beta1)
     second = state.second[index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     state.first[index], state.second[index] = first, second

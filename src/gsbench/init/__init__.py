@@ -1,5 +1,4 @@
-"""Initialisers, which make a COLMAP model with cameras and an initial point cloud from a
-capture."""
+"""Initialisers, which make a COLMAP model with cameras and an initial cloud from a capture."""
 
 from gsbench.init.base import MODEL_FOLDER, read_cloud
 from gsbench.init.dim import Dim, SiftKornia

@@ -24,6 +24,8 @@ WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
+# of the images with a pose: fewer let the search for a mapping go on, and warn in the report
+REGISTERED_SHARE = 0.9
 Poses = Literal["shared", "own"]
 PointsFrom = Literal["all", "train"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP accepts no larger seed
@@ -175,8 +177,7 @@ class Preparation:
 
 
 class Initializer(ABC):
-    """Makes cameras and an initial point cloud for a capture. Subclasses are dataclasses whose
-    fields are the settings.
+    """Makes cameras and an initial cloud. Subclasses are dataclasses; their fields are settings.
 
     Examples:
         If only the points are new, derive from `PlacedCloud`. Its ``run`` adds cameras, report and
@@ -205,8 +206,7 @@ class Initializer(ABC):
     random_points: ClassVar[bool] = False
 
     def needs_reference(self, capture: Capture) -> bool:
-        """Return whether `run` needs a ``reference`` model for this capture because it came without
-        cameras."""
+        """Return whether `run` needs a ``reference``, since the capture came without cameras."""
         return False
 
     def content(self) -> str | None:
@@ -222,8 +222,7 @@ class Initializer(ABC):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write the model to `MODEL_FOLDER`, the report to `REPORT_FILE` and a picture to
-        `PICTURE_FILE`.
+        """Write a model to `MODEL_FOLDER`, a report to `REPORT_FILE`, a picture to `PICTURE_FILE`.
 
         All are below ``output_dir``. The cameras have the sizes of the files in ``capture.images``.
         ``reference`` is a COLMAP model of the same files whose cameras replace those of the

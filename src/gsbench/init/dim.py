@@ -1,5 +1,4 @@
-"""Deep image matching: features and matches from networks, geometry from COLMAP. kornia's SIFT
-takes the same path.
+"""Deep image matching: features and matches from networks or kornia's SIFT, geometry from COLMAP.
 
 The tables below list the weights files of the extractors and of LightGlue.
 """
@@ -12,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from annotated_types import Ge, Interval
+from annotated_types import Interval
 from pydantic import NonNegativeFloat, PositiveInt
 
 from gsbench.errors import InputError
 from gsbench.init.base import Preparation, Timer
-from gsbench.init.colmap.pairs import Pairing
+from gsbench.init.colmap_initializer import ColmapInitializer
 from gsbench.init.networks.features import FeatureSettings
-from gsbench.init.sfm import MIN_DETECTION_SIZE, ColmapInitializer
+from gsbench.init.options import FeatureOptions
 from gsbench.logs import Progress
 from gsbench.scene.types import Capture
 from gsbench.settings import AnyPath, Fraction
@@ -28,7 +27,7 @@ from gsbench.weights import WeightsFile, digests_of_unpinned, find_all_weights
 
 if TYPE_CHECKING:
     from gsbench.init.colmap.database import DatabaseTask
-
+    from gsbench.init.networks.extract_and_match import NetworkJob
 
 logger = logging.getLogger(__name__)
 
@@ -80,19 +79,12 @@ NMS_RADII = {"superpoint": 3, "aliked": 2, "disk": 2}  # px
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureInitializer(ColmapInitializer):
-    """Base of initialisers with features and matches from outside COLMAP, which verifies and maps
-    or triangulates them.
+class FeatureInitializer(FeatureOptions, ColmapInitializer):
+    """Base of initialisers whose features and matches come from outside COLMAP.
 
-    ``max_image_size`` is in px of the longest side. Features and matches are stored in the
-    ``work_dir`` of `run`, by image and by pair, so an interrupted run continues there.
+    Features and matches are stored in the ``work_dir`` of `run`, by image and by pair, so an
+    interrupted run continues there.
     """
-
-    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # SIFT has no "lowres"
-    max_keypoints: PositiveInt = 2048
-    max_image_size: Annotated[int, Ge(MIN_DETECTION_SIZE)] = 1600
-    max_ratio: Annotated[float, Interval(gt=0, le=1)] = 0.95
-    device: str = "cpu"
 
     @abstractmethod
     def feature_settings(self) -> FeatureSettings:
@@ -112,31 +104,30 @@ class FeatureInitializer(ColmapInitializer):
     def prepare(
         self, capture: Capture, work_dir: Path, reference: Path | None, progress: Progress
     ) -> Preparation:
-        from gsbench.init.networks.extract_and_match import NetworkJob, extract_and_match
+        from gsbench.init.networks.extract_and_match import extract_and_match
 
-        job = NetworkJob(
-            self, self.feature_settings(), capture, reference, work_dir, *self.find_weights()
-        )
-        return run_with_progress(
-            extract_and_match, job, progress, what=f"{self.name}: features and matches"
-        )
+        job = self._job(capture, reference, work_dir)
+        what = f"{self.name}: features and matches"
+        return run_with_progress(extract_and_match, job, progress, what=what)
+
+    def _job(self, capture: Capture, reference: Path | None, work_dir: Path) -> NetworkJob:
+        from gsbench.init.networks.extract_and_match import NetworkJob
+
+        settings, weights = self.feature_settings(), self.find_weights()
+        return NetworkJob(self, settings, capture, reference, work_dir, *weights)
 
     def fill_database(self, task: DatabaseTask, progress: Progress, timer: Timer) -> dict[str, int]:
-        from gsbench.init.colmap.database import verify_pairs, write_keypoints, write_matches
-        from gsbench.init.colmap.reconstruct import verification_options
-        from gsbench.init.networks.extract_and_match import NetworkJob, choose_pairs, open_store
+        from gsbench.init.colmap.database import write_keypoints, write_matches
+        from gsbench.init.colmap.geometry import verification_options, verify_pairs
+        from gsbench.init.networks.extract_and_match import choose_pairs, open_store
 
-        job = NetworkJob(
-            self, self.feature_settings(), task.capture, None, task.work_dir, *self.find_weights()
-        )
+        job = self._job(task.capture, None, task.work_dir)
         store = open_store(job)
-        write_keypoints(
-            task.database,
-            {name: store.require_features(name).colmap_keypoints for name in task.names},
-        )
+        keypoints = {name: store.require_features(name).colmap_keypoints for name in task.names}
+        write_keypoints(task.database, keypoints)
         pairs = choose_pairs(job, task.names, task.pairs)
         matches = {pair: store.require_matches(*pair) for pair in pairs}
-        matches = {pair: indices for pair, indices in matches.items() if len(indices) > 0}
+        matches = {pair: indices for pair, indices in matches.items() if len(indices)}
         write_matches(task.database, matches)
         with timer.phase("verify"):
             verify_pairs(task.database, sorted(matches), verification_options(self), progress)
@@ -148,8 +139,7 @@ class FeatureInitializer(ColmapInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class Dim(FeatureInitializer):
-    """Deep image matching: SuperPoint, ALIKED or DISK features, matched by LightGlue or mutual
-    nearest neighbours."""
+    """Deep image matching: SuperPoint, ALIKED or DISK; LightGlue or mutual nearest neighbours."""
 
     name: ClassVar[str] = "dim"
 
@@ -175,20 +165,12 @@ class Dim(FeatureInitializer):
             )
 
     def feature_settings(self) -> FeatureSettings:
-        threshold, radius = self.keypoint_threshold, self.nms_radius
-        return FeatureSettings(
-            extractor=self.extractor,
-            matcher=self.matcher,
-            max_image_size=self.max_image_size,
-            max_keypoints=self.max_keypoints,
-            keypoint_threshold=KEYPOINT_THRESHOLDS[self.extractor]
-            if threshold is None
-            else threshold,
-            nms_radius=NMS_RADII[self.extractor] if radius is None else radius,
-            aliked_model=self.aliked_model,
-            filter_threshold=self.filter_threshold,
-            max_ratio=self.max_ratio,
-        )
+        unset = {
+            "keypoint_threshold": KEYPOINT_THRESHOLDS[self.extractor],
+            "nms_radius": NMS_RADII[self.extractor],
+        }
+        defaults = {name: value for name, value in unset.items() if getattr(self, name) is None}
+        return FeatureSettings.of(self, **defaults)
 
     def find_weights(self) -> tuple[Path | None, Path | None]:
         paths = find_all_weights(self._weights_files(), self._weights_folder(), self.download)
@@ -220,21 +202,14 @@ class Dim(FeatureInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SiftKornia(FeatureInitializer):
-    """kornia's SIFT, which needs no weights, through the same steps as `Dim`. It is a substitute,
-    not the same."""
+    """kornia's SIFT, without weights, in the same steps as `Dim`: a substitute, not the same."""
 
     name: ClassVar[str] = "sift_kornia"
 
     max_keypoints: PositiveInt = 8192
 
     def feature_settings(self) -> FeatureSettings:
-        return FeatureSettings(
-            extractor="sift_kornia",
-            matcher="mutual_nearest",
-            max_image_size=self.max_image_size,
-            max_keypoints=self.max_keypoints,
-            max_ratio=self.max_ratio,
-        )
+        return FeatureSettings.of(self, extractor="sift_kornia", matcher="mutual_nearest")
 
     def find_weights(self) -> tuple[Path | None, Path | None]:
         return None, None

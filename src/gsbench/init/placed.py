@@ -1,5 +1,4 @@
-"""Initialisers that keep the reference cameras and take their points from the data set, at random,
-or from a file.
+"""Initialisers that keep the reference's cameras and take points from elsewhere.
 
 A file holds points of any origin (laser scans, multi-view stereo), or a trained model.
 """
@@ -9,6 +8,7 @@ from __future__ import annotations
 import math
 import shutil
 from abc import abstractmethod
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
@@ -45,8 +45,7 @@ if TYPE_CHECKING:
 
 
 class GivenCameras(Initializer):
-    """Base of initialisers that keep the reference's cameras and only make points. Subclasses are
-    dataclasses."""
+    """Base of initialisers that keep the reference's cameras and make points, as dataclasses."""
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
@@ -59,8 +58,7 @@ class GivenCameras(Initializer):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report; ``work_dir`` is not used. Raises ``InputError`` if there are no
-        cameras."""
+        """Write model and report, without ``work_dir``. Raises ``InputError`` without cameras."""
         if reference is None and capture.model is None:
             raise InputError(
                 f"init={self.name} needs cameras and scene {capture.name} came without: make them "
@@ -107,8 +105,7 @@ def _build(job: tuple[GivenCameras, Capture, Path, Path | None], progress: Progr
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset(GivenCameras):
-    """Uses the capture's own model, restricted to the selected images, with cameras scaled to the
-    files.
+    """Uses the capture's own model, restricted to the selected images and fitted to their files.
 
     ``points_from=train`` keeps the points that at least two training views see, in the colours of
     those views.
@@ -141,8 +138,7 @@ class Dataset(GivenCameras):
 
 
 class PlacedCloud(GivenCameras):
-    """Base of initialisers that put a new cloud under the reference's cameras. Subclasses are
-    dataclasses."""
+    """Base of initialisers that put a new cloud under the reference's cameras, as dataclasses."""
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
@@ -166,8 +162,7 @@ class PlacedCloud(GivenCameras):
 
 @dataclass(frozen=True, kw_only=True)
 class Random(PlacedCloud):
-    """Uniform points and colours in a cube around the mean of the training cameras, under the
-    reference cameras.
+    """Uniform points and colours in a cube around the mean of the reference's training cameras.
 
     ``size`` is half the cube's edge in scene extents; 3 and 100,000 points are gsplat's defaults
     for a random start.
@@ -181,20 +176,17 @@ class Random(PlacedCloud):
     seed: Seed = 0
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.init import report
-        from gsbench.init.colmap import reconstruct
+        from gsbench.init.colmap.alignment import training_centers, training_extent
 
-        poses = reconstruct.poses_by_name(model)
-        centers = [poses[name][0] for name in capture.train_names if name in poses]
-        extent = report.training_extent(model, capture)
+        extent = training_extent(model, capture)
         if extent == 0:
             raise InputError(
                 f"init=random: the training cameras of scene {capture.name} are all at one place"
             )
         generator = np.random.default_rng(self.seed)
-        points = np.mean(centers, axis=0) + self.size * extent * generator.uniform(
-            -1.0, 1.0, (self.count, 3)
-        )
+        center = training_centers(model, capture).mean(axis=0)
+        cube = generator.uniform(-1.0, 1.0, (self.count, 3))
+        points = center + self.size * extent * cube
         return PointCloud(points, generator.integers(0, 256, (self.count, 3), dtype=np.uint8))
 
 
@@ -219,9 +211,8 @@ class Carved(Random):
         if not kept.any():
             raise InputError(
                 f"init=carved: of {self.count} points none is in view of {self.seen_by} training "
-                "cameras of scene "
-                f"{capture.name}; take more (init.count), a smaller box (init.size) or fewer "
-                "cameras (init.seen_by)"
+                f"cameras of scene {capture.name}; take more (init.count), a smaller box "
+                "(init.size) or fewer cameras (init.seen_by)"
             )
         return PointCloud(cloud.points[kept], cloud.colors[kept])
 
@@ -229,8 +220,7 @@ class Carved(Random):
 def points_in_view(
     points: Array, name: str, model: pycolmap.Reconstruction
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] that project into the
-    image ``name``.
+    """Indices [V], pixels [V, 2] and distances [V] of the ``points`` [P, 3] in view of ``name``.
 
     All three are empty if the image has no pose in the model. Occlusion is ignored.
     """
@@ -259,8 +249,7 @@ TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Points [P, 3] float64 and their colours [P, 3], None if the file has no colours; the suffix
-    tells the format.
+    """Points [P, 3] float64 and colours [P, 3], or None without; the suffix tells the format.
 
     A ``.ply`` file, text or binary, has vertices with x, y, z in any order and type, and colours as
     whole numbers or in [0, 1]. A text file has the columns x, y, z, optionally followed by red,
@@ -274,9 +263,8 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
             points, colors = _read_ply(path)
         elif suffix in TEXT_SUFFIXES:
             content = without_byte_order_mark(path.read_bytes()).decode()
-            points, colors = _columns(
-                np.loadtxt(StringIO(content), delimiter="," if suffix == ".csv" else None, ndmin=2)
-            )
+            between = "," if suffix == ".csv" else None
+            points, colors = _columns(np.loadtxt(StringIO(content), delimiter=between, ndmin=2))
         else:
             raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
     # readers may raise any exception on a damaged file, numpy even tokenizer errors
@@ -301,16 +289,19 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
 def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
     vertices = read_ply_data(path)["vertex"].data
-    present = vertices.dtype.names or ()
-    lacking = [name for name in "xyz" if name not in present]
-    if lacking:
+    present = set(vertices.dtype.names or ())
+    if lacking := [name for name in "xyz" if name not in present]:
         raise ValueError(f"its vertices have no property {', '.join(lacking)}")
+
+    def columns(names: Iterable[str]) -> NDArray[np.generic]:
+        return np.stack([vertices[name] for name in names], axis=1)
+
     points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
     for names in COLOR_NAMES:
-        if all(name in present for name in names):
-            return points, np.stack([vertices[name] for name in names], axis=1)
-    if all(name in present for name in DC_NAMES):  # a model of Gaussians
-        dc = np.stack([vertices[name] for name in DC_NAMES], axis=1).astype(np.float64)
+        if present.issuperset(names):
+            return points, columns(names)
+    if present.issuperset(DC_NAMES):  # a model of Gaussians
+        dc = columns(DC_NAMES).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays, and is refused
     return points, None
 
@@ -324,8 +315,7 @@ def _columns(table: NDArray[np.generic]) -> tuple[Array, NDArray[np.generic] | N
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] multiplied by
-    255."""
+    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] times 255."""
     values = colors.astype(np.float64)
     if colors.dtype.kind == "f" and values.max() <= 1.0:
         values = values * 255
@@ -372,11 +362,9 @@ class Points(CloudFromFile):
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         points, colors = read_points(self.file)
-        points = capture.normalization.apply(points)
-        chosen = np.sort(
-            np.random.default_rng(self.seed).permutation(len(points))[: self.max_points]
-        )
-        points, colors = points[chosen], None if colors is None else colors[chosen]
+        order = np.random.default_rng(self.seed).permutation(len(points))
+        chosen = np.sort(order[: self.max_points])
+        points = capture.normalization.apply(points)[chosen]
         seen = seen_colors(points, capture, model)
         if (seen < 0).all():
             raise InputError(
@@ -385,15 +373,14 @@ class Points(CloudFromFile):
                 "lies in other coordinates; bring it into those of the cameras"
             )
         if colors is None:
-            colors = np.where(seen < 0, GREY, seen).astype(np.uint8)
-        return PointCloud(points, colors)
+            return PointCloud(points, np.where(seen < 0, GREY, seen).astype(np.uint8))
+        return PointCloud(points, colors[chosen])
 
 
 def seen_colors(
     points: Array, capture: Capture, model: pycolmap.Reconstruction
 ) -> NDArray[np.int16]:
-    """Colours [P, 3] of ``points`` in the photograph of the nearest training camera that has them
-    in view, else -1.
+    """Colours [P, 3] of ``points`` from the nearest training camera that has them in view, else -1.
 
     Occlusion is ignored; the nearest camera is the least likely to be occluded. Pixels that a mask
     ignores give no colour.
@@ -435,13 +422,11 @@ class Ply(CloudFromFile):
     ) -> TrainingPoints | None:
         from gsbench.gaussians.ply import read_ply, write_ply
 
-        if capture.normalization.is_identity:
-            shutil.copyfile(self.file, output_dir / GAUSSIANS_FILE)
+        target, normalization = output_dir / GAUSSIANS_FILE, capture.normalization
+        if normalization.is_identity:
+            shutil.copyfile(self.file, target)
         else:
-            write_ply(
-                read_ply(self.file, normalization=capture.normalization),
-                output_dir / GAUSSIANS_FILE,
-            )
+            write_ply(read_ply(self.file, normalization=normalization), target)
         return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:

@@ -1,2 +1,1 @@
-"""Planning trials and running them: in this process, in other processes of this machine, or in
-Slurm."""
+"""Planning trials and running them: in this process, in others of this machine, or in Slurm."""

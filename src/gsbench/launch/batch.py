@@ -27,11 +27,8 @@ log = logging.getLogger(__name__)
 
 def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
     """Run the trials that are not done by their launcher, and return the outcomes of all."""
-    runs, launcher = (
-        checked_runs_folder(trials[0].values["runs"]),
-        trials[0].values["launch"]["name"],
-    )
-    with storage_errors(runs), stop_on_signals():
+    launcher = trials[0].values["launch"]["name"]
+    with storage_errors(checked_runs_folder(trials[0].values["runs"])), stop_on_signals():
         # A wrong folder of weights is an error even if all trials are done.
         if launcher != "slurm" and (missing := missing_weights(trials)):
             raise InputError("; ".join(missing))
@@ -40,31 +37,28 @@ def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
         if unfinished and launcher == "slurm":
             outcomes += run_slurm(unfinished)
         elif unfinished:
+            run = run_serial if launcher == "serial" else run_local
             with Mirror() as mirror:
-                outcomes += (run_serial if launcher == "serial" else run_local)(unfinished, mirror)
+                outcomes += run(unfinished, mirror)
         return outcomes
 
 
 def begin_for_another_launcher(trials: Sequence[Trial]) -> None:
-    """Check, plan and declare trials that another launcher (a Hydra plugin) will run, perhaps
-    several at once."""
+    """Check, plan and declare trials that a Hydra plug-in will run, perhaps several at once."""
     with storage_errors(checked_runs_folder(trials[0].values["runs"])):
         _begin(trials, [trial for trial in trials if _why_not_done(trial)])
 
 
 def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
-    """Refuse trials that are known to fail; then make the runs folder, tidy the store, write plan
-    and declarations."""
+    """Refuse trials known to fail; make the runs folder, tidy the store, write the plan."""
     declared_metrics(trials)  # raises for two metrics in one experiment, before anything is written
-    runs, launcher = (
-        checked_runs_folder(trials[0].values["runs"]),
-        trials[0].values["launch"]["name"],
-    )
+    runs = checked_runs_folder(trials[0].values["runs"])
     # A node of a cluster may have folders and devices that this machine lacks.
-    if launcher != "slurm" and (missing := missing_folders(unfinished)):
+    here = trials[0].values["launch"]["name"] != "slurm"
+    if here and (missing := missing_folders(unfinished)):
         raise InputError("; ".join(missing))
-    check_parts(unfinished, on_this_machine=launcher != "slurm")
-    if launcher != "slurm":
+    check_parts(unfinished, on_this_machine=here)
+    if here:
         check_trackers(unfinished)
     for line in borrowed_names(unfinished):
         log.warning("%s", line)
@@ -81,8 +75,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
-    """The outcomes of finished trials, and the unfinished ones; each folder once, since a sweep may
-    repeat a value."""
+    """The outcomes of finished trials, and the unfinished ones, each folder once."""
     outcomes: list[Outcome] = []
     unfinished: list[Trial] = []
     for folder, trial in {trial.folder: trial for trial in trials}.items():
@@ -102,8 +95,10 @@ def _why_not_done(trial: Trial) -> str:
 
 @cache
 def _unavailable(options: str) -> frozenset[str]:
-    """The metrics that cannot be computed now. The cache searches for (and downloads) weights once
-    per sweep."""
+    """The metrics that cannot be computed now.
+
+    The cache searches for (and downloads) weights once per sweep.
+    """
     from gsbench.eval.options import EvalConfig
     from gsbench.pipeline.parts import make_evaluator
 
@@ -114,47 +109,39 @@ def _unavailable(options: str) -> frozenset[str]:
 
 
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
-    """A line for each missing folder of photographs, model or weights that trials name, and how to
-    get photographs."""
+    """A line for each missing folder of photographs, model or weights, and where to get them."""
     from gsbench.datasets.catalog import how_to_get
     from gsbench.scene.readers import missing_folder, missing_model
 
-    scenes = [
-        scene
-        for scene in (trial.values["scene"] for trial in trials)
-        if scene["kind"] != "courtyard"
-    ]
-    named_paths = {(scene["name"], scene["path"]) for scene in scenes}
-    folders = [(name, Path(path).expanduser()) for name, path in sorted(named_paths, key=str)]
-    missing = [(name, folder) for name, folder in folders if not folder.is_dir()]
-    lines = [missing_folder(name, folder) for name, folder in missing]
-    models = {
-        (scene["name"], scene["path"], scene["sparse"])
-        for scene in scenes
-        if scene["kind"] == "colmap"
-    }
-    for name, path, sparse in sorted(models, key=str):
-        if (root := Path(path).expanduser()).is_dir() and (
-            line := missing_model(name, root, sparse)
-        ):
-            lines.append(line)
+    missing: list[tuple[str, Path]] = []
+    models: list[str] = []
+    scenes = [trial.values["scene"] for trial in trials]
+    known = {(one["name"], one["path"], one["kind"], one.get("sparse")) for one in scenes}
+    for name, path, kind, sparse in sorted(known, key=str):
+        if kind == "courtyard":
+            continue
+        folder = Path(path).expanduser()
+        if not folder.is_dir():
+            missing.append((name, folder))
+        elif kind == "colmap":
+            models.append(missing_model(name, folder, sparse))
+    missing = list(dict.fromkeys(missing))
+    lines = [missing_folder(name, folder) for name, folder in missing] + list(filter(None, models))
     return lines + ([how_to_get(missing)] if missing else []) + missing_weights(trials)
 
 
 def missing_weights(trials: Sequence[Trial]) -> list[str]:
     """A line for each missing folder of weights that the trials name."""
-    folders = {
-        (group, str(folder))
-        for group in ("eval", "init")
-        for folder in (trial.values[group].get("weights") for trial in trials)
-        if folder is not None
-    }
-    return [
-        f"{group}.weights={folder}: no such folder; without it, weights are looked for where "
-        "gsbench keeps them"
-        for group, folder in sorted(folders)
-        if not Path(folder).expanduser().is_dir()
-    ]
+    lines = []
+    for group in ("eval", "init"):
+        named = {trial.values[group].get("weights") for trial in trials} - {None}
+        for folder in sorted(map(str, named)):
+            if not Path(folder).expanduser().is_dir():
+                lines.append(
+                    f"{group}.weights={folder}: no such folder; without it, weights are looked for "
+                    "where gsbench keeps them"
+                )
+    return lines
 
 
 def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
@@ -170,9 +157,8 @@ def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
 
 def check_trackers(trials: Sequence[Trial]) -> None:
     """Raise InputError if a trial's tracker needs a package that is not installed."""
-    for sink in sorted(
-        {t.values["tracking"]["sink"] for t in trials if t.values["tracking"]["enabled"]}
-    ):
+    tracking = [trial.values["tracking"] for trial in trials]
+    for sink in sorted({settings["sink"] for settings in tracking if settings["enabled"]}):
         if importlib.util.find_spec(sink) is None:
             raise InputError(
                 f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install "
@@ -181,29 +167,26 @@ def check_trackers(trials: Sequence[Trial]) -> None:
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:
-    """A line for each of the user's classes whose name in tables would be that of a class of
-    gsbench."""
-    classes = {
-        (group, str(part.get("name")), str(part["_target_"]))
-        for trial in trials
-        for group, part in ((group, trial.values[group]) for group in ("densify", "init"))
-        if part.get("_target_") is not None and not str(part["_target_"]).startswith(OWN)
-    }
-    return [
-        f"{target} is shown as {name}, like gsbench's own: "
-        f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"
-        for group, name, target in sorted(classes)
-        if name in options(group)
-    ]
+    """A line for each class of the user's whose name in tables is that of a class of gsbench."""
+    lines = []
+    for group in ("densify", "init"):
+        parts = [trial.values[group] for trial in trials]
+        classes = {(str(part.get("name")), str(part.get("_target_") or OWN)) for part in parts}
+        for name, target in sorted(classes):
+            if name in options(group) and not target.startswith(OWN):
+                lines.append(
+                    f"{target} is shown as {name}, like gsbench's own: "
+                    f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"
+                )
+    return lines
 
 
 def need_no_check(trials: Sequence[Trial]) -> bool:
-    """Return whether all components have their shipped options, which gsbench's own tests have
-    checked.
+    """Return whether all components have shipped options, which gsbench's tests have checked.
 
     Then a dry run need not load torch.
     """
-    for word in {word for trial in trials for word in trial.overrides}:
+    for word in set().union(*(trial.overrides for trial in trials)):
         key, _, value = word.lstrip("+~").partition("=")
         group = re.split("[./@]", key)[0]
         # Hydra's own settings change no component, unless they bring files from elsewhere.

@@ -75,6 +75,12 @@ class Outcome:
         return TrialFolder(self.folder).label
 
 
+def _say_last(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> None:
+    """Log the outcome of the trial that ended last, and how many have ended."""
+    last = outcomes[-1]
+    log.info("%s: %s  (%d of %d)", last.label, last.message, len(outcomes), len(trials))
+
+
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a complete trial."""
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
@@ -90,8 +96,10 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
 
 
 def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials. A trial that another process is running comes last, so that two sweeps share
-    the work."""
+    """Run the trials.
+
+    A trial that another process is running comes last, so that two sweeps share the work.
+    """
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
     for number, trial in enumerate(trials, 1):
@@ -130,8 +138,10 @@ DAYS = 24 * 60  # minutes
 
 @dataclass
 class TrialJob:
-    """The callable that submitit runs. When its time is up, submitit requeues what ``checkpoint``
-    returns."""
+    """The callable that submitit runs.
+
+    When its time is up, submitit requeues what ``checkpoint`` returns.
+    """
 
     values: dict[str, Any]
     path: list[str]  # sys.path of the submitting process
@@ -183,8 +193,7 @@ class TrialJob:
 
 
 def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials in processes of this machine, ``launch.parallel`` at once; return when all
-    have ended."""
+    """Run the trials in processes of this machine, ``launch.parallel`` at once, to the end."""
     values = trials[0].values
     parallel, name = values["launch"]["parallel"], values["name"]
     import submitit
@@ -219,8 +228,10 @@ def job_folder(values: dict[str, Any]) -> Path:
 def _run(
     trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror
 ) -> list[Outcome]:
-    """Run at most ``parallel`` processes at once. If this process is stopped it stops them; if
-    killed, they go on."""
+    """Run at most ``parallel`` processes at once.
+
+    If this process is stopped it stops them; if killed, they go on.
+    """
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
         while waiting or running:
@@ -234,13 +245,7 @@ def _run(
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
-                log.info(
-                    "%s: %s  (%d of %d)",
-                    outcomes[-1].label,
-                    outcomes[-1].message,
-                    len(outcomes),
-                    len(trials),
-                )
+                _say_last(outcomes, trials)
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
@@ -267,8 +272,7 @@ def clouds_first(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome:
-    """The outcome of an ended job, from the trial's files, or else from the end of the job's
-    log."""
+    """The outcome of an ended job, from the trial's files, else from the end of its log."""
     values = next(trial.values for trial in trials if trial.folder == folder)
     files, log_file = TrialFolder(folder), job.paths.stderr
     record = files.sound_record()
@@ -308,8 +312,7 @@ CHECKS_UNTIL_LOST = 2
 
 
 def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the trials in Slurm; those that an earlier command submitted are awaited, not submitted
-    again.
+    """Run the trials in Slurm; await those that an earlier command submitted.
 
     Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of
     status "queued".
@@ -370,8 +373,7 @@ def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
 
 
 def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
-    """The job of each trial by the trial's folder: its job in the queue, or else a task of a new
-    array job."""
+    """The job of each trial by its folder: one in the queue, or a task of a new array job."""
     import submitit
 
     folders = [trial.folder for trial in trials]
@@ -416,22 +418,13 @@ def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outco
             if queue is not None:  # while the scheduler does not answer, no job counts as lost
                 for folder, job in jobs.items():
                     unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
-            ended += [
-                folder
-                for folder in jobs
-                if unseen[folder] >= CHECKS_UNTIL_LOST and folder not in ended
-            ]
+            lost = [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST]
+            ended += [folder for folder in lost if folder not in ended]
         for folder in ended:
             outcomes.append(collect(jobs.pop(folder), folder, trials))
             with suppress(OSError):
                 forget_submission(folder)
-            log.info(
-                "%s: %s  (%d of %d)",
-                outcomes[-1].label,
-                outcomes[-1].message,
-                len(outcomes),
-                len(trials),
-            )
+            _say_last(outcomes, trials)
         if not ended:
             time.sleep(SECONDS_BETWEEN_POLLS)
     return outcomes

@@ -1,5 +1,4 @@
-"""The progress of a sweep: the states of its trials by arm and scene, its speed, time left and
-leading arm."""
+"""The progress of a sweep: states by arm and scene, speed, time left and leading arm."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ class Progress:
 
 
 def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
-    """A row for each arm and scene of an experiment in the folder ``runs``, as ``gsbench status
-    --watch`` shows it.
+    """A row for each arm and scene of an experiment, as ``gsbench status --watch`` shows it.
 
     Its columns are arm, scene, done, running, failed, waiting (numbers of trials) and
     iterations_per_second (of running trainings, else 0). ``attrs`` has seconds_left and leader.
@@ -98,15 +96,20 @@ def _names(folders: Sequence[Path]) -> dict[Path, Name]:
         hashes[folder.parent].add(folder.name.partition(SEED)[0])
     names = {}
     for folder in folders:
-        several = len(hashes[folder.parent]) > 1
-        mark = f" {folder.name.partition(SEED)[0]}" if several else ""
-        names[folder] = (folder.parent.name + mark, folder.parents[1].name)
+        arm = folder.parent.name
+        if len(hashes[folder.parent]) > 1:
+            arm += f" {folder.name.partition(SEED)[0]}"
+        names[folder] = (arm, folder.parents[1].name)
     return names
 
 
+def _kinds(name: Name) -> tuple[Name, ...]:
+    """The trials that tell how long one takes, the most similar ones first."""
+    return name, (name[0], ""), ("", "")
+
+
 def _training(folder: Path) -> tuple[int, float]:
-    """The last iteration of the training in progress, and its iterations per second; zeros if there
-    is none."""
+    """The last iteration of the present training, and iterations per second; else zeros."""
     building = TrialFolder(folder).building()
     file = Path(building.folder, CURVES) if building.folder else None
     rows = read_rows(file) if file is not None and file.exists() else []
@@ -125,21 +128,16 @@ def _seconds_left(
     """
     known: dict[Name, list[float]] = defaultdict(list)
     for trial in trials:
-        arm, scene = names[trial.path]
-        seconds = sum(trial.record.seconds.values())
-        for name in ((arm, scene), (arm, ""), ("", "")):
-            known[name].append(seconds)
+        for kind in _kinds(names[trial.path]):
+            known[kind].append(sum(trial.record.seconds.values()))
     if not known:
         return None
     total = 0.0
     for state in states:
         if state.state in ("done", "failed"):
             continue
-        arm, scene = names[state.folder]
-        seconds = fmean(
-            next(known[name] for name in ((arm, scene), (arm, ""), ("", "")) if name in known)
-        )
-        total += seconds * (1 - _share_done(state) if state.state == "running" else 1)
+        similar = next(known[kind] for kind in _kinds(names[state.folder]) if kind in known)
+        total += fmean(similar) * (1 - _share_done(state) if state.state == "running" else 1)
     return total / max(1, sum(state.state == "running" for state in states))
 
 
@@ -173,6 +171,5 @@ def _in_words(means: dict[str, float], metric: Quantity, shared: int) -> str:
         return f"no arm leads in {metric.name}; {shared} trials of each are compared"
     return (
         f"{best} leads so far: {metric.name} {metric.format(means[best])}, mean of the {shared} "
-        "scenes and seeds that "
-        "all arms have. This is not a verdict."
+        "scenes and seeds that all arms have. This is not a verdict."
     )

@@ -40,8 +40,7 @@ LEVELS = 3  # folders of scene, arm and trial
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedTrial(Record):
-    """A planned trial: its overrides, the folder in which the command was given, and the Unix
-    time."""
+    """A planned trial: its overrides, the folder of the command, and the Unix time."""
 
     overrides: tuple[str, ...]
     cwd: str
@@ -130,8 +129,7 @@ def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
 
 
 def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
-    """The metric that each experiment's trials declare (``eval.primary``), by the experiment's
-    folder, or None.
+    """The metric that trials declare (``eval.primary``) or None, by the experiment's folder.
 
     Raises InputError if trials of one experiment declare different metrics.
     """
@@ -141,17 +139,15 @@ def declared_metrics(trials: Sequence[Trial]) -> dict[Path, str | None]:
         metric, before = trial.values["eval"].get("primary"), metrics.get(home)
         if metric and before and metric != before:
             raise InputError(
-                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: "
-                "a verdict is about "
-                "one metric, so give one of them, or run two experiments (name=…)"
+                f"trials of {home.name} declare eval.primary={before} and eval.primary={metric}: a "
+                "verdict is about one metric, so give one of them, or run two experiments (name=…)"
             )
         metrics[home] = before or metric
     return metrics
 
 
 def declare(trials: Sequence[Trial]) -> None:
-    """Add a declaration to each experiment's record, unless the latest one already covers these
-    trials.
+    """Add a declaration to each experiment's record, unless the latest covers these trials.
 
     It has the metric (`declared_metrics`) and all trials, done or not. A command without a metric
     keeps the declared one: the trials that it adds are declared with that metric, with their own
@@ -174,20 +170,17 @@ def declare(trials: Sequence[Trial]) -> None:
                 log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
+            # Old declarations name no trials: they cover all of this metric.
+            is_covered = together == before or (latest is not None and not latest.names_trials)
             same_metric = latest is not None and latest.primary == metric
-            if (
-                latest is not None
-                and same_metric
-                and (together == before or not latest.names_trials)
-            ):
+            if same_metric and is_covered:
                 continue
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
             write_text(home / DECLARED, record_text([*declarations, added]))
         if same_metric:
             log.warning(
                 "%s: trials are added to those declared with %s; if there are results already, it "
-                "no longer decides "
-                "the verdict alone",
+                "no longer decides the verdict alone",
                 home.name,
                 metric,
             )
@@ -202,8 +195,7 @@ def declare(trials: Sequence[Trial]) -> None:
 
 
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add questions to the experiment's record: of a file of claims, of a sweep in looks, or of
-    people's votes.
+    """Add a claims file's, sweep's or round's questions to the experiment's record.
 
     Returns the recorded declaration: if the latest one of its kind is equal, that one with its
     earlier time.

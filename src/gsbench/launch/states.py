@@ -1,4 +1,5 @@
 """The states of trials, from their folders and from Slurm's queue, and the listing of a dry run.
+
 Loads no torch.
 
 A file in a trial's folder names its Slurm job.
@@ -59,8 +60,7 @@ def states_of_experiment(home: Path) -> list[TrialState]:
 
 
 def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
-    """The states, in which failed and stopped trials are superseded if a trial of the same settings
-    got further.
+    """The states; failed trials are superseded if one of the same settings got further.
 
     Such trials differ only in the code of a user's class, which was repaired in between.
     """
@@ -171,8 +171,7 @@ class Submission(Record):
 
 @dataclass(frozen=True)
 class QueuedJob:
-    """A job or array task in the queue: its state as Slurm names it, and the reason why it
-    waits."""
+    """A job or array task in the queue: its state as Slurm names it, and why it waits."""
 
     state: str
     reason: str
@@ -198,8 +197,7 @@ def record_submission(folder: Path, job: str, log: Path) -> None:
 
 
 def read_submission(folder: Path) -> Submission | None:
-    """The last job of the trial in ``folder``; None if it was never submitted, or if the job has
-    ended normally."""
+    """The last job of the trial in ``folder``; None if none, or if it ended normally."""
     return read_if_sound(folder / SUBMITTED, Submission)
 
 
@@ -230,8 +228,7 @@ def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "runn
 
 
 def read_queue(users: Iterable[str]) -> Queue | None:
-    """The jobs and array tasks of ``users`` by id; None if there is no Slurm, or if it does not
-    answer."""
+    """The jobs and array tasks of ``users`` by id; None without an answer of Slurm."""
     command = [
         "squeue",
         f"--user={','.join(sorted(users))}",
@@ -280,16 +277,14 @@ class FinishedTrials:
                         self._seconds[similarity].append(seconds / record.iterations)
 
     def elsewhere(self, trial: TrialFolder) -> str | None:
-        """Another experiment that has finished the same trial, so that its stages are reused; None
-        if there is none."""
+        """Another experiment that has finished the same trial, whose stages are reused, or None."""
         others = (
             folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path
         )
         return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
 
     def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
-        """Seconds for the whole trial with ``values``, and the number of finished trials that this
-        is known from.
+        """Seconds for the trial with ``values``, and the number of trials that this rests on.
 
         These have the same scene at the same size, the same rasterizer and, if possible, the same
         densifier. Times are taken per iteration. Without such trials there is no estimate, ``(0,
@@ -302,8 +297,7 @@ class FinishedTrials:
 
 
 def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
-    """What trials with similar times have in common: scene, rasterizer and densifier; scene and
-    rasterizer."""
+    """What trials of similar times share: scene, rasterizer and densifier, or the first two."""
     shared = [settings["scene"], settings["raster"]["name"]]
     return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
 

@@ -1,5 +1,7 @@
-"""The parts of a trial: the objects that its configuration describes. Errors name the
-configuration's key."""
+"""The parts of a trial: the objects that its configuration describes.
+
+Errors name the configuration's key.
+"""
 
 import dataclasses
 import inspect
@@ -73,8 +75,9 @@ REQUIRED_METHODS = {  # of a user's class, by the group that names it
 
 
 class Parts:
-    """The objects that the resolved configuration ``values`` describes. Each is made at its first
-    use and kept.
+    """The objects that the resolved configuration ``values`` describes.
+
+    Each is made at its first use and kept.
 
     The first use raises InputError for a wrong key. It also runs the user's code if the class is
     the user's own.
@@ -110,8 +113,7 @@ class Parts:
 
     @cached_property
     def trainer(self) -> Densifier | External:
-        """The trainer that the group densify describes: a densifier of gsbench's own trainer, or
-        another program."""
+        """The trainer of the group densify: a densifier of gsbench's own, or another program."""
         trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
         return trainer
 
@@ -139,11 +141,9 @@ class Parts:
     def threads(self) -> int:
         """The CPU threads that the trial may use on this machine."""
         wanted = self.values["threads"]
-        return (
-            available_threads(self.values["launch"]["parallel"])
-            if wanted == "auto"
-            else int(wanted)
-        )
+        if wanted == "auto":
+            return available_threads(self.values["launch"]["parallel"])
+        return int(wanted)
 
     @cached_property
     def raster(self) -> Proven:
@@ -174,8 +174,9 @@ class Parts:
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
     def check(self, on_this_machine: bool) -> None:
-        """Raise InputError, which names the key, for what is known to fail. Call it before any
-        work.
+        """Raise InputError, which names the key, for what is known to fail.
+
+        Call it before any work.
 
         With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
         checked too.
@@ -227,8 +228,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
     elif options and not own:
         raise InputError(
             f"{group}._target_={target} has options but is not a dataclass: make it one, so that "
-            "results are stored "
-            "under their values"
+            "results are stored under their values"
         )
     try:
         return cls(**options)
@@ -253,15 +253,16 @@ def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Ra
     if not isinstance(name, str) or any(name == executor.name for executor in EXECUTORS):
         raise InputError(
             f"raster._target_={target} needs an attribute name, a text that results and tables "
-            "show and that no other "
-            f"rasterizer has; it has {name!r}"
+            f"show and that no other rasterizer has; it has {name!r}"
         )
     return rasterizer
 
 
 def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str, Metric]:
-    """The user's own metrics that the settings ``eval`` name. Raises InputError for an unusable
-    one."""
+    """The user's own metrics that the settings ``eval`` name.
+
+    Raises InputError for an unusable one.
+    """
     metrics: dict[str, Metric] = {}
     for name, options in values.get("extra", {}).items():
         metrics[name] = build(f"eval.extra.{name}", options, allow_targets)
@@ -269,8 +270,7 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
         if facts_of(name, metrics[name]).direction == 0 and metric_and_question(primary)[0] == name:
             raise InputError(
                 f"eval.primary={primary}: {options['_target_']} does not say whether more or less "
-                "is better "
-                "(direction), so no verdict can be about it"
+                "is better (direction), so no verdict can be about it"
             )
     return metrics
 
@@ -292,14 +292,15 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
         raise InputError(unknown_setting(key, unknown, parameters))
     raise InputError(
         f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
-        f"{', '.join(parameters) or 'none'}); "
-        f"remove it by ~{key}, or start from another choice, {group}=NAME"
+        f"{', '.join(parameters) or 'none'}); remove it by ~{key}, or start from another choice, "
+        f"{group}=NAME"
     )
 
 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
-    """The class at the import path ``package.module.Class``. Raises InputError if ``group`` cannot
-    use it.
+    """The class at the import path ``package.module.Class``.
+
+    Raises InputError if ``group`` cannot use it.
 
     Warns of code whose version the results cannot record.
     """
@@ -318,12 +319,11 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if module_digest(module) is None:
         log.warning("no file of %s was found: results do not record its version", target)
     if unnamed := unnamed_modules(loaded_before, {module, *permitted}):
-        words = ", ".join(unnamed)
         log.warning(
             "%s imports %s, and results do not record their versions: name them in allow_targets "
             "too",
             target,
-            words,
+            ", ".join(unnamed),
         )
     return cls
 

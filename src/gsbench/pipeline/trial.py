@@ -1,5 +1,4 @@
-"""One trial: its steps in order, how it gets from a configuration to ``results.json``, and the
-content of that file."""
+"""One trial: its steps in order, and the content of its ``results.json``."""
 
 import logging
 import sys
@@ -7,7 +6,6 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +54,7 @@ from gsbench.runs.trial_record import (
     RENDERS_ALONE,
     Budget,
     Code,
+    Declared,
     Evaluation,
     Failure,
     Training,
@@ -69,6 +68,7 @@ from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
 from gsbench.system.locks import hold
 from gsbench.system.stopping import reinstall_handlers
+from gsbench.train.proof import Proven
 
 log = logging.getLogger(__name__)
 
@@ -95,8 +95,9 @@ class TrialSteps:
         self.parts, self.store = parts, store
 
     def steps(self) -> Iterator[keys.Step]:
-        """The steps in order. A caller that wants results builds each step before it asks for the
-        next.
+        """The steps in order.
+
+        A caller that wants results builds each step before it asks for the next.
 
         Keys are known without building, with one exception: the courtyard's photographs must be
         rendered before their fingerprint is known. While they are missing from the store, the step
@@ -128,11 +129,10 @@ class TrialSteps:
         yield init
         self.views = Views(store, self.capture, init, parts.scene)
         program = parts.program
-        trained = (
-            train_step(self.views, parts)
-            if program is None
-            else external_step(self.views, program, parts)
-        )
+        if program is None:
+            trained = train_step(self.views, parts)
+        else:
+            trained = external_step(self.views, program, parts)
         yield trained
         yield ground_truth_step(self.views)
         yield evaluate_step(self.views, trained, parts)
@@ -161,8 +161,10 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
 
 @contextmanager
 def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[None]:
-    """Write ``failed.json`` if the block fails. Code that ends the process has failed, even with
-    exit code 0."""
+    """Write ``failed.json`` if the block fails.
+
+    Code that ends the process has failed, even with exit code 0.
+    """
     try:
         with storage_errors(folder.runs):
             try:
@@ -175,9 +177,8 @@ def _recorded_failures(values: dict[str, Any], folder: TrialFolder) -> Iterator[
                 raise TrainingError(text) from ended
             except torch.OutOfMemoryError as error:
                 raise TrainingError(
-                    f"the memory of device={values['device']} is full: lower scene.max_size or "
-                    "the number of trials at "
-                    "once (launch.parallel), or end other programs on that device"
+                    f"the memory of device={values['device']} is full: lower scene.max_size or the "
+                    "number of trials at once (launch.parallel), or end other programs there"
                 ) from error
     except Exception as error:
         log.debug("the trial failed", exc_info=True)
@@ -218,28 +219,15 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         for step in trial_steps.steps():
             if step.stage.name == keys.TRAIN.name:
                 scene = trial_steps.views.scene
-                log.info(
-                    "%s: %d training and %d test views",
-                    folder.label,
-                    len(scene.train),
-                    len(scene.test),
-                )
+                counts = len(scene.train), len(scene.test)
+                log.info("%s: %d training and %d test views", folder.label, *counts)
             entries[step.stage.name] = entry = store.get(step)
             code |= step.code
             if step.stage is keys.INIT:
                 link_or_copy(entry.path / REPORT_FILE, folder.path / layout.INIT_REPORT)
-        results = results_of(
-            values,
-            trial_steps.capture,
-            trial_steps.views.scene,
-            parts.rasterizer.name,
-            entries,
-            code,
-        )
-        results = replace(
-            results, raster_proof=parts.raster.proof, raster_passed_over=[*parts.raster.passed_over]
-        )
-        published = _publish(folder.path, entries, trial_steps.capture.normalization)
+        capture, scene = trial_steps.capture, trial_steps.views.scene
+        results = results_of(values, capture, scene, parts.raster, entries, code)
+        published = _publish(folder.path, entries, capture.normalization)
         made_of = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
         was_done = folder.write_finished(values, results, sources, made_of, published)
@@ -253,15 +241,14 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
 
 
 def source_files(capture: Capture, store: Store) -> list[Path]:
-    """The user's files from which a capture was read; none for a scene that gsbench made in the
-    store."""
+    """The user's files from which a capture was read; none for a scene that gsbench made."""
     if capture.images.resolve().is_relative_to(store.root.resolve()):
         return []
-    images = [(capture.images / name).resolve() for name in capture.image_names]
-    images += [file.resolve() for file in (*capture.masks.values(), *capture.read_from)]
-    return images + (
-        [] if capture.model is None else [path.resolve() for path in model_files(capture.model)]
-    )
+    files = [capture.images / name for name in capture.image_names]
+    files += [*capture.masks.values(), *capture.read_from]
+    if capture.model is not None:
+        files += model_files(capture.model)
+    return [file.resolve() for file in files]
 
 
 def _publish(
@@ -271,18 +258,19 @@ def _publish(
 
     The model gets the coordinates in which the scene was given.
     """
-    init, trained, evaluated = (
-        entries[stage.name].path for stage in (keys.INIT, keys.TRAIN, keys.EVALUATE)
-    )
+    stages = keys.INIT, keys.TRAIN, keys.EVALUATE, keys.GROUND_TRUTH
+    init, trained, evaluated, truth = (entries[stage.name].path for stage in stages)
     links = {
         folder / name: trained / name for name in PUBLISHED_TRAINING if (trained / name).exists()
     }
     links[folder / layout.PER_VIEW] = evaluated / layout.PER_VIEW
-    pictures = {name: evaluated / name for name in (layout.RENDERS, layout.FIGURES)}
-    truth = entries[keys.GROUND_TRUTH.name].path
-    for name, source in (
-        pictures | {layout.GROUND_TRUTH: truth, layout.MASKS: truth / layout.MASKS}
-    ).items():
+    pictures = {
+        layout.RENDERS: evaluated / layout.RENDERS,
+        layout.FIGURES: evaluated / layout.FIGURES,
+        layout.GROUND_TRUTH: truth,
+        layout.MASKS: truth / layout.MASKS,
+    }
+    for name, source in pictures.items():
         links |= {folder / name / file.name: file for file in sorted(source.glob("*.png"))}
     if (init / PICTURE_FILE).exists():
         links[folder / layout.FIGURES / layout.INITIAL_CLOUD] = init / PICTURE_FILE
@@ -299,79 +287,66 @@ def _publish(
 
 # on whose versions a result depends
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
+# fields that results.json takes from the training and from the evaluation as they are
+OF_TRAINING = (
+    "iterations",
+    "num_init_points",
+    "num_gaussians",
+    "causes",
+    "initial_cloud",
+    "scene_extent",
+    "peak_memory_mb",
+    "machine",
+    "trained_by",
+)
+OF_EVALUATION = ("metrics", "awaited", "one_color_psnr")
 
 
 def results_of(
     values: dict[str, Any],
     capture: Capture,
     scene: Scene,
-    raster: str,
+    raster: Proven,
     entries: Mapping[str, StoredResult],
     code: Mapping[str, str],
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``.
 
-    ``capture`` are the photographs, ``raster`` names the executor that rendered, ``entries`` are
-    the steps' store entries by stage. ``code`` maps the parts of gsbench's source that the steps
-    used to their states.
+    ``capture`` are the photographs, ``raster`` is what rendered, ``entries`` are the steps' store
+    entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
+    states.
     """
-    init, trained, evaluated = (
-        entries[keys.INIT.name],
-        entries[keys.TRAIN.name],
-        entries[keys.EVALUATE.name],
-    )
+    stages = keys.INIT, keys.TRAIN, keys.EVALUATE
+    init, trained, evaluated = (entries[stage.name] for stage in stages)
     training = read_typed(trained.path / layout.TRAINING, Training)
     evaluation = read_typed(evaluated.path / layout.METRICS, Evaluation)
     manifest = read_manifest(evaluated.path)
-    primary, declarations = (
-        values["eval"].get("primary"),
-        read_declarations(TrialFolder.of(values).home),
-    )
-    declared = [one for one in declarations if one.kind == "sweep" and one.primary == primary]
-    sizes = sorted(
-        {(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]},
-        reverse=True,
-    )
+    is_ready_made = training.trained_by is None and not training.iterations
     seconds = {"init": init.seconds, "train": training.seconds, "evaluate": evaluated.seconds}
-    evaluated_from, unknown = training.evaluated_from, dict[str, str]()
-    if evaluated_from == FROM_RENDERS:
-        raster, unknown["gaussians"] = "unknown", RENDERS_ALONE
-    if training.peak_memory_mb is None:
-        unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
-    if training.trained_by is None and not training.iterations:  # a ready-made model
-        del seconds[keys.TRAIN.name]
-        evaluated_from = FROM_MODEL
-        unknown |= dict.fromkeys(
-            ("train_time", "total_time"), f"{MADE_ELSEWHERE}: not trained here"
-        )
+    if is_ready_made:
+        del seconds["train"]
+    only_renders = training.evaluated_from == FROM_RENDERS
+    views = [*scene.train, *scene.test]
+    copied = {name: getattr(training, name) for name in OF_TRAINING}
+    copied |= {name: getattr(evaluation, name) for name in OF_EVALUATION}
     return TrialRecord(
         status="complete",
         experiment=values["name"],
-        scene=values["scene"]["name"],
-        init=values["init"]["name"],
-        densify=values["densify"]["name"],
+        **{group: values[group]["name"] for group in ("scene", "init", "densify")},
         seed=values["seed"],
-        raster=raster,
+        raster="unknown" if only_renders else raster.rasterizer.name,
+        raster_proof=raster.proof,
+        raster_passed_over=[*raster.passed_over],
         protocol=manifest.inputs["protocol"],
-        iterations=training.iterations,
-        metrics=evaluation.metrics,
-        unavailable=evaluation.unavailable | unknown,
+        unavailable=evaluation.unavailable | _unknown_costs(training, is_ready_made),
         measured=manifest.created,  # of an evaluation found in the store: when it was put there
-        declared=declared[-1].summary() if declared else None,
-        awaited=evaluation.awaited,
+        declared=_declared_sweep(values),
         metric_facts=evaluation.facts,
         metrics_at=evaluation.at,
-        num_init_points=training.num_init_points,
-        num_gaussians=training.num_gaussians,
-        causes=training.causes,
-        one_color_psnr=evaluation.one_color_psnr,
-        initial_cloud=training.initial_cloud,
         twins=TwinViews(
             left_out={**capture.left_out, **scene.twins.left_out}, near=dict(scene.twins.near)
         ),
-        scene_extent=training.scene_extent,
         seconds=seconds,
-        peak_memory_mb=training.peak_memory_mb,
         budget=Budget(
             max_gaussians=values["densify"].get("max_gaussians"),
             cap=values["densify"].get("cap"),
@@ -382,16 +357,14 @@ def results_of(
         test_views=len(scene.test),
         split=split_text(keys.flatten(values)),
         held_out=capture.held_out,
-        resolution=sizes[0],
+        resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
         init_report=read_json(init.path / REPORT_FILE),
         hashes={
             "config": keys.config_hash(values),
             "data": capture.fingerprint,
-            "init": init.key,
             "cloud": cloud_hash(init.path),
-            "train": trained.key,
-            "evaluate": evaluated.key,
+            **{stage.name: entries[stage.name].key for stage in stages},
         },
         code=Code(
             sources=keys.user_modules(values),
@@ -399,11 +372,34 @@ def results_of(
             rooms=dict(sorted(code.items())),
             **training.checkout,
         ),
-        machine=training.machine,
         versions=versions(),
-        evaluated_from=evaluated_from,
-        trained_by=training.trained_by,
+        evaluated_from=FROM_MODEL if is_ready_made else training.evaluated_from,
+        **copied,
     )
+
+
+def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
+    """The costs that nobody measured, each with the reason: for what other programs trained."""
+    unknown = {}
+    if training.evaluated_from == FROM_RENDERS:
+        unknown["gaussians"] = RENDERS_ALONE
+    if training.peak_memory_mb is None:
+        unknown["peak_memory_mb"] = "another program's memory of a GPU is not measured"
+    if is_ready_made:
+        reason = f"{MADE_ELSEWHERE}: not trained here"
+        unknown |= {"train_time": reason, "total_time": reason}
+    return unknown
+
+
+def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
+    """What the sweep of this trial had declared about its metric when the trial ended."""
+    primary = values["eval"].get("primary")
+    declared = [
+        one
+        for one in read_declarations(TrialFolder.of(values).home)
+        if one.kind == "sweep" and one.primary == primary
+    ]
+    return declared[-1].summary() if declared else None
 
 
 def cloud_hash(init: Path) -> str:
@@ -419,7 +415,8 @@ def cloud_hash(init: Path) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
-    own = {"python": sys.version.split()[0], "gsbench": __version__}
-    return own | {
-        package: version for package in PACKAGES if (version := version_of(package)) is not None
-    }
+    found = {"python": sys.version.split()[0], "gsbench": __version__}
+    for package in PACKAGES:
+        if version := version_of(package):
+            found[package] = version
+    return found

@@ -1,5 +1,4 @@
-"""Rasterizers: one contract (``raster.base``) and several executors (``raster.executors``), chosen
-by name.
+"""Rasterizers: one contract (``raster.base``), several executors (``raster.executors``).
 
 Does not import torch until a rasterizer is made.
 """
@@ -17,8 +16,10 @@ if TYPE_CHECKING:
 
 
 def create_rasterizer(name: str, device: torch.device, threads: int | None = None) -> Rasterizer:
-    """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``; ``threads``
-    limits the CPU threads of ``cpu``."""
+    """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``.
+
+    ``threads`` limits the CPU threads of ``cpu``.
+    """
     executor = resolve(name, device.type)
     module, _, attribute = executor.target.rpartition(".")
     rasterizer_class = getattr(importlib.import_module(module), attribute)

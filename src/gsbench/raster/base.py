@@ -1,5 +1,7 @@
-"""The contract of every rasterizer: inputs, outputs, and the constants of 3DGS. Does not import
-torch."""
+"""The contract of every rasterizer: inputs, outputs, and the constants of 3DGS.
+
+Does not import torch.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,10 @@ CONSTANTS = RasterConstants()
 
 
 def slope_limits(camera: Camera) -> tuple[float, float, float, float]:
-    """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most;
-    y/z least, most."""
+    """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most.
+
+    Y/z least, most.
+    """
     margin_x = CONSTANTS.fov_margin * camera.width / (2 * camera.fx)
     margin_y = CONSTANTS.fov_margin * camera.height / (2 * camera.fy)
     return (
@@ -164,8 +168,10 @@ class RenderOutput:
         return self.footprint(values)
 
     def require_splitting_matrix(self) -> Tensor:
-        """Return the splitting matrices [N, 3, 3] of this view. Raises RuntimeError if they were
-        not requested, and before ``backward``."""
+        """Return the splitting matrices [N, 3, 3] of this view.
+
+        Raises RuntimeError if they were not requested, and before ``backward``.
+        """
         if self.splitting_probe is None or self.splitting_probe.grad is None:
             raise RuntimeError(
                 "this densifier needs splitting matrices: render with splitting_matrix=True, then "
@@ -210,10 +216,10 @@ class Rasterizer(Protocol):
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """Render ``gaussians`` from ``camera`` with harmonics up to ``sh_degree`` (0 to 3) over
-        ``background`` [3].
+        """Render ``gaussians`` from ``camera`` over ``background`` [3].
 
-        Differentiable in the six tensors of ``gaussians`` and in ``screen_points``. Pixels are
-        sampled at their centres, which are integers: a point projects to ``fx x/z + cx - 0.5``.
+        Harmonics count up to ``sh_degree``, 0 to 3. Differentiable in the six tensors of
+        ``gaussians`` and in ``screen_points``. Pixels are sampled at their centres, which are
+        integers: a point projects to ``fx x/z + cx - 0.5``.
         """
         ...

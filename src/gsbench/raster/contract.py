@@ -1,13 +1,12 @@
-"""A test of the contract of ``raster.base``: it compares a rasterizer with the float64 reference on
-seeded scenes.
+"""A test of the contract of ``raster.base``.
 
-gsbench tests its own executors with the same scenes. To test yours:
+It compares a rasterizer with the float64 reference on seeded scenes. gsbench tests its own
+executors with the same scenes. To test yours:
 
     assert departures(MyRasterizer()) == []
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,11 +29,10 @@ FOOTPRINT_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Case:
-    """A seeded scene with its camera. ``principal`` is the offset of the principal point from the
-    image centre, px.
+    """A seeded scene with its camera.
 
-    ``spread`` scales the distances of the Gaussians from the axis through their middle, which is
-    ``depth`` away.
+    ``principal`` is the offset of the principal point from the image centre, px. ``spread`` scales
+    the distances of the Gaussians from the axis through their middle, which is ``depth`` away.
     """
 
     width: int
@@ -68,8 +66,10 @@ class Case:
         )
 
     def gaussians(self) -> Gaussians:
-        """float64 values that are exact in float32; some Gaussians are behind the camera or outside
-        the image."""
+        """float64 values that are exact in float32.
+
+        Some Gaussians are behind the camera or outside the image.
+        """
         generator = torch.Generator().manual_seed(self.width * 1000 + self.count)
 
         def normal(*shape: int) -> Tensor:
@@ -104,25 +104,21 @@ CASES = (
 def render_with_gradients(
     rasterizer: Rasterizer, case: Case, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Render ``case``; also return gradients, as float64 on the CPU, of a fixed random weighting of
-    image and alpha.
+    """Render ``case``.
 
+    Also return gradients, as float64 on the CPU, of a fixed random weighting of image and alpha.
     Includes the splitting matrices if the rasterizer offers them.
     """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, device=device)
-    extra = (
-        {"splitting_matrix": True}
-        if offers(rasterizer.name, "has_splitting_matrix", rasterizer)
-        else {}
-    )
+    has_matrix = offers(rasterizer.name, "has_splitting_matrix", rasterizer)
+    extra = {"splitting_matrix": True} if has_matrix else {}
     output = rasterizer.render(
         gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **extra
     )
     generator = torch.Generator().manual_seed(7)
-    weights = torch.randn(case.height, case.width, 4, generator=generator, dtype=torch.float64).to(
-        device, dtype
-    )
+    weights = torch.randn(case.height, case.width, 4, generator=generator, dtype=torch.float64)
+    weights = weights.to(device, dtype)
     ((output.image * weights[..., :3]).sum() + (output.alpha * weights[..., 3]).sum()).backward()
     gradients = {name: tensor.grad for name, tensor in gaussians.tensors().items()}
     gradients |= {
@@ -138,8 +134,7 @@ def render_with_gradients(
 
 
 class Error(NamedTuple):
-    """The largest error of a quantity in a case, what the contract allows, and the place of the
-    error in words."""
+    """The largest error of a quantity in a case, its limit, and its place in words."""
 
     case: str
     quantity: str
@@ -164,122 +159,93 @@ class Error(NamedTuple):
 def departures(
     rasterizer: Rasterizer, device: str = "cpu", cases: tuple[Case, ...] = CASES
 ) -> list[str]:
-    """List where ``rasterizer``, in float32 on ``device``, departs from the contract, one line
-    each; [] if nowhere.
+    """List where ``rasterizer``, in float32 on ``device``, departs from the contract.
 
-    For all ``cases``, it compares image, alpha, radii, all gradients and, if offered, footprint and
-    splitting matrices with the reference. It also tests a scene without Gaussians. Takes seconds.
+    One line each; [] if nowhere. For all ``cases``, it compares image, alpha, radii, all gradients
+    and, if offered, footprint and splitting matrices with the reference. It also tests a scene
+    without Gaussians. Takes seconds.
     """
     lines = []
     for case in cases:
         try:
-            lines += [
-                str(error) for error in measure(rasterizer, case, device) if error.is_departure
-            ]
+            errors = measure(rasterizer, case, device)
+            lines += [str(error) for error in errors if error.is_departure]
         except (RuntimeError, ValueError, TypeError, NotImplementedError) as error:
             lines.append(f"{case}: {type(error).__name__}: {error}")
     return lines + _without_gaussians(rasterizer, device)
 
 
 def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
-    """The largest error of each quantity of ``rasterizer``, in float32 on ``device``, against the
-    float64 reference.
+    """The largest error of each quantity of ``rasterizer`` against the float64 reference.
 
-    A shape or dtype that is not the contract's is an infinite error.
+    It runs in float32 on ``device``. A shape or dtype that is not the contract's is an infinite
+    error.
     """
     expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
-    errors = []
-
-    def compare(
-        quantity: str, value: Tensor, reference: Tensor, limit: float, relative: bool, place: Place
-    ) -> None:
-        value, reference = value.detach().cpu().double(), reference.detach().double()
-        if value.shape != reference.shape:
-            shapes = (
-                f"has shape {tuple(value.shape)}, expected {tuple(reference.shape)}"
-                if value.dim()
-                else "is missing"
-            )
-            errors.append(Error(str(case), quantity, math.inf, limit, shapes))
-            return
-        off = (value - reference).abs()
-        largest = float(off.max()) if off.numel() else 0.0
-        at = place(int(off.argmax())) if off.numel() else "nothing"
-        scale = max(float(reference.abs().max()), 1e-30) if relative and off.numel() else 1.0
-        unit = " of its largest entry" if relative else ""
-        errors.append(Error(str(case), quantity, largest / scale, limit, at, unit))
-
-    def pixel(index: int) -> str:
-        return f"pixel ({index % case.width}, {index // case.width})"
-
-    compare(
-        "image",
-        output.image,
-        expected.image,
-        VALUE_TOLERANCE,
-        False,
-        lambda index: pixel(index // 3),
-    )
-    compare("alpha", output.alpha, expected.alpha, VALUE_TOLERANCE, False, pixel)
-    compare(
-        "radius",
-        output.radii,
-        expected.radii,
-        RADIUS_TOLERANCE,
-        False,
-        lambda index: f"Gaussian {index}",
-    )
+    errors = [
+        _compare(case, "image", output.image, expected.image, VALUE_TOLERANCE, pixel_size=3),
+        _compare(case, "alpha", output.alpha, expected.alpha, VALUE_TOLERANCE, pixel_size=1),
+        _compare(case, "radius", output.radii, expected.radii, RADIUS_TOLERANCE),
+    ]
     if output.radii.dtype != torch.int32:
-        errors.append(
-            Error(
-                str(case),
-                "radius",
-                math.inf,
-                RADIUS_TOLERANCE,
-                f"is {output.radii.dtype}, expected torch.int32",
-            )
-        )
+        found = f"is {output.radii.dtype}, expected torch.int32"
+        errors.append(Error(str(case), "radius", math.inf, RADIUS_TOLERANCE, found))
     for name, reference in references.items():
         if name == "splitting_probe" and name not in gradients:
             continue  # optional
         if reference.dim() == 0:  # no gradient: at degree 0 nothing depends on ``sh_rest``
             reference = torch.zeros_like(gradients[name])
-        size = reference.numel() // max(1, case.count) or 1  # numbers for each Gaussian
         quantity = "splitting matrix" if name == "splitting_probe" else f"gradient of {name}"
-        compare(
-            quantity,
-            gradients[name],
-            reference,
-            GRADIENT_TOLERANCE,
-            True,
-            lambda index, size=size: f"Gaussian {index // size}",  # type: ignore[misc]
+        errors.append(
+            _compare(case, quantity, gradients[name], reference, GRADIENT_TOLERANCE, True)
         )
     if output.footprint is not None:
         for name, off in footprint_errors(output, expected).items():
-            errors.append(
-                Error(
-                    str(case),
-                    f"footprint ({name})",
-                    off,
-                    FOOTPRINT_TOLERANCE,
-                    "all pixels",
-                    " of the sum",
-                )
-            )
+            field = f"footprint ({name})"
+            limit = FOOTPRINT_TOLERANCE
+            errors.append(Error(str(case), field, off, limit, "all pixels", " of the sum"))
     return errors
 
 
-Place = Callable[[int], str]  # words for the place of a tensor's flat index
+def _compare(
+    case: Case,
+    quantity: str,
+    value: Tensor,
+    reference: Tensor,
+    limit: float,
+    relative: bool = False,
+    pixel_size: int = 0,
+) -> Error:
+    """The largest error of a tensor, perhaps ``relative`` to the largest entry.
+
+    An image has ``pixel_size`` numbers for each pixel; other tensors have rows, one per Gaussian.
+    """
+    value, reference = value.detach().cpu().double(), reference.detach().double()
+    if value.shape != reference.shape:
+        shapes = f"has shape {tuple(value.shape)}, expected {tuple(reference.shape)}"
+        found = shapes if value.dim() else "is missing"
+        return Error(str(case), quantity, math.inf, limit, found)
+    unit = " of its largest entry" if relative else ""
+    off = (value - reference).abs()
+    if not off.numel():
+        return Error(str(case), quantity, 0.0, limit, "nothing", unit)
+    index = int(off.argmax())
+    if pixel_size:
+        row, column = divmod(index // pixel_size, case.width)
+        place = f"pixel ({column}, {row})"
+    else:
+        numbers = off.numel() // max(1, case.count) or 1  # of each Gaussian; 1 without a gradient
+        place = f"Gaussian {index // numbers}"
+    scale = max(float(reference.abs().max()), 1e-30) if relative else 1.0
+    return Error(str(case), quantity, float(off.max()) / scale, limit, place, unit)
 
 
 def footprint_errors(output: RenderOutput, expected: RenderOutput) -> dict[str, float]:
-    """The error of each field of ``output``'s footprint against ``expected``, relative to the
-    field's sum."""
+    """The error of each field of ``output``'s footprint, relative to the field's sum."""
     height, width = expected.alpha.shape
-    values = torch.rand(
-        height, width, generator=torch.Generator().manual_seed(8), dtype=torch.float64
-    )
+    generator = torch.Generator().manual_seed(8)
+    values = torch.rand(height, width, generator=generator, dtype=torch.float64)
     assert output.footprint is not None
     assert expected.footprint is not None
     footprint, reference = output.footprint(values.to(output.alpha)), expected.footprint(values)
@@ -301,9 +267,7 @@ def _without_gaussians(rasterizer: Rasterizer, device: str) -> list[str]:
         output.image.sum().backward()
     except (RuntimeError, ValueError, TypeError, IndexError, ZeroDivisionError) as error:
         return [f"without Gaussians: {type(error).__name__}: {error}"]
-    if (
-        not torch.equal(output.image, background.expand(case.height, case.width, 3))
-        or output.alpha.abs().max() > 0
-    ):
-        return ["without Gaussians: the image is not the background"]
-    return []
+    is_background = torch.equal(output.image, background.expand(case.height, case.width, 3))
+    if is_background and output.alpha.abs().max() == 0:
+        return []
+    return ["without Gaussians: the image is not the background"]

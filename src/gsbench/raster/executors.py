@@ -48,8 +48,10 @@ class Executor:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """The reason why it cannot run here on a device of this type, and the remedy; None if it
-        can run."""
+        """The reason why it cannot run here on a device of this type, and the remedy.
+
+        It is None if it can run.
+        """
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             alternatives = ", ".join(
@@ -111,8 +113,10 @@ def names() -> tuple[str, ...]:
 
 
 def find_executor(name: str) -> Executor:
-    """Return the executor called ``name``. Raises InputError, which lists the names, if there is
-    none."""
+    """Return the executor called ``name``.
+
+    Raises InputError, which lists the names, if there is none.
+    """
     for executor in EXECUTORS:
         if executor.name == name:
             return executor
@@ -123,11 +127,10 @@ def find_executor(name: str) -> Executor:
 
 
 def offers(name: str, fact: str, own: object = None) -> bool:
-    """Return whether the rasterizer called ``name`` offers an optional output; ``fact`` is such as
-    ``has_footprint``.
+    """Return whether the rasterizer called ``name`` offers an optional output.
 
-    If ``name`` is not an executor of gsbench, the attribute ``fact`` of the rasterizer ``own``
-    decides.
+    ``fact`` is such as ``has_footprint``. If ``name`` is not an executor of gsbench, the attribute
+    ``fact`` of the rasterizer ``own`` decides.
     """
     offered = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
     return offered.get(name, bool(getattr(own, fact, False)))
@@ -149,10 +152,9 @@ def resolve(name: str, device_type: str) -> Executor:
 
 
 def automatic(device_type: str) -> list[Executor]:
-    """The executors that ``auto`` takes on a device of this type, the best first; the last is the
-    reference.
+    """The executors that ``auto`` takes on a device of this type, the best first.
 
-    Logs a warning if only the slow reference can run.
+    The last is the reference. Logs a warning if only the slow reference can run.
     """
     candidates = [executor for executor in EXECUTORS if device_type in executor.devices]
     usable = [executor for executor in candidates if executor.obstacle(device_type) is None]
@@ -168,10 +170,9 @@ def automatic(device_type: str) -> list[Executor]:
 
 
 def missing_tools() -> list[str]:
-    """List what Triton lacks to compile the C code that launches its kernels: a C compiler,
-    Python's headers.
+    """List what Triton lacks to compile the C code that launches its kernels.
 
-    Each line names the package to install.
+    A C compiler, Python's headers. Each line names the package to install.
     """
     missing = []
     compiler = os.environ.get("CC")
@@ -198,8 +199,10 @@ def missing_tools() -> list[str]:
 
 @cache
 def load_driver() -> None:
-    """Make Triton load its launcher for the GPU, which may compile it. Raises InputError that names
-    what is missing."""
+    """Make Triton load its launcher for the GPU, which may compile it.
+
+    Raises InputError that names what is missing.
+    """
     try:
         from triton import knobs
         from triton.runtime import driver

@@ -1,10 +1,10 @@
-"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract of ``raster.base``, for
-comparison.
+"""gsplat's CUDA kernels (Ye et al., arXiv 2409.06765) under the contract, to compare.
 
-This module calls gsplat's functions one by one, so that the conventions of 3DGS hold, which
-gsplat's ``rasterization`` does not follow: the near plane is 0.2, and a Gaussian reaches the tiles
-of a square of 3 sigma along its larger axis at any opacity. It works with gsplat 1.5.3 and with
-1.6, whose harmonics take other arguments. Some differences are inside gsplat's kernels and remain:
+The contract is that of ``raster.base``. This module calls gsplat's functions one by one, so that
+the conventions of 3DGS hold, which gsplat's ``rasterization`` does not follow: the near plane is
+0.2, and a Gaussian reaches the tiles of a square of 3 sigma along its larger axis at any opacity.
+It works with gsplat 1.5.3 and with 1.6, whose harmonics take other arguments. Some differences are
+inside gsplat's kernels and remain:
 
 - ``image`` and ``alpha``: gsplat 1.5 clamps alpha to 0.999 (1.6 to 0.99, as the contract), and the
   clamp blocks the gradient. A tile at the edge of the square is included if any part of it is
@@ -44,8 +44,10 @@ COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # number of harmonics up to each degre
 
 
 class GsplatRasterizer:
-    """Renders with gsplat on a CUDA device, float32. ``library`` is the module ``gsplat`` or one
-    with its functions."""
+    """Renders with gsplat on a CUDA device, float32.
+
+    ``library`` is the module ``gsplat`` or one with its functions.
+    """
 
     name = "gsplat"
 
@@ -70,8 +72,10 @@ class GsplatRasterizer:
         background: Tensor,
         absolute_gradient: bool = False,
     ) -> RenderOutput:
-        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that
-        cannot be used."""
+        """See `gsbench.raster.base.Rasterizer`.
+
+        Raises ValueError that names a parameter that cannot be used.
+        """
         check_settings(gaussians, camera, sh_degree, background)
         points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(points) if absolute_gradient else None
@@ -81,6 +85,7 @@ class GsplatRasterizer:
         bad = Readback(bad_values(gaussians, background))
         width, height, tile = camera.width, camera.height, CONSTANTS.tile
         on_device = self._on_device(camera, gaussians.means)
+        # radii [1, N, 2], means [1, N, 2] px, depths [1, N], conics [1, N, 3]
         radii, means, depths, conics, _ = self.library.fully_fused_projection(
             gaussians.means,
             None,
@@ -92,7 +97,7 @@ class GsplatRasterizer:
             height,
             eps2d=CONSTANTS.blur,
             near_plane=CONSTANTS.near,
-        )  # radii [1, N, 2], means [1, N, 2] px, depths [1, N], conics [1, N, 3]
+        )
         seen = (radii > 0).all(-1)  # [1, N]
         square = _square_radii(conics.detach(), seen)  # [1, N] int32
         tiles_x, tiles_y = -(-width // tile), -(-height // tile)
@@ -162,22 +167,18 @@ class _DeviceCamera:
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = camera.rotation, camera.translation
         intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        numbers = (
-            view[None],
-            intrinsics[None],
-            camera.center,
-            np.array([camera.width / 2, camera.height / 2]),
-        )
+        half_size = np.array([camera.width / 2, camera.height / 2])
+        numbers = (view[None], intrinsics[None], camera.center, half_size)
         return cls(*map(like.new_tensor, numbers))
 
 
 class _Composite(torch.autograd.Function):
-    """gsplat's compositing on leaves of its own graph, so that ``backward`` here sees the gradient
-    of the means.
+    """gsplat's compositing on leaves of its own graph.
 
-    gsplat stores the absolute gradient as an attribute of the means that it was given. A hook on
-    these means that reads the attribute would be a reference cycle through C++, which the garbage
-    collector cannot free: the memory of every step would leak. This function avoids the cycle.
+    So ``backward`` here sees the gradient of the means. gsplat stores the absolute gradient as an
+    attribute of the means that it was given. A hook on these means that reads the attribute would
+    be a reference cycle through C++, which the garbage collector cannot free: the memory of every
+    step would leak. This function avoids the cycle.
     """
 
     @staticmethod
@@ -231,31 +232,29 @@ def _empty(
     zero = 0 * points.sum()
     image = background.expand(camera.height, camera.width, 3) + zero
     alpha = torch.zeros_like(image[..., 0]) + zero
-    return RenderOutput(
-        image, alpha, torch.zeros_like(points[:, 0], dtype=torch.int32), points, absolute
-    )
+    radii = torch.zeros_like(points[:, 0], dtype=torch.int32)
+    return RenderOutput(image, alpha, radii, points, absolute)
 
 
 def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
-    """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3]; 0 if not
-    ``seen``."""
+    """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3].
+
+    It is 0 if not ``seen``.
+    """
     # the inverse of the covariance: yy, -xy, xx over its determinant
     a, b, c = conics.double().unbind(-1)
     determinant = 1 / (a * c - b * b)
     half_trace = 0.5 * (a + c) * determinant
     root = (half_trace * half_trace - determinant).clamp_min(CONSTANTS.eigenvalue_floor).sqrt()
-    radii = (
-        (CONSTANTS.sigma_extent * (half_trace + root).sqrt())
-        .ceil()
-        .nan_to_num(0, 0, 0)
-        .clamp(0, MAX_RADIUS)
-    )
-    return torch.where(seen, radii, 0.0).to(torch.int32)
+    radii = (CONSTANTS.sigma_extent * (half_trace + root).sqrt()).ceil()
+    return torch.where(seen, radii.nan_to_num(0, 0, 0).clamp(0, MAX_RADIUS), 0.0).to(torch.int32)
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:
-    """Mask [N]: whether the square around the mean touches the image; px, with the first pixel
-    centre at 0.5."""
+    """Mask [N]: whether the square around the mean touches the image.
+
+    Px, with the first pixel centre at 0.5.
+    """
     x, y = means.unbind(-1)
     inside = (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
     return inside & (radii > 0)

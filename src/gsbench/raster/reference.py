@@ -1,9 +1,8 @@
-"""The readable definition of the rasterizer in torch, tile by tile, for any device, float32 or
-float64.
+"""The readable definition of the rasterizer in torch, tile by tile.
 
-Tests compare the faster executors with this one in float64. The formulas are those of EWA splatting
-(Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023); the constants are in
-``raster.base.RasterConstants``.
+It runs on any device, in float32 or float64. Tests compare the faster executors with this one in
+float64. The formulas are those of EWA splatting (Zwicker et al. 2001) as in 3DGS (Kerbl et al.
+2023); the constants are in ``raster.base.RasterConstants``.
 """
 
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from gsbench.raster.staged import check_inputs
 from gsbench.scene.types import Camera
 
 MAX_RADIUS = 2**24  # px; keeps the radius of a huge Gaussian within int32
+Tile = tuple[slice, slice]  # the rows and the columns of a tile's pixels
 
 
 @dataclass
@@ -54,35 +54,32 @@ class ReferenceRasterizer:
         gradient_abs = torch.zeros_like(screen_points) if absolute_gradient else None
 
         projected = project(gaussians, camera)
-        tile_min, tile_max = tile_rectangles(projected, camera, CONSTANTS.tile)
+        index = projected.index
+        tile_min, tile_max = tile_rectangles(projected, camera)
         reached = ((tile_max - tile_min) > 0).all(-1)  # [M]
         radii = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
-        radii[projected.index[reached]] = projected.radii[reached].to(torch.int32)
+        radii[index[reached]] = projected.radii[reached].to(torch.int32)
 
-        means = projected.means + screen_points[projected.index] * half_size  # [M, 2]
+        means = projected.means + screen_points[index] * half_size  # [M, 2]
         probe, image_probe = None, None
         if splitting_matrix:
             probe = gaussians.means.new_zeros(len(gaussians), 3, 3, requires_grad=True)
-            jacobians = mean_jacobians(
-                gaussians.means.detach()[projected.index], camera
-            )  # [M, 2, 3]
-            image_probe = jacobians @ probe[projected.index] @ jacobians.mT  # [M, 2, 2] all zero
-        rgb = self._colors(gaussians, projected.index, camera, sh_degree)  # [M, 3]
-        opacities = gaussians.opacities[projected.index]  # [M]
+            jacobians = mean_jacobians(gaussians.means.detach()[index], camera)  # [M, 2, 3]
+            image_probe = jacobians @ probe[index] @ jacobians.mT  # [M, 2, 2] all zero
+        rgb = self._colors(gaussians, index, camera, sh_degree)  # [M, 3]
+        opacities = gaussians.opacities[index]  # [M]
 
         # Adding zero connects the image with the graph even if no tile is reached, so that
         # ``backward`` always works.
         image = background.expand(camera.height, camera.width, 3) + 0 * screen_points.sum()
         alpha = torch.zeros(camera.height, camera.width, dtype=image.dtype, device=image.device)
-        for members, (x0, y0, x1, y1) in members_of_tiles(
-            projected.depths, tile_min, tile_max, camera
-        ):
-            pixels = pixel_centres(x0, y0, x1, y1, image)
+        for members, tile in members_of_tiles(projected.depths, tile_min, tile_max, camera):
+            pixels = pixel_centres(tile, image)
             # One mean per pixel, so that the hook sees the gradient of each pixel before the sum.
             pixel_means = means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
             if gradient_abs is not None and pixel_means.requires_grad:
                 pixel_means.register_hook(
-                    _absolute_sum_into(gradient_abs, projected.index[members], half_size)
+                    _absolute_sum_into(gradient_abs, index[members], half_size)
                 )
             # Recomputed in the backward pass: memory for intermediate results is that of one tile.
             tile_image, tile_alpha = checkpoint(
@@ -97,8 +94,8 @@ class ReferenceRasterizer:
                 use_reentrant=False,
                 preserve_rng_state=False,
             )
-            image[y0:y1, x0:x1] = tile_image.reshape(y1 - y0, x1 - x0, 3)
-            alpha[y0:y1, x0:x1] = tile_alpha.reshape(y1 - y0, x1 - x0)
+            alpha[tile] = tile_alpha.reshape(alpha[tile].shape)
+            image[tile] = tile_image.reshape(*alpha[tile].shape, 3)
         footprint = partial(self._footprint, gaussians.map(torch.Tensor.detach), camera)
         return RenderOutput(image, alpha, radii, screen_points, gradient_abs, footprint, probe)
 
@@ -106,53 +103,47 @@ class ReferenceRasterizer:
     def _footprint(
         self, gaussians: Gaussians, camera: Camera, values: Tensor | None = None
     ) -> Footprint:
-        covered = torch.zeros(len(gaussians), dtype=torch.int32, device=gaussians.means.device)
-        sums, distances = torch.zeros(
-            2, len(gaussians), dtype=gaussians.means.dtype, device=gaussians.means.device
-        )
+        sums, distances = gaussians.means.new_zeros(2, len(gaussians))
+        covered = torch.zeros_like(sums, dtype=torch.int32)
         projected = project(gaussians, camera)
-        tile_min, tile_max = tile_rectangles(projected, camera, CONSTANTS.tile)
-        for members, (x0, y0, x1, y1) in members_of_tiles(
-            projected.depths, tile_min, tile_max, camera
-        ):
-            pixels, index = pixel_centres(x0, y0, x1, y1, sums), projected.index[members]
+        tiles = members_of_tiles(projected.depths, *tile_rectangles(projected, camera), camera)
+        for members, tile in tiles:
+            pixels, index = pixel_centres(tile, sums), projected.index[members]
             means = projected.means[members].expand(len(pixels), -1, -1)  # [P, K, 2]
             conics, opacities = projected.conics[members], gaussians.opacities[index]
             blended = blending_weights(pixels, means, conics, opacities) > 0  # [P, K]
             covered.index_add_(0, index, blended.sum(0, dtype=torch.int32))
-            distances.index_add_(
-                0, index, ((means - pixels.unsqueeze(1)).norm(dim=-1) * blended).sum(0)
-            )
+            apart = (means - pixels.unsqueeze(1)).norm(dim=-1)  # [P, K]
+            distances.index_add_(0, index, (apart * blended).sum(0))
             if values is not None:
-                sums.index_add_(
-                    0, index, (values[y0:y1, x0:x1].reshape(-1, 1).to(sums) * blended).sum(0)
-                )
+                own = values[tile].reshape(-1, 1).to(sums)  # [P, 1]
+                sums.index_add_(0, index, (own * blended).sum(0))
         return Footprint(covered, view_depths(gaussians, camera), sums, distances)
 
     @staticmethod
     def _colors(gaussians: Gaussians, index: Tensor, camera: Camera, sh_degree: int) -> Tensor:
         center = gaussians.means.new_tensor(camera.center)
-        directions = torch.nn.functional.normalize(
-            gaussians.means[index] - center, dim=-1
-        )  # [M, 3]
+        offsets = gaussians.means[index] - center
+        directions = torch.nn.functional.normalize(offsets, dim=-1)  # [M, 3]
         return colors(gaussians.sh_dc[index], gaussians.sh_rest[index], directions, sh_degree)
 
 
-def pixel_centres(x0: int, y0: int, x1: int, y1: int, like: Tensor) -> Tensor:
-    """The pixel centres of a rectangle, row by row, [P, 2] (x, y), with the dtype and on the device
-    of ``like``."""
-    return torch.cartesian_prod(
-        torch.arange(y0, y1, dtype=like.dtype, device=like.device),
-        torch.arange(x0, x1, dtype=like.dtype, device=like.device),
-    ).flip(-1)
+def pixel_centres(tile: Tile, like: Tensor) -> Tensor:
+    """The pixel centres of a rectangle, row by row, [P, 2] (x, y).
+
+    They have the dtype and the device of ``like``.
+    """
+    rows, columns = (
+        torch.arange(side.start, side.stop, dtype=like.dtype, device=like.device) for side in tile
+    )
+    return torch.cartesian_prod(rows, columns).flip(-1)
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projection:
-    """Project the Gaussians to the image plane; leave out those behind ``near`` or with an unusable
-    covariance.
+    """Project the Gaussians to the image plane.
 
-    A first pass without a graph selects the usable ones, so that an overflow in another Gaussian
-    cannot reach their gradients.
+    Leave out those behind ``near`` or with an unusable covariance. A first pass without a graph
+    selects the usable ones, so that an overflow in another Gaussian cannot reach their gradients.
     """
     with torch.no_grad():
         depths = view_depths(gaussians, camera)  # [N]
@@ -174,38 +165,34 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
 def _to_image(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Means [M, 2] px; entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view
-    depths [M]."""
+    """Means [M, 2] px.
+
+    Entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view depths [M].
+    """
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
     x, y, z = (gaussians.means @ rotation.T + translation).unbind(-1)  # each [M]
     left, right, top, bottom = slope_limits(camera)
     slope_x, slope_y = (x / z).clamp(left, right), (y / z).clamp(top, bottom)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            torch.stack([camera.fx / z, zero, -camera.fx * slope_x / z], -1),
-            torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1),
-        ],
-        -2,
-    )  # [M, 2, 3]
+    row_x = torch.stack([camera.fx / z, zero, -camera.fx * slope_x / z], -1)
+    row_y = torch.stack([zero, camera.fy / z, -camera.fy * slope_y / z], -1)
+    jacobian = torch.stack([row_x, row_y], -2)  # [M, 2, 3]
+    # 3DGS eq. 5 and 6: the covariance is J W R S (J W R S)^T.
     axes = gaussians.rotations * gaussians.scales.unsqueeze(-2)  # [M, 3, 3] columns: scaled axes
     image_axes = jacobian @ rotation @ axes  # [M, 2, 3]
     covariance = image_axes @ image_axes.mT  # [M, 2, 2]
-    means = torch.stack(
-        [camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5], -1
-    )
-    blurred = (
-        covariance[:, 0, 0] + CONSTANTS.blur,
-        covariance[:, 0, 1],
-        covariance[:, 1, 1] + CONSTANTS.blur,
-    )
-    return means, blurred, z
+    column = camera.fx * x / z + camera.cx - 0.5
+    row = camera.fy * y / z + camera.cy - 0.5
+    xx, yy = covariance[:, 0, 0] + CONSTANTS.blur, covariance[:, 1, 1] + CONSTANTS.blur
+    return torch.stack([column, row], -1), (xx, covariance[:, 0, 1], yy), z
 
 
 def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
-    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3], without the limits
-    on the slopes."""
+    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3].
+
+    They have no limits on the slopes.
+    """
     rotation = means.new_tensor(camera.rotation)  # [3, 3]
     # each [M, 1]
     x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)
@@ -214,35 +201,34 @@ def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
     return torch.stack([row_x, row_y], 1)
 
 
-def tile_rectangles(projected: Projection, camera: Camera, tile: int) -> tuple[Tensor, Tensor]:
-    """The tiles that each Gaussian's square of side 2 radius touches: first and past-the-last,
-    int64 [M, 2] (x, y)."""
+def tile_rectangles(projected: Projection, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The tiles that each Gaussian's square of side 2 radius touches.
+
+    First and past-the-last, int64 [M, 2] (x, y).
+    """
+    tile = CONSTANTS.tile
     means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
-    grid = torch.tensor(
-        [-(-camera.width // tile), -(-camera.height // tile)], device=means.device
-    )  # [2]
-    # so that the conversion to int64 is defined
-    limit = torch.tensor(2.0**30, dtype=means.dtype, device=means.device)
-    first = ((means - radii) / tile).clamp(-limit, limit).floor().long()
-    past = ((means + radii + tile - 1) / tile).clamp(-limit, limit).floor().long()
+    grid = means.new_tensor([-(-camera.width // tile), -(-camera.height // tile)])  # [2]
     zero = torch.zeros_like(grid)
-    return torch.maximum(torch.minimum(first, grid), zero), torch.maximum(
-        torch.minimum(past, grid), zero
-    )
+    # Clamped before the conversion to int64, which is defined for numbers of this size only.
+    first = ((means - radii) / tile).floor().clamp(zero, grid)
+    past = ((means + radii + tile - 1) / tile).floor().clamp(zero, grid)
+    return first.long(), past.long()
 
 
 def bin_gaussians(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, tiles_x: int
 ) -> list[tuple[int, Tensor]]:
-    """List all tiles with Gaussians: the row-major number, and the Gaussians [K], front to back
-    (ties by index)."""
+    """List all tiles with Gaussians.
+
+    The row-major number, and the Gaussians [K], front to back (ties by index).
+    """
     order = torch.sort(depths, stable=True).indices  # [M]
     low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
     counts = size.prod(-1)  # [M]
     owner = torch.repeat_interleave(counts)  # [pairs] indices into ``order``
-    within = (
-        torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]
-    )  # [pairs]
+    begins = counts.cumsum(0) - counts  # [M]
+    within = torch.arange(len(owner), device=owner.device) - begins[owner]  # [pairs]
     column, row = within % size[owner, 0], within // size[owner, 0]
     tiles = (low[owner, 1] + row) * tiles_x + low[owner, 0] + column  # [pairs]
     by_tile = torch.sort(tiles, stable=True)
@@ -253,13 +239,13 @@ def bin_gaussians(
 
 def members_of_tiles(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, camera: Camera
-) -> Iterator[tuple[Tensor, tuple[int, int, int, int]]]:
-    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels: first x, y;
-    past-the-last x, y."""
+) -> Iterator[tuple[Tensor, Tile]]:
+    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels."""
     tile, tiles_x = CONSTANTS.tile, -(-camera.width // CONSTANTS.tile)
     for number, members in bin_gaussians(depths, tile_min, tile_max, tiles_x):
         x, y = number % tiles_x * tile, number // tiles_x * tile
-        yield members, (x, y, min(x + tile, camera.width), min(y + tile, camera.height))
+        rows = slice(y, min(y + tile, camera.height))
+        yield members, (rows, slice(x, min(x + tile, camera.width)))
 
 
 def composite(
@@ -271,7 +257,7 @@ def composite(
     background: Tensor,
     image_probe: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Blend K Gaussians, front to back, at P pixels.
+    """Blend K Gaussians, front to back, at P pixels (3DGS eq. 3).
 
     ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3].
     Returns colours [P, 3] and opacities [P]. A pixel stops before the Gaussian that would lower its
@@ -289,12 +275,11 @@ def blending_weights(
     opacities: Tensor,
     image_probe: Tensor | None = None,
 ) -> Tensor:
-    """Alpha times transmittance, [P, K], for the arguments of ``composite``; 0 where a Gaussian is
-    not blended.
+    """Alpha times transmittance, [P, K], for the arguments of ``composite``.
 
-    ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum over pixels of (d loss / d s) times
-    the second derivative of s by the projected mean, where s is the opacity times the density at
-    the pixel.
+    0 where a Gaussian is not blended. ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum
+    over pixels of (d loss / d s) times the second derivative of s by the projected mean, where s is
+    the opacity times the density at the pixel.
     """
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy

@@ -1,5 +1,7 @@
-"""Code that executors share: checks of inputs, asynchronous reads from a device, and autograd for
-compiled stages."""
+"""Code that executors share.
+
+Checks of inputs, asynchronous reads from a device, and autograd for compiled stages.
+"""
 
 from abc import ABC, abstractmethod
 from functools import partial
@@ -22,8 +24,7 @@ MAX_PRINCIPAL_OFFSET = 100.0
 
 
 def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
-    """Raise ValueError, which names the parameter, for anything that ``Rasterizer.render`` cannot
-    use.
+    """Raise ValueError, with the parameter's name, for what ``Rasterizer.render`` cannot use.
 
     Reads every value of ``gaussians`` and waits for a device once. To avoid that, executors call
     ``check_settings`` first. If their kernels then find a bad value, or ``bad_values``, read later,
@@ -93,8 +94,7 @@ def _check_background(background: Tensor) -> None:
 
 
 def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> None:
-    """Raise ValueError for the first parameter with a non-finite value, or for a quaternion of
-    length zero."""
+    """Raise ValueError for the first parameter that is not finite, or a quaternion of length 0."""
     if background is not None:
         _check_background(background)
     for name, tensor in gaussians.tensors().items():
@@ -160,8 +160,10 @@ class Lifetime:
 
 
 class RenderRequest(NamedTuple):
-    """The inputs of one render besides the Gaussians. The backward pass fills ``absolute`` [N,
-    2]."""
+    """The inputs of one render besides the Gaussians.
+
+    The backward pass fills ``absolute`` [N, 2].
+    """
 
     camera: Camera
     degree: int
@@ -171,8 +173,7 @@ class RenderRequest(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients by the six tensors and ``screen_points``, and the splitting matrices, if
-    requested."""
+    """Gradients by the six tensors and the screen points; splitting matrices, if requested."""
 
     tensors: list[Tensor]
     screen: Tensor  # [N, 2]
@@ -180,11 +181,11 @@ class Gradients(NamedTuple):
 
 
 class StagedRasterizer(ABC, Generic[FrameT]):
-    """A rasterizer with separate stages: its forward pass leaves a frame for the backward pass and
-    the footprint.
+    """A rasterizer with separate stages.
 
-    This class implements ``render`` of the contract and the connection with autograd. A subclass
-    implements the stages, whose tensors are contiguous.
+    Its forward pass leaves a frame for the backward pass and the footprint. This class implements
+    ``render`` of the contract and the connection with autograd. A subclass implements the stages,
+    whose tensors are contiguous.
     """
 
     name: str
@@ -197,8 +198,10 @@ class StagedRasterizer(ABC, Generic[FrameT]):
     def forward(
         self, gaussians: Gaussians, request: RenderRequest
     ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
-        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame, with memory for
-        ``request.lifetime``."""
+        """Return image [H, W, 3], alpha [H, W], radii [N] and the frame.
+
+        The frame has memory for ``request.lifetime``.
+        """
 
     @abstractmethod
     def backward(
@@ -231,8 +234,10 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         absolute_gradient: bool = False,
         splitting_matrix: bool = False,
     ) -> RenderOutput:
-        """See `gsbench.raster.base.Rasterizer`. Raises ValueError that names a parameter that
-        cannot be used."""
+        """See `gsbench.raster.base.Rasterizer`.
+
+        Raises ValueError that names a parameter that cannot be used.
+        """
         check_settings(gaussians, camera, sh_degree, background)
         self.check(gaussians)
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
@@ -254,8 +259,10 @@ class StagedRasterizer(ABC, Generic[FrameT]):
 
 
 class _Render(torch.autograd.Function):
-    """The node of a render in autograd's graph. It keeps no reference to itself, so it is freed
-    with the graph."""
+    """The node of a render in autograd's graph.
+
+    It keeps no reference to itself, so it is freed with the graph.
+    """
 
     @staticmethod
     def forward(

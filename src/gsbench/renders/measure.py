@@ -1,5 +1,4 @@
-"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them into an
-experiment.
+"""The work of ``gsbench evaluate``: measuring renders of any program, and importing them.
 
 Renders are compared with the photographs of a trial, of a scene as a trial would see it, or of a
 folder. An imported trial has only metrics and pictures: no model, no times, and an unknown number
@@ -59,6 +58,7 @@ from gsbench.system.resources import available_threads
 from gsbench.view.trials import find_trial
 from gsbench.words import counted, did_you_mean, some_of
 
+PerView = Mapping[str, Mapping[str, float]]  # values by metric, by view
 # groups of the configuration that apply to renders too
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")
 CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
@@ -87,8 +87,7 @@ class ReferenceImages:
 
 @dataclass(frozen=True)
 class Destination:
-    """The trial that renders become: experiment, scene, arm (initialiser and densifier) and
-    seed."""
+    """The trial that renders become: experiment, scene, arm (initialiser, densifier), seed."""
 
     experiment: str
     scene: str
@@ -106,14 +105,12 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
 def _measure(
     options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
 ) -> None:
-    """Measure the pictures in the folder ``renders``; ``photographs`` is used if the command names
-    none."""
+    """Measure the pictures in ``renders``; ``photographs`` serve if the command names none."""
     if options.truth is not None:
         truth = _reference_images(options, runs)
     elif photographs is not None:
-        truth = replace(
-            _folder(photographs, options.settings), what=f"the photographs in {options.renders}"
-        )
+        truth = _folder(photographs, options.settings)
+        truth = replace(truth, what=f"the photographs in {options.renders}")
     else:
         raise InputError(
             "--truth PLACE is needed: only predictions of nerfbaselines bring their photographs"
@@ -147,8 +144,7 @@ def _measure(
 
 
 def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImages:
-    """The photographs; those of a scene come from the trials of the experiment in ``--as``, if it
-    has any."""
+    """The photographs; those of a scene come from trials of the experiment in ``--as``, if any."""
     overrides = [
         word for word in options.settings if not word.startswith(("eval", f"{PERMISSIONS}="))
     ]
@@ -167,15 +163,13 @@ def _reference_images(options: argparse.Namespace, runs: Path) -> ReferenceImage
 
 
 def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[str]) -> Evaluator:
-    """The evaluator with the settings of the photographs' trial or scene, unless the command gives
-    others."""
+    """The evaluator with the settings of the photographs' trial or scene, or with the command's."""
     allowed = typed_permissions([word for word in settings if word.startswith(f"{PERMISSIONS}=")])
     allow_modules(allowed)
     config: Mapping[str, Any] = truth.config
     if any(word.startswith("eval") for word in settings):
-        config = compose_one(
-            [word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]
-        ).values
+        own_words = [word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]
+        config = compose_one(own_words).values
     chosen = dict(config["eval"]) | ({} if protocol is None else {"protocol": protocol})
     own = build_metrics(chosen, list(allowed))
     return make_evaluator(EvalConfig(**chosen), select_device(config.get("device", "auto")), own)
@@ -185,7 +179,7 @@ def _lines(
     truth: ReferenceImages,
     evaluator: Evaluator,
     matching: Matching,
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     folder: Path | None,
 ) -> list[str]:
     metrics = summarize(per_view, evaluator.unavailable)
@@ -199,10 +193,10 @@ def _lines(
         lines.append(f"left out, without a photograph: {some_of(matching.left_out)}")
     lines.append("  ".join([" " * width, *names.values()]))
     for view, row in [*per_view.items(), ("mean", metrics)]:
-        cells = [
-            f"{row[key]:.{facts[key].decimals + 1}f}".rjust(len(names[key])) for key in metrics
-        ]
-        lines.append("  ".join([view.ljust(width), *cells]))
+        cells = [view.ljust(width)]
+        for key, heading in names.items():
+            cells.append(f"{row[key]:.{facts[key].decimals + 1}f}".rjust(len(heading)))
+        lines.append("  ".join(cells))
     lines += [f"{key}: n/a, {evaluator.unavailable[key]}" for key in sorted(evaluator.awaited)]
     if folder is not None:
         lines.append(f"entered as {folder}")
@@ -212,7 +206,7 @@ def _lines(
 def _as_dict(
     evaluator: Evaluator,
     matching: Matching,
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     folder: Path | None,
 ) -> dict[str, Any]:
     return {
@@ -228,8 +222,7 @@ def _as_dict(
 
 
 def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
-    """The photographs of ``place``: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or the
-    name of a scene.
+    """The photographs of a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or a scene.
 
     ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of
     these.
@@ -252,8 +245,7 @@ def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> Re
 
 
 def reference_images_of(trial: TrialResult) -> ReferenceImages:
-    """The reference images of a finished trial, with the names and in the order of its own
-    evaluation."""
+    """The reference images of a finished trial, as its own evaluation names and orders them."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     if trial.record.resolution is None or "data" not in trial.record.hashes:
         raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
@@ -277,10 +269,8 @@ def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
     one.
     """
     config = compose_one([f"scene={name}", *settings]).values
-    if (
-        not any(word.startswith("init=") for word in settings)
-        and config["scene"]["kind"] != "photos"
-    ):
+    chooses = any(word.startswith("init=") for word in settings)
+    if not chooses and config["scene"]["kind"] != "photos":
         config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
     store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
     trial = TrialSteps(Parts(config), store)
@@ -329,6 +319,7 @@ def find_destination(
     scene_name = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
+    # on file systems without capitals, "Store" is "store"
     if experiment.casefold() in IN_RUNS:
         raise InputError(
             f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment"
@@ -348,9 +339,9 @@ def find_destination(
     if not dash:
         init, name = truth.init or "", arm
         trials = _trials(runs / experiment, scene_name)
-        inits = sorted({trial.init for trial in trials if not trial.from_renders}) or sorted(
-            {t.init for t in trials}
-        )
+        # the trials that gsbench trained come before those made of renders
+        trained = [trial for trial in trials if not trial.from_renders]
+        inits = sorted({trial.init for trial in trained or trials})
         if len(inits) > 1:
             raise InputError(
                 f"{experiment} has {', '.join(inits)} on {scene_name}: say which, as in "
@@ -361,18 +352,17 @@ def find_destination(
 
 
 def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
-    """Raise `InputError` if the experiment's trials of the scene were tested on other
-    photographs."""
+    """Raise `InputError` if the experiment tests the scene on other photographs."""
     for trial in _trials(runs / destination.experiment, destination.scene):
+        # Numbers of other photographs, or of another size, are no answer to the same question.
         conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:
             raise InputError(
-                f"{destination.experiment} tests {destination.scene} on other photographs (such "
-                f"as {trial.label}, "
-                f"{conditions['resolution']} px) than {truth.what} ({size} px), so nothing could "
-                "be compared: give "
-                f"--truth {destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
+                f"{destination.experiment} tests {destination.scene} on other photographs (such as "
+                f"{trial.label}, {conditions['resolution']} px) than {truth.what} ({size} px), so "
+                "nothing could be compared: give --truth "
+                f"{destination.experiment}:{destination.scene}:{trial.init}-{trial.densify}"
             )
 
 
@@ -380,7 +370,7 @@ def import_trial(
     destination: Destination,
     truth: ReferenceImages,
     pairs: Sequence[PicturePair],
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     evaluator: Evaluator,
     source: Mapping[str, str],
     runs: Path,
@@ -391,31 +381,24 @@ def import_trial(
     holds other renders.
     """
     renders = {pair.view: file_sha256(pair.picture) for pair in pairs}
-    identity = sha256_of(
-        {"renders": renders, "data": truth.data, "protocol": evaluator.protocol.id}
-    )
-    arm = (
-        runs
-        / destination.experiment
-        / destination.scene
-        / f"{destination.init}-{destination.densify}"
-    )
+    protocol = evaluator.protocol.id
+    identity = sha256_of({"renders": renders, "data": truth.data, "protocol": protocol})
+    name = f"{destination.init}-{destination.densify}"
+    arm = runs / destination.experiment / destination.scene / name
     folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
+    # Two trainings with one seed would count as one pair in every comparison.
     if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
         raise InputError(
-            f"seed {destination.seed} of {destination.init}-{destination.densify} on "
-            f"{destination.scene} is taken "
-            f"({taken[0]}): give another --seed, or remove that folder"
+            f"seed {destination.seed} of {name} on {destination.scene} is taken ({taken[0]}): "
+            "give another --seed, or remove that folder"
         )
-    for name, files in (
-        (RENDERS, {png_name(pair.view): pair.picture for pair in pairs}),
-        (GROUND_TRUTH, {png_name(pair.view): pair.photograph for pair in pairs}),
-        (MASKS, {png_name(pair.view): pair.mask for pair in pairs if pair.mask is not None}),
-    ):
-        if files:
-            (folder / name).mkdir(parents=True, exist_ok=True)
-        for target, file in files.items():
-            with atomic(folder / name / target, sync=False) as temporary:
+    for pair in pairs:
+        files = {RENDERS: pair.picture, GROUND_TRUTH: pair.photograph, MASKS: pair.mask}
+        for kind, file in files.items():
+            if file is None:  # all pixels of the view count
+                continue
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            with atomic(folder / kind / png_name(pair.view), sync=False) as temporary:
                 Image.fromarray(read_image(file)).save(temporary, format="PNG")
     config = _config(destination, truth, runs)
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
@@ -430,18 +413,14 @@ def _results(
     destination: Destination,
     truth: ReferenceImages,
     identity: str,
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     evaluator: Evaluator,
     source: Mapping[str, str],
 ) -> TrialRecord:
     evaluation = summary_of(evaluator, per_view)
     return TrialRecord(
         status="complete",
-        experiment=destination.experiment,
-        scene=destination.scene,
-        init=destination.init,
-        densify=destination.densify,
-        seed=destination.seed,
+        **vars(destination),
         evaluated_from=FROM_RENDERS,
         raster="unknown",
         protocol=evaluator.protocol.id,
@@ -465,28 +444,19 @@ def _results(
 
 def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dict[str, Any]:
     groups = {group: truth.config[group] for group in KEPT_GROUPS}
-    own = (
-        truth.config["init"]
-        if truth.config["init"]["name"] == destination.init
-        else {"name": destination.init}
-    )
-    names: dict[str, Any] = {
+    own = truth.config["init"]
+    return {
         "name": destination.experiment,
         "seed": destination.seed,
         "runs": str(runs),
+        **groups,
+        "scene": dict(groups["scene"]) | {"name": destination.scene},
+        "init": own if own["name"] == destination.init else {"name": destination.init},
+        "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS},
     }
-    groups["scene"] = dict(groups["scene"]) | {"name": destination.scene}
-    return (
-        names
-        | groups
-        | {"init": own, "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS}}
-    )
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:
     """The experiment's trials of a scene; none if the experiment does not exist yet."""
-    return (
-        [trial for trial in read_experiment(home).trials if trial.scene == scene]
-        if home.is_dir()
-        else []
-    )
+    trials = read_experiment(home).trials if home.is_dir() else []
+    return [trial for trial in trials if trial.scene == scene]

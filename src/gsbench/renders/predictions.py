@@ -1,5 +1,4 @@
-"""Predictions of nerfbaselines: a folder, a .tar.gz, or the zip of a published result, with its
-names.
+"""Predictions of nerfbaselines: a folder, a .tar.gz, or the zip of a published result.
 
 ``color/`` has the renders and ``gt-color/`` the photographs, each as ``<name of the
 photograph>.png``, beside ``info.json`` (`save_predictions` of nerfbaselines 1.2). A published zip
@@ -22,20 +21,22 @@ RENDERED, PHOTOGRAPHS = "color", "gt-color"
 # Archives may come from strangers: this stops one that unpacks to far more than test views need.
 MAX_TOTAL_BYTES = 20 << 30
 CHUNK = 1 << 20
+# raised by the two libraries for damaged, encrypted or foreign archives
+DAMAGE = (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError)
 
 
 @contextmanager
 def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
-    """The folder of renders at ``place``, and that of photographs if nerfbaselines wrote them; an
-    archive is unpacked.
+    """The folders of renders and, from nerfbaselines, of photographs; an archive is unpacked.
 
     Raises InputError if ``place`` is neither a folder nor such an archive.
     """
     if place.is_dir():
-        home = next(
-            (one for one in (place, place / "predictions") if (one / PHOTOGRAPHS).is_dir()), None
-        )
-        yield (place, None) if home is None else (home / RENDERED, home / PHOTOGRAPHS)
+        for home in (place, place / "predictions"):
+            if (home / PHOTOGRAPHS).is_dir():
+                yield home / RENDERED, home / PHOTOGRAPHS
+                return
+        yield place, None
         return
     if not place.exists():
         raise InputError(f"{place} is not a folder of renders")
@@ -43,14 +44,7 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
     with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
         try:
             _unpack(place, Path(scratch))
-        except (
-            tarfile.TarError,
-            zipfile.BadZipFile,
-            EOFError,
-            OSError,
-            ValueError,
-            RuntimeError,
-        ) as error:
+        except DAMAGE as error:
             raise InputError(
                 f"{place} cannot be unpacked ({error}): give a folder, a .zip or a .tar.gz"
             ) from None
@@ -58,23 +52,18 @@ def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
 
 
 def _unpack(archive: Path, scratch: Path) -> None:
-    """Write the renders and photographs of an archive below ``scratch``; no other member is
-    read."""
+    """Write the renders and photographs of an archive below ``scratch``, and no other member."""
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as packed:
-            sizes = {
-                member.filename: member.file_size
-                for member in packed.infolist()
-                if not member.is_dir()
-            }
+            files = [member for member in packed.infolist() if not member.is_dir()]
+            sizes = {member.filename: member.file_size for member in files}
             for name, target in _wanted(archive, sizes).items():
                 with packed.open(name) as source:
                     _write(source, scratch / target, sizes[name])
     else:
         with tarfile.open(archive) as packed_tar:
-            members = {
-                member.name.removeprefix("./"): member for member in packed_tar if member.isfile()
-            }
+            regular = [member for member in packed_tar if member.isfile()]
+            members = {member.name.removeprefix("./"): member for member in regular}
             sizes = {name: member.size for name, member in members.items()}
             for name, target in _wanted(archive, sizes).items():
                 content = packed_tar.extractfile(members[name])
@@ -84,15 +73,15 @@ def _unpack(archive: Path, scratch: Path) -> None:
 
 
 def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
-    """The names of the members that are renders or photographs, with the places to write them
-    to."""
+    """The members that are renders or photographs, with the places to write them to."""
     home = _home(archive, list(sizes))
     wanted = {}
     for name in sizes:
-        inside = (
-            PurePosixPath(name.removeprefix(home)) if name.startswith(home) else PurePosixPath()
-        )
+        if not name.startswith(home):
+            continue
+        inside = PurePosixPath(name.removeprefix(home))
         if inside.parts[:1] in ((RENDERED,), (PHOTOGRAPHS,)) and inside.suffix == ".png":
+            # a name may lead out of the folder, by dots or, on Windows, by backslashes
             if ".." in inside.parts or "\\" in name:
                 raise InputError(f"{archive}: {name!r} leads out of the archive")
             wanted[name] = str(inside)
@@ -104,14 +93,12 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
 
 
 def _home(archive: Path, names: Sequence[str]) -> str:
-    """The folder in the archive that has renders and photographs, with a slash at its end; "" for
-    the archive."""
+    """The folder in the archive that has both, with a slash at its end; "" for the archive."""
     both = sorted(_parents(names, RENDERED) & _parents(names, PHOTOGRAPHS))
     if len(both) != 1:
         raise InputError(
-            f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as "
-            "nerfbaselines writes it, and has "
-            f"{len(both) or 'none'}"
+            f"{archive} must have one folder with {RENDERED}/ and {PHOTOGRAPHS}/, as nerfbaselines "
+            f"writes it, and has {len(both) or 'none'}"
         )
     return both[0]
 
@@ -123,13 +110,13 @@ def _parents(names: Sequence[str], folder: str) -> set[str]:
 
 
 def _write(source: IO[bytes], target: Path, size: int) -> None:
-    """Copy exactly ``size`` bytes; raises ValueError for a member that has more or fewer than the
-    archive says."""
+    """Copy exactly ``size`` bytes; raises ValueError for a member with more or fewer."""
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
     with target.open("wb") as file:
         while piece := source.read(CHUNK):
             written += len(piece)
+            # A small number in the directory of an archive may hide gigabytes.
             if written > size:
                 break
             file.write(piece)

@@ -1,5 +1,4 @@
-"""The experiments in a runs folder, the search that tunes an arm (``tuning.json``), and declared
-questions."""
+"""Experiments in a runs folder, searches that tune an arm (``tuning.json``), and declarations."""
 
 import calendar
 import json
@@ -33,8 +32,7 @@ def list_experiments(runs_dir: Path) -> list[str]:
 
 
 def experiment_home(runs_dir: Path, name: str) -> Path:
-    """The folder of the experiment ``name``; for an unknown name raises InputError that lists the
-    experiments."""
+    """The folder of the experiment ``name``; raises InputError with the known names for another."""
     names = list_experiments(runs_dir)
     if name not in names:
         raise InputError(
@@ -50,8 +48,7 @@ def make_home(home: Path) -> None:
 
 
 def trial_folders(home: Path) -> Iterator[str]:
-    """The paths of all folders three levels below ``home`` (scene, arm, trial), in no particular
-    order."""
+    """The paths of all folders three levels below ``home`` (scene, arm, trial), in any order."""
     for scene in folders_in(home):
         for arm in folders_in(scene):
             yield from folders_in(arm)
@@ -76,8 +73,10 @@ def folders_in(folder: str | Path) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchPoint(Record):
-    """A point of a search; ``value`` is the mean of the metric over its trials, None if one of them
-    has no value."""
+    """A point of a search.
+
+    ``value`` is the mean of the metric over its trials, None if one of them has no value.
+    """
 
     settings: dict[str, Whole | Number]
     value: Number | None
@@ -85,8 +84,7 @@ class SearchPoint(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class TuningRecord(Record):
-    """The search for the settings of ``arm`` (INIT-DENSIFY), which the experiment ``sweep`` then
-    trains.
+    """The search for the settings of ``arm`` (INIT-DENSIFY), which ``sweep`` then trains.
 
     ``ranges`` are the searched ranges as given, those in ``log`` on a logarithmic scale. ``wanted``
     is the number of points, each judged by trials of ``seeds`` on validation views of ``scenes``.
@@ -136,15 +134,13 @@ Planned = Mapping[str, tuple[int, ...]]
 
 
 def trial_key(scene: str, arm: str, config_hash: str) -> str:
-    """The key that trials of an experiment share if they differ only in the seed:
-    ``garden/sfm-adc/3fa9c1d2``."""
+    """The key of trials that differ only in the seed: ``garden/sfm-adc/3fa9c1d2``."""
     return f"{scene}/{arm}/{config_hash}"
 
 
 @dataclass(frozen=True, order=True)
 class Arm:
-    """An arm of a comparison: an initialiser, a densifier, and the swept settings that distinguish
-    it.
+    """An arm of a comparison: initialiser, densifier, and the swept settings that distinguish it.
 
     ``variant`` holds (setting, value as text) pairs. The arms of a file of claims have its names
     and no ``init``.
@@ -165,8 +161,7 @@ class Arm:
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):
-    """A question: does ``arm`` differ from ``baseline`` in ``metric`` in the direction ``sign``, by
-    at least ``least``?
+    """A question: is ``arm`` better than ``baseline`` in ``metric`` (``sign``) by ``least``?
 
     - ``sign``: of the claimed difference, arm minus baseline; 0 if no difference is claimed.
     - ``least``: the smallest difference that matters, in the metric's unit or (``relative``) as a
@@ -202,8 +197,9 @@ class Question(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Declaration(Record):
-    """Questions that were declared at ``time`` (UTC). ``error_rate`` is the chance that any answer
-    is false.
+    """Questions that were declared at ``time`` (UTC).
+
+    ``error_rate`` is the chance that any answer is false.
 
     ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all
     seeds are judged at once. ``trials`` are the planned trials if the questions name none; None if
@@ -232,12 +228,14 @@ class Declaration(Record):
     @property
     def when(self) -> str:
         """``2026-11-21 20:05 UTC``"""
-        return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.moment))
+        return display_time(self.time)
 
     @property
     def kind(self) -> Literal["sweep", "claims", "votes"]:
-        """The subject: a sweep's metric, people's votes, or claims (of a file or a gate): their
-        questions are named."""
+        """The subject: a sweep's metric, people's votes, or claims (of a file or a gate).
+
+        The questions of claims are named.
+        """
         if self.vote_round:
             return "votes"
         return "claims" if any(question.name for question in self.questions) else "sweep"
@@ -250,8 +248,10 @@ class Declaration(Record):
 
     @property
     def names_trials(self) -> bool:
-        """Return whether the planned trials are recorded. They are not in the part that a trial
-        repeats."""
+        """Return whether the planned trials are recorded.
+
+        They are not in the part that a trial repeats.
+        """
         return self.trials is not None or any(question.scenes for question in self.questions)
 
     @property
@@ -264,8 +264,7 @@ class Declaration(Record):
 
     @property
     def hash(self) -> str:
-        """sha256 of everything that affects the answers: different hashes are different
-        declarations."""
+        """sha256 of all that affects the answers: different hashes are different declarations."""
         return sha256_of(replace(self, time="1970-01-01T00:00:00Z", missing={}).to_json())
 
     def summary(self) -> Declared:
@@ -315,8 +314,7 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
 
 
 def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
-    """The latest of ``declarations`` (in the order of time), with the time since which it has been
-    in force."""
+    """The latest of ``declarations`` (in the order of time), and when it came into force."""
     first = len(declarations) - 1
     while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
         first -= 1
@@ -334,6 +332,11 @@ def record_text(declarations: Iterable[Declaration]) -> str:
     """The content of ``declared.jsonl``, in the order of time."""
     ordered = sorted(declarations, key=lambda declaration: declaration.moment)
     return "".join(json.dumps(declaration.to_json()) + "\n" for declaration in ordered)
+
+
+def display_time(stamp: str) -> str:
+    """A time stamp (`STAMP`) for people: ``2026-11-21 20:05 UTC``."""
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(unix_time(stamp) or 0))
 
 
 def unix_time(text: object) -> int | None:

@@ -1,5 +1,4 @@
-"""Hashes of what determines a result: of a configuration, of each step of a trial (its key), and of
-the code.
+"""Hashes of what makes a result: of a configuration, of each step (its key), and of the code.
 
 A step is a stage with its inputs. Its key is known before it runs. Loads neither Hydra nor torch.
 
@@ -67,8 +66,7 @@ def sha256_of(values: Any) -> str:
 
 
 def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
-    """Nested mappings as one mapping with dotted keys; empty inner mappings are dropped unless
-    ``keep_empty``.
+    """Nested mappings as one with dotted keys; without empty ones unless ``keep_empty``.
 
     Examples:
         >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
@@ -88,8 +86,9 @@ def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, A
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the pipeline, such as training. Bump ``version`` by hand when its code computes
-    something else.
+    """A stage of the pipeline, such as training.
+
+    Bump ``version`` by hand when its code computes something else.
 
     ``resumable`` stages continue from the files of a killed build; the others start in an empty
     folder. Files that match ``scratch`` are needed only by the build, and removed when the result
@@ -102,15 +101,13 @@ class Stage:
     scratch: tuple[str, ...] = ()
 
     def key(self, inputs: dict[str, Any]) -> str:
-        """sha256 of the stage's name, its version and all of its inputs, which include upstream
-        keys."""
+        """sha256 of the stage's name, its version and all inputs, which include upstream keys."""
         return sha256_of({"stage": self.name, "version": self.version, "inputs": inputs})
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of a trial: ``build(folder)`` computes its result, which ``inputs`` (with upstream
-    keys) determine.
+    """One step of a trial: ``build(folder)`` computes the result that ``inputs`` determine.
 
     ``code`` has the states of the rooms that it uses (`ROOMS`). ``check`` is called after building;
     it raises if other code than that in ``inputs`` may have built the result.
@@ -143,8 +140,7 @@ STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)
 
 @dataclass(frozen=True)
 class UserCode:
-    """The user's code in a trial: the digests of its modules, and the classes that the
-    configuration names.
+    """The user's code in a trial: digests of its modules, and the classes that are configured.
 
     ``targets`` maps a place of the configuration (``densify``, ``eval.extra.sharp``) to a class's
     import path, gsbench's own classes included.
@@ -154,8 +150,7 @@ class UserCode:
     targets: Mapping[str, str] = field(default_factory=dict)
 
     def is_behind(self, component: Any, place: str) -> bool:
-        """Return whether the component's class is named by, or defined in, a module that is not
-        gsbench's."""
+        """Return whether the component's class is named by, or comes from, a user's module."""
         defined_in = f"{type(component).__module__}."
         return not (self.targets.get(place, OWN).startswith(OWN) and defined_in.startswith(OWN))
 
@@ -188,8 +183,7 @@ def options_of(
 
 
 def rasterizer_inputs(rasterizer: Any, user: UserCode = NO_USER_CODE) -> str | dict[str, Any]:
-    """The rasterizer as it enters a stage's key: by name if gsbench's own, else by class, code and
-    options."""
+    """The rasterizer in a stage's key: gsbench's own by name, others by class, code and options."""
     name: str = rasterizer.name
     return (
         {"name": name} | options_of("raster", rasterizer, user)
@@ -205,8 +199,10 @@ def step_of(
     user: UserCode = NO_USER_CODE,
     in_processes: bool = False,
 ) -> Step:
-    """A step. Its inputs get the states of those parts of gsbench's source behind it that differ
-    from the release.
+    """A step.
+
+    Its inputs get the states of those parts of gsbench's source behind it that differ from the
+    release.
 
     ``in_processes`` says that the build starts processes, which import the code anew.
     """
@@ -220,9 +216,8 @@ def step_of(
         ]
         if changed:
             raise InputError(
-                f"{', '.join(changed)} changed while {stage.name} ran, so it may have used the "
-                "old and the new "
-                "code: start again"
+                f"{', '.join(changed)} changed while {stage.name} ran, so it may have used the old "
+                "and the new code: start again"
             )
 
     if edited_rooms := edited(states):
@@ -289,8 +284,7 @@ def changed_since_asked(rooms: Iterable[str]) -> list[str]:
 
 @cache
 def _first_contents(room: str) -> dict[str, bytes]:
-    """The files of a room when this process first asked for them: later edits do not change what it
-    runs."""
+    """The files of a room when first asked for: later edits change nothing in this process."""
     return _contents(room)
 
 
@@ -331,8 +325,7 @@ def _released() -> dict[str, dict[str, str]]:
 
 
 def syntax_of(source: bytes) -> bytes:
-    """The syntax tree of a Python file without docstrings, as text; the source itself if it cannot
-    be parsed."""
+    """A Python file's syntax tree without docstrings, as text; its source if unparsable."""
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError):
@@ -346,8 +339,7 @@ def syntax_of(source: bytes) -> bytes:
 
 
 def room_digests(room: str) -> dict[str, str]:
-    """The digests of a room's files, and of their syntax, as `RELEASED` records them for each
-    room."""
+    """The digests of a room's files, and of their syntax, as `RELEASED` records them."""
     contents = _contents(room)
     syntax = {name: syntax_of(content) for name, content in contents.items()}
     return {"bytes": _digest(contents), "syntax": _digest(syntax)}
@@ -364,8 +356,7 @@ _digests_at_import: dict[str, tuple[ModuleSpec, str | None]] = {}
 
 
 def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
-    """``{module: sha256}`` of the user's code behind a configuration; {} if all of its classes are
-    gsbench's.
+    """``{module: sha256}`` of the user's code behind a configuration; {} if there is none.
 
     These are the modules of its classes, and the modules in ``allow_targets``, which the classes
     may import. An installed module is included only if a class comes from it.
@@ -384,8 +375,9 @@ def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def module_digest(name: str, folder: str | None = None) -> str | None:
-    """The sha256 of a top-level module: of its file, or of all code in its package. None if it is
-    not found.
+    """The sha256 of a top-level module: of its file, or of all code in its package.
+
+    None if it is not found.
 
     A module that this process has imported keeps its digest: that is the code that runs. With
     ``folder``, the module is found as by a program that is started there, without regard to what
@@ -404,16 +396,14 @@ def module_digest(name: str, folder: str | None = None) -> str | None:
 
 
 def has_changed_since_import(name: str) -> bool:
-    """Return whether a module's files differ from the code that this process has imported and
-    runs."""
+    """Return whether a module's files differ from the code that this process has imported."""
     loaded = sys.modules.get(name)
     spec = None if loaded is None else loaded.__spec__
     return spec is not None and module_digest(name) != _digest_on_disk(spec)
 
 
 def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
-    """The user's modules that were imported since ``before`` but are not ``named``: their edits
-    change no key."""
+    """The user's modules imported since ``before`` but not ``named``: their edits change no key."""
     tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {
         *named,
         PACKAGE.name,
@@ -425,8 +415,7 @@ def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str
 
 
 def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield every ``_target_`` at any depth, lists included, as (keys that lead to its mapping, the
-    target)."""
+    """Yield every ``_target_`` at any depth, also in lists, as (keys to its mapping, target)."""
     return (
         (inner, value)
         for inner, key, value in entries_of(values, place)
@@ -437,8 +426,7 @@ def targets_in(values: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple
 def entries_of(
     values: Any, place: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], str, Any]]:
-    """Yield every entry at any depth, lists included, as (keys that lead there, its key, its
-    value)."""
+    """Yield every entry at any depth, also in lists, as (keys that lead there, key, value)."""
     if isinstance(values, Mapping | list | tuple):
         for key, value in values.items() if isinstance(values, Mapping) else enumerate(values):
             yield place, str(key), value
@@ -457,8 +445,7 @@ def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
 
 
 def _digest_on_disk(spec: ModuleSpec) -> str | None:
-    """The sha256 of a module's code: of its content if it is one file, else of the list of its
-    files' hashes."""
+    """The sha256 of a module's code: of its one file, else of the list of its files' hashes."""
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
     if not folders:
         file = Path(spec.origin or "")
@@ -477,8 +464,7 @@ def _digest_on_disk(spec: ModuleSpec) -> str | None:
 
 
 def _is_installed(spec: ModuleSpec) -> bool:
-    """Return whether a module is Python's own or of an installed package: their versions stand for
-    them."""
+    """Return whether a module is Python's or an installed package's, whose version counts."""
     paths = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
     library = [sysconfig.get_path(key) for key in ("stdlib", "platstdlib")]
     return all(

@@ -66,8 +66,10 @@ class Manifest(Record):
 
 @dataclass(frozen=True)
 class StoredResult:
-    """A finished result in the store; ``cached`` if it was not built now, ``seconds`` is the time
-    of building it."""
+    """A finished result in the store.
+
+    ``cached``: it was not built now. ``seconds``: the time of building it.
+    """
 
     path: Path
     key: str
@@ -76,8 +78,7 @@ class StoredResult:
 
 
 class Store:
-    """The store below ``root``; ``on_build`` is called with each stage that is built, and its
-    partial folder."""
+    """The store below ``root``; ``on_build`` gets each stage that is built, and its folder."""
 
     def __init__(
         self, root: Path, on_build: Callable[[Stage, Path], None] = lambda stage, folder: None
@@ -142,8 +143,10 @@ class Store:
         )
 
     def _build(self, step: Step) -> StoredResult:
-        """Build or finish the partial folder, and publish it. The caller holds the lock of the
-        step's key."""
+        """Build or finish the partial folder, and publish it.
+
+        The caller holds the lock of the step's key.
+        """
         final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
         seconds = None
         # else the build was killed between writing the manifest and publishing
@@ -171,8 +174,10 @@ class Store:
         return StoredResult(final, step.key, seconds, cached=False)
 
     def sweep(self, stages: Iterable[Stage]) -> None:
-        """Remove the remains of killed processes that no build would continue. Locked folders are
-        left alone."""
+        """Remove the remains of killed processes that no build would continue.
+
+        Locked folders are left alone.
+        """
         for stage in stages:
             for partial in (self.root / stage.name).glob(".*.partial"):
                 key = partial.name[1 : -len(".partial")]
@@ -190,8 +195,7 @@ class Store:
 
 
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:
-    """Write the manifest of ``folder`` with a checksum of every file, after all files are safely on
-    the disk."""
+    """Write the manifest of ``folder``: checksums of all files, once these are safe on the disk."""
     scratch = {path for pattern in step.stage.scratch for path in folder.rglob(pattern)}
     outputs = {}
     for path in sorted(folder.rglob("*")):
@@ -252,8 +256,10 @@ def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder. It is renamed first, so that a kill in between leaves nothing that looks
-    like a result."""
+    """Remove a folder.
+
+    It is renamed first, so that a kill in between leaves nothing that looks like a result.
+    """
     removed = folder.with_name(f".{folder.name.lstrip('.')}.removed")
     shutil.rmtree(removed, ignore_errors=True)
     os.replace(folder, removed)

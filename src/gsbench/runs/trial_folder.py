@@ -56,8 +56,7 @@ TAIL_BYTES = 4096  # of a growing log, enough for its last rows
 
 
 class TrialFolder:
-    """The folder ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>`` of a trial, and
-    its files.
+    """The folder ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<k>`` of a trial.
 
     Examples:
         >>> TrialFolder(Path("runs/table1/garden/sfm-adc/3fa9c1d2-seed0")).label
@@ -89,8 +88,7 @@ class TrialFolder:
 
     @property
     def key(self) -> str:
-        """The folder within its experiment, without the seed
-        (`gsbench.runs.experiments.trial_key`)."""
+        """The folder in its experiment, without the seed (`gsbench.runs.experiments.trial_key`)."""
         return self.path.relative_to(self.home).as_posix().rpartition(layout.SEED)[0]
 
     @property
@@ -105,8 +103,7 @@ class TrialFolder:
         return f"{self.path.parent.parent.name}/{self.path.parent.name} seed {seed} ({hash8})"
 
     def require_no_links(self) -> None:
-        """Raise InputError if the folder, a folder above it, or anything in it is a link, a pipe or
-        a device."""
+        """Raise InputError if the folder, one above it, or its content is a link or a device."""
         require_no_links(self.runs, self.path, below=True)
 
     # ---- state
@@ -141,8 +138,7 @@ class TrialFolder:
         return read_if_sound(self.path / layout.BUILDING, Building) or Building()
 
     def stage_and_step(self) -> tuple[str, int]:
-        """The present stage of the unfinished trial ("" if none has begun), and the last logged
-        iteration."""
+        """The present stage of an unfinished trial ("" before the first), and last iteration."""
         building = self.building()
         try:
             tail = (
@@ -158,8 +154,10 @@ class TrialFolder:
     # ---- configuration
 
     def configuration(self) -> dict[str, Any]:
-        """The configuration in ``config.yaml``, without its permissions; raises InputError if it
-        cannot be used."""
+        """The configuration in ``config.yaml``, without its permissions.
+
+        Raises InputError if it cannot be used.
+        """
         path = self.path / layout.CONFIG
         try:
             values = read_yaml(path)
@@ -201,13 +199,14 @@ class TrialFolder:
             return None
 
     def made_of(self) -> MadeOf | None:
-        """The inputs of the results, not checked for changes; None if they are not recorded. Raises
-        as `record`."""
+        """The inputs of the results, not checked for changes; None if they are not recorded.
+
+        Raises as `record`.
+        """
         return read_typed(self.path / layout.RESULTS, ResultsFile).made_of
 
     def settings(self) -> dict[str, Any]:
-        """The settings in ``results.json``, else those in ``config.yaml``: YAML takes some twenty
-        times longer to read.
+        """The settings in ``results.json``, else in ``config.yaml``, which takes 20 times longer.
 
         Raises FileNotFoundError and DamagedError.
         """
@@ -274,8 +273,7 @@ class TrialFolder:
         values: dict[str, Any],
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None,
     ) -> str:
-        """The reason to run or check the trial with the resolved configuration ``values``; "" if it
-        is done.
+        """The cause to run or check the trial with the configuration ``values``; "" if done.
 
         It is done if none of its inputs has changed. If it lacks a metric whose weights or packages
         were missing, it is done only if ``unavailable_now``, called with the ``eval`` settings,
@@ -302,8 +300,7 @@ class TrialFolder:
     # ---- files beside the results
 
     def curves(self, name: str = layout.CURVES, kind: Any = Row) -> list[Any]:
-        """The rows of a file of JSON lines that a training wrote over its iterations; [] if there
-        is no such file.
+        """The rows of a file of JSON lines that a training wrote; [] without the file.
 
         With a warning, a finished trial's file that was changed after it was written is left out,
         and so are all rows from a damaged one on.
@@ -334,8 +331,10 @@ class TrialFolder:
         return sorted((self.path / kind).glob("*.png"))
 
     def _unchanged(self, name: str) -> bytes:
-        """The content of a file; raises as `read_bytes`, and DamagedError if it was changed after
-        it was written."""
+        """The content of a file.
+
+        Raises as `read_bytes`, and DamagedError if it was changed after it was written.
+        """
         content = read_bytes(self.path / name)
         if self._digests is None:
             self.sound_record()
@@ -372,8 +371,7 @@ _digests: dict[Stamp, str] = {}
 def find_changes(
     folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf
 ) -> Iterator[str]:
-    """Reasons why the complete trial in ``folder`` is out of date; those that are found quickly
-    come first.
+    """Reasons why the complete trial in ``folder`` is out of date, quickly found ones first.
 
     Files are compared by size and time of change, small files of gsbench's also by content.
     """

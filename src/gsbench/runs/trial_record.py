@@ -1,6 +1,7 @@
-"""The types of a trial's files: ``results.json``, the records of stages in the store
-(``training.json``, ``metrics.json``), and the JSON lines of a training. They are used for writing
-and for reading.
+"""The types of a trial's files, for writing and for reading.
+
+``results.json``, the records of stages in the store (``training.json``, ``metrics.json``), and the
+JSON lines of a training.
 """
 
 import logging
@@ -47,8 +48,7 @@ Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an obj
 
 @dataclass(frozen=True, kw_only=True)
 class Budget(Record):
-    """Limits on the growth of a trial: a maximum of Gaussians, the rule that keeps it, and a time
-    limit in s."""
+    """Limits on a trial's growth: a maximum of Gaussians, the rule that keeps it, and seconds."""
 
     max_gaussians: Count | None = None
     cap: str | None = None
@@ -57,8 +57,7 @@ class Budget(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Code(Record):
-    """The versions of the code: sha256 of a user's modules (``sources``), versions of gsbench's
-    stages.
+    """The versions of the code: sha256 of a user's modules (``sources``), and of the stages.
 
     ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.keys`). ``commit`` is
     that of the checkout that trained; ``edited`` says whether files that git tracks had changed.
@@ -100,8 +99,7 @@ class Declared(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class ExternalTrainer(Record):
-    """The program that trained in gsbench's place: its name, its version, what it prints on that,
-    and the command."""
+    """The program that trained in gsbench's place: its name, version, own words, and command."""
 
     program: str
     version: str
@@ -159,8 +157,9 @@ class RasterProof(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
-    """A finished trial. A value that cannot be known is None; the file leaves out None if that is
-    the default.
+    """A finished trial.
+
+    A value that cannot be known is None; the file leaves out None if that is the default.
 
     ``metrics`` are means over the test views. ``unavailable`` says why other metrics are missing;
     ``awaited`` names those of them that need only weights or packages. ``seconds`` are by stage;
@@ -217,14 +216,12 @@ class TrialRecord(Record):
 
     @property
     def remark(self) -> str:
-        """A line for the state of a finished trial: why its results may surprise; "" if they do
-        not."""
+        """A line for a finished trial's state: why its results may surprise; else ""."""
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
     def learnt_nothing(self) -> str:
-        """A line that the renders are not better than one colour; "" if they are, or if that is not
-        known."""
+        """A line that the renders are not better than one colour; "" if they are, or if unknown."""
         psnr, one_color = self.metrics.get("psnr"), self.one_color_psnr
         if psnr is None or one_color is None or psnr > one_color:
             return ""
@@ -250,8 +247,10 @@ class UnfinishedError(DamagedError):
 
 
 def record_from(content: bytes, path: Path) -> TrialRecord:
-    """Parse the ``content`` of the results file ``path``; raises DamagedError and
-    UnfinishedError."""
+    """Parse the ``content`` of the results file ``path``.
+
+    Raises DamagedError and UnfinishedError.
+    """
     try:
         return adapter(TrialRecord).validate_json(content)
     except ValidationError as error:
@@ -270,8 +269,10 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Training(Record):
-    """The counts, time and memory of a training. ``trained_by`` and ``evaluated_from`` are set if a
-    program trained."""
+    """The counts, time and memory of a training.
+
+    ``trained_by`` and ``evaluated_from`` are set if a program trained.
+    """
 
     iterations: Count
     num_init_points: Count
@@ -301,8 +302,7 @@ class Evaluation(Record):
 
 
 def split_text(config: Mapping[str, Any]) -> str:
-    """``every_nth``, ``sector 0 of 8`` or ``list``; with ``, matched`` or ``, validation`` if it
-    is."""
+    """``every_nth``, ``sector 0 of 8`` or ``list``, then ``, matched`` or ``, validation``."""
     text, sectors = str(config.get("scene.split")), config.get("scene.sectors")
     if text == "sector":
         text = f"sector {config.get('scene.sector')} of {sectors}"
@@ -337,8 +337,7 @@ class TrackingSettings(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration(Record):
-    """The keys that every usable ``config.yaml`` of a trial has; `gsbench.config.schema` checks the
-    others."""
+    """The keys that every usable ``config.yaml`` has; `gsbench.config.schema` checks the others."""
 
     name: FolderName
     seed: Count
@@ -369,8 +368,7 @@ class Failure(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Building(Record):
-    """``building.json``: the present stage of an unfinished trial, and the folder in which it is
-    built."""
+    """``building.json``: the present stage of an unfinished trial, and where it is built."""
 
     stage: str = ""
     folder: str = ""
@@ -378,8 +376,7 @@ class Building(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class MadeOf(Record):
-    """The configuration (``settings``) and its hash (``config``), versions, and files with their
-    stamps.
+    """The configuration (``settings``), its hash (``config``), versions, and files with stamps.
 
     ``results`` is the hash of the rest of ``results.json``. ``sources`` are the user's files,
     ``folders`` their folders with times of change. ``entries`` are the stages' results in the
@@ -464,8 +461,7 @@ def read_rows(path: Path, kind: Any = Row, read: Callable[[Path], bytes] = read_
 
 
 def whole_lines(path: Path) -> list[tuple[str, int]]:
-    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, each with its
-    iteration."""
+    """The lines of a file such as ``metrics.jsonl`` up to the first damaged one, by iteration."""
     try:
         content = read_bytes(path)
     except FileNotFoundError:

@@ -58,15 +58,13 @@ class RoundKey(Record):
     showings: Annotated[tuple[Showing, ...], MinLen(1)]
 
     def commitment(self, showing: Showing) -> str:
-        """The salted hash of a showing's sides, which the page has: without the salt it tells
-        nothing."""
+        """The salted hash of a showing's sides; on the page, it tells nothing without the salt."""
         sides = f"{showing.id} {showing.left} {showing.right}"
         return hmac.new(self.salt.encode(), sides.encode(), hashlib.sha256).hexdigest()
 
     @cached_property
     def round(self) -> str:
-        """The name of the round: a hash of all commitments, so a key that was changed later has
-        another name."""
+        """The name of the round: a hash of all commitments, so a changed key has another name."""
         return hashlib.sha256("".join(map(self.commitment, self.showings)).encode()).hexdigest()[
             :12
         ]
@@ -93,8 +91,7 @@ class Vote(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Ballot(Record):
-    """The file that a person saves at the end of a round; ``finished`` is the time of the last
-    answer."""
+    """The file that a person saves at the end of a round; ``finished``: of the last answer."""
 
     round: RoundId
     person: PersonId
@@ -116,8 +113,10 @@ class Ballot(Record):
 
 
 def read_key(folder: Path) -> RoundKey:
-    """The key of the round in ``folder``; raises InputError if it is missing, damaged or was
-    changed."""
+    """The key of the round in ``folder``.
+
+    Raises InputError if it is missing, damaged or was changed.
+    """
     if not (folder / VOTE_KEY).is_file():
         raise InputError(
             f"this experiment has no round {folder.name}: `gsbench vote make` makes rounds"

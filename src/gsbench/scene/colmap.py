@@ -1,10 +1,9 @@
-"""Reading COLMAP models safely, fitting them to the image files, converting their cameras, and
-writing models."""
+"""Reading COLMAP models safely, fitting them to image files, and writing models."""
 
 import codecs
 import tempfile
 import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,13 +19,13 @@ from gsbench.scene.distortion import without_distortion
 from gsbench.scene.images import check_size, image_size, match_names
 from gsbench.scene.types import Array, Camera, CameraModel, Capture, to_pinhole
 
+Cloud = tuple[Array, NDArray[np.uint8]]  # positions [P, 3] in world units, colours [P, 3]
 UNIT_TOLERANCE = 1e-9  # a quaternion whose length differs from 1 by no more is not normalised again
 MIN_TRACK = 2  # images that must see a 3D point, as in COLMAP
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a COLMAP model, binary or text, of the current (rigs, frames) or the older three-file
-    layout.
+    """Read a COLMAP model, binary or text, with rigs and frames or in the older three files.
 
     Raises `InputError`, one line, if it is missing or damaged.
     """
@@ -37,6 +36,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         for image in model.images.values():
             if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
                 raise ValueError(f"image {image.name} has no finite pose")
+    # raised by pycolmap for files that passed the check and yet are damaged
     except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(
@@ -64,8 +64,7 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
 
 
 def _normalize_quaternions(model: pycolmap.Reconstruction) -> None:
-    """Give the quaternions of rigs and frames unit length. COLMAP normalises only those of
-    images."""
+    """Give quaternions of rigs and frames unit length; COLMAP normalises only those of images."""
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             if pose is not None and abs(pose.rotation.norm() - 1) > UNIT_TOLERANCE:
@@ -97,18 +96,22 @@ def normalize_capture(capture: Capture, folder: Path) -> Capture:
         return capture
     model = read_model(capture.model)
     normalize_model(model, normalization)
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
+    save_model(model, folder)
     return replace(
         capture, model=folder, normalization=normalization, advised_normalization=IDENTITY
     )
 
 
+def save_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write ``model`` in COLMAP's binary format."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
+
+
 def normalize_model(
     model: pycolmap.Reconstruction, normalization: Normalization, undo: bool = False
 ) -> None:
-    """Move ``model`` from the coordinates in which it was given to those of the training; ``undo``
-    moves it back."""
+    """Move ``model`` from given coordinates to those of the training; ``undo`` moves it back."""
     to_training = pycolmap.Sim3d(
         normalization.scale,
         pycolmap.Rotation3d(),
@@ -137,6 +140,8 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     model = read_model(capture.model)
     names = match_names(registered_names(model), capture.image_names)
     fitted = pycolmap.Reconstruction()
+    # The files of one camera may have several sizes, as where some were shrunk: then each
+    # size gets a camera, and the first one keeps the id.
     next_camera_id = max(model.cameras, default=0) + 1
     camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
     kept: set[int] = set()
@@ -152,20 +157,13 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
                 camera_ids[key], next_camera_id = next_camera_id, next_camera_id + 1
             else:
                 camera_ids[key] = image.camera_id
-            fitted.add_camera_with_trivial_rig(
-                rescaled_camera(camera, *size, camera_id=camera_ids[key])
-            )
+            fitted.add_camera_with_trivial_rig(rescaled_camera(camera, *size, camera_ids[key]))
         scale = np.array(size) / (camera.width, camera.height)
-        points = (
-            np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
-            * scale
-        )  # [K, 2]
-        fitted.add_image_with_trivial_frame(
-            pycolmap.Image(
-                name=name, keypoints=points, camera_id=camera_ids[key], image_id=image_id
-            ),
-            image.cam_from_world(),
+        points = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+        resized = pycolmap.Image(
+            name=name, keypoints=points * scale, camera_id=camera_ids[key], image_id=image_id
         )
+        fitted.add_image_with_trivial_frame(resized, image.cam_from_world())
         kept.add(image_id)
     _copy_points(model, fitted, kept)
     return fitted
@@ -186,13 +184,24 @@ def rescaled_camera(
     if model == pycolmap.CameraModelId.SIMPLE_PINHOLE:
         model, params = pycolmap.CameraModelId.PINHOLE, [params[0], *params]
     # Copied because a Camera object taken from a Reconstruction is a view into it.
-    copy = pycolmap.Camera(
-        camera_id=camera_id, model=model, width=camera.width, height=camera.height, params=params
-    )
+    copy = new_camera(camera_id, model, camera.width, camera.height, params)
     copy.has_prior_focal_length = camera.has_prior_focal_length
     if (width, height) != (camera.width, camera.height):
         copy.rescale(width, height)
     return copy
+
+
+def new_camera(
+    camera_id: int,
+    model: pycolmap.CameraModelId | str,
+    width: int,
+    height: int,
+    params: Sequence[float],
+) -> pycolmap.Camera:
+    """A COLMAP camera of a size in px, with parameters in COLMAP's order."""
+    return pycolmap.Camera(
+        camera_id=camera_id, model=model, width=width, height=height, params=list(params)
+    )
 
 
 def plain_camera(camera: pycolmap.Camera) -> CameraModel:
@@ -204,8 +213,7 @@ def plain_camera(camera: pycolmap.Camera) -> CameraModel:
 
 
 def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) -> Camera:
-    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if the camera is
-    distorted."""
+    """Convert a COLMAP camera and pose to a `Camera`; raises `InputError` if it is distorted."""
     plain = plain_camera(camera)
     if plain.distorted:
         raise InputError(
@@ -216,8 +224,7 @@ def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) ->
 
 
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
-    """Cameras with the poses of the registered images ``names``; distortion and principal points
-    are ignored.
+    """Cameras with the poses of the images ``names``, without distortion or principal points.
 
     They tell where cameras stand and look. They are not for rendering.
     """
@@ -233,65 +240,50 @@ def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> l
     return cameras
 
 
-def model_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """The 3D points, sorted by id: positions [P, 3] in world units and colours [P, 3] uint8."""
+def model_points(model: pycolmap.Reconstruction) -> Cloud:
+    """The 3D points, sorted by id."""
     points = [point for _, point in sorted(model.points3D.items())]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
-def write_model(
-    folder: Path,
-    cameras: Mapping[str, Camera],
-    text: bool = False,
-    cloud: tuple[Array, NDArray[np.uint8]] | None = None,
-) -> None:
-    """Write PINHOLE cameras with their poses as a COLMAP model; images with equal intrinsics share
-    one camera.
+def write_model(folder: Path, cameras: Mapping[str, Camera], cloud: Cloud | None = None) -> None:
+    """Write PINHOLE cameras with their poses as a COLMAP model; equal intrinsics share a camera.
 
     ``cloud``, positions [P, 3] and colours [P, 3], becomes the model's points, without tracks. By
     default the model has no points.
     """
     frames = {}
     for name, camera in cameras.items():
-        pinhole = CameraModel(
-            "PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy)
-        )
+        params = (camera.fx, camera.fy, camera.cx, camera.cy)
+        pinhole = CameraModel("PINHOLE", camera.width, camera.height, params)
         frames[name] = pinhole, camera.rotation, camera.translation
-    write_frames(folder, frames, text, cloud)
+    write_frames(folder, frames, cloud)
 
 
 def write_frames(
     folder: Path,
     frames: Mapping[str, tuple[CameraModel, Array, Array]],
-    text: bool = False,
-    cloud: tuple[Array, NDArray[np.uint8]] | None = None,
+    cloud: Cloud | None = None,
 ) -> None:
-    """Write cameras of any camera model with their world-to-camera rotations [3, 3] and
-    translations [3].
+    """Write cameras of any model with world-to-camera rotations [3, 3] and translations [3].
 
     Images with equal intrinsics share one camera. ``cloud`` is as in `write_model`.
     """
     model = pycolmap.Reconstruction()
     ids: dict[CameraModel, int] = {}
-    for image_id, (name, (camera, rotation, translation)) in enumerate(
-        sorted(frames.items()), start=1
-    ):
+    for image_id, name in enumerate(sorted(frames), start=1):
+        camera, rotation, translation = frames[name]
         if camera not in ids:
             ids[camera] = len(ids) + 1
-            size = {"width": camera.width, "height": camera.height}
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    camera_id=ids[camera], model=camera.name, params=list(camera.params), **size
-                )
-            )
+            own = new_camera(ids[camera], camera.name, camera.width, camera.height, camera.params)
+            model.add_camera_with_trivial_rig(own)
         image = pycolmap.Image(name=name, camera_id=ids[camera], image_id=image_id)
         pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
         model.add_image_with_trivial_frame(image, pose)
     for point, color in zip(*cloud, strict=True) if cloud is not None else ():
         model.add_point3D(point, pycolmap.Track(), color)
-    folder.mkdir(parents=True, exist_ok=True)
-    (model.write_text if text else model.write_binary)(folder)
+    save_model(model, folder)
 
 
 def _copy_points(

@@ -73,8 +73,7 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def check_model(folder: Path) -> None:
-    """Raise `InputError`, one line, if a file of the model is truncated, has extra bytes, or has
-    impossible values."""
+    """Raise `InputError`, one line, for a file that is cut, too long or has impossible values."""
     checks = ModelChecks()
     for file in model_files(folder):  # in this order: images refer to cameras, points to images
         binary_record, text_record = _RECORDS[file.stem]
@@ -96,8 +95,7 @@ def check_model(folder: Path) -> None:
 def _walk_binary(
     file: Path, record: Callable[[bytes, int, ModelChecks], int], checks: ModelChecks
 ) -> None:
-    """Check a file of a count and records; ``record`` checks the one at an offset and returns the
-    offset after it."""
+    """Check a count and records; ``record`` checks one at an offset and returns the next offset."""
     data = file.read_bytes()
     (count,) = _COUNT.unpack_from(data)
     offset = _COUNT.size
@@ -166,8 +164,7 @@ DECIMAL_COMMA = re.compile(r"(?:^|(?<=\s))-?\d+,\d+(?=\s|$)", re.MULTILINE)
 def _walk_text(
     file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks
 ) -> None:
-    """Check a file line by line, without comments; ``record`` gets a line and the lines after
-    it."""
+    """Check a file by lines, without comments; ``record`` gets a line and the lines after it."""
     text = without_byte_order_mark(file.read_bytes()).decode()
     lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
     try:
@@ -182,16 +179,14 @@ def _walk_text(
 
 
 def text_names(folder: Path) -> dict[int, str]:
-    """The names of the images of the text model in ``folder`` by their ids, with the blanks that
-    they may contain."""
+    """The names of the images of a text model by id, with the blanks that they may contain."""
     checks = _NamesOnly()
     _walk_text(folder / "images.txt", _text_image, checks)
     return checks.names
 
 
 def count_images(folder: Path) -> int:
-    """The number of images with a pose in the model in ``folder``; raises `InputError` if it cannot
-    be read."""
+    """The number of posed images of the model in ``folder``; raises `InputError` if unreadable."""
     file = next(file for file in model_files(folder) if file.stem == "images")
     try:
         if file.suffix == ".txt":
@@ -267,8 +262,7 @@ MAX_POINT_ID = 2**64 - 2  # ids of 3D points are 64-bit
 
 
 class ModelChecks:
-    """Checks the records of a model one by one, cameras first; raises `InputError` for the first
-    impossible one."""
+    """Checks records one by one, cameras first; raises `InputError` for the first bad one."""
 
     def __init__(self) -> None:
         self._cameras: set[int] = set()
@@ -283,8 +277,7 @@ class ModelChecks:
         is_size = 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE
         if not is_size or not all(map(math.isfinite, params)) or min(focal_lengths) <= 0:
             raise InputError(
-                f"camera {camera_id} is damaged ({width}x{height} px, parameters "
-                f"{', '.join(f'{p:g}' for p in params)})"
+                f"camera {camera_id} is damaged ({width}x{height} px, parameters {_listed(params)})"
             )
         _check_id(camera_id, self._cameras, "camera", MAX_ID)
         self._cameras.add(camera_id)
@@ -305,18 +298,13 @@ class ModelChecks:
         """Check a pose: quaternion (w, x, y, z) and translation."""
         sound = len(pose) == 7 and all(map(math.isfinite, pose))
         if not sound or not 1 / MAX_LENGTH < math.hypot(*pose[:4]) < MAX_LENGTH:
-            raise InputError(
-                f"{owner} has no pose that can be used "
-                f"({', '.join(f'{value:g}' for value in pose)})"
-            )
+            raise InputError(f"{owner} has no pose that can be used ({_listed(pose)})")
 
     def point(
         self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]
     ) -> None:
         if not all(map(math.isfinite, position)):
-            raise InputError(
-                f"point {point_id} lies nowhere ({', '.join(f'{value:g}' for value in position)})"
-            )
+            raise InputError(f"point {point_id} lies nowhere ({_listed(position)})")
         _check_id(point_id, self._points, "point", MAX_POINT_ID)
         self._points.add(point_id)
         for image_id, index in track:
@@ -338,6 +326,10 @@ class _NamesOnly(ModelChecks):
         self, image_id: int, pose: Sequence[float], camera_id: int, name: str, num_points: int
     ) -> None:
         self.names[image_id] = name
+
+
+def _listed(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def _check_id(number: int, earlier: Collection[int], what: str, largest: int) -> None:

@@ -44,8 +44,7 @@ def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
 
 
 def largest_distortion(camera: pycolmap.Camera) -> float:
-    """The largest distance in px between the projections of a camera and of the pinhole with its
-    focal lengths.
+    """The largest distance in px between a camera's projections and those of its pinhole.
 
     It is measured for the rays on which the pinhole has the pixels of a grid over the image, and
     NaN if the camera does not see one of them.

@@ -1,5 +1,4 @@
-"""Dividing photographs into training and test views by a rule or by lists, and the rest again for
-validation.
+"""Dividing photographs into training and test views, and the rest again for validation.
 
 Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround
 the scene are ordered by azimuth around its centre and up direction. Other cameras are ordered along
@@ -35,8 +34,7 @@ class Arrangement:
 
 
 def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
-    """Order cameras by azimuth around the scene if they surround it, else along the principal axis
-    of their centres.
+    """Order cameras by azimuth if they surround the scene, else along their principal axis.
 
     The azimuths start at the first camera, or after a gap of more than 30 degrees.
     """
@@ -44,9 +42,8 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
     azimuths, fault = _azimuths(cameras, centers)
     if azimuths is not None:
         order = np.argsort(azimuths, kind="stable")
-        gaps = np.diff(
-            azimuths[order], append=azimuths[order[0]] + 360.0
-        )  # [V] after each camera, degrees
+        around = azimuths[order]
+        gaps = np.diff(around, append=around[0] + 360.0)  # [V] after each camera, degrees
         widest = int(gaps.argmax())
         gap = float(gaps[widest])
         if gap >= SURROUNDED:
@@ -56,21 +53,19 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
             )
     if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
-        return Arrangement(
-            tuple(np.argsort(along_principal_axis(centers), kind="stable").tolist()), description
-        )
+        order = np.argsort(along_principal_axis(centers), kind="stable")
+        return Arrangement(tuple(order.tolist()), description)
     if gap > OPEN_RING:
         order = np.roll(order, -(widest + 1))
-    return Arrangement(
-        tuple(int(index) for index in order),
+    description = (
         "by azimuth around the scene's up and centre, as the cameras surround it (gaps up to "
-        f"{gap:.0f} degrees)",
+        f"{gap:.0f} degrees)"
     )
+    return Arrangement(tuple(order.tolist()), description)
 
 
 def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
-    """The positions of sector number ``sector`` when ``count`` ordered views are cut into
-    ``sectors`` contiguous ones.
+    """The positions of one of ``sectors`` contiguous parts of ``count`` ordered views.
 
     The sizes of sectors differ by at most one. With ``exactly``, only so many positions from the
     sector's start.
@@ -84,8 +79,7 @@ def sector_range(count: int, sector: int, sectors: int, exactly: int | None = No
 
 
 def along_principal_axis(centers: Array) -> Array:
-    """Coordinates [V] of camera centres [V, 3] on their principal axis, which points away from the
-    first camera."""
+    """Coordinates [V] of centres [V, 3] on their principal axis, away from the first camera."""
     offsets = centers - centers.mean(axis=0)
     _, _, axes = np.linalg.svd(offsets, full_matrices=False)
     coordinates: Array = offsets @ axes[0]
@@ -94,21 +88,25 @@ def along_principal_axis(centers: Array) -> Array:
     return -coordinates if coordinates[np.argmax(off_center)] > 0.0 else coordinates
 
 
+def _forwards(cameras: Sequence[Camera]) -> Array:
+    return np.array([camera.rotation[2] for camera in cameras])
+
+
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
-    """The point [3] nearest to all viewing axes, in least squares; None if the axes are
-    parallel."""
-    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
+    """The point [3] nearest to all viewing axes in least squares; None if they are parallel."""
+    forwards = _forwards(cameras)  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
     if float(np.linalg.eigvalsh(normal)[0]) < PARALLEL:
         return None
+    # The sum over cameras of |P (p - c)|^2, where P takes away what lies along a viewing axis, is
+    # least where (mean P) p = mean (P c).
     solution: Array = np.linalg.solve(normal, (across @ centers[:, :, None]).mean(axis=0)[:, 0])
     return solution
 
 
 def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
-    """The mean of the cameras' up directions [3] or, if they cancel out, the normal of the plane of
-    the centres."""
+    """The mean up direction [3] or, if directions cancel out, the normal of the centres' plane."""
     mean = -np.array([camera.rotation[1] for camera in cameras]).mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length > 0.5:
@@ -120,12 +118,11 @@ def scene_up(cameras: Sequence[Camera], centers: Array) -> Array:
 
 
 def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, str]:
-    """Azimuths [V] in [0, 360) degrees from the first camera, counter-clockwise from above; or None
-    and the reason."""
+    """Azimuths [V] in [0, 360) from the first camera, counter-clockwise; or None and the reason."""
     center = point_looked_at(cameras, centers)
     if center is None:
         return None, "the cameras look in one direction"
-    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
+    forwards = _forwards(cameras)  # [V, 3]
     facing = float((((center - centers) * forwards).sum(axis=1) > 0).mean())
     if facing < FACING:
         return None, f"the cameras do not look at one place; {facing:.0%} do"
@@ -138,8 +135,7 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
 
 
 def select_images(names: Sequence[str], max_images: int, least: int = MIN_IMAGES) -> list[str]:
-    """Select at most ``max_images`` of n names, evenly spaced: the k-th of m selected names has
-    index ``k * n // m``.
+    """Select at most ``max_images`` of n names: the k-th of m selected has index ``k * n // m``.
 
     The first name is always kept, and views on a closed ring stay evenly spaced. Images are
     selected before the split.
@@ -163,19 +159,16 @@ def split_names(
 ) -> tuple[list[str], list[str]]:
     """Split sorted names into (training, test).
 
-    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none.
-    Explicit lists replace this rule. If only one list is given, the other side gets all other
-    names. If both are given, names in neither list are dropped.
+    Every ``test_every``-th name from the first is a test view. Explicit lists replace this rule. If
+    only one list is given, the other side gets all other names. If both are given, names in neither
+    list are dropped.
 
-    Raises `InputError` if there is no training view, or no test view although ``test_every`` is not
-    0.
+    Raises `InputError` if there is no training view or no test view.
     """
-    if test_every < 0:
-        raise InputError(
-            f"scene.test_every must be 0 (no test views) or positive, got {test_every}"
-        )
+    if test_every < 1:
+        raise InputError(f"scene.test_every must be positive, got {test_every}")
     if train is None and test is None:
-        held_out = set(names[::test_every]) if test_every else set()
+        held_out = set(names[::test_every])
     elif test is None:
         held_out = set(names) - set(train or ())
     else:
@@ -193,11 +186,8 @@ def split_names(
             f"the split leaves no training view of {len(names)}: raise scene.test_every or "
             "correct the lists"
         )
-    if not testing and test_every:
-        raise InputError(
-            f"the split leaves no test view of {len(names)}: correct the lists, or give "
-            "scene.test_every=0"
-        )
+    if not testing:
+        raise InputError(f"the split leaves no test view of {len(names)}: correct the lists")
     return training, testing
 
 
@@ -232,10 +222,9 @@ def hold_out(
     split = _divide(names, rule, lists, cameras)
     if not rule.validation:
         return split
-    again = (
-        replace(rule, split="every_nth", train_list=None, test_list=None) if rule.by_lists else rule
-    )
-    validation = _divide(split.train, again, (None, None), cameras)
+    if rule.by_lists:  # they are used up
+        rule = replace(rule, split="every_nth", train_list=None, test_list=None)
+    validation = _divide(split.train, rule, (None, None), cameras)
     away = f"the {counted(len(split.test), 'test view')} ({split.description}) put away unseen"
     return replace(validation, description=f"for validation {validation.description}, with {away}")
 
@@ -246,23 +235,19 @@ def _divide(
     matched = max(1, len(names) // rule.sectors) if rule.match_views else None
     if rule.by_lists:
         train, test = split_names(names, rule.test_every, *lists)
-        return Split(tuple(train), tuple(test), "by lists")
-    if rule.split == "sector":
-        test, description = _sector(names, rule, matched, cameras)
-    elif matched is not None:
-        test = select_images(names, matched, least=1)
-        description = (
-            f"{matched} evenly spread over the sorted names, as many as in a sector of "
-            f"{rule.sectors}"
-        )
-    else:
+        description = "by lists"
+    elif rule.split != "sector" and matched is None:
         train, test = split_names(names, rule.test_every)
-        return Split(
-            tuple(train),
-            tuple(test),
-            f"every {rule.test_every}th image" if rule.test_every else "none",
-        )
-    train, test = split_names(names, test=test)
+        description = f"every {rule.test_every}th image"
+    else:
+        if rule.split == "sector":
+            chosen, description = _sector(names, rule, matched, cameras)
+        else:
+            assert matched is not None
+            chosen = select_images(names, matched, least=1)
+            spread = f"{matched} evenly spread over the sorted names"
+            description = f"{spread}, as many as in a sector of {rule.sectors}"
+        train, test = split_names(names, test=chosen)
     return Split(tuple(train), tuple(test), description)
 
 
@@ -272,8 +257,7 @@ def _sector(
     if cameras is None:
         raise InputError(
             "scene.split=sector needs the cameras, and these photographs came without: give a "
-            "COLMAP model "
-            "(scene=colmap; gsbench export writes that of a trial)"
+            "COLMAP model (scene=colmap; gsbench export writes that of a trial)"
         )
     if len(names) < rule.sectors:
         raise InputError(

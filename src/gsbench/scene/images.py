@@ -1,5 +1,4 @@
-"""Photographs and masks: finding them by name, reading, resizing, and filling in what a mask
-ignores.
+"""Photographs and masks: finding, reading, resizing, and filling in what a mask ignores.
 
 Every image becomes uint8 RGB. EXIF orientation is ignored, as in COLMAP, because cameras refer to
 the stored pixels.
@@ -58,8 +57,7 @@ NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 
 
 def list_images(folder: Path) -> list[str]:
-    """The sorted image files in a folder and its sub-folders, relative, with "/" as separator,
-    without hidden files.
+    """The sorted image files below a folder, relative, with "/" as separator, without hidden files.
 
     Links to folders are followed, and no folder is read twice.
     """
@@ -84,11 +82,8 @@ def list_images(folder: Path) -> list[str]:
             elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
                 unread += 1
     if unread:
-        log.warning(
-            "%s: %s not read: save as JPEG",
-            folder,
-            f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}",
-        )
+        files = f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
+        log.warning("%s: %s not read: save as JPEG", folder, files)
     return sorted(names)
 
 
@@ -144,8 +139,7 @@ def stem_of(name: str) -> str:
 
 
 def check_picture_names(names: Iterable[str], folder: Path) -> None:
-    """Raise `InputError` if a view's picture would have a too long name, or the same name as
-    another view's."""
+    """Raise `InputError` for a view whose picture has a too long name or that of another view's."""
     view_of: dict[str, str] = {}
     for name in names:
         picture = png_name(name)
@@ -230,8 +224,7 @@ def resize_image(
 
 
 def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) -> None:
-    """Raise `InputError` if the aspect ratios of image and camera differ by more than rounding to
-    whole pixels."""
+    """Raise `InputError` if aspect ratios of image and camera differ by more than rounding."""
     (width, height), (camera_width, camera_height) = size, camera_size
     if same_up_to_rounding(size, camera_size):
         return
@@ -242,8 +235,7 @@ def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) 
     if same_up_to_rounding((height, width), camera_size):
         raise InputError(
             f"{message}: it is stored on its side (EXIF orientation {exif_orientation(path)}, "
-            "which COLMAP ignores); "
-            "use the files that the model was made from"
+            "which COLMAP ignores); use the files that the model was made from"
         )
     raise InputError(
         f"{message}: use the files that the model was made from, or an evenly scaled copy"
@@ -251,8 +243,7 @@ def check_size(path: Path, size: tuple[int, int], camera_size: tuple[int, int]) 
 
 
 def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bool:
-    """Return whether one scale maps ``reference`` to ``size`` with an error of at most one pixel on
-    each side."""
+    """Return whether one scale maps ``reference`` to ``size`` up to one pixel on each side."""
     (width, height), (reference_width, reference_height) = size, reference
     lowest = max((width - 1) / reference_width, (height - 1) / reference_height)
     highest = min((width + 1) / reference_width, (height + 1) / reference_height)
@@ -260,8 +251,7 @@ def same_up_to_rounding(size: tuple[int, int], reference: tuple[int, int]) -> bo
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image with Pillow, without reading pixels; raises `InputError` if it is missing or is
-    not an image."""
+    """Open an image without reading pixels; raises `InputError` if it is missing or no image."""
     require_regular(path)
     try:
         return Image.open(path, formats=FORMATS)
@@ -273,8 +263,7 @@ def open_image(path: Path) -> Image.Image:
 
 
 def find_masks(folder: Path, images: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The mask file in ``folder`` of each image: ``a/b.jpg.png`` for ``a/b.jpg``, as COLMAP names
-    it.
+    """The mask file in ``folder`` of each image, as COLMAP names it: ``b.jpg.png`` for ``b.jpg``.
 
     ``names`` are paths below ``images``, the folder of the images. Raises InputError naming the
     images without a mask, or for a mask that is not an image or differs in size from its
@@ -284,16 +273,14 @@ def find_masks(folder: Path, images: Path, names: Sequence[str]) -> dict[str, Pa
     if missing := [name for name, mask in masks.items() if not mask.is_file()]:
         raise InputError(
             f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
-            "(all white where every "
-            "pixel counts)"
+            "(all white where every pixel counts)"
         )
     for name, mask in masks.items():
         size, wanted = image_size(mask), image_size(images / name)
         if size != wanted:
             raise InputError(
                 f"{mask}: the mask is {size[0]}x{size[1]} px and its image {name} "
-                f"{wanted[0]}x{wanted[1]}: give masks "
-                "of the images' size"
+                f"{wanted[0]}x{wanted[1]}: give masks of the images' size"
             )
     return masks
 
@@ -307,19 +294,14 @@ def read_mask(path: Path) -> Mask:
     with open_image(path) as image:
         try:
             image.load()
-            if (
-                image.has_transparency_data
-                and np.asarray(image.convert("RGBA"))[..., 3].min() < 255
-            ):
+            transparent = image.has_transparency_data
+            if transparent and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
                 raise InputError(
                     f"{path}: a mask says by black what is ignored, not by transparency: save it "
                     "as grey"
                 )
-            pixels = np.asarray(
-                image.convert("RGB")
-                if image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
-                else image
-            )
+            in_colors = image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
+            pixels = np.asarray(image.convert("RGB") if in_colors else image)
         except InputError:
             raise
         except Exception as error:  # Pillow's readers may raise any exception on a damaged file
@@ -341,8 +323,7 @@ def read_mask(path: Path) -> Mask:
     if grey_share > MAX_GREY_SHARE:
         raise InputError(
             f"{path}: {grey_share:.0%} of its pixels are grey, so it is not a mask: make it black "
-            "where pixels are "
-            "ignored, else white"
+            "where pixels are ignored, else white"
         )
     return mask
 
@@ -361,8 +342,7 @@ def write_png(image: NDArray[np.uint8], path: Path, exif: bytes = b"") -> None:
 def prepare_photograph(
     folder: Path, images: Path, masks: Mapping[str, Path], name: str, backdrop: Backdrop = "black"
 ) -> None:
-    """Write the photograph ``name`` with its ignored pixels replaced and its transparent pixels
-    over ``backdrop``.
+    """Write the photograph ``name`` without its ignored and transparent pixels.
 
     The photograph goes to ``images/<name>`` below ``folder``: a copy if nothing changes, else a PNG
     with the original EXIF data. Its mask, if any, goes to ``masks/<name>.png`` in black and white.
@@ -388,8 +368,7 @@ def prepare_photograph(
 
 
 def prepared_mask(folder: Path, name: str) -> Path:
-    """The file to which `prepare_photograph` writes the mask of the image ``name``, as COLMAP names
-    it."""
+    """The file of the mask that `prepare_photograph` writes, as COLMAP names it."""
     return folder / MASKS / f"{name}{SUFFIX}"
 
 
@@ -413,9 +392,8 @@ def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
     weights = np.pad(mask, to_even).astype(np.float32)
     rows, columns = weights.shape[0] // 2, weights.shape[1] // 2
     blocks = (rows, 2, columns, 2)
-    sums = (
-        (np.pad(image * mask[..., None], (*to_even, (0, 0)))).reshape(*blocks, 3).sum((1, 3))
-    )  # [H/2, W/2, 3]
+    padded = np.pad(image * mask[..., None], (*to_even, (0, 0)))
+    sums = padded.reshape(*blocks, 3).sum((1, 3))  # [H/2, W/2, 3]
     counted = weights.reshape(blocks).sum((1, 3))  # [H/2, W/2]
     coarse = _pull_push(sums / np.maximum(counted, 1)[..., None], counted > 0)
     pushed = _double(_double(coarse, 0), 1)[:height, :width]
@@ -435,8 +413,7 @@ def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
 
 
 def resize_mask(mask: Mask, width: int, height: int) -> Mask:
-    """The mask at another size: a pixel counts if all original pixels with centres in its area
-    count.
+    """The mask at another size: a pixel counts if all original ones centred in its area count.
 
     The filters that resize photographs reach further than that. Beyond the mask's border they use
     the pixels that `fill_ignored` made.

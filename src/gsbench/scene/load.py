@@ -1,5 +1,4 @@
-"""Loading a `Scene` with pinhole cameras and images at their final size, from a capture and a
-COLMAP model.
+"""Loading a `Scene` of pinhole cameras and final images from a capture and a COLMAP model.
 
 Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's
 name is a digest of everything that the pixels depend on. A folder appears by one rename, so a set
@@ -150,15 +149,12 @@ def _prepare_views(
             file = f"{index:05d}.png" if changed else ""
             entries[name] = {"file": file, "pose": pose}
             if changed:
-                mask = capture.masks.get(name)
-                changes[name] = ImageToPrepare(
-                    capture.images / name, model, work / file, downscaling, mask
-                )
+                source, mask = capture.images / name, capture.masks.get(name)
+                changes[name] = ImageToPrepare(source, model, work / file, downscaling, mask)
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
-        for name, camera in zip(
-            changes, prepare_all(list(changes.values()), progress), strict=True
-        ):
+        prepared = prepare_all(list(changes.values()), progress)
+        for name, camera in zip(changes, prepared, strict=True):
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
@@ -180,8 +176,7 @@ def _publish(work: Path, folder: Path) -> None:
 def _model_cameras(
     capture: Capture, model_dir: Path
 ) -> dict[str, tuple[CameraModel, list[list[float]]]]:
-    """The COLMAP camera at the file's size and the 3x4 pose of every image of the capture that has
-    a pose."""
+    """The COLMAP camera at the file's size and the 3x4 pose of every posed image of the capture."""
     # not needed if the views are cached
     from gsbench.scene.colmap import plain_camera, read_model, rescaled_camera
 
@@ -212,16 +207,10 @@ def _model_cameras(
 
 def _report_unregistered(capture: Capture, registered: set[str]) -> None:
     for kind, names in (("training", capture.train_names), ("test", capture.test_names)):
-        missing = [name for name in names if name not in registered]
-        if missing:
-            log.warning(
-                "scene %s: %d of %d %s views have no pose and are left out: %s",
-                capture.name,
-                len(missing),
-                len(names),
-                kind,
-                some_of(missing),
-            )
+        if missing := [name for name in names if name not in registered]:
+            share = f"{len(missing)} of {len(names)} {kind} views"
+            what = "have no pose and are left out"
+            log.warning("scene %s: %s %s: %s", capture.name, share, what, some_of(missing))
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -237,18 +226,15 @@ def _camera(entry: dict[str, object]) -> Camera:
 def _cache_key(
     capture: Capture, model_dir: Path, downscaling: Downscaling, made_by: Mapping[str, str | None]
 ) -> str:
-    """A digest of the images, the model's cameras and poses, the settings, and the versions that
-    prepare the images."""
+    """A digest of images, cameras, poses, settings, and versions of what prepares the images."""
     digest = hashlib.sha256()
     for file in sorted(model_files(model_dir)):
-        if file.stem != "points3D":
-            digest.update(
-                f"{file.name}\0{hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode()
-            )
+        if file.stem != "points3D":  # views do not depend on points
+            content = hashlib.sha256(file.read_bytes()).hexdigest()
+            digest.update(f"{file.name}\0{content}\n".encode())
     settings = [*vars(downscaling).values(), sorted(made_by.items())]
-    digest.update(
-        json.dumps([CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]).encode()
-    )
+    parts = [CACHE_VERSION, capture.fingerprint, capture.image_names, *settings]
+    digest.update(json.dumps(parts).encode())
     return digest.hexdigest()[:32]
 
 
@@ -302,8 +288,7 @@ def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
 
 
 def prepare_image(image: ImageToPrepare) -> Camera:
-    """Read, undistort if needed, downscale, and write one image as PNG; returns its final camera,
-    at the origin."""
+    """Read, undistort if needed, shrink and write one image; returns its final camera."""
     pixels = read_image(image.source)  # [H, W, 3]
     if pixels.shape[:2] != (image.camera.height, image.camera.width):
         raise InputError(f"{image.source}: the image changed its size while it was read: run again")
@@ -321,8 +306,7 @@ def prepare_image(image: ImageToPrepare) -> Camera:
 
 
 def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) -> None:
-    """Undistort and shrink the mask as the image: a pixel counts if no ignored pixel contributes to
-    its area."""
+    """Treat the mask as the image: a pixel counts if no ignored pixel contributes to its area."""
     mask = read_mask(source)
     if image.camera.distorted:
         levels = np.repeat(mask[..., None].astype(np.uint8) * WHITE, 3, axis=2)  # [H, W, 3]
@@ -345,13 +329,11 @@ def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np
 
     from gsbench.scene.colmap import plain_camera
 
-    source = pycolmap.Camera(
-        model=camera.name, width=camera.width, height=camera.height, params=list(camera.params)
-    )
+    size = {"width": camera.width, "height": camera.height}
+    source = pycolmap.Camera(model=camera.name, params=list(camera.params), **size)
     refusal = (
         f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
-        "pinhole images: "
-        "use another camera model"
+        "pinhole images: use another camera model"
     )
     if source.is_spherical():
         raise InputError(refusal)

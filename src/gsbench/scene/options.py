@@ -1,5 +1,4 @@
-"""The settings of a scene: where its photographs lie, how many are read, how large, and which are
-held out."""
+"""The settings of a scene: where photographs lie, how many, how large, which are held out."""
 
 import math
 from dataclasses import dataclass, fields
@@ -20,8 +19,7 @@ MIN_SIZE = 16  # px: the smallest side of an image that is trained on
 def downscaled_size(
     width: int, height: int, downscale: int = 1, max_size: int | None = None
 ) -> tuple[int, int]:
-    """The size after dividing by ``downscale``, and then shrinking the longest side to ``max_size``
-    if it is longer.
+    """The size divided by ``downscale``, with the longest side at most ``max_size``.
 
     Sides are rounded half up to at least 1. The size never grows.
 
@@ -36,28 +34,27 @@ def downscaled_size(
     if max_size is not None and max_size < 1:
         raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
     longest = max(width, height)
-    # One fraction for both sides, so that the longest side becomes exactly max_size.
-    numerator, denominator = (
-        (max_size, longest) if max_size and max_size * downscale < longest else (1, downscale)
-    )
-    return tuple(
-        max(1, math.floor(side * numerator / denominator + 0.5)) for side in (width, height)
-    )  # type: ignore[return-value]
+    numerator, denominator = 1, downscale
+    if max_size and max_size * downscale < longest:
+        # One fraction for both sides, so that the longest side becomes exactly max_size.
+        numerator, denominator = max_size, longest
+
+    def scaled(side: int) -> int:
+        return max(1, math.floor(side * numerator / denominator + 0.5))
+
+    return scaled(width), scaled(height)
 
 
 def check_final_size(
     size: tuple[int, int], downscale: int, max_size: int | None, what: str
 ) -> None:
-    """Raise InputError if ``what``, of ``size`` (width, height) px, would have a side below 16 px
-    in training."""
+    """Raise InputError if ``what``, of ``size`` (width, height), would have a side below 16 px."""
     width, height = downscaled_size(*size, downscale, max_size)
     if min(width, height) < MIN_SIZE:
-        cause = f"scene.downscale={downscale}" + (
-            "" if max_size is None else f" with scene.max_size={max_size}"
-        )
+        limit = "" if max_size is None else f" with scene.max_size={max_size}"
         raise InputError(
-            f"{cause} leaves {width}x{height} px of {what} ({size[0]}x{size[1]} px): at least "
-            f"{MIN_SIZE} px are needed"
+            f"scene.downscale={downscale}{limit} leaves {width}x{height} px of {what} "
+            f"({size[0]}x{size[1]} px): at least {MIN_SIZE} px are needed"
         )
 
 
@@ -69,8 +66,7 @@ TRAIN_LIST, TEST_LIST = "train_list.txt", "test_list.txt"  # as nerfbaselines na
 
 @dataclass(frozen=True)
 class SplitRule:
-    """Settings that say which views are held out; the fields are those of
-    `gsbench.scene.options.SceneConfig`.
+    """Settings that say which views are held out; the fields are those of `SceneConfig`.
 
     ``every_nth`` holds out every ``test_every``-th name, from the first. ``sector`` holds out
     sector number ``sector`` of ``sectors`` contiguous ones
@@ -103,8 +99,7 @@ class SplitRule:
         if self.split == "matched":
             raise InputError(
                 "scene.split=matched is a pair of trials: sweep it, as in -m "
-                "scene.split=every_nth,sector "
-                "scene.match_views=true"
+                "scene.split=every_nth,sector scene.match_views=true"
             )
         if self.sector >= self.sectors:
             raise InputError(
@@ -130,8 +125,7 @@ MAX_SIZE = 16_384  # px, a side of a view of the courtyard
 
 
 def folder_name(path: str | None) -> str:
-    """The last part of ``path`` as the scene's name, or ``scene`` if it cannot name a folder of
-    results."""
+    """The last part of ``path`` as the scene's name, or ``scene`` if it names no folder."""
     name = Path(path or "").expanduser().absolute().name
     return name if is_folder_name(name) else "scene"
 
@@ -180,15 +174,13 @@ class SceneConfig:
         if self.kind == "courtyard" and self.path:
             raise InputError(
                 f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos "
-                "(bare photographs), "
-                "scene=colmap or scene=transforms"
+                "(bare photographs), scene=colmap or scene=transforms"
             )
         self.split_rule.check()
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
                 "scene.split=sector needs the cameras, and these photographs came without: give a "
-                "COLMAP model "
-                "(scene=colmap)"
+                "COLMAP model (scene=colmap)"
             )
         if self.kind == "courtyard" and self.masks is not None:
             raise InputError(

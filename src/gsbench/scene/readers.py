@@ -50,8 +50,7 @@ def read_colmap(
     exact_poses: bool = False,
     masks: str | None = None,
 ) -> Capture:
-    """Read a COLMAP folder: ``path/<images>`` (else "images") and ``path/<sparse>`` (else
-    "sparse/0" or "sparse").
+    """Read a COLMAP folder: ``path/<images>`` ("images"), ``path/<sparse>`` ("sparse/0", "sparse").
 
     The photographs are the files in the folder that have a pose in the model; their extensions may
     differ from the model's names. `select_images` chooses the ones that are kept, `SplitRule` the
@@ -67,28 +66,18 @@ def read_colmap(
     root = existing_folder(name, path)
     model_folder, others = _find_sparse(root, sparse)
     if others:
-        log.warning(
-            "%s has %s; %s is read because it has the most images (%s); scene.sparse chooses "
-            "another",
-            root,
-            counted(len(others) + 1, "COLMAP model"),
-            model_folder.relative_to(root),
-            ", ".join(others),
-        )
+        found = counted(len(others) + 1, "COLMAP model")
+        why = f"is read because it has the most images ({', '.join(others)})"
+        chosen = model_folder.relative_to(root)
+        log.warning("%s has %s; %s %s; scene.sparse chooses another", root, found, chosen, why)
     folder = _subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
     mask_folder, files = _masks_and_images(root, folder, masks)
     matches = match_names(wanted, files)
-    missing = [image for image in wanted if image not in matches]
-    if missing:
-        log.warning(
-            "%s: %d of %d images of the model have no file: %s",
-            folder,
-            len(missing),
-            len(wanted),
-            some_of(missing),
-        )
+    if missing := [image for image in wanted if image not in matches]:
+        share = f"{len(missing)} of {len(wanted)} images of the model"
+        log.warning("%s: %s have no file: %s", folder, share, some_of(missing))
     _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
     model_names = {file: image for image, file in matches.items()}
     capture = _make_capture(
@@ -105,11 +94,9 @@ def read_colmap(
     )
     # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as
     # they are.
-    return (
-        capture
-        if exact_poses
-        else replace(capture, advised_normalization=find_normalization(camera_centers(model)))
-    )
+    if exact_poses:
+        return capture
+    return replace(capture, advised_normalization=find_normalization(camera_centers(model)))
 
 
 def read_transforms(
@@ -121,8 +108,7 @@ def read_transforms(
     split: SplitRule = EVERY_NTH,
     masks: str | None = None,
 ) -> Capture:
-    """Read the photographs that ``transforms.json`` in ``path`` names, with the cameras in the
-    COLMAP folder ``model``.
+    """Read the photographs that ``transforms.json`` names, with cameras of the COLMAP ``model``.
 
     ``transforms`` is the content of the file (`gsbench.scene.transforms.read_transforms`), and
     ``model`` was written from it (`gsbench.scene.colmap.write_frames`). ``split=list`` holds out
@@ -168,8 +154,7 @@ def read_photos(
     split: SplitRule = EVERY_NTH,
     masks: str | None = None,
 ) -> Capture:
-    """Read bare photographs: all images in ``path/<images>``, or ``path/images`` if there is one,
-    or ``path``.
+    """Read bare photographs: all in ``path/<images>``, else ``path/images``, else ``path``.
 
     Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP
     model beside the photographs is ignored.
@@ -182,9 +167,8 @@ def read_photos(
     else:
         folder = root / "images" if (root / "images").is_dir() else root
     mask_folder, names = _masks_and_images(root, folder, masks)
-    _require_enough(
-        len(names), folder, f"({', '.join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))})"
-    )
+    formats = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
+    _require_enough(len(names), folder, f"({formats})")
     return _make_capture(
         name, folder, names, None, False, max_images, split, root, None, mask_folder
     )
@@ -201,17 +185,12 @@ def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path
             f"scene.masks: {mask_folder} is the folder of the images: put the masks into one of "
             "their own"
         )
-    images = [
-        name
-        for name in list_images(folder)
-        if not (folder / name).resolve().is_relative_to(resolved)
-    ]
-    return mask_folder, images
+    paths = {name: (folder / name).resolve() for name in list_images(folder)}
+    return mask_folder, [name for name in paths if not paths[name].is_relative_to(resolved)]
 
 
 def existing_folder(name: str, path: Path | str) -> Path:
-    """The folder ``path`` of the scene ``name``; raises `InputError` if it is not set or does not
-    exist."""
+    """The folder ``path`` of the scene ``name``; raises `InputError` if missing or not set."""
     if path is None or str(path) == "":
         raise InputError(f"scene {name}: scene.path is not set: give the folder of the photos")
     root = Path(path).expanduser()
@@ -226,8 +205,7 @@ def missing_folder(name: str, root: Path) -> str:
 
 
 def missing_model(name: str, root: Path, sparse: str | None) -> str:
-    """The reason why the folder ``root`` of the scene ``name`` has no COLMAP model, or "" if it has
-    one."""
+    """The reason why ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
     try:
         _find_sparse(root, sparse)
     except InputError as error:
@@ -241,8 +219,7 @@ def fingerprint(
     model_files: Iterable[Path] = (),
     masks: Mapping[str, Path] = MappingProxyType({}),
 ) -> str:
-    """sha256 over the names and contents of images, model files and masks, independent of their
-    folders."""
+    """sha256 over names and contents of images, model files and masks, wherever they lie."""
     digest = hashlib.sha256()
     entries = [(f"image/{name}", folder / name) for name in sorted(names)]
     entries += [(f"model/{file.name}", file) for file in sorted(model_files)]
@@ -279,6 +256,7 @@ def _make_capture(
     if train is not None and test is not None:
         names = sorted({*train, *test})
     held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
+    # A test view that is trained on under another name would measure memory.
     copies = copies_of_test_views(folder, held_out.train, held_out.test)
     report_left_out(folder, copies, "with the content of a test view")
     kept = tuple(sorted({*held_out.train, *held_out.test} - set(copies)))
@@ -287,6 +265,7 @@ def _make_capture(
         len(kept), folder, "in the split lists" if split.by_lists else "left by the split"
     )
     masks = {} if mask_folder is None else find_masks(mask_folder, folder, kept)
+    files = [] if model is None else model_files(model)
     return Capture(
         name=name,
         images=folder,
@@ -294,9 +273,7 @@ def _make_capture(
         test_names=held_out.test,
         model=model,
         exact_poses=exact_poses,
-        fingerprint=fingerprint(
-            folder, kept, model_files(model) if model is not None else (), masks
-        ),
+        fingerprint=fingerprint(folder, kept, files, masks),
         held_out=held_out.description,
         masks=masks,
         left_out=left_out | copies,
@@ -304,8 +281,7 @@ def _make_capture(
 
 
 def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[str]:
-    """The image files that the names in a split list mean; names may lack an extension or have
-    another one."""
+    """The image files that a split list names; extensions may lack or differ."""
     matches = match_names(wanted, names)
     if unknown := [name for name in wanted if name not in matches]:
         raise InputError(
@@ -316,8 +292,7 @@ def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[
 
 
 def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
-    """The training and the test list; ``split=list`` without file names reads the lists that
-    nerfbaselines writes."""
+    """The training and the test list; ``split=list`` alone reads those of nerfbaselines."""
     train, test = split.train_list, split.test_list
     if split.split == "list" and train is None and test is None:
         train, test = (
@@ -326,8 +301,7 @@ def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[st
         if train is None and test is None:
             raise InputError(
                 f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the "
-                "files with "
-                "scene.train_list and scene.test_list"
+                "files with scene.train_list and scene.test_list"
             )
     return _read_list(root, train, "scene.train_list"), _read_list(root, test, "scene.test_list")
 
@@ -359,8 +333,7 @@ def _subfolder(root: Path, folder: str, key: str) -> Path:
 
 
 def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
-    """The folder of the COLMAP model, and the others that were found, each with its number of
-    images.
+    """The folder of the COLMAP model, and the others found, each with its number of images.
 
     COLMAP writes a folder sparse/0, sparse/1, … for each part that it could not connect, in no
     order of size. The model with the most images is taken, and of equal ones the first.
@@ -369,25 +342,19 @@ def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
         model_files(root / sparse)
         return root / sparse, []
     for parent in (root / "sparse", root / "colmap" / "sparse"):
-        numbered = [
-            folder for folder in parent.glob("*") if folder.name.isdecimal() and folder.is_dir()
-        ]
-        found = [
-            folder
-            for folder in (*sorted(numbered, key=lambda path: int(path.name)), parent)
-            if _is_model(folder)
-        ]
+        numbered = [folder for folder in parent.glob("*") if folder.name.isdecimal()]
+        ordered = [*sorted(numbered, key=lambda path: int(path.name)), parent]
+        found = [folder for folder in ordered if _is_model(folder)]
         if len(found) == 1:
-            return found[0], []
+            return found[0], []  # not counted: a damaged one gets a better message later
         if found:
             counts = {folder: count_images(folder) for folder in found}
             largest = max(found, key=counts.__getitem__)
-            others = [
-                f"{path.relative_to(root)}: {counted(counts[path], 'image')}"
-                for path in found
-                if path != largest
+            del counts[largest]
+            return largest, [
+                f"{path.relative_to(root)}: {counted(count, 'image')}"
+                for path, count in counts.items()
             ]
-            return largest, others
     raise InputError(
         f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use "
         "scene=photos"

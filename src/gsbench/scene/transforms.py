@@ -1,5 +1,4 @@
-"""Reading ``transforms.json`` of nerfstudio, instant-ngp and Blender, and converting its cameras to
-COLMAP's form.
+"""Reading ``transforms.json`` of nerfstudio, instant-ngp and Blender into COLMAP's form.
 
 A ``transform_matrix`` maps camera coordinates to world coordinates, in OpenGL axes (x right, y up,
 looking along -z). Intrinsics have COLMAP's meaning. ``applied_transform`` and ``applied_scale``
@@ -41,6 +40,7 @@ from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 Row = Annotated[list[Number], Len(4, 4)]
+Optional = Number | None
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
 
 ONE_FILE = "transforms.json"
@@ -66,24 +66,24 @@ class Intrinsics(Record):
 
     camera_model: str | None = None
     is_fisheye: bool | None = None  # instant-ngp's key for OPENCV_FISHEYE
-    w: Number | None = None
-    h: Number | None = None
-    fl_x: Number | None = None
-    fl_y: Number | None = None
-    cx: Number | None = None
-    cy: Number | None = None
-    camera_angle_x: Number | None = None  # horizontal field of view, radians
-    camera_angle_y: Number | None = None  # vertical
-    x_fov: Number | None = None  # the same in degrees: instant-ngp's keys
-    y_fov: Number | None = None
-    k1: Number | None = None
-    k2: Number | None = None
-    k3: Number | None = None
-    k4: Number | None = None
-    k5: Number | None = None
-    k6: Number | None = None
-    p1: Number | None = None
-    p2: Number | None = None
+    w: Optional = None
+    h: Optional = None
+    fl_x: Optional = None
+    fl_y: Optional = None
+    cx: Optional = None
+    cy: Optional = None
+    camera_angle_x: Optional = None  # horizontal field of view, radians
+    camera_angle_y: Optional = None  # vertical
+    x_fov: Optional = None  # the same in degrees: instant-ngp's keys
+    y_fov: Optional = None
+    k1: Optional = None
+    k2: Optional = None
+    k3: Optional = None
+    k4: Optional = None
+    k5: Optional = None
+    k6: Optional = None
+    p1: Optional = None
+    p2: Optional = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,8 +157,7 @@ def find_files(folder: Path) -> dict[str, Path]:
     if "train" not in files:
         raise InputError(
             f"{folder}: neither {ONE_FILE} nor {SPLIT_FILES['train']} is here: give the folder "
-            "that holds it, or take "
-            "scene=colmap or scene=photos"
+            "that holds it, or take scene=colmap or scene=photos"
         )
     if "test" in files:
         files.pop("val", None)  # reports on Blender's scenes use the training and test views alone
@@ -166,8 +165,7 @@ def find_files(folder: Path) -> dict[str, Path]:
 
 
 def read_transforms(folder: Path) -> Transforms:
-    """Read the cameras in ``folder``; raises InputError, one line, for a file that cannot be
-    understood."""
+    """Read the cameras in ``folder``; raises InputError, one line, for a file not understood."""
     files = find_files(folder)
     records = {split: _read_record(path) for split, path in files.items()}
     find = _FileFinder(folder)
@@ -187,13 +185,8 @@ def read_transforms(folder: Path) -> Transforms:
             images[name] = _camera(folder / name, path, record, frame), *_pose(path, frame, applied)
             names[split].append(name)
         if missing:
-            log.warning(
-                "%s: %d of %d images have no file: %s",
-                path,
-                len(missing),
-                len(record.frames),
-                some_of(missing),
-            )
+            share = f"{len(missing)} of {len(record.frames)}"
+            log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
         if record.ply_file_path is not None:
             points = folder / _relative_path(path, record.ply_file_path)
             if not points.is_file():
@@ -211,8 +204,7 @@ def read_transforms(folder: Path) -> Transforms:
 
 
 def _relative_path(path: Path, written: str) -> PurePosixPath:
-    """The path ``written`` in the file ``path``; raises InputError if it leads out of the file's
-    folder."""
+    """The path ``written`` in a file; raises InputError if it leads out of the file's folder."""
     relative = PurePosixPath(written.replace("\\", "/"))
     if relative.is_absolute() or ".." in relative.parts or PureWindowsPath(written).drive:
         raise InputError(
@@ -238,8 +230,7 @@ def names_of(kind: type[Record]) -> frozenset[str]:
 
 
 class _FileFinder:
-    """Finds the image file that ``file_path`` means, as images of COLMAP models are found
-    (`match_names`)."""
+    """Finds the image that ``file_path`` means, as those of COLMAP models are (`match_names`)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -249,8 +240,7 @@ class _FileFinder:
         return list_images(self.folder)
 
     def __call__(self, path: Path, written: str) -> str | None:
-        """The name below the folder, or None if there is no file. Blender's files leave out the
-        extension."""
+        """The name below the folder, or None without a file. Blender leaves out the extension."""
         relative = _relative_path(path, written)
         if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
             return relative.as_posix()
@@ -263,8 +253,7 @@ class _FileFinder:
 def _named_split(
     path: Path, record: TransformsRecord, images: Collection[str]
 ) -> tuple[list[str], list[str]] | None:
-    """nerfstudio's lists of names: those to train on, and those to test on or else to validate
-    on."""
+    """nerfstudio's lists of names: to train on, and to test on or else to validate on."""
     train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
     held_out = val if test is None else test
     if held_out is None:
@@ -302,8 +291,8 @@ def _applied_transform(path: Path, record: TransformsRecord) -> AppliedTransform
 
 
 def nearest_rotation(matrix: Array, what: str) -> Array:
-    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if ``matrix`` is far from a
-    rotation."""
+    """The rotation nearest to ``matrix`` [3, 3]; raises InputError if that is far from it."""
+    # U V^T of the singular value decomposition is the nearest orthogonal matrix (Schönemann 1966).
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
@@ -344,8 +333,7 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
     if focal_x is None or focal_y is None or min(focal_x, focal_y) <= 0.0:
         raise InputError(
             f"{where}: no focal length: fl_x, camera_angle_x (between 0 and pi) or x_fov (between "
-            "0 and 180) must be "
-            "given, or the same for y"
+            "0 and 180) must be given, or the same for y"
         )
     cx, cy = value("cx"), value("cy")
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
@@ -393,8 +381,7 @@ def _distortion(
 def _focal_length(
     side: float, given: float | None, angle: float | None, degrees: float | None
 ) -> float | None:
-    """The focal length in px along a side in px: as given, else from the field of view in radians
-    or degrees.
+    """The focal length in px along a side, given or from the field of view (radians or degrees).
 
     None if nothing is given, and 0 for a field of view that is none.
     """

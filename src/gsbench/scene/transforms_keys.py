@@ -1,5 +1,4 @@
-"""The keys of ``transforms.json`` that other programs write, and what becomes of those that gsbench
-does not use.
+"""The keys of ``transforms.json`` of other programs, and what becomes of unused ones.
 
 Sources: nerfstudio's page "Data conventions" and its reader; instant-ngp's page "Tips for training
 NeRF models" and its loader (nerf_loader.cu), whose keys most exporters write (Metashape, Polycam
@@ -70,20 +69,16 @@ REFUSED = {
 def check_keys(
     path: Path, document: Any, file_keys: Collection[str], frame_keys: Collection[str]
 ) -> None:
-    """Look at all keys of the parsed file ``path`` that are not in ``file_keys`` and, for frames,
-    ``frame_keys``.
+    """Look at all keys of a file that are not in ``file_keys`` or, of frames, ``frame_keys``.
 
     Raises InputError for a key of `REFUSED` whose value says something. Logs one line that names
     unknown keys.
     """
     unknown: set[str] = set()
-    for place, record, used in (
-        ("", document, file_keys),
-        *(
-            (f" (frame {number})", frame, frame_keys)
-            for number, frame in enumerate(document["frames"])
-        ),
-    ):
+    records = [("", document, file_keys)]
+    for number, frame in enumerate(document["frames"]):
+        records.append((f" (frame {number})", frame, frame_keys))
+    for place, record, used in records:
         for key, value in record.items():
             if key in REFUSED and says_something(key, value):
                 raise InputError(f"{path}: {key}{place}: {REFUSED[key]}")
@@ -99,8 +94,7 @@ def check_keys(
 
 
 def says_something(key: str, value: Any) -> bool:
-    """Return whether a value asks for more than its absence: not null, false, empty, zero or a list
-    of zeros."""
+    """Return whether a value asks for something: not null, false, empty, or zeros alone."""
     if key.startswith("transform_matrix"):
         return value is not None
     if isinstance(value, list):

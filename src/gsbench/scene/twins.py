@@ -1,5 +1,4 @@
-"""Photographs that a capture has twice: copies by name, by content and by pixels, and views that
-look nearly the same.
+"""Photographs that a capture has twice: copies, and views that look nearly the same.
 
 A test view whose copy is trained on measures memory, so copies of test views are left out of
 training. Near twins, such as the next shot of a burst, are used and reported.
@@ -39,8 +38,7 @@ LEAST_DEVIATION = 1.0  # of 255 grey values: smaller pictures of less have no co
 
 
 def copies_by_name(names: Sequence[str], wanted: Collection[str] = ()) -> dict[str, str]:
-    """Map each photograph whose path differs from another's in the extension alone to the one that
-    is used instead.
+    """Map each photograph whose path differs in the extension alone to the one that is used.
 
     A name in ``wanted`` is used first; then the format that more of the ``names`` have, so that a
     folder which has all photographs in one format is read in that format; then a JPEG.
@@ -86,8 +84,7 @@ def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]
 
 
 def report_left_out(folder: Path, left_out: Mapping[str, str], why: str) -> None:
-    """Write one line on photographs that are left out; ``left_out`` maps each to the one that it
-    copies."""
+    """Write one line on photographs that are left out, each mapped to the one that it copies."""
     if left_out:
         pairs = [f"{name} ({other} is used)" for name, other in left_out.items()]
         log.warning(
@@ -100,8 +97,7 @@ def report_left_out(folder: Path, left_out: Mapping[str, str], why: str) -> None
 
 
 def without_copies(scene: Scene) -> Scene:
-    """The scene without training views that have the same pixels as a test view, and with its near
-    twins noted.
+    """The scene without training views that have a test view's pixels, its near twins noted.
 
     Pixels are compared at their final size, where both masks count. Raises InputError if no
     training view is left.
@@ -112,6 +108,7 @@ def without_copies(scene: Scene) -> Scene:
     for test in scene.test:
         for view in scene.train:
             value = likeness(small[test.name], small[view.name])
+            # Equal pixels are a costly question, asked of similar pictures only.
             if value < NEAR:  # NaN, where little is to be compared, goes on
                 continue
             if same_pixels(test, view):
@@ -120,8 +117,7 @@ def without_copies(scene: Scene) -> Scene:
                 candidates[test.name].append((value, view.name))
     near: dict[str, str] = {}
     for name, found in candidates.items():
-        trained_on = [one for one in found if one[1] not in equal]
-        if trained_on:
+        if trained_on := [one for one in found if one[1] not in equal]:
             near[name] = max(trained_on)[1]
     report_left_out(Path(scene.name), equal, "with the pixels of a test view")
     if near:
@@ -146,8 +142,7 @@ SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_], tuple[int, int]]
 
 
 def small_picture(view: View) -> SmallPicture:
-    """The view as a small grey picture, the cells that its mask counts, and its own (width, height)
-    in px."""
+    """The view as a small grey picture, the cells that count, and its own (width, height) in px."""
     height, width = view.image.shape[:2]
     scale = GRID / max(width, height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -157,8 +152,7 @@ def small_picture(view: View) -> SmallPicture:
 
 
 def likeness(one: SmallPicture, other: SmallPicture) -> float:
-    """The correlation of two small pictures where both count; -1 for another shape, NaN where too
-    little counts.
+    """The correlation of small pictures where both count; -1: other shape, NaN: too little.
 
     A correlation ignores brightness and contrast, which a camera's exposure changes between two
     shots.
@@ -175,8 +169,7 @@ def likeness(one: SmallPicture, other: SmallPicture) -> float:
 
 
 def same_pixels(one: View, other: View) -> bool:
-    """Return whether two views have the same pixels where both count; False if there is no such
-    pixel."""
+    """Return whether two views have the same pixels where both count, and any does."""
     if one.image.shape != other.image.shape:
         return False
     both = np.ones(one.image.shape[:2], bool)

@@ -1,5 +1,4 @@
-"""Types of a scene: a `Camera`, a `Capture` of photographs before initialisation, and a `Scene` of
-views with cameras.
+"""Types of a scene: `Camera`, `Capture` before initialisation, and `Scene` of views with cameras.
 
 Also measures of cameras: the scene extent, and the distance of test cameras from the training
 cameras.
@@ -56,6 +55,7 @@ class Camera:
             raise ValueError(f"camera: cx and cy must be finite, got cx={self.cx}, cy={self.cy}")
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
+        # 1e-4: quaternions are written with few digits, and pycolmap accepts any length
         if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
             raise ValueError("camera: rotation must be an orthonormal 3x3 matrix")
         if translation.shape != (3,) or not np.isfinite(translation).all():
@@ -90,8 +90,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A COLMAP camera as plain values: the model's name, the size in px, and the parameters in
-    COLMAP's order."""
+    """A COLMAP camera as plain values: model name, size in px, parameters in COLMAP's order."""
 
     name: str
     width: int
@@ -195,8 +194,7 @@ class Scene:
 
 
 def extent_of_centers(centers: NDArray[np.float64]) -> float:
-    """1.1 x the largest distance of a camera centre [V, 3] from their mean, in world units (3DGS's
-    getNerfppNorm)."""
+    """1.1 x the largest distance of a centre [V, 3] from their mean, world units (3DGS)."""
     return float(EXTENT_MARGIN * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
@@ -215,8 +213,7 @@ def angles_between(directions: Array, references: Array) -> Array:
 def nearest_training_cameras(
     cameras: Sequence[Camera], training: Sequence[Camera], extent: float
 ) -> list[dict[str, float]]:
-    """Measure how far each camera is from the training camera nearest in angle, and from the one
-    nearest in position.
+    """Measure how far each camera is from the training cameras nearest in angle and in position.
 
     ``angle_to_nearest`` is the smallest angle between the viewing directions, in degrees.
     ``distance_to_nearest`` is the smallest distance between the centres, in scene extents; it is
@@ -231,13 +228,9 @@ def nearest_training_cameras(
         np.array([camera.center for camera in group]) for group in (cameras, training)
     )
     angles = angles_between(directions, training_directions).min(axis=1)  # [V]
-    distances = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1).min(
-        axis=1
-    )  # [V]
-    measured = []
-    for angle, distance in zip(angles, distances, strict=True):
-        values = {ANGLE: float(angle)}
-        if extent > 0:
+    measured = [{ANGLE: float(angle)} for angle in angles]
+    if extent > 0:
+        apart = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1)  # [V, W]
+        for values, distance in zip(measured, apart.min(axis=1), strict=True):
             values[DISTANCE] = float(distance) / extent
-        measured.append(values)
     return measured

@@ -1,5 +1,7 @@
-"""The installation of gsbench: its folder, the command that installs extras, and its state in
-git."""
+"""The installation of gsbench.
+
+Its folder, the command that installs extras, and its state in git.
+"""
 
 import json
 import os
@@ -18,8 +20,10 @@ DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" 
 
 
 def install_command(extra: str = "") -> str:
-    """The shell command that installs gsbench with an extra such as ``view``, from the place it was
-    installed from."""
+    """The shell command that installs gsbench with an extra such as ``view``.
+
+    It installs from where gsbench came from.
+    """
     extras = f"[{extra}]" if extra else ""
     root = checkout()
     if root is None:
@@ -28,8 +32,10 @@ def install_command(extra: str = "") -> str:
 
 
 def installed_from() -> Path | None:
-    """The folder that pip installed gsbench from, by pip's record (PEP 610); None for a package
-    index."""
+    """The folder that pip installed gsbench from, by pip's record (PEP 610).
+
+    It is None for a package index.
+    """
     try:
         record = distribution(DISTRIBUTION).read_text("direct_url.json")
     except PackageNotFoundError:
@@ -40,8 +46,10 @@ def installed_from() -> Path | None:
 
 
 def checkout() -> Path | None:
-    """The folder of the source checkout that gsbench runs from; None if it was installed as a
-    wheel."""
+    """The folder of the source checkout that gsbench runs from.
+
+    It is None if it was installed as a wheel.
+    """
     root = Path(__file__).resolve().parents[3]
     return (
         root
@@ -82,10 +90,10 @@ SAFE_SETTINGS = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protoc
 
 
 def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
-    """The ``commit`` of the checkout that contains ``folder``, and whether it is ``edited``: None
-    if that is unknown.
+    """The ``commit`` of the checkout that contains ``folder``, and whether it is ``edited``.
 
-    Empty if there is no checkout, or if git does not track the file ``tracked``.
+    It is None if that is unknown. Empty if there is no checkout, or if git does not track the file
+    ``tracked``.
     """
     commit = _git(folder, "rev-parse", "HEAD") if _git(folder, "ls-files", "--", tracked) else None
     if not commit:
@@ -100,14 +108,15 @@ def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
 
 @cache
 def own_checkout() -> dict[str, Any]:
-    """The commit of gsbench's own checkout, and whether tracked files had changed; empty if it is
-    no checkout."""
+    """The commit of gsbench's own checkout, and whether tracked files had changed.
+
+    Empty if it is no checkout.
+    """
     return checkout_of(Path(__file__).parent, Path(__file__).name)
 
 
 def _has_filters(folder: Path) -> bool:
-    """Return whether the repository names programs (filters) that git would run to compare files,
-    or may do so.
+    """Return whether git may run programs (filters) of the repository to compare files.
 
     A capture from a stranger may be a repository. Filters of the user's own configuration do not
     count.
@@ -119,8 +128,7 @@ def _has_filters(folder: Path) -> bool:
 
 
 class WorkTrees:
-    """Work trees of commits of the repository that contains ``folder``, made below the empty folder
-    ``place``.
+    """Work trees of commits of ``folder``'s repository, below the empty folder ``place``.
 
     They belong to a new repository that shares the objects. So the user's checkout and its list of
     work trees do not change, and no hook, filter or other program of the repository's configuration
@@ -139,11 +147,10 @@ class WorkTrees:
         )
 
     def commits(self, first: str, last: str) -> list[tuple[str, str, str]]:
-        """List (hash, date, subject) of the commits from ``first`` to ``last``, without those
-        inside merges.
+        """List (hash, date, subject) of the commits from ``first`` to ``last``.
 
-        Raises InputError if one of them is not a commit, or if ``first`` does not come before
-        ``last``.
+        Those inside merges are left out. Raises InputError if one of them is not a commit, or if
+        ``first`` does not come before ``last``.
         """
         names = [
             run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{one}^{{commit}}")
@@ -171,10 +178,10 @@ class WorkTrees:
 
 
 def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> str:
-    """Run git in ``folder``, with `SAFE_SETTINGS` and without `REPOSITORY_VARIABLES`, and return
-    its output.
+    """Run git in ``folder`` and return its output.
 
-    Raises InputError with git's message if it fails.
+    It has `SAFE_SETTINGS`, and is without `REPOSITORY_VARIABLES`. Raises InputError with git's
+    message if it fails.
     """
     environment = {
         key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES

@@ -1,5 +1,4 @@
-"""Run a function in a separate process, so that a crash in native code becomes an error with a
-reason.
+"""Run a function in a process of its own, where a crash becomes an error with a reason.
 
 The child is a fresh interpreter, not a fork, so it inherits no threads or locks. It imports only
 what the function needs and never the parent's ``__main__``, so it works from console scripts,
@@ -41,12 +40,12 @@ SECONDS_BETWEEN_LOOKS = 0.01
 
 
 def continue_in_child() -> bool:
-    """Fork, and return True in the child. This process does not return: it waits for the child,
-    kills all descendants, and ends with the exit status of the child.
+    """Fork, and return True in the child.
 
-    All of them also end when the standard input of this process is closed, that is, when its parent
-    is gone. Call it while there is only one thread. Returns False, in this process, on systems
-    without fork.
+    This process does not return: it waits for the child, kills all descendants, and ends with the
+    exit status of the child. All of them also end when the standard input of this process is
+    closed, that is, when its parent is gone. Call it while there is only one thread. Returns False,
+    in this process, on systems without fork.
     """
     if not hasattr(os, "fork"):
         return False
@@ -68,8 +67,10 @@ def continue_in_child() -> bool:
 
 
 def end_descendants() -> None:
-    """Kill all descendants of this process. It repeats this, since they may start others
-    meanwhile."""
+    """Kill all descendants of this process.
+
+    It repeats this, since they may start others meanwhile.
+    """
     # not at the top: the import takes longer than many of the functions that run here
     import psutil
 
@@ -175,8 +176,10 @@ POLL_SECONDS = 0.25
 
 
 class ProgressFile:
-    """A `Progress` that appends to a file, from which the parent process reads. Its short writes
-    are atomic."""
+    """A `Progress` that appends to a file, from which the parent process reads.
+
+    Its short writes are atomic.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -193,8 +196,10 @@ def run_with_progress(
     what: str,
     log: Path | None = None,
 ) -> T:
-    """Return ``function(job, progress)``, computed in a fresh process (`run_isolated`), and forward
-    its progress."""
+    """Return ``function(job, progress)``, computed in a fresh process (`run_isolated`).
+
+    Its progress is forwarded.
+    """
     with tempfile.TemporaryDirectory(prefix="gsbench-progress-") as folder:
         channel = ProgressFile(Path(folder, "progress.txt"))
         channel.path.touch()
@@ -225,10 +230,10 @@ def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
 
 
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
-    """The command of a fresh interpreter, with the same module search path, that calls ``name`` of
-    ``module``.
+    """The command of a fresh interpreter that calls ``name`` of ``module``.
 
-    The function has no parameters; ``arguments`` are in ``sys.argv[2:]``.
+    It has the same module search path. The function has no parameters; ``arguments`` are in
+    ``sys.argv[2:]``.
     """
     search_path = json.dumps([sys.path, allowed_modules()])
     # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
@@ -243,8 +248,10 @@ def python_command(module: str, name: str, *arguments: str) -> list[str]:
 
 
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
-    """Start the child, wait for it and return its exit code. On any exception here, also Ctrl-C,
-    end it."""
+    """Start the child, wait for it and return its exit code.
+
+    On any exception here, also Ctrl-C, end it.
+    """
     command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
     # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one
     # traceback, not two. Nothing is written to the pipe at stdin. When it closes, the child ends,
@@ -278,8 +285,10 @@ def _end_group(leader: int) -> None:
 
 
 def _child() -> None:
-    """The main function of the child. Its arguments are the paths of the pickled call and of the
-    result to write."""
+    """The main function of the child.
+
+    Its arguments are the paths of the pickled call and of the result to write.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if not continue_in_child():
         threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -306,8 +315,10 @@ def _portable(error: Exception) -> Exception:
 
 
 def describe_exit(code: int) -> str:
-    """Describe the unexpected end of a process by its exit code: "crashed (SIGSEGV)", "ended early
-    (exit code 1)"."""
+    """Describe the unexpected end of a process by its exit code.
+
+    "crashed (SIGSEGV)", "ended early (exit code 1)".
+    """
     if code < 0:
         try:
             name = signal.Signals(-code).name

@@ -1,5 +1,7 @@
-"""Compilation of kernels by numba: options, the cache on disk, and the message to the user during
-compilation."""
+"""Compilation of kernels by numba.
+
+Options, the cache on disk, and the message to the user during compilation.
+"""
 
 import functools
 import hashlib
@@ -74,11 +76,11 @@ def cache_folder(package: Path = PACKAGE) -> Path:
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call: without the GIL, without Python's division checks,
-    cached on disk.
+    """Compile ``function`` at its first call.
 
-    Reference counts are off, too (``_nrt``): numba would update them atomically at each inlined
-    call. So a kernel must not allocate memory; the caller owns all arrays.
+    Without the GIL, without Python's division checks, cached on disk. Reference counts are off, too
+    (``_nrt``): numba would update them atomically at each inlined call. So a kernel must not
+    allocate memory; the caller owns all arrays.
     """
     # read when the decorator runs; other users of numba in this process keep theirs
     previous = config.CACHE_DIR

@@ -36,11 +36,11 @@ NUMBA_MINIMA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}
 
 
 def describe_machine(device: torch.device) -> dict[str, str]:
-    """Describe this machine for results: ``cpu``, ``architecture``, ``kernels``, ``torch``,
-    ``device``.
+    """Describe this machine for results.
 
-    ``kernels`` is the processor type that kernels are compiled for, with its instruction set;
-    ``torch`` is the instruction set that torch uses; ``device`` is the name of the GPU, or "cpu".
+    ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``. ``kernels`` is the processor type
+    that kernels are compiled for, with its instruction set; ``torch`` is the instruction set that
+    torch uses; ``device`` is the name of the GPU, or "cpu".
     """
     import torch
 
@@ -54,8 +54,10 @@ def describe_machine(device: torch.device) -> dict[str, str]:
 
 
 def kind_of_machine(record: Mapping[str, Any]) -> str:
-    """A record of `describe_machine` as one phrase. Results with equal phrases can be equal to the
-    bit."""
+    """A record of `describe_machine` as one phrase.
+
+    Results with equal phrases can be equal to the bit.
+    """
     cpu = f"{record['cpu']} ({record['kernels']}, torch {record['torch']})"
     return cpu if record["device"] == "cpu" else f"{record['device']}, {cpu}"
 
@@ -80,8 +82,10 @@ def _linux_name() -> str:
 
 
 def load_numba() -> Any:
-    """Import numba. Raises InputError if one of its environment variables would make the import
-    fail."""
+    """Import numba.
+
+    Raises InputError if one of its environment variables would make the import fail.
+    """
     for name, minimum in NUMBA_MINIMA.items():
         value = os.environ.get(name, str(minimum))
         if not value.isascii() or not value.isdigit() or int(value) < minimum:
@@ -99,8 +103,7 @@ def load_numba() -> Any:
 
 
 def numba_target() -> tuple[str, str]:
-    """The processor that numba compiles for, and its features in LLVM's form
-    ("+sse2,-avx512f,…")."""
+    """The processor that numba compiles for, and its features ("+sse2,-avx512f,…")."""
     import llvmlite.binding
 
     numba = load_numba()
@@ -112,8 +115,10 @@ def numba_target() -> tuple[str, str]:
 
 
 def kernel_target() -> str:
-    """The target of numba, this processor or ``NUMBA_CPU_NAME``: its LLVM name and, on x86-64, its
-    level."""
+    """The target of numba, this processor or ``NUMBA_CPU_NAME``.
+
+    Its LLVM name and, on x86-64, its level.
+    """
     name, features = numba_target()
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return name
@@ -124,8 +129,7 @@ def kernel_target() -> str:
 
 
 def x86_level(features: set[str]) -> str:
-    """The highest x86-64 micro-architecture level whose features (LLVM names) are all in
-    ``features``."""
+    """The highest x86-64 level whose features (LLVM's names) are all in ``features``."""
     level = "x86-64-v1"
     for name, required in X86_LEVELS.items():
         if not features.issuperset(required):

@@ -1,7 +1,6 @@
-"""Cores, GPUs and slots for trials that run at once on a machine, and their peak memory. Does not
-import torch.
+"""Cores, GPUs and slots for trials that run at once on a machine, and their peak memory.
 
-For work on a GPU, peak memory is that of the GPU, else that of this process.
+Does not import torch. For work on a GPU, peak memory is that of the GPU, else that of this process.
 """
 
 from __future__ import annotations
@@ -50,8 +49,10 @@ log = logging.getLogger(__name__)
 
 
 def available_threads(parallel: int = 1) -> int:
-    """The number of CPU threads for one of ``parallel`` trials: that of Slurm, else an equal share
-    of the cores."""
+    """The number of CPU threads for one of ``parallel`` trials.
+
+    That of Slurm, else an equal share of the cores.
+    """
     slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
     if slurm.isdigit() and int(slurm) > 0:
         return int(slurm)
@@ -60,8 +61,10 @@ def available_threads(parallel: int = 1) -> int:
 
 @cache
 def trials_at_once(max_gaussians: int | None, device: str) -> int:
-    """A good number of trials at once: the number of GPUs, if they train, else by cores and
-    memory."""
+    """A good number of trials at once.
+
+    The number of GPUs, if they train, else by cores and memory.
+    """
     if names_one_gpu(device):
         return 1
     if device != "cpu" and (gpus := installed_gpus()):
@@ -74,8 +77,10 @@ def trials_at_once(max_gaussians: int | None, device: str) -> int:
 
 @contextmanager
 def take_slot(runs: Path, count: int) -> Iterator[int]:
-    """Hold the first free one of ``count`` slots of this machine: a limit for trials of all
-    commands together."""
+    """Hold the first free one of ``count`` slots of this machine.
+
+    A limit for trials of all commands together.
+    """
     folder = runs / ".slots" / socket.gethostname()
     folder.mkdir(parents=True, exist_ok=True)
     while True:
@@ -91,8 +96,10 @@ def take_slot(runs: Path, count: int) -> Iterator[int]:
 
 
 def assign_gpu(slot: int, visible: str | None) -> None:
-    """Let this process see one GPU, by its slot, of those that the parent saw. Call it before
-    importing torch."""
+    """Let this process see one GPU, by its slot, of those that the parent saw.
+
+    Call it before importing torch.
+    """
     gpus = (
         [gpu.strip() for gpu in visible.split(",") if gpu.strip()]
         if visible is not None
@@ -105,8 +112,10 @@ def assign_gpu(slot: int, visible: str | None) -> None:
 
 
 def names_one_gpu(device: str) -> bool:
-    """Return whether the setting ``device`` names a GPU by its number, such as cuda:1, which all
-    trials then use."""
+    """Return whether ``device`` names a GPU by its number, such as cuda:1.
+
+    All trials then use it.
+    """
     return device.startswith("cuda:")
 
 
@@ -116,8 +125,10 @@ def installed_gpus() -> list[str]:
 
 
 def nvidia_smi(query: str) -> list[str]:
-    """The answers of ``nvidia-smi`` to ``--query-gpu=QUERY``, one for each GPU; [] without a
-    driver."""
+    """The answers of ``nvidia-smi`` to ``--query-gpu=QUERY``, one for each GPU.
+
+    It is [] without a driver.
+    """
     try:
         listing = subprocess.run(
             ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
@@ -132,8 +143,10 @@ def nvidia_smi(query: str) -> list[str]:
 
 
 def assign_threads(threads: int | str, parallel: int) -> None:
-    """Limit threads of libraries in this process to ``threads`` ("auto": its share). Call it before
-    importing torch."""
+    """Limit threads of libraries in this process to ``threads`` ("auto": its share).
+
+    Call it before importing torch.
+    """
     count = available_threads(parallel) if threads == "auto" else int(threads)
     for variable in THREAD_VARIABLES:
         os.environ[variable] = str(count)
@@ -161,8 +174,10 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def peak_memory_mb(device: torch.device) -> float:
-    """Peak memory since `reset_peak_memory`, MiB: torch's allocations on a GPU, else this process's
-    resident memory."""
+    """Peak memory since `reset_peak_memory`, MiB.
+
+    Torch's allocations on a GPU, else this process's resident memory.
+    """
     if device.type == "cuda":
         import torch
 
@@ -185,8 +200,10 @@ def peak_resident_mb() -> float:
 
 
 def peak_child_mb() -> float:
-    """The largest peak resident memory of an ended child of this process, MiB; 0 if the platform
-    does not report it."""
+    """The largest peak resident memory of an ended child of this process, MiB.
+
+    It is 0 if the platform does not report it.
+    """
     return 0.0 if resource is None else _max_resident_mb(resource.RUSAGE_CHILDREN)
 
 

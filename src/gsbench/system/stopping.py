@@ -44,8 +44,10 @@ def requested() -> bool:
 
 @contextmanager
 def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
-    """Raise `Stopped` in the main thread if a signal comes within the block; restore the earlier
-    handlers after it."""
+    """Raise `Stopped` in the main thread if a signal comes within the block.
+
+    Restore the earlier handlers after it.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -62,8 +64,10 @@ def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C within the block. Processes started in it inherit this and always ignore
-    Ctrl-C."""
+    """Ignore Ctrl-C within the block.
+
+    Processes started in it inherit this and always ignore Ctrl-C.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -75,8 +79,10 @@ def interrupts_ignored() -> Iterator[None]:
 
 
 def reinstall_handlers() -> None:
-    """Install the handlers of `stop_on_signals` again: importing pycolmap replaces the handler of
-    SIGTERM."""
+    """Install the handlers of `stop_on_signals` again.
+
+    Importing pycolmap replaces the handler of SIGTERM.
+    """
     if threading.current_thread() is threading.main_thread():
         for signum in _State.signals:
             signal.signal(signum, _on_signal)
@@ -84,8 +90,10 @@ def reinstall_handlers() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Defer a first signal within the block: it sets `requested` and raises `Stopped` at the end; a
-    second stops."""
+    """Defer a first signal within the block: it sets `requested` and raises `Stopped` at the end.
+
+    A second stops.
+    """
     reinstall_handlers()
     _State.deferring += 1
     try:

@@ -1,5 +1,4 @@
-"""The page of an experiment in MLflow: table and verdict as its description, and a view that
-compares the arms.
+"""The page of an experiment in MLflow: its table and verdict, and a view that compares arms.
 
 MLflow's page keeps what it shows (columns, groups, charts) in a tag of the experiment, if somebody
 shares that as a link: ``mlflow.sharedViewState.KEY`` holds JSON, and the address has
@@ -35,6 +34,7 @@ TRIED = ("3.17.",)  # versions of MLflow whose page was seen to show the views
 COLUMNS = ("scene", "init", "densify", "seed")  # tags of a run
 ARM = "arm"  # the parameter by which runs are grouped
 VERDICT = "- Verdict, "  # how the notes begin that belong above the table
+NO_VERDICT = "No verdict: it needs a declared metric (eval.primary), two arms and two seeds."
 OWN_NOTE = "`gsbench report"  # in a description that `publish` wrote
 CHART_HEIGHT = 250  # px
 NAME_WIDTH = 290  # px of the runs' names
@@ -43,8 +43,7 @@ Sections = dict[str, list[dict[str, Any]]]  # charts by the headings of their se
 
 
 def publish(home: Path, uri: str | None) -> str:
-    """Renew the page of the experiment in ``home``; returns the experiment's id in the tracker
-    ``uri``.
+    """Renew the page of the experiment in ``home``; returns its id in the tracker ``uri``.
 
     Raises InputError, and any error of the tracker's client.
     """
@@ -93,9 +92,9 @@ def description(experiment: Experiment) -> str:
     # The page shows only the first line until it is clicked: decided pairs of arms come first
     # there.
     short = [line.removeprefix(VERDICT).partition(" (")[0] for line in verdicts]
-    answer = "; ".join(sorted(short, key=lambda text: "undecided" in text))
+    answer = "; ".join(sorted(short, key=lambda text: "undecided" in text)) or NO_VERDICT
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
-    text = "\n".join([f"**{answer}**" if answer else "", "", *verdicts, "", *rest]).strip()
+    text = "\n".join([f"**{answer}**", "", *verdicts, "", *rest]).strip()
     if len(text) + len(end) > MAX_TAG:
         text = text[: MAX_TAG - len(end)].rpartition("\n")[0]
     return text + end
@@ -107,8 +106,7 @@ def packed(state: dict[str, Any]) -> str:
 
 
 def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
-    """The state of MLflow's page that shows the ``trials`` in groups by arm, with a chart for each
-    result."""
+    """The state of MLflow's page: ``trials`` in groups by arm, with a chart for each result."""
     measured = {key for trial in trials for key in trial.metrics}
     keys = [
         *(key for key in known_keys() if key in measured),
@@ -140,8 +138,7 @@ def _group_of(trial: TrialResult, swept: Sequence[str]) -> str:
 def _state(
     results: list[str], sections: Sections, groups: Any, expanded: dict[str, bool]
 ) -> dict[str, Any]:
-    """The state of MLflow's page with these metrics in its list, charts in sections, and groups of
-    runs."""
+    """The state of MLflow's page: metrics in its list, charts in sections, groups of runs."""
     columns = [*(f"tags.`{tag}`" for tag in COLUMNS), *(f"metrics.`{name}`" for name in results)]
     return {
         # the search

@@ -1,5 +1,4 @@
-"""Mirroring: reads the files of trials and sends new records to their tracker, in a process beside
-the trials.
+"""Mirroring: a process beside the trials reads their files and sends new records to trackers.
 
 Why a process: a tracker's client may hang in a socket, a lock or a C library for any time. A
 hanging thread cannot be ended, and a thread that is inside a C library when the interpreter exits
@@ -60,8 +59,7 @@ class MirrorError(Exception):
 
 
 class Mirror:
-    """Mirrors the trials that begin within a ``with`` block, all by one process; none if it is
-    ``idle``.
+    """Mirrors the trials that begin within a ``with`` block, by one process; none if ``idle``.
 
     At the end of the block, it waits a bounded time for the tracker. Errors of the tracker are
     never raised: one line in the log says what is missing.
@@ -76,8 +74,7 @@ class Mirror:
         return self
 
     def follow(self, folder: Path, options: dict[str, Any]) -> None:
-        """Mirror the trial in ``folder``, with the settings ``tracking``, from when it runs until
-        it has ended."""
+        """Mirror the trial in ``folder`` with the settings ``tracking`` from start to end."""
         if self._idle or not options["enabled"]:
             return
         self._options = options
@@ -101,8 +98,10 @@ class Mirror:
             )
 
     def _start(self) -> subprocess.Popen[bytes]:
-        """A fresh interpreter that runs `gsbench.tracking.mirror.follow`. Raises OSError where it
-        cannot start."""
+        """A fresh interpreter that runs `gsbench.tracking.mirror.follow`.
+
+        Raises OSError where it cannot start.
+        """
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process runs
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
@@ -155,8 +154,9 @@ SECONDS_AFTER_PARENT = 10.0
 
 
 class TrackerRun:
-    """The tracker's run of the trial in ``folder``, new or continued. It is locked until it is
-    closed.
+    """The tracker's run of the trial in ``folder``, new or continued.
+
+    It is locked until it is closed.
 
     ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError
     if another process mirrors the trial, and any error of the tracker.
@@ -185,8 +185,10 @@ class TrackerRun:
         return self._state.shows(self._trial.results_hash())
 
     def add_curves(self) -> None:
-        """Log the records that were written since the last call. A run that shows results is left
-        as it is."""
+        """Log the records that were written since the last call.
+
+        A run that shows results is left as it is.
+        """
         if self._state.complete is not None:
             return
         for name, newest, scalars in self._trial.curves(self._state.logged):
@@ -195,8 +197,7 @@ class TrackerRun:
         self._note()
 
     def end(self) -> None:
-        """Log the rest, and close the run with the trial's end by its files: failed, done, or
-        otherwise killed."""
+        """Log the rest; close the run by the trial's files: failed, done, or otherwise killed."""
         if self.is_complete:
             return
         # the run shows earlier results, which new ones have replaced
@@ -226,8 +227,7 @@ class TrackerRun:
 
 
 def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
-    """Mirror ended trials that the tracker lacks; yields a line for each mirrored or left-out
-    trial, and a summary.
+    """Mirror ended trials that the tracker lacks; yields a line for each, and a summary.
 
     Raises MirrorError if the tracker refuses a trial.
     """
@@ -250,8 +250,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
         if address := untyped_address(options, uri):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "
-                f"--uri {address} was "
-                "not typed"
+                f"--uri {address} was not typed"
             )
             continue
         try:
@@ -270,8 +269,10 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
 
 
 def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> bool:
-    """Mirror an ended trial; returns False if the tracker lacked nothing. Raises the errors of
-    `TrackerRun`."""
+    """Mirror an ended trial; returns False if the tracker lacked nothing.
+
+    Raises the errors of `TrackerRun`.
+    """
     with closing(TrackerRun(folder, options, values)) as run:
         if run.is_complete:
             return False
@@ -307,8 +308,7 @@ Lines = Queue[str | None]  # of stdin; None is the end
 
 
 def follow() -> NoReturn:
-    """Mirror the trials whose folders come as lines on stdin, until stdin ends and the trials have
-    ended.
+    """Mirror the trials whose folders come on stdin, until it and the trials have ended.
 
     Arguments of the process: the time between two readings of the files, and how long the parent
     waits for this process at the end; both in seconds.
@@ -358,8 +358,10 @@ def _follow(lines: Lines, pause: float) -> None:
 
 
 class _FollowedTrial:
-    """A trial to mirror. Its run is opened once the trial runs or has ended, or when the sweep
-    ends."""
+    """A trial to mirror.
+
+    Its run is opened once the trial runs or has ended, or when the sweep ends.
+    """
 
     def __init__(self, folder: TrialFolder) -> None:
         self.folder, self.has_ended = folder, False
@@ -368,8 +370,10 @@ class _FollowedTrial:
         self._run: TrackerRun | None = None
 
     def catch_up(self, last: bool) -> None:
-        """Send the new records, and the trial's end once it has ended. ``last`` says that the sweep
-        has ended."""
+        """Send the new records, and the trial's end once it has ended.
+
+        ``last`` says that the sweep has ended.
+        """
         # The state is read before the curves: if it says that the trial has ended, the curves are
         # complete.
         state = self.folder.state()
@@ -387,8 +391,10 @@ class _FollowedTrial:
             self.has_ended = True
 
     def _has_ended_since(self) -> bool:
-        """Return whether the trial has ended since it was added. Older result files are of an
-        earlier run."""
+        """Return whether the trial has ended since it was added.
+
+        Older result files are of an earlier run.
+        """
         for name in (RESULTS, FAILED):
             with suppress(OSError):
                 if (self.folder.path / name).stat().st_mtime >= self._added_at:

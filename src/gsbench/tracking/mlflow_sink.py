@@ -51,14 +51,12 @@ def default_uri(runs: Path) -> str:
 
 
 def tracker_uri(uri: str | None, runs: Path) -> str:
-    """The tracker's address: the configured ``uri``, else MLFLOW_TRACKING_URI, else the database in
-    the runs folder."""
+    """The tracker's address: ``uri``, else MLFLOW_TRACKING_URI, else the runs folder's database."""
     return uri or os.environ.get(VARIABLE) or default_uri(runs)
 
 
 def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str | None:
-    """The tracker's address in the settings ``tracking`` of a file, if it may not be used; else
-    None.
+    """The tracker's address in a file's settings ``tracking`` if it may not be used, else None.
 
     It may be used if it is the ``typed`` one or that of the environment.
     """
@@ -73,8 +71,10 @@ def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:
-    """A client of the tracker. Creates a missing database under a lock, since MLflow's own set-up
-    has races."""
+    """A client of the tracker.
+
+    Creates a missing database under a lock, since MLflow's own set-up has races.
+    """
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
     import mlflow
@@ -92,8 +92,7 @@ def connect(uri: str | None, runs: Path) -> MlflowClient:
 
 
 def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
-    """The id of experiment ``name``, which is created under a lock if missing, and restored if
-    deleted."""
+    """The id of experiment ``name``: created under a lock if missing, restored if deleted."""
     from mlflow.exceptions import MlflowException
 
     with FileLock(runs / LOCK):
@@ -117,8 +116,7 @@ def ensure_experiment(client: MlflowClient, name: str, runs: Path) -> str:
 
 
 def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> None:
-    """Raise InputError if a run in the runs folder's own database has its artifacts outside of that
-    folder.
+    """Raise InputError if a run in the runs folder's database has its artifacts elsewhere.
 
     ``address`` is the run's artifact location. Other trackers are not checked: the user typed them.
     """
@@ -132,8 +130,7 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(
             f"{runs / DATABASE} would send artifacts to {address}; if this runs folder was moved, "
-            f"remove {DATABASE} "
-            f"and {ARTIFACTS} there: `gsbench sync` makes them again"
+            f"remove {DATABASE} and {ARTIFACTS} there: `gsbench sync` makes them again"
         )
     require_no_links(runs, place, below=True)
 
@@ -182,8 +179,10 @@ class MlflowSink:
         self._started = 0  # ms since 1970
 
     def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Open the run (see `gsbench.tracking.sinks.Sink`). A deleted run, or one in another
-        tracker, is replaced."""
+        """Open the run (see `gsbench.tracking.sinks.Sink`).
+
+        A deleted run, or one in another tracker, is replaced.
+        """
         runs, uri = self._trial.folder.runs, str(self.client.tracking_uri)
         if uri == default_uri(runs):
             uri = OWN_DATABASE  # a runs folder may be moved

@@ -1,5 +1,4 @@
-"""A trial in a tracker's terms, the contract of a tracker, and the trackers TensorBoard and Weights
-& Biases."""
+"""A trial in a tracker's terms, a tracker's contract, and TensorBoard and Weights & Biases."""
 
 import os
 import re
@@ -60,8 +59,10 @@ def picture_key(view: str, kind: str) -> str:
 
 
 def arm_name(densify: str, init: str) -> str:
-    """The name of an arm. What is compared most often comes first, since trackers cut long names at
-    their end."""
+    """The name of an arm.
+
+    What is compared most often comes first, since trackers cut long names at their end.
+    """
     return f"{densify} · {init}"
 
 
@@ -74,8 +75,7 @@ def eval_name(key: str) -> str:
 
 @dataclass(frozen=True)
 class Scalar:
-    """One number of a trial: its name, its value, the iteration, and the seconds of training until
-    then."""
+    """One number of a trial: its name, value, iteration, and the seconds of training until then."""
 
     key: str
     value: float
@@ -85,8 +85,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of a complete trial: what a tracker shows at its end, in Markdown (``note``) and in
-    numbers."""
+    """The end of a trial in a tracker, in Markdown (``note``) and in numbers."""
 
     note: str
     scalars: Sequence[Scalar]
@@ -150,23 +149,23 @@ class Sink(Protocol):
     state_file: str  # in the trial's folder, for the state that `open` returns
 
     def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Begin a run for the trial, or continue the run that ``state`` names; returns the state to
-        keep.
+        """Begin a run for the trial, or continue that of ``state``; returns the state to keep.
 
         ``results`` is the hash of the trial's results, None without results. If ``state.complete``
         is another hash, the run shows results that are no longer the trial's, and is replaced.
         """
 
     def log(self, scalars: Sequence[Scalar]) -> None:
-        """Log numbers. Some may be repetitions: a process may be killed between sending and noting
-        that."""
+        """Log numbers.
+
+        Some may be repetitions: a process may be killed between sending and noting that.
+        """
 
     def complete(self, summary: Summary) -> None:
         """Show the results, and that the trial is done."""
 
     def stop(self, status: str, reason: str | None) -> None:
-        """Show that the trial ended without results: ``status`` KILLED, or FAILED for a
-        ``reason``."""
+        """Show that the trial ended without results: ``status`` KILLED, or FAILED (``reason``)."""
 
 
 @dataclass(frozen=True)
@@ -206,14 +205,12 @@ class TrackedTrial:
         }
 
     def results_hash(self) -> str | None:
-        """The hash of the results, by which a mirror knows whether it shows them; None without
-        results."""
+        """The hash of the results, by which a mirror knows whether it shows them, or None."""
         results = self.folder.sound_record()
         return None if results is None else sha256_of(results.to_json())
 
     def curves(self, logged: dict[str, int]) -> Iterator[tuple[str, int, list[Scalar]]]:
-        """Yield for each file of curves with new records: its name, its newest iteration, and the
-        new scalars.
+        """Yield name, newest iteration and new scalars of each file of curves with new records.
 
         Records after the iteration ``logged[name]`` are new.
         """
@@ -244,8 +241,7 @@ class TrackedTrial:
                 yield name, int(records[-1]["step"]), scalars
 
     def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
-        """The summary of the finished trial, with at most ``images`` test views, and the model if
-        ``with_model``."""
+        """The finished trial with at most ``images`` test views, and its model ``with_model``."""
         step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
         numbers = {eval_name(key): value for key, value in results.metrics.items()}
         counts = {
@@ -284,8 +280,7 @@ class TrackedTrial:
         )
 
     def _note(self, results: TrialRecord) -> str:
-        """The results in one line, the folder, and the command that repeats the trial, in
-        Markdown."""
+        """The results in one line, the folder, and the command that repeats it, in Markdown."""
         shown = [(find_metric(key), key, value) for key, value in results.metrics.items()]
         texts = [f"{facts.name if facts else key} {value:.4g}" for facts, key, value in shown]
         if results.num_gaussians is not None:
@@ -342,8 +337,10 @@ def _read_picture(path: Path) -> Array:
 
 
 def _seconds(record: Mapping[str, float]) -> float:
-    """The training time of a record. Without one, a function of its iteration, so that each reading
-    gives the same."""
+    """The training time of a record.
+
+    Without one, a function of its iteration, so that each reading gives the same.
+    """
     return float(record.get("seconds", record["step"] / 1000))
 
 
@@ -416,8 +413,10 @@ class WandbSink:
         self._run: Any = None
 
     def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Open the run (see `gsbench.tracking.sinks.Sink`). A run with earlier results stays beside
-        the new one."""
+        """Open the run (see `gsbench.tracking.sinks.Sink`).
+
+        A run with earlier results stays beside the new one.
+        """
         if state.shows(results):
             return state
         if state.complete is not None or state.id is None:

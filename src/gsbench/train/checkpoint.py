@@ -22,8 +22,10 @@ DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``; delete all but the
-    last two."""
+    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``.
+
+    Delete all but the last two.
+    """
     path = folder / f"checkpoint-{step:08d}.pt"
     with atomic(path) as temporary, temporary.open("wb") as stream:
         torch.save(state, stream)
@@ -50,8 +52,10 @@ class CheckpointWriter:
         self._pending: Future[None] | None = None
 
     def save(self, step: int, state: dict[str, Any]) -> None:
-        """Save the state of ``step``, perhaps in the background. Raises the error of the previous
-        save if it failed."""
+        """Save the state of ``step``, perhaps in the background.
+
+        Raises the error of the previous save if it failed.
+        """
         self.finish()
         if self._executor is None:
             save_checkpoint(self.folder, step, state)

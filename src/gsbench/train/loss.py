@@ -1,8 +1,8 @@
-"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2: its definition in
-torch, and the choice of the fastest implementation for a device.
+"""The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2.
 
-SSIM is that of `gsbench.eval.ssim`: padded with zeros, the mean over the whole map, as in the
-reference code of 3DGS.
+Its definition in torch, and the choice of the fastest implementation for a device. SSIM is that of
+`gsbench.eval.ssim`: padded with zeros, the mean over the whole map, as in the reference code of
+3DGS.
 """
 
 from collections.abc import Callable
@@ -34,11 +34,11 @@ def torch_photometric_loss(
 def photometric_loss(
     image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3] (floating, or uint8
-    divided by 255).
+    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3].
 
-    Three scalars; only the loss has a gradient, by ``image``. For many images, a
-    ``PhotometricLoss`` is faster: it has threads and reuses memory.
+    ``target`` is floating, or uint8, which is divided by 255. Three scalars; only the loss has a
+    gradient, by ``image``. For many images, a ``PhotometricLoss`` is faster: it has threads and
+    reuses memory.
     """
     return PhotometricLoss(ssim_weight, threads=1)(image, target)
 

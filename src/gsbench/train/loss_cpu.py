@@ -1,10 +1,10 @@
-"""The photometric loss compiled for the CPU: one fused forward pass over rows, and a hand-written
-gradient.
+"""The photometric loss compiled for the CPU.
 
-Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers
-apart. So one vector holds 16 adjacent numbers of all channels. Each row is filtered horizontally
-once, into a ring buffer of 11 rows, which are then filtered vertically. Statistics of the target
-are computed again in each step, to need no memory per view.
+One fused forward pass over rows, and a hand-written gradient. Images stay interleaved [H, W, 3]: a
+row is 3 W numbers, and horizontal neighbours are 3 numbers apart. So one vector holds 16 adjacent
+numbers of all channels. Each row is filtered horizontally once, into a ring buffer of 11 rows,
+which are then filtered vertically. Statistics of the target are computed again in each step, to
+need no memory per view.
 """
 
 from typing import Any
@@ -45,8 +45,10 @@ BYTE_MAX = np.float32(255)
 
 @inlined
 def _blur_row(source, start, target, place, numbers):
-    """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``, without
-    padding."""
+    """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``.
+
+    The result has no padding.
+    """
     for i in range(0, numbers, LANES):
         center = start + PAD + i
         total = load(source, center) * WEIGHTS[0]
@@ -58,8 +60,10 @@ def _blur_row(source, start, target, place, numbers):
 
 @inlined
 def _blur_column(ring, first, i, row, stride):
-    """Filter vertically around ``row`` at number ``i``. Rows of the ring start at ``first``,
-    ``stride`` apart."""
+    """Filter vertically around ``row`` at number ``i``.
+
+    Rows of the ring start at ``first``, ``stride`` apart.
+    """
     total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
     for k in range(1, WINDOW_RADIUS + 1):
         pair = load(ring, first + (row - k + TAPS) % TAPS * stride + i) + load(
@@ -78,8 +82,10 @@ def _sum(vector, scratch):
 
 @inlined
 def _read_row(image, row, numbers, divisor, out):
-    """Read a row of a float32 or uint8 image, divided by ``divisor``, into ``out`` behind its PAD
-    zeros."""
+    """Read a row of a float32 or uint8 image into ``out``, behind its PAD zeros.
+
+    It is divided by ``divisor``.
+    """
     start = row * numbers
     if numbers < LANES:
         for i in range(numbers):
@@ -106,12 +112,11 @@ def _write_row(line, row, numbers, image):
 
 @kernel
 def similarity_rows(memory, begin, end, height, width, image, target, divisor, derivatives, sums):
-    """Write the sums of SSIM and of |image - target| of the rows ``begin`` to ``end`` to ``sums``
-    [H, 2].
+    """Write the sums of SSIM and of |image - target| to ``sums`` [H, 2].
 
-    ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not empty, gets the derivatives of the
-    sum of SSIM by the blurred image, its blurred square and its blurred product with the target,
-    padded with zeros. ``memory`` is scratch.
+    The rows are ``begin`` to ``end``. ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not
+    empty, gets the derivatives of the sum of SSIM by the blurred image, its blurred square and its
+    blurred product with the target, padded with zeros. ``memory`` is scratch.
     """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
@@ -149,10 +154,8 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             continue
         similarity = splat(ZERO)
         for i in range(0, numbers, LANES):
-            mean_x, mean_y = (
-                _blur_column(ring, 0, i, center, length),
-                _blur_column(ring, part, i, center, length),
-            )
+            mean_x = _blur_column(ring, 0, i, center, length)
+            mean_y = _blur_column(ring, part, i, center, length)
             square = _blur_column(ring, 2 * part, i, center, length)
             product = _blur_column(ring, 3 * part, i, center, length)
             a1 = fma(mean_x * mean_y, TWO, F_C1)
@@ -197,8 +200,10 @@ def gradient_rows(
     ssim_factor,
     gradient,
 ):
-    """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3]. The symmetric blur is its
-    own adjoint."""
+    """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3].
+
+    The symmetric blur is its own adjoint.
+    """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
     padded = length + 2 * PAD
@@ -245,8 +250,7 @@ class CompiledLoss:
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
     ) -> tuple[float, float, Tensor | None]:
-        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient of the loss by
-        ``image``."""
+        """Return mean SSIM, mean L1 and, if wanted, the gradient of the loss by ``image``."""
         height, width, _ = image.shape
         numbers = image.numel()
         pixels = image.detach().contiguous().numpy().reshape(-1)

@@ -69,8 +69,10 @@ def _zeros(like):
 
 @triton.jit
 def _push(sums, value):
-    """Advance the running sums by one row, whose blurred ``value`` is added. The first sum is then
-    complete."""
+    """Advance the running sums by one row, whose blurred ``value`` is added.
+
+    The first sum is then complete.
+    """
     return (
         tl.fma(value, W5, sums[1]),
         tl.fma(value, W4, sums[2]),
@@ -119,22 +121,17 @@ def measure_similarity(
     DIFFERENTIATE: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """Write the sums of SSIM and of |image - target scale| over the ``rows`` of this program to
-    ``sums`` [programs, 2].
+    """Write the sums of SSIM and of |image - target scale| to ``sums`` [programs, 2].
 
-    If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the derivatives of the sum of SSIM by the
-    blurred image, its blurred square and its blurred product with the target.
+    This program has ``rows`` rows. If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the
+    derivatives of the sum of SSIM by the blurred image, its blurred square and its blurred product
+    with the target.
     """
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
-    mean_x, mean_y, square_x, square_y, product = (
-        _zeros(zero),
-        _zeros(zero),
-        _zeros(zero),
-        _zeros(zero),
-        _zeros(zero),
-    )
+    mean_x, mean_y, product = _zeros(zero), _zeros(zero), _zeros(zero)
+    square_x, square_y = _zeros(zero), _zeros(zero)
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
@@ -176,8 +173,10 @@ def measure_similarity(
 
 @triton.jit(do_not_specialize=["programs"])
 def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
-    """Write loss, mean L1 and mean SSIM to ``values`` [3], from ``sums`` [programs, 2] over
-    ``size`` numbers."""
+    """Write loss, mean L1 and mean SSIM to ``values`` [3].
+
+    ``sums`` [programs, 2] are over ``size`` numbers.
+    """
     similarity, l1 = tl.zeros([GROUP], tl.float32), tl.zeros([GROUP], tl.float32)
     for start in range(0, programs, GROUP):
         program = start + tl.arange(0, GROUP)
@@ -223,11 +222,9 @@ def differentiate(
                 product += _load(
                     derivatives + 2 * plane, row, neighbour, height, numbers, _weight(k)
                 )
-        d_mean, d_square, d_product = (
-            _push(d_mean, mean),
-            _push(d_square, square),
-            _push(d_product, product),
-        )
+        d_mean = _push(d_mean, mean)
+        d_square = _push(d_square, square)
+        d_product = _push(d_product, product)
 
         center = row - RADIUS
         inside = (center >= first) & (number < numbers)
@@ -239,8 +236,10 @@ def differentiate(
 
 
 class TritonLoss:
-    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``. Same bits on every run on
-    one GPU."""
+    """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``.
+
+    Same bits on every run on one GPU.
+    """
 
     def __init__(self, ssim_weight: float) -> None:
         self.ssim_weight = ssim_weight
@@ -291,13 +290,11 @@ class _TritonLossFunction(torch.autograd.Function):
             launch_grid(add_up, 1)(
                 sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024
             )
-        ctx.weight, ctx.scale, ctx.derivatives, ctx.rows, ctx.grid = (
-            loss.ssim_weight,
-            scale,
-            derivatives,
-            rows,
-            grid,
-        )
+        ctx.weight = loss.ssim_weight
+        ctx.scale = scale
+        ctx.derivatives = derivatives
+        ctx.rows = rows
+        ctx.grid = grid
         ctx.save_for_backward(image, target)
         ctx.set_materialize_grads(False)
         total, l1, similarity = values.unbind()

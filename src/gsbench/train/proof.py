@@ -1,11 +1,10 @@
-"""The proof of a rasterizer on a GPU before its first training there: it must agree with the
-float64 reference.
+"""The proof of a rasterizer on a GPU before its first training there.
 
-Kernels are compiled on the user's machine, by its versions of driver, torch and Triton, for its
-GPU. Tests elsewhere say little about that. So the first process that would use an executor on such
-a combination compares it, in some ten seconds, and a stamp below the user's cache folder keeps the
-result. Executors of the CPU are proven by the tests of gsbench and only on request, by ``gsbench
-doctor --prove``.
+It must agree with the float64 reference. Kernels are compiled on the user's machine, by its
+versions of driver, torch and Triton, for its GPU. Tests elsewhere say little about that. So the
+first process that would use an executor on such a combination compares it, in some ten seconds, and
+a stamp below the user's cache folder keeps the result. Executors of the CPU are proven by the tests
+of gsbench and only on request, by ``gsbench doctor --prove``.
 """
 
 from __future__ import annotations
@@ -74,12 +73,12 @@ def prove(
     scenes: tuple[Case, ...] = SCENES,
     loss: Loss | None = None,
 ) -> RasterProof:
-    """Compare ``rasterizer`` on ``device`` with the reference; some seconds, and the compilation of
-    its kernels.
+    """Compare ``rasterizer`` on ``device`` with the reference.
 
-    All ``scenes`` are rendered, with gradients; again, for equal bits; and the first is trained for
-    ten steps. An executor that is known to depart where alpha is clamped, and in radii (gsplat), is
-    compared elsewhere. ``loss`` is by default that of a training on ``device``.
+    Some seconds, and the compilation of its kernels. All ``scenes`` are rendered, with gradients;
+    again, for equal bits; and the first is trained for ten steps. An executor that is known to
+    depart where alpha is clamped, and in radii (gsplat), is compared elsewhere. ``loss`` is by
+    default that of a training on ``device``.
     """
     started = time.perf_counter()
     executor = find_executor(rasterizer.name)
@@ -160,8 +159,7 @@ def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
 def _training_errors(
     rasterizer: Rasterizer, device: torch.device, case: Case, loss: Loss
 ) -> Iterator[Error]:
-    """The errors of ten steps with the loss and Adam of the device, in float32, against torch's in
-    float64."""
+    """The errors of ten steps with the device's loss and Adam, against torch's in float64."""
     other = dataclasses.replace(case, count=case.count + 1)  # another random scene, to be learnt
     with torch.no_grad():
         target = (
@@ -194,8 +192,10 @@ def _training_errors(
 def _train(
     rasterizer: Rasterizer, case: Case, target: Tensor, loss: Loss
 ) -> tuple[list[float], Tensor]:
-    """The losses of ten steps towards ``target`` [H, W, 3], whose device and dtype count, and the
-    last image."""
+    """The losses of ten steps towards ``target`` [H, W, 3], and the last image.
+
+    The device and dtype of ``target`` count.
+    """
     model = TrainableGaussians(
         case.gaussians().map(lambda tensor: tensor.to(target)), LearningRates(), 1.0
     )
@@ -212,8 +212,10 @@ def _train(
 
 
 def versions_on(device: torch.device) -> dict[str, str]:
-    """Versions and digests of all that makes the kernels on ``device``: a change of any calls for a
-    new proof."""
+    """Versions and digests of all that makes the kernels on ``device``.
+
+    A change of any calls for a new proof.
+    """
     digest = hashlib.sha256()
     for source in SOURCES:
         root = PACKAGE / source
@@ -266,8 +268,7 @@ def stamp_of(raster: str, device: torch.device) -> Path:
 
 
 def prove_apart(raster: str, device: str) -> RasterProof:
-    """`prove` the executor called ``raster`` in a process of its own, where a fault cannot take
-    this one along."""
+    """`prove` the executor ``raster`` in a process of its own, which a fault cannot leave."""
     try:
         return run_isolated(_prove_by_name, raster, device, what=f"the proof of raster={raster}")
     except torch.OutOfMemoryError as error:
@@ -293,16 +294,17 @@ def _prove_by_name(raster: str, device: str) -> RasterProof:
 
 
 def known_proof(raster: str, device: torch.device) -> RasterProof | None:
-    """The last proof of ``raster`` on ``device`` with the versions that are here; None if there is
-    none."""
+    """The last proof of ``raster`` on ``device`` with the versions that are here.
+
+    It is None if there is none.
+    """
     return read_if_sound(stamp_of(raster, device), RasterProof)
 
 
 def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterProof:
-    """The proof of ``raster`` on ``device``: the one that passed earlier, or a new one. Two
-    processes make it once.
+    """The proof of ``raster`` on ``device``: the one that passed earlier, or a new one.
 
-    With ``again``, always a new one.
+    Two processes make it once. With ``again``, always a new one.
     """
     stamp = stamp_of(raster, device)
     with _exclusive(stamp):
@@ -331,8 +333,10 @@ def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterPr
 
 @contextmanager
 def _exclusive(stamp: Path) -> Iterator[None]:
-    """Hold the lock of ``stamp``. Without a folder to write to there is nothing to share, so
-    nothing is locked."""
+    """Hold the lock of ``stamp``.
+
+    Without a folder to write to there is nothing to share, so nothing is locked.
+    """
     try:
         stamp.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(stamp.parent, os.W_OK)
@@ -346,8 +350,10 @@ def _exclusive(stamp: Path) -> Iterator[None]:
 
 
 class Proven(NamedTuple):
-    """A rasterizer, its proof (None on a CPU), and a line for each better one that ``raster=auto``
-    passed over."""
+    """A rasterizer and its proof (None on a CPU).
+
+    And a line for each better one that ``raster=auto`` passed over.
+    """
 
     rasterizer: Rasterizer
     proof: RasterProof | None = None

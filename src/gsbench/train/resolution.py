@@ -1,5 +1,7 @@
-"""Training on small pictures first, with as many Gaussians as they can show (DashGaussian, arXiv
-2503.18402)."""
+"""Training on small pictures first (DashGaussian, arXiv 2503.18402).
+
+It has as many Gaussians as the pictures can show.
+"""
 
 import math
 from collections.abc import Sequence
@@ -24,15 +26,19 @@ NUM_POINTS = 32  # of the schedule, equally spaced in the spectrum that they sho
 
 @dataclass(frozen=True)
 class ScaleSchedule:
-    """A schedule: from iteration ``begins[i]`` the sides of pictures are divided by ``scales[i]``,
-    which falls to 1."""
+    """The sides of pictures are divided by ``scales[i]`` from iteration ``begins[i]`` on.
+
+    The scales fall to 1.
+    """
 
     begins: tuple[int, ...]
     scales: tuple[float, ...]
 
     def at(self, step: int) -> int:
-        """The whole number by which iteration ``step`` divides sides; between two points, the area
-        of pictures grows linearly."""
+        """The whole number by which iteration ``step`` divides sides.
+
+        Between two points, the area of pictures grows linearly.
+        """
         area = np.interp(step, self.begins, [scale**-2 for scale in self.scales])
         return int(area**-0.5 + 1e-9)
 
@@ -44,8 +50,7 @@ class ScaleSchedule:
 
 
 def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSchedule:
-    """The schedule for training on ``images`` [H, W, 3] from iteration 0 to ``until`` (arXiv
-    2503.18402).
+    """The schedule for ``images`` [H, W, 3] from iteration 0 to ``until`` (arXiv 2503.18402).
 
     A picture reduced to a fraction of its size keeps the central window of that fraction of its
     spectrum; the energy of a size is the sum of the moduli of the Fourier transform over this
@@ -55,9 +60,8 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
     """
     sides = {side for image in images for side in image.shape[:2]}
     # From 0 to 1, the fractions at which a central window over a spectrum gains pixels.
-    fractions = np.unique(
-        [0.0, 1.0, *(2 * k / side for side in sides for k in range(side // 2 + 1))]
-    )  # [F]
+    gains = [2 * np.arange(side // 2 + 1) / side for side in sides]
+    fractions = np.unique(np.concatenate([[0.0, 1.0], *gains]))  # [F]
     curves = np.stack([_window_energies(image, fractions) for image in images])  # [V, F]
     if not (curves[:, -1] > 0).all():  # a black picture has no energy at any size
         return ScaleSchedule((0,), (1.0,))
@@ -73,10 +77,9 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
         *(1 / _first_reaching(fractions, mean, energy) for energy in energies[1:-1]),
         1.0,
     ]
-    begins = [
-        int(until * math.log(e / first) / math.log(whole / first)) if whole > first else 0
-        for e in energies
-    ]
+    begins = [0] * NUM_POINTS
+    if whole > first:
+        begins = [int(until * math.log(e / first) / math.log(whole / first)) for e in energies]
     begins[-1] = until
     # of several points at one iteration, the last
     points = dict(zip(begins, map(float, scales), strict=True))
@@ -86,24 +89,19 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
 def _window_energies(
     image: NDArray[np.uint8], fractions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The energy of an image's spectrum within central windows of the sizes ``fractions`` [F], [F];
-    the last window is the whole spectrum."""
-    spectrum = np.fft.fftshift(np.abs(np.fft.fft2(image / 255.0, axes=(0, 1))), axes=(0, 1)).sum(
-        -1
-    )  # [H, W]
+    """The energy of an image's spectrum within central windows of the sizes ``fractions`` [F], [F].
+
+    The last window is the whole spectrum.
+    """
+    channels = np.abs(np.fft.fft2(image / 255.0, axes=(0, 1)))  # [H, W, 3]
+    spectrum = np.fft.fftshift(channels, axes=(0, 1)).sum(-1)  # [H, W]
     height, width = spectrum.shape
     sums = np.zeros((height + 1, width + 1))  # summed-area table
     sums[1:, 1:] = spectrum.cumsum(0).cumsum(1)
     row, column = height // 2, width // 2  # of frequency zero
-    half_height, half_width = (
-        (side * fractions / 2 + 1e-9).astype(int) for side in (height, width)
-    )  # [F] px
-    top, bottom, left, right = (
-        row - half_height,
-        row + half_height,
-        column - half_width,
-        column + half_width,
-    )
+    down = (height * fractions / 2 + 1e-9).astype(int)  # [F] px
+    across = (width * fractions / 2 + 1e-9).astype(int)
+    top, bottom, left, right = row - down, row + down, column - across, column + across
     energies = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
     energies[-1] = sums[-1, -1]
     return energies
@@ -145,8 +143,10 @@ class Resolution:
         return self.schedule.at(last_round if last_round > options.densify_start else 0)
 
     def position_step(self, step: int) -> float:
-        """The iteration of the means' learning-rate schedule to use at iteration ``step``: the
-        schedule starts when the sides are divided by less than two."""
+        """The iteration of the means' learning-rate schedule to use at iteration ``step``.
+
+        The schedule starts when the sides are divided by less than two.
+        """
         end, wait = self.options.position_steps, self.schedule.full_from
         return end * max(0, step - wait) / max(end - wait, 1)
 
@@ -164,8 +164,10 @@ class Resolution:
         return min(self.initial + added, int((1 + MAX_GROWTH) * refinement.event.before))
 
     def observe(self, event: RefineEvent) -> None:
-        """Update the momentum by the number of candidates of a round: those that grew and those
-        that were refused."""
+        """Update the momentum by the number of candidates of a round.
+
+        Those that grew and those that were refused.
+        """
         candidates = sum(getattr(event, name) for name in RefineEvent.GROWN) + event.blocked_by_cap
         self.momentum = max(
             self.momentum, int(KEPT_MOMENTUM * self.momentum + min(MAX_CANDIDATES, candidates))
@@ -173,8 +175,10 @@ class Resolution:
 
 
 class ScaledViews:
-    """The cameras and images of the training views, reduced. The full size and the last other size
-    are cached."""
+    """The cameras and images of the training views, reduced.
+
+    The full size and the last other size are cached.
+    """
 
     def __init__(
         self, views: Sequence[View], targets: Targets, device: torch.device, budget: int | None
@@ -193,13 +197,14 @@ class ScaledViews:
 
 
 def _reduced(view: View, scale: int) -> View:
-    """``view`` with sides divided by ``scale``, by the authors' filter (`scene.images.resize_image`
-    has another)."""
+    """``view`` with sides divided by ``scale``, by the authors' filter.
+
+    `scene.images.resize_image` has another.
+    """
     width, height = max(1, view.camera.width // scale), max(1, view.camera.height // scale)
     image = torch.from_numpy(view.image).permute(2, 0, 1).unsqueeze(0).float()  # [1, 3, H, W]
     small = torch.nn.functional.interpolate(image, (height, width), mode="bilinear", antialias=True)
-    pixels = (
-        small.round().to(torch.uint8).squeeze(0).permute(1, 2, 0).contiguous().numpy()
-    )  # [height, width, 3]
+    rounded = small.round().to(torch.uint8).squeeze(0)  # [3, height, width]
+    pixels = rounded.permute(1, 2, 0).contiguous().numpy()
     mask = None if view.mask is None else resize_mask(view.mask, width, height)
     return replace(view, camera=view.camera.resized(width, height), image=pixels, mask=mask)

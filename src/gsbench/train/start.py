@@ -1,9 +1,8 @@
-"""Checks of what a training starts from: can its views show the initial points, and do the colours
-agree?
+"""Checks of what a training starts from.
 
-A cloud in other coordinates, a point far outside, or a camera far from the others still gives a
-number. Each of these is an error or a warning here, before the first iteration. The measured facts
-are kept with the results.
+Can its views show the initial points, and do the colours agree? A cloud in other coordinates, a
+point far outside, or a camera far from the others still gives a number. Each of these is an error
+or a warning here, before the first iteration. The measured facts are kept with the results.
 """
 
 from __future__ import annotations
@@ -50,11 +49,11 @@ def check_start(
     random_points: bool = False,
     normalization: Normalization = IDENTITY,
 ) -> InitialCloud:
-    """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views; warn
-    below the limits.
+    """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views.
 
-    Positions are those of the training; messages undo ``normalization``. ``random_points`` says
-    that points and colours were drawn at random, so they need not fit the photographs.
+    Warn below the limits. Positions are those of the training; messages undo ``normalization``.
+    ``random_points`` says that points and colours were drawn at random, so they need not fit the
+    photographs.
 
     Raises InputError for a start from which nothing can be learnt.
     """
@@ -147,11 +146,10 @@ def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
 
 
 def far_cameras(scene: Scene) -> list[str]:
-    """A line for each training camera far from the others: it sets the scene extent, and with it
-    all rates and sizes.
+    """A line for each training camera far from the others.
 
-    3DGS takes the extent from the farthest camera. Global structure from motion sometimes leaves
-    such a camera.
+    It sets the scene extent, and with it all rates and sizes. 3DGS takes the extent from the
+    farthest camera. Global structure from motion sometimes leaves such a camera.
     """
     _, distances = camera_distances(scene)
     typical = float(np.median(distances))
@@ -165,8 +163,10 @@ def far_cameras(scene: Scene) -> list[str]:
 
 
 def odd_lenses(scene: Scene) -> list[str]:
-    """A line for each way in which intrinsics differ from those of common lenses, such as values in
-    other units."""
+    """A line for each way in which intrinsics differ from those of common lenses.
+
+    Often they are values in other units.
+    """
     names: dict[str, list[str]] = defaultdict(list)
     lines: dict[str, str] = {}
     for view in scene.train:
@@ -222,8 +222,7 @@ def _identical_share(points: Array) -> float:
 def _views_of(
     points: Array, views: tuple[View, ...]
 ) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
-    """The number of views that have each point in view, [P], and its colour in the nearest of
-    these, [P, 3], else -1.
+    """The number of views of each point, [P], and its colour in the nearest, [P, 3], or -1.
 
     A point is in view if it lies beyond the near plane and within the image. Occlusion is ignored;
     the nearest view is the least likely to be occluded. Pixels that a mask ignores have no colour.
@@ -238,11 +237,9 @@ def _views_of(
         x, y, z = local[ahead].T
         column, row = np.floor([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        seen, column, row = (
-            ahead[inside],
-            column[inside].astype(np.int64),
-            row[inside].astype(np.int64),
-        )
+        seen = ahead[inside]
+        column = column[inside].astype(np.int64)
+        row = row[inside].astype(np.int64)
         seen_by[seen] += 1
         distance = np.linalg.norm(local[seen], axis=1)
         is_nearer = distance < nearest[seen]
@@ -254,12 +251,11 @@ def _views_of(
 
 
 def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | None:
-    """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs [P, 3], -1
-    where there is none.
+    """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs.
 
-    1 minus the mean difference over the mean difference to the colours shown for all points: 1 is
-    equal, 0 is chance. None if the points or the photographs have one colour, or fewer than two
-    points are shown.
+    ``shown`` [P, 3] is -1 where there is none. 1 minus the mean difference over the mean difference
+    to the colours shown for all points: 1 is equal, 0 is chance. None if the points or the
+    photographs have one colour, or fewer than two points are shown.
     """
     is_shown = shown[:, 0] >= 0
     own, photograph = colors[is_shown].astype(np.int64), shown[is_shown].astype(np.int64)  # [S, 3]

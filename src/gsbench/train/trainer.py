@@ -67,10 +67,10 @@ class LossLog:
             self._take()
 
     def wait(self) -> dict[str, float]:
-        """Wait for all losses; return ``step``, ``loss``, ``l1`` and ``ssim`` of the latest
-        iteration.
+        """Wait for all losses.
 
-        Raises FloatingPointError, which names the first iteration whose total was not finite.
+        Return ``step``, ``loss``, ``l1`` and ``ssim`` of the latest iteration. Raises
+        FloatingPointError, which names the first iteration whose total was not finite.
         """
         while self._pending:
             self._take()
@@ -81,11 +81,9 @@ class LossLog:
         loss, l1, ssim, total = readback.values().tolist()
         if not math.isfinite(total):
             raise FloatingPointError(f"the loss became {total} at iteration {step}")
-        self.smoothed = (
-            loss
-            if math.isnan(self.smoothed)
-            else SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
-        )
+        is_first = math.isnan(self.smoothed)
+        mean = SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
+        self.smoothed = loss if is_first else mean
         self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
 
 
@@ -119,18 +117,15 @@ class Trainer:
         seed: int,
         snapshot_at: Collection[int] = (),
     ) -> None:
-        self.scene, self.densifier, self.rasterizer, self.options = (
-            scene,
-            densifier,
-            rasterizer,
-            options,
-        )
+        self.scene = scene
+        self.densifier = densifier
+        self.rasterizer = rasterizer
+        self.options = options
         self.snapshot_at = frozenset(snapshot_at)
         self.device = initial.means.device
         initial = densifier.prepare(initial)
-        self.background = torch.tensor(
-            list(options.background), dtype=torch.float32, device=self.device
-        )  # [3]
+        color = [*options.background]
+        self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
         self.gaussians = TrainableGaussians(initial, options, scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = generators(seed)
@@ -161,8 +156,10 @@ class Trainer:
     def run(
         self, folder: Path, on_status: Callable[[Status], None] = lambda status: None
     ) -> Gaussians:
-        """Train to the last iteration or the end of the time budget; return the Gaussians,
-        detached."""
+        """Train to the last iteration or the end of the time budget.
+
+        Return the Gaussians, detached.
+        """
         self._resume(folder)
         if self.snapshot_at:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
@@ -185,8 +182,10 @@ class Trainer:
     def _loop(
         self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]
     ) -> None:
-        """Iterate until the end, a signal to stop or the end of the time budget; write metrics,
-        events, checkpoints."""
+        """Iterate until the end, a signal to stop or the end of the time budget.
+
+        Write metrics, events, checkpoints.
+        """
         options = self.options
         first_step, started, earlier_seconds = self.step, time.perf_counter(), self.seconds
         last_checkpoint = time.monotonic()
@@ -232,11 +231,11 @@ class Trainer:
                     break
 
     def iterate(self, folder: Path) -> RefineEvent | None:
-        """Run one iteration in 3DGS's order: rates, SH degree, render, backward, statistics,
-        refinement, Adam.
+        """Run one iteration in 3DGS's order.
 
-        Its losses reach ``losses``, on a GPU with a delay. Snapshots are written below ``folder``.
-        Raises TrainingError if a parameter is out of range or no Gaussian is left.
+        Rates, SH degree, render, backward, statistics, refinement, Adam. Its losses reach
+        ``losses``, on a GPU with a delay. Snapshots are written below ``folder``. Raises
+        TrainingError if a parameter is out of range or no Gaussian is left.
         """
         self.step += 1
         step, options = self.step, self.options
@@ -282,9 +281,8 @@ class Trainer:
         """Render the training view ``index`` as in the present iteration, with gradients."""
         camera = self.scaled_views.at(self.scale)[0][index]
         # Passed only if needed: a user's rasterizer may not have this argument.
-        extra: dict[str, Any] = (
-            {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
-        )
+        wants = self.densifier.needs_splitting_matrix
+        extra: dict[str, Any] = {"splitting_matrix": True} if wants else {}
         return self.rasterizer.render(
             self.gaussians.values,
             camera,
@@ -296,8 +294,10 @@ class Trainer:
 
     @contextmanager
     def _explained(self, folder: Path) -> Iterator[None]:
-        """Raise TrainingError, with the last good state, if the loss is not finite or the device's
-        memory is full."""
+        """Raise TrainingError if the loss is not finite or the device's memory is full.
+
+        It names the last good state.
+        """
         try:
             yield
         except FloatingPointError as error:
@@ -341,11 +341,9 @@ class Trainer:
     def _resume(self, folder: Path) -> None:
         state = load_checkpoint(folder)
         if state is not None:
-            self.step, self.seconds, self.losses.smoothed = (
-                state["step"],
-                state["seconds"],
-                state["smoothed_loss"],
-            )
+            self.step = state["step"]
+            self.seconds = state["seconds"]
+            self.losses.smoothed = state["smoothed_loss"]
             self.gaussians = TrainableGaussians.load(
                 state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
             )
@@ -365,8 +363,10 @@ def _last_state(folder: Path) -> str:
 
 
 def snapshot_file(step: int) -> str:
-    """The path, below a training's folder, of the model at iteration ``step``, before it refines
-    (as 3DGS saves it)."""
+    """The path, below a training's folder, of the model at iteration ``step``.
+
+    It is the model before it refines, as 3DGS saves it.
+    """
     return f"snapshots/iteration_{step}.ply"
 
 
@@ -379,8 +379,10 @@ LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of
 
 
 def volume_histogram(step: int, log_scales: Tensor) -> dict[str, Any]:
-    """The record of iteration ``step`` with a histogram of volumes, for Gaussians with
-    ``log_scales`` [N, 3]."""
+    """The record of iteration ``step`` with a histogram of the volumes.
+
+    The Gaussians have ``log_scales`` [N, 3].
+    """
     volumes = (log_volume(log_scales) / math.log(10)).cpu().numpy()
     clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
     counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
@@ -394,11 +396,10 @@ def append(stream: TextIO, record: dict[str, Any]) -> None:
 
 
 def drop_after(path: Path, step: int) -> None:
-    """Remove records later than ``step`` and an incomplete last line from a JSON-lines file, if the
-    file exists.
+    """Remove records later than ``step`` from a JSON-lines file, if it exists.
 
-    A resumed training writes the removed records again. A kill leaves the old or the new file,
-    never a part of one.
+    An incomplete last line goes, too. A resumed training writes the removed records again. A kill
+    leaves the old or the new file, never a part of one.
     """
     if path.exists():
         write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))

@@ -1,5 +1,7 @@
-"""The training views: their random order, their images on the device, and renders of them for
-densifiers."""
+"""The training views.
+
+Their random order, their images on the device, and renders of them for densifiers.
+"""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -82,13 +84,17 @@ class Targets:
             )
 
     def mask(self, index: int) -> Tensor | None:
-        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device; None if
-        all pixels count."""
+        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device.
+
+        It is None if all pixels count.
+        """
         return self._masks[index]
 
     def get(self, index: int) -> Tensor:
-        """The image of view ``index``, perhaps still being copied: use it only in work queued after
-        this call."""
+        """The image of view ``index``, perhaps still being copied.
+
+        Use it only in work queued after this call.
+        """
         image = self._images[index]
         if self.resident or self._device.type != "cuda":
             return image
@@ -98,11 +104,10 @@ class Targets:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """Training views for densifiers, rendered and measured as in training
-    (`gsbench.densify.scores.TrainingViews`).
+    """Training views for densifiers, rendered and measured as in training.
 
-    Pixels that a mask ignores are replaced by those of the photograph, so that they have no error
-    and no gradient.
+    They are `gsbench.densify.scores.TrainingViews`. Pixels that a mask ignores are replaced by
+    those of the photograph, so that they have no error and no gradient.
     """
 
     views: Sequence[View]

@@ -1,5 +1,4 @@
-"""The verbs of the command line: functions ``VERB(argv, runs) -> exit code``, where ``runs`` is the
-runs folder."""
+"""The verbs of the command line: functions ``VERB(argv, runs) -> exit code`` on ``runs``."""
 
 import importlib
 from collections.abc import Callable
@@ -19,6 +18,7 @@ VERBS = {  # their modules, with their purposes as `gsbench --help` lists them
     ),
     "gate": ("versions", "for continuous integration: is this version worse than a trusted one?"),
     "bisect": ("versions", "which commit of a trainer made its results worse?"),
+    "ledger": ("ledger", "try many ideas under one false discovery rate, and confirm those kept"),
     "plan": ("claims", "how many scenes and seeds you need to see a difference"),
     "ablate": (
         "claims",

@@ -12,8 +12,9 @@ MAX_PORT = 65535
 
 
 class ArgumentParser(argparse.ArgumentParser):
-    """An argparse parser that raises InputError for what it does not understand; ``--help`` prints
-    and exits.
+    """An argparse parser that raises InputError for what it does not understand.
+
+    ``--help`` prints and exits.
 
     ``gsbench VERB --help`` prints the verb's purpose, and ``more``.
     """
@@ -24,21 +25,20 @@ class ArgumentParser(argparse.ArgumentParser):
         description = f"{purpose[:1].upper()}{purpose[1:]}{stop} {more}"
         super().__init__(prog=f"gsbench {verb}".strip(), description=description, **options)
 
+    def flag(self, name: str, meaning: str) -> None:
+        """Add an option without a value, False unless given."""
+        self.add_argument(name, action="store_true", help=meaning)
+
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         # Settings may stand anywhere on the line, and permissions also before the first positional
         # word.
         words = sorted(args or [], key=lambda word: word.lstrip("+").startswith("allow_targets="))
         parsed, unknown = self.parse_known_intermixed_args(words, namespace)
         if unknown:
-            options = [option for action in self._actions for option in action.option_strings]
-            hints = (
-                did_you_mean(word.partition("=")[0], options)
-                for word in unknown
-                if word.startswith("--")
-            )
-            self.error(
-                f"unrecognized arguments: {' '.join(unknown)}{next(filter(None, hints), '')}"
-            )
+            known = list(self._option_string_actions)
+            wrong = [word.partition("=")[0] for word in unknown if word.startswith("--")]
+            hints = filter(None, (did_you_mean(option, known) for option in wrong))
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{next(hints, '')}")
         return parsed
 
     def error(self, message: str) -> NoReturn:
@@ -74,11 +74,14 @@ def add_question(parser: argparse.ArgumentParser) -> None:
 
 
 def add_where(parser: argparse.ArgumentParser) -> None:
-    """Add ``--where KEY=VALUE``, whose values `gsbench.analysis.cells.select_trials` takes as a
-    dict."""
-    text = "only such trials (repeatable)"
+    """Add ``--where KEY=VALUE``; `gsbench.analysis.cells.select_trials` takes a dict of them."""
     parser.add_argument(
-        "--where", type=_condition, action="append", default=[], metavar="KEY=VALUE", help=text
+        "--where",
+        type=_condition,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="only such trials (repeatable)",
     )
 
 

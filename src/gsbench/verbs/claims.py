@@ -1,7 +1,7 @@
-"""Verbs that answer whether an idea helps: ``gsbench check``, ``plan`` and ``ablate``
-(docs/claims.md)."""
+"""Verbs that answer whether an idea helps: ``check``, ``plan`` and ``ablate`` (docs/claims.md)."""
 
 import argparse
+import itertools
 import math
 import tempfile
 from collections.abc import Sequence
@@ -52,9 +52,7 @@ def check(argv: Sequence[str], runs: Path) -> int:
         metavar="allow_targets=[MINE]",
         help="what the claims' arms may run beside gsbench; a file of claims cannot allow it",
     )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="show trials, time and what is not testable here"
-    )
+    parser.flag("--dry-run", "show trials, time and what is not testable here")
     parser.add_argument(
         "--from",
         dest="archive",
@@ -73,7 +71,8 @@ def check(argv: Sequence[str], runs: Path) -> int:
             raise InputError(
                 "check --from runs nothing, so no other option than --out goes with it"
             )
-        return _recheck(file, options.archive, options.out)
+        _recheck(file, options.archive, options.out)
+        return 0
     if options.out is not None:
         raise InputError(
             f"--out goes with --from; what is run here writes {HTML} beside its trials"
@@ -86,9 +85,8 @@ def check(argv: Sequence[str], runs: Path) -> int:
     return 0
 
 
-def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
-    """Print the verdicts by the archive's trials, and write their page to ``out`` if given; returns
-    0.
+def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> None:
+    """Print the verdicts by the archive's trials, and write their page to ``out`` if given.
 
     Raises InputError for an ``out`` of another format.
     """
@@ -103,7 +101,6 @@ def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> int:
             with writable_output(out):
                 write_text(out, to_html(page))
             print(out)
-    return 0
 
 
 def _permissions(words: Sequence[str]) -> Sequence[str]:
@@ -118,27 +115,23 @@ def _permissions(words: Sequence[str]) -> Sequence[str]:
 
 
 def describe(check: Check) -> list[str]:
-    """The lines of a dry run: each claim with its question or why it is not testable, the trials,
-    and the time."""
+    """The lines of a dry run: each claim's question or why it is not testable, trials, and time."""
     file, declaration = check.file, check.declaration
     questions = {question.name: question for question in declaration.questions}
     lines = [f"{file.paper}: {counted(len(questions), 'claim')} to be tested"]
     for claim in file.claims:
         missing = declaration.missing.get(claim.id, [])
         if claim.id not in questions:
-            lines.append(
-                f"not testable here  {claim.id}: {claim.not_testable or '; '.join(missing)}"
-            )
+            why = claim.not_testable or "; ".join(missing)
+            lines.append(f"not testable here  {claim.id}: {why}")
             continue
-        what = (
-            f"{claim.metric} of {claim.arm} against {claim.baseline}: {claim.direction}, by "
-            f"{claim.effect} at least"
+        scenes = ", ".join(questions[claim.id].scenes)
+        looks = ", ".join(map(str, declaration.looks))
+        lines.append(
+            f"to be tested       {claim.id}: {claim.metric} of {claim.arm} against "
+            f"{claim.baseline}: {claim.direction}, by {claim.effect} at least; on {scenes}; "
+            f"looks at {looks} seeds"
         )
-        scenes, looks = (
-            ", ".join(questions[claim.id].scenes),
-            ", ".join(map(str, declaration.looks)),
-        )
-        lines.append(f"to be tested       {claim.id}: {what}; on {scenes}; looks at {looks} seeds")
         lines += [f"                   without {reason}" for reason in missing]
     if not questions:
         return lines
@@ -153,7 +146,6 @@ def describe(check: Check) -> list[str]:
 
 
 def _run(check: Check) -> None:
-
     make_runs_folder(check.runs)
     check = replace(check, declaration=declare_questions(check.home, check.declaration))
 
@@ -205,8 +197,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
     for baseline, arm in pairs:
-        compared = [trial for trial in trials if trial.arm in (baseline, arm)]
-        paired = pair(compared, Question(metric=metric.key, baseline=baseline, arm=arm))
+        paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
             raise InputError(
                 f"no trials of {baseline} and {arm} can be paired in {metric.name}: "
@@ -219,29 +210,27 @@ def plan(argv: Sequence[str], runs: Path) -> int:
 
 def _lines(components: Components, metric: Quantity, difference: float) -> list[str]:
     digits = f".{metric.decimals + 1}f"
-    between = (
-        "" if components.between is None else f", between scenes by {components.between:{digits}}"
-    )
+    between = ""
+    if components.between is not None:
+        between = f", between scenes by {components.between:{digits}}"
     lines = [
         f"  differences in {metric.name} vary between seeds by "
         f"{components.within:{digits}}{between} "
         f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
     ]
-    for like_these in (False, True):
-        group = f"scenes like these (from {MIN_SCENES} scenes on)" if like_these else "these scenes"
+    groups = {"these scenes": False, f"scenes like these (from {MIN_SCENES} scenes on)": True}
+    for group, like_these in groups.items():
         if like_these and components.between is None:
             lines.append(f"  for {group}: run pilot trials on a second scene")
             continue
         designs = designs_needed(difference, components, like_these)
         designs.sort(key=lambda design: (design.trials, design.scenes))
-        texts = [
+        shown = ", ".join(
             f"{design.scenes} × {design.seeds} ({design.trials} trials)"
             for design in designs[:MAX_DESIGNS]
-        ]
-        lines.append(
-            f"  to see {difference:g} on {group}, scenes × seeds: "
-            f"{', '.join(texts) or 'none that can be run'}"
         )
+        what = f"  to see {difference:g} on {group}, scenes × seeds"
+        lines.append(f"{what}: {shown or 'none that can be run'}")
     return lines
 
 
@@ -256,25 +245,28 @@ def _above_zero(text: str) -> float:
 
 
 def ablate(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: the exit code says, as a sweep's does, whether a trial failed; raises
-    InputError for bad input."""
+    """Run the verb: the exit code says, as a sweep's does, whether a trial failed.
+
+    Raises InputError for bad input.
+    """
     from gsbench.pipeline.parts import Parts  # here, for a quick answer to --help
 
     options = _ablate_parser().parse_args(argv)
-    settings = options.settings
-    named = any(word.startswith(("name=", "+experiment=")) for word in settings)
-    words = [*settings, *([] if named else [f"name={_default_name(settings)}"])]
+    words = list(options.settings)
+    if not any(word.startswith(("name=", "+experiment=")) for word in words):
+        words.append(f"name={_default_name(words)}")
     first = _trials(words)
     densify = _only_densifier(first)
-    own = getattr(type(Parts(first[0].values).trainer), "SWITCHES", {})
-    declared = ablation.declared_switches(own, first[0].values["densify"])
+    values = first[0].values
+    own = getattr(type(Parts(values).trainer), "SWITCHES", {})
+    declared = ablation.declared_switches(own, values["densify"])
     switches = ablation.choose_switches(declared, options.switches, densify)
-    by_run = {
-        run: _trials([*words, *_words(ablation.off_settings(run, switches), first[0])])
-        for run in ablation.runs_to_train(switches)
-    }
+    by_run = {}
+    for run in ablation.runs_to_train(switches):
+        off = _words(ablation.off_settings(run, switches), values["densify"])
+        by_run[run] = _trials([*words, *off])
     _check_different(by_run)
-    trials = [trial for group in by_run.values() for trial in group]
+    trials = list(itertools.chain(*by_run.values()))
     print(
         f"{densify}: {counted(len(switches), 'part')} ({', '.join(switches)}), {len(by_run)} runs, "
         f"{counted(len(trials), 'trial')}"
@@ -283,23 +275,18 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
         hashes = ", ".join(dict.fromkeys(trial.folder.name.partition(SEED)[0] for trial in group))
         print(f"  {hashes}: {ablation.run_name(run, list(switches))}")
     if options.dry_run:
-        print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
+        print("\n".join(describe_plan(trials, values["launch"]["parallel"])))
         return 0
-    home = trials[0].files.home
     code = run_trials(trials)
     if code == 0:
+        home = trials[0].files.home
         keys = {
             run: {t.values["scene"]["name"]: t.files.key for t in group}
             for run, group in by_run.items()
         }
-        metric = options.metric or trials[0].values["eval"].get("primary") or DEFAULT_METRIC
-        print(
-            "\n".join(
-                ablation.markdown_table(
-                    ablation.judge_runs(read_experiment(home).trials, keys, metric)
-                )
-            )
-        )
+        metric = options.metric or values["eval"].get("primary") or DEFAULT_METRIC
+        judged = ablation.judge_runs(read_experiment(home).trials, keys, metric)
+        print("\n".join(ablation.markdown_table(judged)))
         print(f"all metrics and pictures: gsbench report {home.name}")
     return code
 
@@ -322,9 +309,7 @@ def _ablate_parser() -> ArgumentParser:
         help="only these; default: all declared",
     )
     parser.add_argument("--metric", help="printed; default: eval.primary, else psnr")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="list the trials and their state; run nothing"
-    )
+    parser.flag("--dry-run", "list the trials and their state; run nothing")
     return parser
 
 
@@ -349,13 +334,13 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
     return str(trials[0].values["densify"]["name"])
 
 
-def _words(settings: dict[str, Any], first: Trial) -> list[str]:
+def _words(settings: dict[str, Any], densify: dict[str, Any]) -> list[str]:
     """The words that give the densifier these settings; a key that it lacks needs Hydra's plus."""
-    densify = first.values["densify"]
-    return [
-        f"{'' if key in densify else '+'}densify.{key}={value_text(value)}"
-        for key, value in settings.items()
-    ]
+    words = []
+    for key, value in settings.items():
+        plus = "" if key in densify else "+"
+        words.append(f"{plus}densify.{key}={value_text(value)}")
+    return words
 
 
 def _default_name(words: Sequence[str]) -> str:

@@ -1,5 +1,4 @@
-"""Verbs for what goes to others or comes from them: ``gsbench evaluate``, ``export``, ``pool`` and
-``site``."""
+"""Verbs for what goes to others or comes from them: evaluate, export, pool and site."""
 
 import logging
 import shutil
@@ -10,7 +9,7 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.errors import InputError
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.files import atomic, writable_output
@@ -50,16 +49,13 @@ def _evaluate_parser() -> ArgumentParser:
     parser.add_argument(
         "--truth",
         metavar="PLACE",
-        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:"
-        "DENSIFY), or a scene's name, whose test views are taken as a trial sees them; not needed "
-        "for predictions",
+        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or a "
+        "scene's name, whose test views are taken as a trial sees them; not needed for predictions",
     )
     parser.add_argument(
         "--protocol", choices=list(PROTOCOLS), help="default: that of the trial, or paper"
     )
-    parser.add_argument(
-        "--by-order", action="store_true", help="match sorted pictures with sorted photographs"
-    )
+    parser.flag("--by-order", "match sorted pictures with sorted photographs")
     parser.add_argument(
         "--as",
         dest="place",
@@ -72,23 +68,45 @@ def _evaluate_parser() -> ArgumentParser:
     parser.add_argument(
         "--scene", metavar="NAME", help="with --as, where PLACE is a folder: what to call the scene"
     )
-    parser.add_argument(
-        "--json", action="store_true", help="print a JSON object instead of a table"
-    )
+    parser.flag("--json", "print a JSON object instead of a table")
     return parser
 
 
 def export(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0 if the file, or folder, was written."""
+    options = _export_parser().parse_args(argv)
+    if options.results is not None:
+        if options.trial:
+            raise InputError("export --results takes an experiment, --out and --pictures alone")
+        export_results(options.results, runs, options.out, options.pictures)
+        return 0
+    if options.pictures:
+        raise InputError("--pictures goes with --results")
+    if not options.trial or options.out is None:
+        raise InputError(
+            "export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export "
+            "--help)"
+        )
+    *before, address = options.trial
+    if before not in ([], ["init"]):
+        raise InputError(
+            f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init "
+            "TRIAL"
+        )
+    from gsbench.view.trials import find_trial
+
+    export_model(find_trial(address, runs), options.out, is_init=bool(before))
+    return 0
+
+
+def _export_parser() -> ArgumentParser:
     parser = ArgumentParser(
         "export",
         "A .html file is a page with the model and the test cameras, made by npx "
-        "(docs/other_models.md). `gsbench "
-        "export init TRIAL --out DIR` copies the COLMAP model that the trial started from. "
-        "`gsbench export --results "
-        "EXPERIMENT` writes results, configurations and hashes as one small archive, without "
-        "pixels unless --pictures "
-        "is given.",
+        "(docs/other_models.md). `gsbench export init TRIAL --out DIR` copies the COLMAP model "
+        "that the trial started from. `gsbench export --results EXPERIMENT` writes results, "
+        "configurations and hashes as one small archive, without pixels unless --pictures is "
+        "given.",
     )
     parser.add_argument(
         "--results",
@@ -107,55 +125,34 @@ def export(argv: Sequence[str], runs: Path) -> int:
         metavar="PATH",
         help="the .ply or .html file to write, for init the folder; a TRIAL needs it",
     )
-    parser.add_argument(
-        "--pictures",
-        action="store_true",
-        help="with --results: the pictures of the test views, too",
-    )
-    options = parser.parse_args(argv)
-    if options.results is not None:
-        if options.trial:
-            raise InputError("export --results takes an experiment, --out and --pictures alone")
-        return export_results(options.results, runs, options.out, options.pictures)
-    if options.pictures:
-        raise InputError("--pictures goes with --results")
-    if not options.trial or options.out is None:
-        raise InputError(
-            "export needs a TRIAL and --out PATH, or --results EXPERIMENT (see gsbench export "
-            "--help)"
-        )
-    from gsbench.view.trials import find_trial, model_file
+    parser.flag("--pictures", "with --results: the pictures of the test views, too")
+    return parser
 
-    is_init = len(options.trial) == 2 and options.trial[0] == "init"
-    if len(options.trial) > 1 and not is_init:
-        raise InputError(
-            f"one TRIAL is exported, not {len(options.trial)}; for an initial model: export init "
-            "TRIAL"
-        )
-    trial = find_trial(options.trial[-1], runs)
-    out = options.out
-    is_page = not is_init and out.suffix.lower() == PAGE
+
+def export_model(trial: TrialResult, out: Path, is_init: bool) -> None:
+    """Write the trained model as a PLY file or a page, or the initial model as a folder."""
+    from gsbench.view.page import write_page
+    from gsbench.view.trials import model_file
+
+    is_page = out.suffix.lower() == PAGE
     if not is_init and not is_page:
         check_form(out)
     with writable_output(out):
-        if is_page:
-            from gsbench.view.page import write_page
-
-            write_page(trial, out)
-        elif is_init:
+        if is_init:
             entry = trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name]
             export_init(entry, out, trial.record.to_training)
+        elif is_page:
+            write_page(trial, out)
         else:
             with atomic(out, sync=False) as temporary:
                 shutil.copyfile(model_file(trial), temporary)
     count = "the initial model" if is_init else f"{trial.record.num_gaussians:,} Gaussians"
     size = sum(path.stat().st_size for path in ([out] if out.is_file() else out.rglob("*")))
     print(f"{out}: {trial.label}, {count}, {readable_bytes(size)}")
-    return 0
 
 
-def export_results(name: str, runs: Path, out: Path | None, pictures: bool = False) -> int:
-    """Write the archive of an experiment's results, and warn of what is left out; returns 0."""
+def export_results(name: str, runs: Path, out: Path | None, pictures: bool = False) -> None:
+    """Write the archive of an experiment's results, and warn of what is left out."""
     from gsbench.claims.archive import write_archive
 
     if not is_folder_name(name):
@@ -170,7 +167,6 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     for line in left_out:
         log.warning("left out: %s", line)
     print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")
-    return 0
 
 
 def check_form(out: Path) -> None:
@@ -184,8 +180,7 @@ def check_form(out: Path) -> None:
 
 
 def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
-    """Copy the COLMAP model of the stage result ``entry`` to `MODEL_FOLDER` of ``out``, as 3DGS
-    trainers read it.
+    """Copy the COLMAP model of the stage result ``entry`` into ``out``, as 3DGS trainers read it.
 
     It gets the coordinates in which the scene was given. Raises InputError if ``out`` has a folder
     of models.
@@ -230,16 +225,11 @@ def pool(argv: Sequence[str], runs: Path) -> int:
     options = parser.parse_args(argv)
     wanted = PooledQuestion(options.arm, options.baseline, options.metric, dict(options.where))
     pooled, notes, faults = pool_sources(options.sources, wanted, options.protocol)
-    title = f"{options.arm[0]} against {options.baseline[0]}"
+    arms = f"{options.arm[0]} against {options.baseline[0]}"
     shown = asked_quantity(options.metric)
-    lines = [
-        f"{title}, difference in {shown.name}{BETTER[shown.direction]}",
-        "",
-        *markdown_table(pooled),
-        "",
-    ]
-    lines += [*describe(pooled), *notes, *faults]
-    print("\n".join(lines))
+    title = f"{arms}, difference in {shown.name}{BETTER[shown.direction]}"
+    table = markdown_table(pooled)
+    print("\n".join([title, "", *table, "", *describe(pooled), *notes, *faults]))
     for fault in faults:
         print(f"gsbench: {fault}", file=sys.stderr)
     return LEFT_OUT if faults else DONE

@@ -56,21 +56,23 @@ def fetch(argv: Sequence[str], runs: Path) -> int:
 
         remove_temporaries(data / STAGING)
         for archive in dataset.archives:
-            wanted = [files for files in scenes if files.scene in archive.scenes]
-            unfinished = [files for files in wanted if missing_parts(data, files)]
-            for files in wanted:
-                if files not in unfinished:
-                    print(
-                        f"{files.scene}: is here, in {data / files.folder} "
-                        f"({', '.join(files.parts)})"
-                    )
+            unfinished = []
+            for files in scenes:
+                if files.scene not in archive.scenes:
+                    continue
+                if missing_parts(data, files):
+                    unfinished.append(files)
+                else:
+                    parts = ", ".join(files.parts)
+                    print(f"{files.scene}: is here, in {data / files.folder} ({parts})")
+            if not unfinished:
+                continue
             where = archive.url if mirror is None else f"{mirror.rstrip('/')}/{archive.name}"
-            if unfinished:
-                with open_archive_at(where, PATIENCE) as zipped:
-                    for files in unfinished:
-                        folder = archive.scenes[files.scene]
-                        line = fetch_scene(zipped, folder, where, data, files, PATIENCE, say)
-                        print(f"{files.scene}: {line}", flush=True)
+            with open_archive_at(where, PATIENCE) as zipped:
+                for files in unfinished:
+                    folder = archive.scenes[files.scene]
+                    line = fetch_scene(zipped, folder, where, data, files, PATIENCE, say)
+                    print(f"{files.scene}: {line}", flush=True)
     return 0
 
 
@@ -80,19 +82,14 @@ def listing(datasets: Sequence[PublicDataset], data: Path) -> list[str]:
     for dataset in datasets:
         lines.append(f"{dataset.name}: {dataset.title}, {dataset.page}")
         for archive in dataset.archives:
-            lines.append(
-                f"  {archive.url}{f' (as a whole {archive.size})' if archive.size else ''}"
-            )
+            size = f" (as a whole {archive.size})" if archive.size else ""
+            lines.append(f"  {archive.url}{size}")
             for scene in sorted(archive.scenes):
                 files = wanted_files(scene)
                 missing = missing_parts(data, files)
-                state = (
-                    "here"
-                    if not missing
-                    else "not here"
-                    if missing == files.parts
-                    else f"{missing[0]} is missing"
-                )
+                state = f"{missing[0]} is missing" if missing else "here"
+                if missing == files.parts:
+                    state = "not here"
                 lines.append(f"    {scene:<12}{', '.join(files.parts):<22}{state}")
     return [*lines, f"data folder: {data} ({DATA_VARIABLE})"]
 
@@ -129,8 +126,10 @@ def _scenes(dataset: PublicDataset, names: Sequence[str]) -> Sequence[str]:
 
 
 def _mirror(mirror: str | None) -> str | None:
-    """The address or folder to fetch from instead of the published one; raises InputError if it is
-    neither."""
+    """The address or folder to fetch from instead of the published one.
+
+    Raises InputError if it is neither.
+    """
     if not mirror:
         return None
     with suppress(ValueError):  # urlsplit raises for an address such as http://[::1
@@ -152,9 +151,7 @@ def _parser(names: Sequence[str]) -> ArgumentParser:
     parser.add_argument(
         "scenes", nargs="*", metavar="SCENE", help="the scenes wanted; none: all of the data set"
     )
-    parser.add_argument(
-        "--list", action="store_true", help="list all scenes, and which ones are here"
-    )
+    parser.flag("--list", "list all scenes, and which ones are here")
     parser.add_argument(
         "--images",
         metavar="FOLDER",

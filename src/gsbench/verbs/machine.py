@@ -1,7 +1,7 @@
-"""Verbs about this machine: ``gsbench doctor`` (what is missing) and ``gsbench bench`` (how fast it
-is)."""
+"""Verbs about this machine: ``doctor`` (what is missing) and ``bench`` (how fast it is)."""
 
 import argparse
+import itertools
 import json
 import shutil
 import sys
@@ -37,10 +37,13 @@ SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained
 MAX_COUNT = 1_000_000_000
 
 
+Verdict = Literal["ok", "note", "bad"]
+
+
 class Finding(NamedTuple):
     """The result of one check: ``ok``, worth a ``note``, or ``bad`` (gsbench will not work)."""
 
-    verdict: Literal["ok", "note", "bad"]
+    verdict: Verdict
     topic: str
     text: str
 
@@ -48,35 +51,26 @@ class Finding(NamedTuple):
 def doctor(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 1 if something is bad, or if a proof fails."""
     parser = ArgumentParser("doctor")
-    parser.add_argument(
-        "--prove",
-        action="store_true",
-        help="compare a rasterizer with the float64 reference on this machine",
-    )
+    parser.flag("--prove", "compare a rasterizer with the float64 reference on this machine")
     parser.add_argument(
         "--raster", default=AUTO, choices=names(), help="the rasterizer to prove (auto)"
     )
     parser.add_argument(
         "--device", default="auto", help="where to prove it: auto, cpu, cuda or cuda:1"
     )
-    parser.add_argument("--json", action="store_true", help="print the proof as JSON")
+    parser.flag("--json", "print the proof as JSON")
     options = parser.parse_args(argv)
     if options.prove:
         return _prove(options.raster, options.device, options.json)
     if options.json or options.raster != AUTO or options.device != "auto":
         raise InputError("doctor: --raster, --device and --json belong to --prove")
-    bad = 0
-    for findings in (
-        check_packages(),
-        check_devices(),
-        check_proofs(),
-        check_weights(),
-        check_runs(runs),
-    ):
-        for verdict, topic, text in findings:
-            print(f"{verdict:<5} {topic:<12} {text}")
-            bad += verdict == "bad"
-    return 1 if bad else 0
+    code = 0
+    checks = check_packages(), check_devices(), check_proofs(), check_weights(), check_runs(runs)
+    for verdict, topic, text in itertools.chain(*checks):
+        print(f"{verdict:<5} {topic:<12} {text}")
+        if verdict == "bad":
+            code = 1
+    return code
 
 
 def _prove(raster: str, device_name: str, as_json: bool) -> int:
@@ -88,13 +82,11 @@ def _prove(raster: str, device_name: str, as_json: bool) -> int:
     proof = proof_of(name, device, again=True)
     if as_json:
         print(json.dumps(proof.to_json() | {"passed": proof.passed}, indent=2))
-        return 0 if proof.passed else 1
-    print(_describe(proof))
-    for line in proof.failures:
-        print(f"  {line}")
-    if not proof.passed:
-        versions = ", ".join(f"{name} {version}" for name, version in proof.versions.items())
-        print(f"{versions}; please report it with {stamp_of(name, device)}")
+    else:
+        print("\n  ".join([_describe(proof), *proof.failures]))
+        if not proof.passed:
+            versions = ", ".join(f"{name} {version}" for name, version in proof.versions.items())
+            print(f"{versions}; please report it with {stamp_of(name, device)}")
     return 0 if proof.passed else 1
 
 
@@ -146,9 +138,8 @@ def check_packages() -> Iterator[Finding]:
     )
     for name in REQUIRED:
         installed = version_of(name)
-        yield Finding(
-            "bad" if installed is None else "ok", name, installed or f"missing: {install_command()}"
-        )
+        text = installed or f"missing: {install_command()}"
+        yield Finding("ok" if installed else "bad", name, text)
     for name, (purpose, extra) in OPTIONAL.items():
         installed = version_of(name)
         text = installed or f"not installed; needed for {purpose}: {install_command(extra)}"
@@ -156,56 +147,40 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_devices() -> Iterator[Finding]:
-    """Findings about torch, the GPUs that it can or cannot use and why, and the rasterizers on each
-    device."""
+    """Findings about torch, the GPUs that it can use or not, and each device's rasterizers."""
     try:
         import torch
     except (ImportError, OSError) as error:
-        yield Finding(
-            "bad",
-            "torch",
-            f"cannot be imported ({str(error).partition(chr(10))[0]}): pip install torch",
-        )
+        first_line = str(error).partition("\n")[0]
+        yield Finding("bad", "torch", f"cannot be imported ({first_line}): pip install torch")
         return
     yield Finding("ok", "torch", str(torch.__version__))
-    usable = torch.cuda.is_available()
-    for index in range(torch.cuda.device_count() if usable else 0):
-        free, total = torch.cuda.mem_get_info(index)
-        text = (
-            f"{torch.cuda.get_device_name(index)}, {readable_bytes(free)} of "
-            f"{readable_bytes(total)} free"
-        )
+    devices = ["cpu"]
+    if torch.cuda.is_available():
+        devices.append("cuda")
         untested = torch.version.hip is not None
-        yield Finding(
-            "note" if untested else "ok",
-            "gpu",
-            f"{text}{': AMD, never tested' if untested else ''}",
-        )
-    if not usable:
+        for index in range(torch.cuda.device_count()):
+            free, total = map(readable_bytes, torch.cuda.mem_get_info(index))
+            text = f"{torch.cuda.get_device_name(index)}, {free} of {total} free"
+            if untested:
+                yield Finding("note", "gpu", f"{text}: AMD, never tested")
+            else:
+                yield Finding("ok", "gpu", text)
+    else:
         listed = len(installed_gpus())
+        cause = "this torch is a build for CPUs"
         if torch.version.cuda is not None:
             cause = "torch finds no usable NVIDIA driver; does nvidia-smi run?"
         elif listed:
-            cause = (
-                f"{counted(listed, 'NVIDIA GPU')} here, but this torch is a build for CPUs: "
-                "see pytorch.org"
-            )
-        else:
-            cause = "this torch is a build for CPUs"
+            cause = f"{counted(listed, 'NVIDIA GPU')} here, but {cause}: see pytorch.org"
         yield Finding("note", "gpu", f"none ({cause}): raster=auto uses the CPU")
-    devices = ["cpu", *(["cuda"] if usable else [])]
     for executor in EXECUTORS:
-        usable_on = [device for device in devices if executor.obstacle(device) is None]
-        if usable_on:
-            yield Finding(
-                "ok",
-                "rasterizer",
-                f"raster={executor.name} on {' and '.join(usable_on)}: {executor.text}",
-            )
+        usable = [device for device in devices if executor.obstacle(device) is None]
+        name = f"raster={executor.name}"
+        if usable:
+            yield Finding("ok", "rasterizer", f"{name} on {' and '.join(usable)}: {executor.text}")
         else:
-            yield Finding(
-                "note", "rasterizer", f"raster={executor.name} {executor.obstacle(devices[-1])}"
-            )
+            yield Finding("note", "rasterizer", f"{name} {executor.obstacle(devices[-1])}")
     chosen = " and ".join(f"{resolve('auto', device).name} on {device}" for device in devices)
     yield Finding("ok", "rasterizer", f"raster=auto is {chosen}")
     yield from check_triton()
@@ -215,13 +190,11 @@ def check_triton() -> Iterator[Finding]:
     """Findings about the compiler that raster=triton needs at its first run on a GPU."""
     from gsbench.raster.executors import missing_tools
 
-    # it comes with torch for CUDA, so there is no GPU to run it on
-    if version_of("triton") is None:
-        return
-    if missing := missing_tools():
-        yield Finding(
-            "note", "triton", f"at its first run on a GPU it needs {' and '.join(missing)}"
-        )
+    # Triton comes with torch for CUDA: without it there is no GPU to run it on.
+    missing = missing_tools() if version_of("triton") else []
+    if missing:
+        text = f"at its first run on a GPU it needs {' and '.join(missing)}"
+        yield Finding("note", "triton", text)
 
 
 def check_weights() -> Iterator[Finding]:
@@ -236,17 +209,17 @@ def check_weights() -> Iterator[Finding]:
     wanted |= {f"LightGlue for {name}": (spec,) for name, spec in LIGHTGLUE_WEIGHTS.items()}
     for purpose, specs in wanted.items():
         try:
-            yield Finding(
-                "ok", "weights", f"{purpose}: {find_first_weights(specs, None, download=False)}"
-            )
+            text = str(find_first_weights(specs, None, download=False))
+            verdict: Verdict = "ok"
         except MissingWeightsError as error:
-            origin = specs[0].url or specs[0].source
-            missing = (
-                f"{specs[0].names[0]} is not here; gsbench downloads it when needed from {origin}"
-            )
-            place = f"or put it into ${WEIGHTS_VARIABLE} or {hub_cache()}"
-            text = f"{missing}; {place}" if "not found" in str(error) else str(error)
-            yield Finding("note", "weights", f"{purpose}: {text}")
+            verdict, text = "note", str(error)
+            if "not found" in text:
+                text = (
+                    f"{specs[0].names[0]} is not here; gsbench downloads it when needed from "
+                    f"{specs[0].url or specs[0].source}; or put it into ${WEIGHTS_VARIABLE} or "
+                    f"{hub_cache()}"
+                )
+        yield Finding(verdict, "weights", f"{purpose}: {text}")
 
 
 def check_runs(runs: Path) -> Iterator[Finding]:
@@ -258,9 +231,8 @@ def check_runs(runs: Path) -> Iterator[Finding]:
     except OSError:
         yield Finding("bad", "runs", f"{runs} cannot be written to: set GSBENCH_RUNS")
     else:
-        yield Finding(
-            "note" if free < LITTLE_SPACE else "ok", "runs", f"{runs}, {readable_bytes(free)} free"
-        )
+        verdict: Verdict = "note" if free < LITTLE_SPACE else "ok"
+        yield Finding(verdict, "runs", f"{runs}, {readable_bytes(free)} free")
 
 
 def _bench_parser() -> ArgumentParser:
@@ -283,17 +255,9 @@ def _bench_parser() -> ArgumentParser:
     parser.add_argument(
         "--threads", type=_count, help="CPU threads (default: as many as torch takes)"
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument(
-        "--kernels",
-        action="store_true",
-        help="with --json: add the time of each kernel, and of waits for the GPU",
-    )
-    parser.add_argument(
-        "--no-memory",
-        action="store_true",
-        help="do not measure peak memory, in processes of their own",
-    )
+    parser.flag("--json", "print JSON")
+    parser.flag("--kernels", "with --json: add the time of each kernel, and of waits for the GPU")
+    parser.flag("--no-memory", "do not measure peak memory, in processes of their own")
     return parser
 
 

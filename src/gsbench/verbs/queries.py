@@ -1,5 +1,4 @@
-"""Questions about the configuration that Hydra answers: ``--cfg job``, ``--info``, tab
-completion."""
+"""Questions on the configuration that Hydra answers: ``--cfg job``, ``--info``, tab completion."""
 
 import os
 import re
@@ -33,16 +32,13 @@ COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
 
 
 def ask_hydra(argv: list[str]) -> int:
-    """Let Hydra answer a question about the configuration, and run no trial. Raises InputError for
-    bad input."""
+    """Let Hydra answer a question about the configuration, and run no trial.
+
+    Raises InputError for bad input.
+    """
     options = _parser().parse_args(argv)
-    asked = [
-        options.cfg is not None,
-        options.info is not None,
-        options.shell_completion,
-        options.hydra_help,
-    ]
-    if sum(asked) != 1 or ((options.resolve or options.package) and options.cfg is None):
+    asked = [options.cfg, options.info, options.shell_completion, options.hydra_help]
+    if sum(map(bool, asked)) != 1 or ((options.resolve or options.package) and not options.cfg):
         raise InputError(
             "ask one thing: --cfg job (with --resolve or --package KEY), --info, or --hydra-help"
         )
@@ -68,8 +64,7 @@ def ask_hydra(argv: list[str]) -> int:
 
 
 def _check_typed(line: str) -> None:
-    """Refuse to complete a line that would make Hydra import a package which the line does not
-    allow."""
+    """Refuse to complete a line that makes Hydra import a package which the line does not allow."""
     words = []
     for word in line.split():
         with suppress(InputError):  # a half-typed word
@@ -82,11 +77,11 @@ def _parser() -> ArgumentParser:
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--cfg", "-c", choices=["job", "hydra", "all"])
-    parser.add_argument("--resolve", action="store_true")
+    parser.flag("--resolve", "with --cfg: show values instead of ${…}")
     parser.add_argument("--package", "-p")
     info = ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]
     parser.add_argument("--info", "-i", nargs="?", const="all", choices=info)
-    parser.add_argument("--hydra-help", action="store_true")
+    parser.flag("--hydra-help", "Hydra's own options")
     parser.add_argument("--shell-completion", "-sc", action="store_true")
     parser.add_argument("--config-dir", "-cd", type=Path)
     return parser

@@ -1,5 +1,4 @@
-"""Verbs that show an experiment's results from its files: ``gsbench tables``, ``report`` and
-``explain``."""
+"""Verbs that show an experiment's results from its files: ``tables``, ``report``, ``explain``."""
 
 import argparse
 import re
@@ -64,19 +63,21 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     trials = select_trials(experiment.trials, dict(options.where))
-    texts = (
-        _trials(trials, options)
-        if options.format == TRIALS
-        else _tables(experiment, trials, options)
-    )
+    if options.format == TRIALS:
+        texts = _trials(trials, options)
+    else:
+        texts = _tables(experiment, trials, options)
     _write(texts, options.out, experiment.name)
     return 0
 
 
 def _format_of(out: Path | None) -> str:
     """The format that the ending of the file ``out`` stands for, else Markdown."""
-    endings = {f".{suffix}": name for name, (suffix, _) in FORMATS.items()}
-    return endings.get(out.suffix.lower(), "md") if out is not None and not out.is_dir() else "md"
+    if out is not None and not out.is_dir():
+        for name, (suffix, _) in FORMATS.items():
+            if out.suffix.lower() == f".{suffix}":
+                return name
+    return "md"
 
 
 def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
@@ -93,13 +94,12 @@ def _tables(
     experiment: Experiment, trials: Sequence[TrialResult], options: argparse.Namespace
 ) -> dict[str, str]:
     """The texts of the tables, by the ending of their file's name."""
-    own_layout = (
-        layout_of(experiment.name) if options.rows is None and options.columns is None else None
-    )
-    layout, metrics = options.layout or own_layout or "plain", options.metrics
+    layout, metrics = options.layout, options.metrics
+    if layout is None and options.rows is None and options.columns is None:
+        layout = layout_of(experiment.name)
     if layout == FAIRNESS:
         return _fairness_sheets(experiment, options.format)
-    if layout == "plain":
+    if layout in (None, "plain"):
         rows, columns = options.rows, options.columns or ()
         if both := sorted(set(rows or ()) & set(columns)):
             raise InputError(f"{', '.join(both)} is in --rows and --columns: choose one")
@@ -121,12 +121,11 @@ def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]
             f"experiment {experiment.name} has one arm, so there is nothing to compare"
         )
     suffix, writer = FORMATS[format_name]
-    return {
-        f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}": writer(
-            fairness_table(trials, first, second)
-        )
-        for first, second in pairs
-    }
+    sheets = {}
+    for first, second in pairs:
+        end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
+        sheets[end] = writer(fairness_table(trials, first, second))
+    return sheets
 
 
 def _as_file(arm: Arm) -> str:
@@ -173,15 +172,13 @@ def _tables_parser() -> ArgumentParser:
         "--layout",
         choices=[*PAPER_TABLES, "plain", FAIRNESS],
         help=f"the paper's layout for any experiment; {FAIRNESS}: for each pair of arms in what "
-        "they differ, what was "
-        "tuned, and whose defaults those are",
+        "they differ, what was tuned, and whose defaults those are",
     )
     return parser
 
 
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
-    """Print the texts, or write them to the file ``out``, or into the folder ``out`` unless it has
-    the format's ending.
+    """Print the texts, or write them to ``out``: a file if its ending is the format's, or a folder.
 
     In a folder, files are named after the experiment. A second table is written beside the file
     ``out``.
@@ -217,11 +214,9 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file = (
-        experiment.folder / REPORT_NAME
-        if options.out is None
-        else file_at(options.out, experiment.name)
-    )
+    file = experiment.folder / REPORT_NAME
+    if options.out is not None:
+        file = file_at(options.out, experiment.name)
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
@@ -232,8 +227,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
 
 
 def file_at(out: Path, experiment: str) -> Path:
-    """The file that ``--out`` means: ``out`` itself, or in a folder a file named after the
-    experiment."""
+    """The file that ``--out`` means: ``out``, or in a folder one with the experiment's name."""
     is_file = out.suffix.lower() in FILE_SUFFIXES and not out.is_dir()
     return out if is_file else out / f"{experiment}-{REPORT_NAME}"
 
@@ -268,9 +262,8 @@ def explain_cell(address: str, runs: Path) -> str:
     ]
     if cell.reason:
         lines.append(f"  not available: {cell.reason}")
-    lines += ["", "Conditions"] + [
-        f"  {key}: {value}" for key, value in trials[0].conditions.items()
-    ]
+    conditions = trials[0].conditions.items()
+    lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
     left_out = [
         line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line
@@ -281,8 +274,7 @@ def explain_cell(address: str, runs: Path) -> str:
 
 
 def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
-    """The trials of a scene and an arm: ``<init>-<densify>``, or the densifier alone if only one
-    arm has it."""
+    """The trials of a scene and an arm: ``<init>-<densify>``, or a densifier that one arm has."""
     of_scene = [trial for trial in experiment.trials if trial.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
@@ -296,53 +288,52 @@ def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
-    """The value and the origin of each trial; a line that equals the previous trial's is not
-    repeated."""
+    """The value and the origin of each trial; a line that repeats the last trial's is left out."""
     lines = ["", "Trials"]
     previous: dict[str, str] = {}
     for trial in trials:
         value, origin = shown.read(trial), _origin(trial)
         lines.append(f"  seed {trial.seed}: {'n/a' if value is None else f'{value:.6g}'}")
+        new = origin.items() - previous.items()
         lines += [
-            f"    {label:<9} {text}"
-            for label, text in origin.items()
-            if previous.get(label) != text
+            f"    {label:<9} {text}" for label, text in origin.items() if (label, text) in new
         ]
-        previous = previous | origin
+        previous |= origin
     return lines
 
 
 def _origin(trial: TrialResult) -> dict[str, str]:
     """The folder of a trial, its counts, hashes, and the programs that made it, by label."""
     record = trial.record
-    if trial.from_renders and not trial.program:
-        counts = ", ".join(f"{key} {value}" for key, value in record.renders.items())
-    elif trial.from_renders:
+    if not trial.from_renders:
+        counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
+    elif trial.program:
         counts = "its own renders"
     else:
-        counts = f"{record.num_gaussians or 0:,} from {record.num_init_points or 0:,} points"
-    origin = {"folder": str(trial.path), "Gaussians": counts}
-    origin["views"] = f"{'?' if record.test_views is None else record.test_views} for testing"
-    origin |= {
-        key: str(value) for key, value in record.hashes.items() if key not in trial.conditions
+        counts = _listed(record.renders)
+    views = "?" if record.test_views is None else record.test_views
+    origin = {
+        "folder": str(trial.path),
+        "Gaussians": counts,
+        "views": f"{views} for testing",
+        **{name: sha for name, sha in record.hashes.items() if name not in trial.conditions},
     }
     if record.trained_by is not None:
         origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
     if machine := trial.machine:
         origin["machine"] = machine
     if trial.code:
-        origin["code"] = ", ".join(
-            f"{part} {short_version(version)}" for part, version in trial.code.items()
-        )
+        origin["code"] = _listed({part: short_version(own) for part, own in trial.code.items()})
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    edited = [
-        name.removeprefix("gsbench's ")
-        for name, state in trial.rooms.items()
-        if state != AS_RELEASED
-    ]
+    rooms = record.code.rooms
+    edited = [room for room, state in rooms.items() if state != AS_RELEASED]
     # before the first release all rooms count as edited
-    if edited and len(edited) < len(trial.rooms):
+    if edited and len(edited) < len(rooms):
         origin["edited"] = f"since the last release: {some_of(edited)}"
-    origin["versions"] = ", ".join(f"{key} {value}" for key, value in record.versions.items())
+    origin["versions"] = _listed(record.versions)
     return origin
+
+
+def _listed(facts: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in facts.items())

@@ -1,6 +1,7 @@
 """Verbs that serve pages on this machine: ``gsbench view`` and ``gsbench ui``."""
 
 import importlib.util
+import itertools
 import os
 import shlex
 import subprocess
@@ -79,7 +80,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
         "--uri", help="the tracker's address; default: $MLFLOW_TRACKING_URI, or the runs folder's"
     )
     parser.add_argument("--port", type=port, default=DASHBOARD_PORT)
-    parser.add_argument("--no-browser", action="store_true", help="only print the addresses")
+    parser.flag("--no-browser", "only print the addresses")
     options = parser.parse_args(argv)
     if options.uri is not None and "://" not in options.uri:
         raise InputError(f"--uri {options.uri} is not an address such as sqlite:///FILE")
@@ -111,8 +112,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
 
 
 def _serves(server: str, experiment: str, page: str) -> bool:
-    """Return whether an MLflow server answers there that knows the experiment by the id in
-    ``page``."""
+    """Return whether an MLflow server there knows the experiment by the id in ``page``."""
     place = f"{server}/api/2.0/mlflow/experiments/get-by-name"
     try:
         answer = requests.get(
@@ -150,26 +150,21 @@ def serve(uri: str, port: int) -> int:
     mlflow_spec = importlib.util.find_spec("mlflow")
     assert mlflow_spec is not None
     assert mlflow_spec.origin is not None
-    command = [
-        sys.executable,
-        "-m",
-        "mlflow",
-        "ui",
-        "--backend-store-uri",
-        uri,
-        "--host",
-        "127.0.0.1",
-    ]
-    command += ["--port", str(port), "--workers", "1"]
     # uvicorn imports modules from the current folder first, where a `yaml.py` may lie; MLflow's own
     # folder is safe.
-    command += [
-        "--uvicorn-opts",
-        f"--app-dir={shlex.quote(str(Path(mlflow_spec.origin).parents[1]))}",
-    ]
+    folder = shlex.quote(str(Path(mlflow_spec.origin).parents[1]))
+    options = {
+        "--backend-store-uri": uri,
+        "--host": "127.0.0.1",
+        "--port": str(port),
+        "--workers": "1",
+        "--uvicorn-opts": f"--app-dir={folder}",
+    }
+    words = itertools.chain(*options.items())
     with stop_on_signals():
         # Not `subprocess.run`: it would kill only `mlflow ui`, and its orphaned server would keep
         # the port.
+        command = [sys.executable, "-m", "mlflow", "ui", *words]
         server = subprocess.Popen(command, env=SETTINGS | LEAN | dict(os.environ))
         try:
             return server.wait()

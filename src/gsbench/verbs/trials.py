@@ -44,27 +44,19 @@ log = logging.getLogger(__name__)
 
 
 def status(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if all trials are done, running or queued, 1 if some failed or are
-    missing."""
+    """Run the verb: 0 if all trials are done, running or queued, 1 if any failed or is missing."""
     parser = ArgumentParser("status")
     parser.add_argument(
         "experiment", nargs="?", help="its name; without one, a line for each experiment"
     )
-    parser.add_argument("--all", action="store_true", help="list the finished trials too")
-    parser.add_argument(
-        "--watch",
-        action="store_true",
-        help="a table of arms and scenes, renewed until all have ended",
-    )
-    parser.add_argument("--json", action="store_true", help="print a JSON list instead of lines")
-    parser.add_argument(
-        "--forget", action="store_true", help="remove trials from the plan that never started"
-    )
-    parser.add_argument(
+    parser.flag("--all", "list the finished trials too")
+    parser.flag("--watch", "a table of arms and scenes, renewed until all have ended")
+    parser.flag("--json", "print a JSON list instead of lines")
+    parser.flag("--forget", "remove trials from the plan that never started")
+    parser.flag(
         "--forget-superseded",
-        action="store_true",
-        help="delete the folders of trials that older code made; what their stages computed stays "
-        "in the store",
+        "delete the folders of trials that older code made; what their stages computed stays in "
+        "the store",
     )
     options = parser.parse_args(argv)
     if options.experiment is None:
@@ -92,16 +84,11 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(json.dumps([asdict(trial) for trial in trials], indent=1, default=str))
     else:
         print("\n".join(lines_of(trials, options.all)))
-    return (
-        0
-        if all(trial.state in ("done", "running", "queued", "superseded") for trial in trials)
-        else 1
-    )
+    return int(any(trial.state in RETRIED for trial in trials))
 
 
 def _watch(home: Path) -> None:
-    """Show the progress of the experiment in ``home`` until all its trials have ended, or until
-    Ctrl-C."""
+    """Show the progress of the experiment in ``home`` until its trials have ended, or Ctrl-C."""
     progress = progress_of(home)
     with (
         suppress(KeyboardInterrupt),
@@ -114,8 +101,7 @@ def _watch(home: Path) -> None:
 
 
 def _progress_view(name: str, progress: Progress) -> Group:
-    """A table of arms by scenes, with the numbers of trials that are done and in other states, and
-    lines below it."""
+    """A table of arms by scenes with the numbers of trials by state, and lines below it."""
     scenes = sorted({scene for _, scene in progress.cells})
     arms = sorted({arm for arm, _ in progress.cells})
     table = Table(title=escape(f"{name}: trials done of all"))
@@ -140,8 +126,7 @@ def _cell(counts: dict[str, int]) -> str:
 
 
 def progress_with_superseded(home: Path) -> list[TrialState]:
-    """The state of every trial of the experiment in ``home``, with ``superseded`` for those that
-    older code made."""
+    """The state of every trial in ``home``; those that older code made are ``superseded``."""
     folders = {folder: trial.cwd for folder, trial in read_plan(home).items()}
 
     # The user's modules are read in the folder where the trial's command was given: another may
@@ -150,17 +135,15 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
         return module_digest(module, folders[trial.path]) if trial.path in folders else None
 
     reasons = find_superseded(read_experiment(home).trials, present_digest)
-    return [
-        replace(trial, state="superseded", note=reasons[trial.folder])
-        if trial.state == "done" and trial.folder in reasons
-        else trial
-        for trial in states_of_experiment(home)
-    ]
+    states = states_of_experiment(home)
+    for place, trial in enumerate(states):
+        if trial.state == "done" and trial.folder in reasons:
+            states[place] = replace(trial, state="superseded", note=reasons[trial.folder])
+    return states
 
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
-    """A line for each trial that is not done, or whose result is in doubt (or for each,
-    ``with_done``); a summary."""
+    """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
     lines = []
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
@@ -208,7 +191,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         help="settings that do not make a different trial: launch=slurm …; allow_targets=[mine] "
         "for your own code",
     )
-    parser.add_argument("--dry-run", action="store_true", help="only list them")
+    parser.flag("--dry-run", "only list them")
     options = parser.parse_args(argv)
     home = experiment_home(runs, options.experiment)
     if refused := [change for change in options.changes if makes_other_trials(key_of(change))]:
@@ -241,8 +224,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
 
 
 def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send its results to a tracker which only a file
-    names.
+    """Raise InputError for a trial that would send results to a tracker which only a file names.
 
     The runs folder may be somebody else's, and its address theirs.
     """
@@ -250,18 +232,16 @@ def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
     for trial in trials:
         if address := untyped_address(trial.values["tracking"], typed_uri):
             raise InputError(
-                f"{trial.files.label} would send its results to {address}, an address from a "
-                "file: to allow it, type "
-                f"{TRACKER}={address} (for a trial in no plan: set {VARIABLE}={address}); "
-                "tracking=none sends nothing"
+                f"{trial.files.label} would send its results to {address}, an address from a file: "
+                f"to allow it, type {TRACKER}={address} (for a trial in no plan: set "
+                f"{VARIABLE}={address}); tracking=none sends nothing"
             )
 
 
 def recompose(
     folder: Path, planned: PlannedTrial | None, runs: Path, changes: list[str], modules: str
 ) -> Trial:
-    """The trial in ``folder``: from its planned overrides, else from the configuration that it
-    wrote.
+    """The trial in ``folder``: from its planned overrides, else from its ``config.yaml``.
 
     Neither gives permission to run code: ``changes`` must give it again. ``modules`` is the folder
     of the user's modules.
@@ -272,10 +252,9 @@ def recompose(
             os.chdir(planned.cwd)
         replaced = {PERMISSIONS, *map(key_of, changes)}
         kept = [word for word in planned.overrides if key_of(word) not in replaced]
-        if any(
-            change.startswith("launch=") and change not in planned.overrides for change in changes
-        ):
-            # they were meant for the other launcher
+        added = set(changes) - set(planned.overrides)
+        if any(change.startswith("launch=") for change in added):
+            # Planned settings of a launcher were meant for the other one.
             kept = [word for word in kept if not word.startswith("launch.")]
         # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
         # theirs.
@@ -308,9 +287,9 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     names = [options.experiment] if options.experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
-        folders = [
-            TrialFolder(Path(place)) for home in homes for place in sorted(trial_folders(home))
-        ]
+        folders: list[TrialFolder] = []
+        for home in homes:
+            folders += [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
         for line in send_missing(folders, options.uri):
             print(line, flush=True)
     except (MirrorError, OSError) as error:

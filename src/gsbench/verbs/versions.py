@@ -14,7 +14,7 @@ from gsbench.analysis.results import TrialResult, group_by, read_experiment
 from gsbench.app.command import one_trial_per_scene, run_trials
 from gsbench.claims import gate as gates
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.stopping import KeyAndSeed, run_looks
+from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.external.program import run_program
@@ -73,7 +73,7 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         gate = gates.Gate(
             declare_questions(home, declaration),
             lambda: old,
-            lambda: _done(home, list(trials.values())),
+            lambda: finished_trials(home, list(trials.values())),
         )
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
@@ -122,21 +122,6 @@ def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> l
     if most is not None and not 0 < most <= len(shared):
         raise InputError(f"--seeds {most}: the archive has {len(shared)} seeds of all scenes")
     return shared[:most]
-
-
-def _done(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
-    """The results of those ``trials`` that are done. Results of earlier code do not count as
-    done."""
-    by_folder = {trial.folder: trial for trial in trials}
-
-    def is_done(result: TrialResult) -> bool:
-        trial, awaited = by_folder.get(result.path), result.record.awaited
-        # A metric whose weights are missing does not make a trial unfinished.
-        return trial is not None and not trial.files.why_not_done(
-            trial.values, lambda options: awaited
-        )
-
-    return list(filter(is_done, read_experiment(home).trials))
 
 
 def bisect(argv: Sequence[str], runs: Path) -> int:

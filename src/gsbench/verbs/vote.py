@@ -1,5 +1,4 @@
-"""``gsbench vote``: a page on which people compare renders blindly, and the verdict of their votes
-(docs/vote.md)."""
+"""``gsbench vote``: a page to compare renders blindly, and people's verdict (docs/vote.md)."""
 
 import argparse
 import random
@@ -105,19 +104,12 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     require_no_links(experiment.folder.parent, folder)
     folder.mkdir(parents=True)
     write_json(folder / VOTE_KEY, key.to_json())
-    asked = [
-        Question(
-            metric=METRIC,
-            least=LEAST_PREFERENCE,
-            baseline=arms[0],
-            arm=arm,
-            name=f"vote {key.round}",
-        )
+    name, baseline = f"vote {key.round}", arms[0]
+    asked = tuple(
+        Question(metric=METRIC, least=LEAST_PREFERENCE, baseline=baseline, arm=arm, name=name)
         for arm in arms[1:]
-    ]
-    declaration = Declaration(
-        time=key.time, questions=tuple(asked), votes=key.votes, vote_round=key.round
     )
+    declaration = Declaration(time=key.time, questions=asked, votes=key.votes, vote_round=key.round)
     declare_questions(experiment.folder, declaration)
     pairs, scenes = len(key.pairs), len({one.scene for one in key.pairs})
     print(
@@ -139,8 +131,7 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
 
 
 def judge(experiment: Experiment, files: Sequence[Path]) -> None:
-    """Take people's files into their rounds, and print the verdicts of these rounds; without files,
-    of all rounds."""
+    """Take people's files into their rounds, and print the verdicts of these rounds, or all."""
     ballots: dict[str, Ballot] = {}
     for file in files:
         if not file.is_file():
@@ -187,23 +178,19 @@ def choose_arms(arms: Sequence[Arm], wanted: Sequence[str]) -> list[Arm]:
 
     Raises InputError unless each word names one arm, and there are two.
     """
-    if not wanted:
-        chosen = sorted(arms, key=lambda arm: arm.densify != BASELINE)
-    else:
-        found = [
-            [arm for arm in arms if word in (str(arm), f"{arm.init}-{arm.densify}", arm.densify)]
-            for word in wanted
-        ]
-        for word, own in zip(wanted, found, strict=True):
-            if len(own) != 1:
-                raise InputError(
-                    f"--arms: {word!r} names {len(own)} arms; there are "
-                    f"{some_of(list(map(str, arms)))}"
-                )
-        chosen = list(dict.fromkeys(own[0] for own in found))
-    if len(chosen) < 2:
-        raise InputError(f"votes compare two arms or more, and here is {chosen[0]} alone")
-    return chosen
+    chosen: list[Arm] = []
+    for word in wanted:
+        own = [arm for arm in arms if word in (str(arm), f"{arm.init}-{arm.densify}", arm.densify)]
+        if len(own) != 1:
+            raise InputError(
+                f"--arms: {word!r} names {len(own)} arms; there are {some_of([*map(str, arms)])}"
+            )
+        chosen += own
+    # Two words may name the same arm.
+    unique = list(dict.fromkeys(chosen)) or sorted(arms, key=lambda arm: arm.densify != BASELINE)
+    if len(unique) < 2:
+        raise InputError(f"votes compare two arms or more, and here is {unique[0]} alone")
+    return unique
 
 
 def _whole(text: str) -> int:

@@ -1,5 +1,4 @@
-"""A trained model as one HTML page that turns in any browser without a network, with the test
-cameras.
+"""A trained model as one HTML page that turns in any browser without a network.
 
 The page is the SuperSplat viewer, written by ``@playcanvas/splat-transform`` (MIT), which npx
 downloads and starts. Its settings, in the viewer's version 2, hold each test view as an annotation
@@ -40,6 +39,7 @@ def write_page(trial: TrialResult, out: Path) -> None:
     Raises GsbenchError with the command to type if npx is missing or fails; then model and settings
     lie beside ``out``.
     """
+    # first of all: whatever is wrong with the trial is said before anything is downloaded
     settings = page_settings(trial)
     npx = shutil.which("npx")
     if npx is None:
@@ -75,8 +75,7 @@ def _by_hand(trial: TrialResult, settings: dict[str, Any], out: Path, cause: str
 
 
 def page_settings(trial: TrialResult) -> dict[str, Any]:
-    """The viewer's settings: the background of the training, and a camera for each test view, the
-    first first."""
+    """The viewer's settings: the training's background, and a camera for each test view."""
     folder = model_folder(trial)
     points, _ = model_points(read_model(folder))
     cameras = [
@@ -88,9 +87,7 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
         "tonemapping": "none",
         "highPrecisionRendering": False,
         "background": {"color": list(trial.config.get("train.background", (0.0, 0.0, 0.0)))},
-        "postEffectSettings": {
-            name: {"enabled": False} | values for name, values in EFFECTS.items()
-        },
+        "postEffectSettings": {name: {"enabled": False, **EFFECTS[name]} for name in EFFECTS},
         "animTracks": [_flight([camera for _, camera in cameras])],
         "cameras": [{"initial": cameras[0][1]}],
         "annotations": [_annotation(name, camera) for name, camera in cameras],
@@ -99,14 +96,10 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
 
 
 def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The path through the cameras and back to the first, which the page shows until somebody takes
-    the mouse."""
+    """The path through the cameras and back, shown until somebody takes the mouse."""
     stops = [*cameras, cameras[0]]
-    values = {
-        "position": [number for camera in stops for number in camera["position"]],
-        "target": [number for camera in stops for number in camera["target"]],
-        "fov": [camera["fov"] for camera in stops],
-    }
+    # of each key the numbers of all stops, one after another
+    values = {key: np.ravel([stop[key] for stop in stops]).tolist() for key in cameras[0]}
     times = [SECONDS_PER_VIEW * k for k in range(len(stops))]
     return {
         "name": "test views",
@@ -136,8 +129,7 @@ EFFECTS: dict[str, dict[str, Any]] = {  # all are off; the viewer wants their va
 def _camera(
     view: View, points: NDArray[np.floating], normalization: Normalization
 ) -> dict[str, Any]:
-    """The place of a test view, the point that it looks at, and its angle (degrees) along the
-    longer side.
+    """The place of a test view, the point that it looks at, and its longer angle in degrees.
 
     The point lies at the median depth of the initial ``points`` [P, 3] before the camera. The
     viewer turns models by half a turn about z, since its y points up.
@@ -147,13 +139,10 @@ def _camera(
     depths = points @ forward + camera.translation[2]  # [P]
     before = depths[depths > MIN_DEPTH]
     depth = float(np.median(before)) if len(before) else 1.0
-    ends = normalization.undo(np.stack([camera.center, camera.center + depth * forward])) * (
-        -1,
-        -1,
-        1,
-    )  # [2, 3]
-    longer = (
-        camera.width / camera.fx if camera.width >= camera.height else camera.height / camera.fy
-    )
-    position, target = ends.tolist()
+    ends = normalization.undo(np.stack([camera.center, camera.center + depth * forward]))  # [2, 3]
+    position, target = (ends * (-1, -1, 1)).tolist()
+    if camera.width >= camera.height:
+        longer = camera.width / camera.fx
+    else:
+        longer = camera.height / camera.fy
     return {"position": position, "target": target, "fov": math.degrees(2 * math.atan(longer / 2))}

@@ -47,8 +47,7 @@ MAX_DISTANCE = 1e9  # world units
 
 
 class Viewer:
-    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0 selects a free
-    port."""
+    """Serves ``painters`` (one or two) on a loopback port until ``stop``; port 0: a free one."""
 
     def __init__(self, painters: Sequence[TrialPainter], port: int) -> None:
         import viser
@@ -77,8 +76,7 @@ class Viewer:
         self.server.stop()
 
     def draw(self, camera: Camera, layers: Layers, view: View | None) -> Picture:
-        """The page's picture from ``camera``: one pane for each trial and, if ``view`` is given,
-        its photograph."""
+        """The page's picture from ``camera``: a pane for each trial, and a photograph."""
         panes = [] if view is None else [(f"photograph {view.name}", photograph_at(camera, view))]
         for painter in self.painters:
             label = f"{painter.trial.label}: {len(painter.trial.gaussians):,} Gaussians"
@@ -105,12 +103,10 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        lowest = min(float(painter.trial.log10_volumes.min()) for painter in self.painters)
-        highest = max(float(painter.trial.log10_volumes.max()) for painter in self.painters)
-        lowest, highest = (
-            math.floor(min(lowest, DEFAULT_THRESHOLD)),
-            math.ceil(max(highest, DEFAULT_THRESHOLD)),
-        )
+        volumes = [painter.trial.log10_volumes for painter in self.painters]
+        volumes.append(np.array([DEFAULT_THRESHOLD]))
+        lowest = math.floor(min(part.min() for part in volumes))
+        highest = math.ceil(max(part.max() for part in volumes))
         # Most folders start closed, because the panel covers the picture on a narrow page.
         with gui.add_folder("Test views"):
             self._view = gui.add_dropdown(
@@ -128,8 +124,7 @@ class Viewer:
             )
             self._legend = gui.add_markdown(self._legend_text())
         self._height = gui.add_dropdown("Picture height, px", HEIGHTS, initial_value=HEIGHTS[1])
-        changes = (self._degree, self._share, self._cloud, self._causes, self._height)
-        for control in changes:
+        for control in (self._degree, self._share, self._cloud, self._causes, self._height):
             control.on_update(lambda _: self._redraw())
         self._threshold.on_update(lambda _: self._update_threshold())
         self._view.on_update(self._go_to_view)
@@ -174,8 +169,7 @@ class Viewer:
 
 
 class Session:
-    """One browser page, whose thread draws the newest state: coarsely while it changes, sharply
-    when it rests."""
+    """One browser page; its thread draws coarsely while things change, sharply at rest."""
 
     def __init__(self, viewer: Viewer, client: Any) -> None:
         self.viewer, self.client = viewer, client
@@ -199,8 +193,7 @@ class Session:
             self._thread.join(timeout=10)
 
     def go_to(self, view: View) -> None:
-        """Move the page's camera to that of ``view``, with a field of view that shows the whole
-        view."""
+        """Move the page's camera to that of ``view``, so that the whole view is seen."""
         own, camera = view.camera, self.client.camera
         aspect = float(camera.aspect or 1.0) / self._panes()
         forward = own.rotation[2]  # [3] world
@@ -218,6 +211,7 @@ class Session:
             self._changed.wait()
             self._changed.clear()
             self._show(MOVING_HEIGHT)
+            # A change within this time starts again with a coarse picture, which keeps up with it.
             if not self._changed.wait(REST_SECONDS):
                 self._show(self.viewer.resting_height)
 
@@ -226,9 +220,8 @@ class Session:
             return
         page = self.client.camera
         try:
-            camera = page_camera(
-                page.wxyz, page.position, page.fov, page.aspect, height, self._panes()
-            )
+            seen = (page.wxyz, page.position, page.fov, page.aspect)
+            camera = page_camera(*seen, height, self._panes())
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
         except Exception as error:  # noqa: BLE001 - a page may send any values, and they must not end this thread
             log.debug("view: %r", error)
@@ -265,21 +258,13 @@ def page_camera(
     width = max(1, round(height * aspect / panes))
     focal = height / 2 / math.tan(fov / 2)
     rotation = world_from_camera.T
-    return Camera(
-        width,
-        height,
-        focal,
-        focal,
-        width / 2,
-        height / 2,
-        rotation,
-        -rotation @ np.asarray(position),
-    )
+    translation = -rotation @ np.asarray(position)
+    intrinsics = (focal, focal, width / 2, height / 2)
+    return Camera(width, height, *intrinsics, rotation, translation)
 
 
 def fitting_fov(camera: Camera, aspect: float) -> float:
-    """The vertical field of view (radians) with which a pane of ``aspect`` shows the whole image of
-    ``camera``."""
+    """The vertical angle (radians) at which a pane of ``aspect`` shows all that ``camera`` does."""
     half_height = max(camera.cy, camera.height - camera.cy) / camera.fy
     half_width = max(camera.cx, camera.width - camera.cx) / camera.fx
     return 2 * math.atan(max(half_height, half_width / aspect))
@@ -293,8 +278,7 @@ def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The upward direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit
-    vector [3].
+    """The direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit [3].
 
     A page rotates around its upward direction. Around the camera's own one, the horizon would tilt.
     """
@@ -306,8 +290,7 @@ def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def orbit_distance(views: Sequence[View]) -> float:
-    """The distance from a page's camera to its pivot: the mean distance of the views from their
-    centre, world units."""
+    """A page's distance to its pivot: the views' mean distance from their centre, world units."""
     centers = np.stack([view.camera.center for view in views])  # [V, 3]
     return max(float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean()), 1e-3)
 
@@ -325,12 +308,12 @@ def check_port(port: int) -> None:
 
 
 def is_own_page(hosts: list[str], origins: list[str]) -> bool:
-    """Return whether ``Host`` and ``Origin`` headers belong to the viewer's own page or to a
-    program without a page.
+    """Return whether the headers are of the viewer's own page or of a program without a page.
 
     Any port is allowed, since connections may be forwarded, but both headers must have the same
     port.
     """
+    # A second header could be read by one program and passed over by another.
     if len(hosts) != 1 or len(origins) > 1:
         return False
     try:
@@ -343,8 +326,7 @@ def is_own_page(hosts: list[str], origins: list[str]) -> bool:
 
 @contextmanager
 def refuse_other_pages() -> Iterator[None]:
-    """Make the server that viser starts within the block refuse foreign pages, for files and for
-    connections.
+    """Make the server that viser starts within the block refuse foreign pages.
 
     Raises GsbenchError if viser did not start its server through `SERVE`.
     """

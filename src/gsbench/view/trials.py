@@ -1,5 +1,4 @@
-"""Trials as the viewer shows them: read from their folders and the store, and drawn from any
-camera.
+"""Trials as the viewer shows them: read from folders and store, drawn from any camera.
 
 A picture is the render, the initial cloud, or large Gaussians coloured by their causes.
 """
@@ -11,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,8 +36,10 @@ from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.view import ADDRESS
 
+# raised by numpy for a file that is missing or damaged
+DAMAGE = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
-TEXT_COLOR, SHADOW_COLOR = (255, 255, 255), (0, 0, 0)
+TEXT_COLOR, SHADOW = (255, 255, 255), (0, 0, 0)
 TEXT_SIZE = 1 / 36  # of a picture's height; smaller if a word does not fit its pane
 MARGIN = 0.5  # of the text's size
 Picture = NDArray[np.uint8]
@@ -82,20 +84,17 @@ def find_trial(address: str, runs: Path) -> TrialResult:
         and (not seed or str(trial.seed) == seed[0])
     ]
     if not matches:
-        addresses = sorted(
-            {f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials}
-        )
-        raise InputError(f"no complete trial {address}; there are {', '.join(addresses)}")
+        arms = {f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials}
+        raise InputError(f"no complete trial {address}; there are {', '.join(sorted(arms))}")
     first = [trial for trial in matches if trial.seed == matches[0].seed]
     if len(first) > 1:
-        raise InputError(
-            f"{address} names {len(first)} trials; give a folder: "
-            f"{', '.join(str(t.path) for t in first)}"
-        )
+        folders = ", ".join(str(trial.path) for trial in first)
+        raise InputError(f"{address} names {len(first)} trials; give a folder: {folders}")
     return matches[0]
 
 
 def _trial_in(folder: Path) -> TrialResult:
+    # RUNS/EXPERIMENT/SCENE/ARM/TRIAL
     if len(folder.parents) < 4 or not (folder / RESULTS).is_file():
         raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
     experiment = load_experiment(folder.parents[3], folder.parents[2].name)
@@ -113,8 +112,7 @@ def model_file(trial: TrialResult) -> Path:
 
 
 def load_viewed(trial: TrialResult, device: torch.device) -> ViewedTrial:
-    """Read everything that the viewer draws of ``trial``; raises InputError naming a missing or
-    damaged file."""
+    """Read all that the viewer draws; raises InputError naming a missing or damaged file."""
     # A page's numbers are float32, so the viewer works in the coordinates of the training.
     gaussians = read_ply(model_file(trial), device, trial.record.to_training)
     model_dir = model_folder(trial)
@@ -135,16 +133,9 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
     try:
         with np.load(path) as lineage:
             causes = lineage["causes"][lineage["ids"]]
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except DAMAGE as error:
         raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
+    # a model and a record of two runs would give Gaussians the causes of others
     if len(causes) != num_gaussians:
         raise InputError(
             f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial "
@@ -165,8 +156,7 @@ def model_folder(trial: TrialResult) -> Path:
 
 
 def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
-    """The test views in the order of their names, with the photographs and cameras of the
-    evaluation."""
+    """The test views in the order of names, as the evaluation saw them."""
     import pycolmap
 
     model = read_model(model_dir)
@@ -204,15 +194,13 @@ class Layers:
 
 
 class TrialPainter:
-    """Draws one trial from any camera. Like its rasterizer, it can be called from several
-    threads."""
+    """Draws one trial from any camera, and from several threads at once, as its rasterizer can."""
 
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
         self._device = trial.gaussians.means.device
-        self._background = torch.tensor(
-            trial.background, dtype=torch.float32, device=self._device
-        )  # [3]
+        background = torch.tensor(trial.background, dtype=torch.float32)  # [3]
+        self._background = background.to(self._device)
 
     @cached_property
     def _by_opacity(self) -> Gaussians:
@@ -228,17 +216,12 @@ class TrialPainter:
     @cached_property
     def _by_cause(self) -> Gaussians:
         """The Gaussians in the colours of their causes."""
-        palette = (
-            torch.tensor([cause.color for cause in Cause], device=self._device) / 255
-        )  # [C, 3]
-        colors = palette[
-            torch.from_numpy(self.trial.causes.astype(np.int64)).to(self._device)
-        ]  # [N, 3]
-        return Gaussians(**(self.trial.gaussians.tensors() | {"sh_dc": rgb_to_dc(colors)}))
+        palette = torch.tensor([cause.color for cause in Cause], device=self._device) / 255
+        causes = torch.from_numpy(self.trial.causes.astype(np.int64)).to(self._device)  # [N]
+        return replace(self.trial.gaussians, sh_dc=rgb_to_dc(palette[causes]))
 
     def draw(self, camera: Camera, layers: Layers) -> Picture:
-        """The trial from ``camera``, [H, W, 3] uint8. With default ``layers`` this is the
-        evaluation's render."""
+        """The trial from ``camera``, [H, W, 3] uint8; by default as the evaluation renders it."""
         gaussians = self._initial if layers.cloud else self.trial.gaussians
         if not layers.cloud and layers.share < 100:
             count = max(1, round(layers.share / 100 * len(gaussians)))
@@ -269,8 +252,7 @@ class TrialPainter:
 
 
 def photograph_at(camera: Camera, view: View) -> Picture:
-    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside the
-    photograph."""
+    """The photograph of ``view`` resampled for the intrinsics of ``camera``, black outside."""
     own, photograph = view.camera, Image.fromarray(view.image)
     shrink = max(own.fx / camera.fx, own.fy / camera.fy)
     # shrink with a filter first, because the transform below only interpolates neighbouring pixels
@@ -296,22 +278,15 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
         text, size = _fitted(label, TEXT_SIZE * height, width)
         if left:
             draw.line([(left, 0), (left, height)], fill=TEXT_COLOR)
-        at, stroke = (left + MARGIN * size, MARGIN * size), max(1, round(size / 8))
-        draw.text(
-            at,
-            text,
-            TEXT_COLOR,
-            ImageFont.load_default(size),
-            stroke_width=stroke,
-            stroke_fill=SHADOW_COLOR,
-        )
+        at, font = (left + MARGIN * size, MARGIN * size), ImageFont.load_default(size)
+        shadow: dict[str, Any] = {"stroke_width": max(1, round(size / 8)), "stroke_fill": SHADOW}
+        draw.text(at, text, TEXT_COLOR, font, **shadow)
         left += width
     return np.asarray(image)
 
 
 def _fitted(label: str, size: float, width: int) -> tuple[str, float]:
-    """The label in lines that fit into ``width`` px, and the text size, which is reduced if a word
-    does not fit."""
+    """The label in lines that fit ``width`` px, and the text size, reduced for a long word."""
     length, room = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
     first, *rest = label.split()
     lines = [first]

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from skimage.transform import SimilarityTransform
 
-from gsbench.init.colmap.alignment import (
+from gsbench.init.colmap.similarity import (
     align_poses,
     fit_similarity,
     rotation_angles,

@@ -28,7 +28,7 @@ def two_gaussians(means: list[list[float]], log_scales: torch.Tensor) -> Gaussia
     )
 
 
-def test_only_the_voluminous_is_outlined() -> None:
+def test_only_the_voluminous_is_outlined():
     scales = torch.tensor([[1.0, 1.0, 1.0], [0.01, 0.01, 0.01]])
     gaussians = two_gaussians([[0.0, 0.0, 4.0], [1.0, 0.5, 4.0]], scales.log())
     camera = orbit_camera(0.0)
@@ -52,7 +52,7 @@ def test_only_the_voluminous_is_outlined() -> None:
     assert np.diff(angles, append=angles[0] + math.tau).max() < 0.3  # closed
 
 
-def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch):
     monkeypatch.setattr(evaluate, "MAX_OUTLINES", 1)
     gaussians = two_gaussians([[0.0, 0.0, 4.0]] * 2, torch.tensor([[-0.5] * 3, [0.0] * 3]))
     camera = orbit_camera(0.0)
@@ -63,7 +63,7 @@ def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("words_in_a_line", [3, 2, 1])
-def test_a_legend_stands_below_the_picture_word_by_word(words_in_a_line: int) -> None:
+def test_a_legend_stands_below_the_picture_word_by_word(words_in_a_line):
     """Words of 11 px, each half of that after the one before, 14 px a line, 2 px from the left."""
     font = ImageFont.load_default(11)
     words = [

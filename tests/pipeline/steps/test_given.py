@@ -52,7 +52,7 @@ if model != "none":
 
 
 @pytest.fixture
-def views(tmp_path: Path) -> Any:
+def views(tmp_path) -> Any:
     """Four training views and two test views of noise, and a cloud of seven points."""
     rng = np.random.default_rng(0)
     made = [
@@ -101,8 +101,8 @@ def trainer(tmp_path: Path, model: str, cameras: bool = True, **settings: Any) -
 
 @pytest.mark.parametrize("cameras", [True, False])
 def test_a_program_is_given_the_training_views_and_the_settings(
-    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cameras: bool
-) -> None:
+    views, tmp_path, monkeypatch, cameras
+):
     monkeypatch.setenv("GSBENCH_RUNS", "here")
     gaussians = random_gaussians(9, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "model.ply")
@@ -142,9 +142,7 @@ def test_a_program_is_given_the_training_views_and_the_settings(
     assert step.key in keys
 
 
-def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(
-    views: Any, tmp_path: Path
-) -> None:
+def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(views, tmp_path):
     normalization = Normalization((5e5, 5.4e6, 300.0), 0.01)
     views.capture = replace(views.capture, normalization=normalization)
     given = tmp_path / "given.ply"
@@ -177,13 +175,7 @@ def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(
 
 
 @pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
-def test_a_program_has_the_time_that_is_set(
-    views: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    minutes: float | None,
-    limit: float | None,
-) -> None:
+def test_a_program_has_the_time_that_is_set(views, tmp_path, monkeypatch, minutes, limit):
     given: list[Any] = []
     ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
     monkeypatch.setattr(train_steps, "run_program", lambda *rest: given.append(rest) or ended)
@@ -197,9 +189,7 @@ def test_a_program_has_the_time_that_is_set(
     assert seconds == limit
 
 
-def test_a_program_gets_the_environment_without_gsbenchs_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_gets_the_environment_without_gsbenchs_own(tmp_path, monkeypatch):
     for name, value in (("GSBENCH_X", "1"), ("KEPT", "2"), SAFE_PATH):
         monkeypatch.setenv(name, value)
     found = train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})
@@ -213,9 +203,7 @@ def test_a_program_gets_the_environment_without_gsbenchs_own(
     assert train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})[SAFE_PATH[0]] == "1"
 
 
-def test_a_training_leaves_its_model_its_lineage_and_its_summary(
-    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_leaves_its_model_its_lineage_and_its_summary(views, tmp_path, monkeypatch):
     told: list[tuple[Any, ...]] = []
     reset: list[torch.device] = []
     monkeypatch.setattr(
@@ -255,10 +243,8 @@ def test_a_training_leaves_its_model_its_lineage_and_its_summary(
     assert "snapshots" not in train_step(views, parts).inputs
 
 
-def test_renders_of_a_program_are_collected_for_the_test_views(
-    views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run(command: Any, log: Path, output: Path, *rest: Any) -> Any:
+def test_renders_of_a_program_are_collected_for_the_test_views(views, tmp_path, monkeypatch):
+    def run(command, log, output, *rest):
         for view in views.scene.test:
             Image.fromarray(255 - view.image).save(output / view.name)
         return SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
@@ -273,14 +259,14 @@ def test_renders_of_a_program_are_collected_for_the_test_views(
     assert (summary["evaluated_from"], summary["num_gaussians"]) == ("renders", None)
 
 
-def test_training_starts_from_gaussians_where_the_initialiser_left_some(views: Any) -> None:
+def test_training_starts_from_gaussians_where_the_initialiser_left_some(views):
     init, cpu = views.store.path(CLOUD_STEP), torch.device("cpu")
     assert len(train_steps.initial_gaussians(init, cpu)) == 7
     write_ply(random_gaussians(9, dtype=torch.float32), init / GAUSSIANS_FILE)
     assert len(train_steps.initial_gaussians(init, cpu)) == 9
 
 
-def test_a_program_without_a_result_is_named_with_its_log(views: Any, tmp_path: Path) -> None:
+def test_a_program_without_a_result_is_named_with_its_log(views, tmp_path):
     step = external_step(views, trainer(tmp_path, "none"), parts_of())
     (tmp_path / "built").mkdir()
     with pytest.raises(TrainingError, match=r"ended well, but .*; log: .*trainer\.log"):
@@ -288,9 +274,7 @@ def test_a_program_without_a_result_is_named_with_its_log(views: Any, tmp_path: 
     assert not any((tmp_path / "built" / "work").glob("data/*"))
 
 
-def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(
-    views: Any, tmp_path: Path
-) -> None:
+def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(views, tmp_path):
     write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
     for said, fits in (("other 7.1", True), ("other 8", False)):
         tells = f"{shlex.quote(sys.executable)} -c \"print('{said}')\""
@@ -307,7 +291,7 @@ def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(
                 step.build(folder)
 
 
-def test_a_program_is_not_told_of_masks(views: Any, tmp_path: Path) -> None:
+def test_a_program_is_not_told_of_masks(views, tmp_path):
     views.capture = replace(views.capture, masks={"0.png": tmp_path})
     with pytest.raises(InputError, match="gets no masks"):
         external_step(views, trainer(tmp_path, "none"), parts_of())
@@ -329,8 +313,8 @@ class Noting:
 
 @pytest.mark.parametrize("has_reference", [False, True])
 def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_come(
-    tmp_path: Path, has_reference: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, has_reference, monkeypatch
+):
     told: list[tuple[Any, ...]] = []
     monkeypatch.setattr(
         scene_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
@@ -341,7 +325,7 @@ def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_co
         Capture("made", tmp_path, ("a.png",), (), None, False, "0"),
     )
     reference = CLOUD_STEP if has_reference else None
-    step = init_step(store, capture, Noting(), reference)  # type: ignore[arg-type]
+    step = init_step(store, capture, Noting(), reference)
     step.build(tmp_path)
     assert told == [("photographs", 1, 1)]
     assert (tmp_path / "given").read_text() == str(
@@ -350,9 +334,9 @@ def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_co
     assert step.inputs["reference"] == (CLOUD_STEP.key if has_reference else None)
     assert step.inputs["options"]["count"] == 3
     others = [
-        init_step(store, capture, Noting(4), reference),  # type: ignore[arg-type]
-        init_step(store, replace(capture, fingerprint="1"), Noting(), reference),  # type: ignore[arg-type]
-        init_step(store, replace(capture, test_names=("a.png",)), Noting(), reference),  # type: ignore[arg-type]
+        init_step(store, capture, Noting(4), reference),
+        init_step(store, replace(capture, fingerprint="1"), Noting(), reference),
+        init_step(store, replace(capture, test_names=("a.png",)), Noting(), reference),
     ]
     assert len({step.key, *(other.key for other in others)}) == 4
     (tmp_path / "a.png").write_bytes(b"torn")

@@ -27,11 +27,11 @@ from gsbench.runs.store import Store
 from gsbench.scene.images import read_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_photos
-from gsbench.scene.types import Capture, Scene
+from gsbench.scene.types import Capture
 
 
 @pytest.fixture
-def photographs(tmp_path: Path) -> Path:
+def photographs(tmp_path) -> Path:
     """Four photographs, the second of them transparent on its left half, and masks that ignore the
     upper half."""
     for index, name in enumerate(("a", "b", "c", "d")):
@@ -48,7 +48,7 @@ def photographs(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs: Path) -> None:
+def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs):
     made = CaptureSource(
         SceneConfig(name="made", kind="courtyard", views=9, width=40, height=30, seed=3)
     ).step
@@ -69,8 +69,8 @@ def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs: Path) -> N
 
 
 def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    photographs, tmp_path, monkeypatch
+):
     told: list[tuple[int, int]] = []
     monkeypatch.setattr(
         scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts))
@@ -104,7 +104,7 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     assert masked_capture(bare, tmp_path / "white").masks == {}
 
 
-def test_ground_truth_is_the_test_views_and_their_masks(tmp_path: Path, tiny_scene: Scene) -> None:
+def test_ground_truth_is_the_test_views_and_their_masks(tmp_path, tiny_scene):
     counts = np.zeros((32, 40), dtype=bool)
     counts[:, 7:] = True
     scene = replace(tiny_scene, test=(tiny_scene.test[0], replace(tiny_scene.test[1], mask=counts)))
@@ -121,7 +121,7 @@ def test_ground_truth_is_the_test_views_and_their_masks(tmp_path: Path, tiny_sce
     np.testing.assert_array_equal(read_mask(tmp_path / "masks" / "08.png"), counts)
 
 
-def test_each_setting_that_changes_views_makes_another_key(tmp_path: Path) -> None:
+def test_each_setting_that_changes_views_makes_another_key(tmp_path):
     capture = Capture("own", tmp_path, ("a", "b", "c"), ("a",), None, False, "0")
     init, store = Step(INIT, {}, lambda folder: None), Store(tmp_path / "store")
     base = SceneConfig(name="own", kind="photos", path=str(tmp_path))

@@ -1,5 +1,4 @@
-"""The report as one HTML file: it needs no network and no other file, and can be read without
-JavaScript."""
+"""The report as one HTML file, readable without network, other files and JavaScript."""
 
 import itertools
 import math
@@ -19,6 +18,7 @@ from gsbench.analysis.differences import short_version
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
@@ -36,6 +36,7 @@ from gsbench.events import RefineEvent
 from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.experiments import TuningRecord
+from gsbench.runs.ledger import read_ledger
 from gsbench.runs.trial_record import Histogram
 from gsbench.scene.images import read_image
 from gsbench.words import counted, signed
@@ -55,8 +56,7 @@ Curve = list[tuple[float, float]]
 
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
-    """The report as HTML, made from the experiment's files alone; every densifier is compared with
-    ``baseline``."""
+    """The report as HTML, from files alone; every densifier is compared with ``baseline``."""
     trials, pairs = compared_pairs(experiment, baseline)
     arms = sorted({trial.arm for trial in trials})
     declared = active_declaration(experiment.folder, trials)
@@ -75,6 +75,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         seeds=experiment.seeds,
         trials=trials,
         versus=[compare_arms(trials, own) for own in judged],
+        ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
@@ -105,8 +106,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
-    """(caption, data URI) of the pictures in trials' ``figures`` folders, for one seed of each
-    scene and arm.
+    """(caption, data URI) of trials' ``figures``, for one seed of each scene and arm.
 
     A picture that arms of a scene share, such as that of their initial cloud, appears once.
     """
@@ -136,6 +136,17 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "views": views,
         "notes": dict.fromkeys([*judged.notes, *faults]),
     }
+
+
+def show_ledger(folder: Path) -> dict[str, Any] | None:
+    """The sentences and tables of the experiment's ledger of ideas; None if it has none."""
+    if not (folder / layout.LEDGER).exists():
+        return None
+    try:
+        ledger = read_ledger(folder)
+    except InputError as error:
+        return {"lines": [str(error)], "tables": []}
+    return {"lines": describe_ledger(ledger), "tables": ledger_tables(ledger)}
 
 
 def show_votes(
@@ -169,8 +180,7 @@ def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
 
 
 def _spread_of_times(trials: Sequence[TrialResult]) -> str:
-    """Say how far the training times of equal trials differ: a smaller change of times means
-    nothing."""
+    """Say how far training times of equal trials differ: smaller changes mean nothing."""
     cells = group_by(trials, lambda trial: (trial.arm, trial.scene)).values()
     times = [[t for trial in cell if (t := COSTS["train_time"][1](trial))] for cell in cells]
     spread = max((max(own) / min(own) - 1 for own in times if own), default=0.0)
@@ -203,8 +213,7 @@ def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[
 
 
 def event_table(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> Table | None:
-    """A row per cause of growth or pruning, with the mean number of Gaussians per arm; None if
-    nothing was logged."""
+    """A row per cause with the mean number of Gaussians per arm; None if nothing was logged."""
     rows = []
     for cause in EVENT_CAUSES:
         means = [
@@ -249,8 +258,7 @@ def _trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
 
 
 def _mean_curves(trials: Sequence[TrialResult], name: str, keys: Sequence[str]) -> dict[str, Curve]:
-    """The mean curve over trials of each key in the trials' file ``name``; each file is read
-    once."""
+    """The mean curve over trials of each key in the file ``name``, each file read once."""
     curves_by_key: dict[str, list[Curve]] = {key: [] for key in keys}
     for trial in trials:
         rows = trial.folder.curves(name)
@@ -271,8 +279,7 @@ def mean_by_step(curves: Sequence[Curve]) -> Curve:
 def volume_charts(
     trials: Sequence[TrialResult], arms: Sequence[Arm]
 ) -> tuple[list[str], list[str]]:
-    """(charts, notes): histograms of the Gaussians' volumes, for final models and for logged
-    iterations."""
+    """(charts, notes): histograms of volumes, for final models and logged iterations."""
     threshold = _threshold(trials)
     final: list[tuple[str, Curve]] = []
     notes = []
@@ -304,16 +311,14 @@ def volume_charts(
 
 
 def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
-    """log10 of the volumes [N] of a trial's Gaussians, in cubed units of its training, as V_th
-    is."""
+    """log10 of the volumes [N] of a trial's Gaussians, in its training's cubed units."""
     return log10_volumes(trial.path / layout.POINT_CLOUD) + 3 * math.log10(
         trial.record.to_training.scale
     )
 
 
 def log10_volumes(path: Path) -> NDArray[np.float64]:
-    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are natural
-    logarithms.
+    """log10 of the volumes ``4/3 π s1 s2 s3`` [N] of a 3DGS PLY, whose scales are logs.
 
     Raises `InputError` for a file that cannot be read as a 3DGS PLY.
     """
@@ -330,8 +335,7 @@ def log10_volumes(path: Path) -> NDArray[np.float64]:
 
 
 def histogram(volumes: NDArray[np.float64]) -> Curve:
-    """(volume, share) of each filled bin of a quarter decade, from the finite log10 ``volumes``
-    [N]."""
+    """(volume, share) of each filled quarter decade of the finite log10 ``volumes`` [N]."""
     finite = volumes[np.isfinite(volumes)]
     bins, counts = np.unique(np.floor(finite / BIN_WIDTH), return_counts=True)
     return list(
@@ -344,8 +348,7 @@ def histogram(volumes: NDArray[np.float64]) -> Curve:
 
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
-    """The logged histograms by iteration, pooled over trials, as (volume at the bin's centre,
-    share)."""
+    """Logged histograms by iteration, pooled over trials, as (bin's centre, share)."""
     pooled: dict[int, dict[float, float]] = defaultdict(lambda: defaultdict(float))
     for trial in trials:
         for row in trial.folder.curves(layout.HISTOGRAMS, Histogram):
@@ -361,8 +364,7 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
 
 
 def _threshold(trials: Sequence[TrialResult]) -> float | None:
-    """The absolute volume threshold (cubed scene units), if all arms that have one have the same;
-    else None."""
+    """The absolute volume threshold (cubed scene units) that all arms share, or None."""
     configs = [group[0].config for group in group_by(trials, lambda trial: trial.arm).values()]
     thresholds = [
         config["densify.volume_threshold"]
@@ -401,8 +403,7 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
 
 
 def search_summary(home: Path) -> tuple[str, str] | None:
-    """A line on the experiment's search, and its chart as SVG; None if there is no search or it
-    cannot be read."""
+    """A line on the experiment's search, and its chart as SVG; None without a readable one."""
     record = read_if_sound(home / layout.TUNING, TuningRecord)
     if record is None:
         return None

@@ -36,8 +36,7 @@ class ForestRow:
     interval: Interval | None = None
 
     def color(self, better: int) -> str:
-        """Grey if the interval contains 0 or is unknown, green on the side of the sign ``better``,
-        else red."""
+        """Grey if the interval contains 0 or is unknown, green on the side ``better``, else red."""
         if self.interval is None or not self.interval.excludes_zero():
             return "#555555"
         return "#1b7837" if self.mean * better > 0.0 else "#b2182b"
@@ -51,8 +50,7 @@ def line_chart(
     log: bool = False,
     marker: float | None = None,
 ) -> str:
-    """Named lines over common axes, both linear or both logarithmic (``log``); "" without any
-    point.
+    """Named lines over common axes, linear or logarithmic (``log``); "" without points.
 
     ``marker`` is the x of a vertical line. Points that a logarithmic axis cannot show are dropped.
     """
@@ -101,8 +99,7 @@ def line_chart(
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
-    """Differences with intervals, one per row, and a line at 0; ``better`` is the sign of an
-    improvement."""
+    """Differences with intervals, one a row, and a line at 0; ``better``: an improvement's sign."""
     if not rows:
         return ""
     intervals = [row.interval for row in rows if row.interval is not None]
@@ -143,8 +140,10 @@ LETTER = 6.6  # px, a letter of 12 px on average
 
 
 def rank_plot(ranking: Ranking) -> str:
-    """Mean ranks, one arm per row. A bar at the right joins arms that do not differ, the scale
-    shows what would."""
+    """Mean ranks, one arm per row.
+
+    A bar at the right joins arms that do not differ, the scale shows what would.
+    """
     names, count, groups = [str(arm) for arm in ranking.arms], len(ranking.scenes), ranking.groups
     left = 20 + LETTER * max(map(len, names))
     right = left + max(160.0, WIDTH - left - 30)
@@ -228,8 +227,7 @@ class Axis:
 
 
 def _round_ticks(low: float, high: float, count: int) -> list[float]:
-    """About ``count`` round values from ``low`` to ``high``, but at least two, since one gives no
-    scale."""
+    """About ``count`` round values from ``low`` to ``high``; two at least, to give a scale."""
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     first = next(index for index, factor in enumerate(ROUND) if factor * power >= raw)

@@ -1,116 +1,126 @@
-"""Similarity transforms between two sets of camera poses."""
+"""Alignment of a model to the reference: pose errors, and what the volume threshold means."""
 
+from __future__ import annotations
+
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 
-from gsbench.scene.types import Array
-
-RANSAC_TRIALS = 500
-# 2.5 sigma, as in least median of squares; the median absolute deviation times 1.4826 estimates
-# sigma.
-INLIER_FACTOR = 2.5 * 1.4826
-# second over first singular value of the centres: below it they count as collinear
-COLLINEAR_RATIO = 1e-2
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """``x_target = scale * rotation @ x_source + translation``."""
-
-    scale: float
-    rotation: Array  # [3, 3]
-    translation: Array  # [3]
-
-    def __call__(self, points: Array) -> Array:
-        """Transform ``points`` [N, 3]."""
-        return self.scale * points @ self.rotation.T + self.translation
+from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
+from gsbench.init.base import Gauge, PoseErrors
+from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
+from gsbench.init.colmap.similarity import (
+    Similarity,
+    align_poses,
+    rotation_angles,
+    transformed_rotations,
+)
+from gsbench.scene.colmap import save_model
+from gsbench.scene.types import Array, Capture, extent_of_centers
 
 
-def fit_similarity(source: Array, target: Array) -> Similarity:
-    """The least-squares similarity from ``source`` to ``target`` [N, 3] (Umeyama 1991, eqs. 40 to
-    42)."""
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    source_centered, target_centered = source - source_mean, target - target_mean
-    u, singular_values, vt = np.linalg.svd(target_centered.T @ source_centered / len(source))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ np.diag(signs) @ vt
-    scale = float(singular_values @ signs / np.mean(np.sum(source_centered**2, axis=1)))
-    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+@dataclass(frozen=True)
+class Alignment:
+    """The place of a model against the reference; None where it was not compared or aligned."""
+
+    scale_to_reference: float | None = None  # None without a reference
+    own_gauge: Gauge | None = None
+    pose_errors: PoseErrors | None = None
+    warnings: tuple[str, ...] = ()
 
 
-def align_poses(
-    source_centers: Array, source_rotations: Array, target_centers: Array, target_rotations: Array
-) -> Similarity:
-    """The similarity that maps the cameras of one model to those of another, robust to wrong
-    cameras.
+def align(
+    model: pycolmap.Reconstruction,
+    reference: pycolmap.Reconstruction | None,
+    capture: Capture,
+    exact: bool,
+    own_gauge: Path | None,
+) -> Alignment:
+    """Compare estimated poses with the reference; with ``own_gauge``, move the model into its.
 
-    Centres are [N, 3] and rotations (world to camera) [N, 3, 3], in the same order of cameras, N >=
-    3. The similarity is fitted to the centres, by the least median of squared residuals over random
-    triples, then by least squares over the inliers. Collinear centres leave the rotation about
-    their line open; then the rotation comes from the cameras' orientations. Raises ``ValueError``
-    if the centres of one model coincide.
+    ``own_gauge`` is the folder for a copy of the model as it was before. ``exact`` says that the
+    reference is the truth.
     """
-    if len(source_centers) < 3:
-        raise ValueError(f"a similarity needs at least 3 common cameras, got {len(source_centers)}")
-    spreads = [
-        np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
-        for centers in (source_centers, target_centers)
-    ]
-    if min(spread[0] for spread in spreads) <= 1e-12:
-        raise ValueError("a similarity needs cameras at different places")
-    if min(spread[1] / spread[0] for spread in spreads) < COLLINEAR_RATIO:
-        return _fit_with_orientations(
-            source_centers, source_rotations, target_centers, target_rotations
-        )
-    best = _least_median_fit(source_centers, target_centers)
-    residuals = np.linalg.norm(best(source_centers) - target_centers, axis=1)  # [N]
-    inliers = residuals <= max(
-        INLIER_FACTOR * float(np.median(residuals)), 1e-9 * float(spreads[1][0])
+    if reference is None:
+        return Alignment()
+    similarity = similarity_to(model, reference)
+    if similarity is None:
+        few = "too few common cameras with the reference: poses are neither aligned nor compared"
+        return Alignment(warnings=(few,))
+    extent = training_extent(reference, capture)
+    errors = compare_poses(model, reference, similarity, extent, exact)
+    if own_gauge is None:
+        return Alignment(similarity.scale, pose_errors=errors)
+    gauge = measure_gauge(training_extent(model, capture), similarity.scale)
+    save_model(model, own_gauge)
+    rotation = pycolmap.Rotation3d(similarity.rotation)
+    model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
+    return Alignment(1.0, gauge, errors)
+
+
+def similarity_to(
+    model: pycolmap.Reconstruction, reference: pycolmap.Reconstruction
+) -> Similarity | None:
+    """The similarity from ``model`` to ``reference``; None for too few common cameras."""
+    try:
+        return align_poses(*common_poses(model, reference))
+    except ValueError:
+        return None
+
+
+def training_extent(model: pycolmap.Reconstruction, capture: Capture) -> float:
+    """3DGS's ``cameras_extent`` of the training images with a pose in the model, else 0."""
+    centers = training_centers(model, capture)
+    return extent_of_centers(centers) if len(centers) else 0.0
+
+
+def training_centers(model: pycolmap.Reconstruction, capture: Capture) -> Array:
+    """The centres [V, 3] of the training images with a pose in the model."""
+    poses = poses_by_name(model)
+    return np.array([poses[name][0] for name in capture.train_names if name in poses])
+
+
+def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
+    """Express the paper's V_th in a model with this scene extent."""
+    in_reference = None
+    if scale_to_reference is not None:
+        in_reference = VOLUME_THRESHOLD * scale_to_reference**3
+    # of the sphere 4/3 pi r^3 = V_th
+    radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
+    return Gauge(
+        scene_extent=extent,
+        scale_to_reference=scale_to_reference,
+        volume_threshold=VOLUME_THRESHOLD,
+        threshold_over_extent_cubed=VOLUME_THRESHOLD / extent**3 if extent > 0 else None,
+        threshold_radius=radius,
+        threshold_radius_over_extent=radius / extent if extent > 0 else None,
+        threshold_in_reference=in_reference,
     )
-    # At least three cameras are inliers: residuals up to the median and, of three cameras, the
-    # third one's too, since a least-squares fit leaves residuals that add up to 0.
-    return fit_similarity(source_centers[inliers], target_centers[inliers])
 
 
-def rotation_angles(first: Array, second: Array) -> Array:
-    """Angles [N] in degrees between rotations [N, 3, 3]."""
-    # The chord |A - B| = 2 sqrt(2) sin(angle / 2) is accurate near an angle of 0, the trace formula
-    # is not.
-    chords = np.linalg.norm(first - second, axis=(1, 2))  # Frobenius norm
-    return np.degrees(2 * np.arcsin(np.clip(chords / (2 * np.sqrt(2)), 0.0, 1.0)))
-
-
-def transformed_rotations(similarity: Similarity, rotations: Array) -> Array:
-    """World-to-camera rotations [N, 3, 3] of the same cameras after ``similarity`` has transformed
-    the world."""
-    return rotations @ similarity.rotation.T
-
-
-def _least_median_fit(source: Array, target: Array) -> Similarity:
-    generator = np.random.default_rng(0)  # a fixed seed: the triples only guide the search
-    best = fit_similarity(source, target)
-    best_median = float(np.median(np.linalg.norm(best(source) - target, axis=1)))
-    for _ in range(RANSAC_TRIALS):
-        triple = generator.choice(len(source), 3, replace=False)
-        spread = np.linalg.svd(source[triple] - source[triple].mean(axis=0), compute_uv=False)
-        if spread[1] <= COLLINEAR_RATIO * spread[0]:
-            continue
-        candidate = fit_similarity(source[triple], target[triple])
-        median = float(np.median(np.linalg.norm(candidate(source) - target, axis=1)))
-        if median < best_median:
-            best, best_median = candidate, median
-    return best
-
-
-def _fit_with_orientations(
-    source: Array, source_rotations: Array, target: Array, target_rotations: Array
-) -> Similarity:
-    """Fit the rotation to the cameras' orientations (chordal mean), then scale and translation to
-    the centres."""
-    u, _, vt = np.linalg.svd((np.swapaxes(target_rotations, 1, 2) @ source_rotations).sum(axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    rotated = (source - source.mean(axis=0)) @ rotation.T
-    centered = target - target.mean(axis=0)
-    scale = float(np.linalg.norm(centered) / np.linalg.norm(rotated))
-    return Similarity(scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
+def compare_poses(
+    model: pycolmap.Reconstruction,
+    reference: pycolmap.Reconstruction,
+    similarity: Similarity,
+    reference_extent: float,
+    exact: bool,
+) -> PoseErrors:
+    """Pose errors of ``model`` after ``similarity``, over the images with a pose in both models."""
+    centers, rotations, reference_centers, reference_rotations = common_poses(model, reference)
+    distances = np.linalg.norm(similarity(centers) - reference_centers, axis=1)  # [N]
+    turned = transformed_rotations(similarity, rotations)
+    angles = rotation_angles(turned, reference_rotations)  # [N]
+    rmse = float(np.sqrt(np.mean(distances**2)))
+    return PoseErrors(
+        num_images=len(distances),
+        exact=exact,
+        center_rmse=rmse,
+        center_mean=float(distances.mean()),
+        center_max=float(distances.max()),
+        center_rmse_relative=rmse / reference_extent if reference_extent > 0 else None,
+        rotation_mean_deg=float(angles.mean()),
+        rotation_max_deg=float(angles.max()),
+    )

@@ -1,5 +1,4 @@
-"""COLMAP's database: creating it with cameras and images, and adding keypoints and matches of any
-extractor."""
+"""COLMAP's database: creating it, and adding keypoints and matches of any extractor."""
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,15 +11,13 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.logs import Progress
+from gsbench.init.colmap.pairs import select_pairs
+from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
 from gsbench.scene.images import image_size, read_image
 from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-# COLMAP reports no progress within a call, so the pairs are divided over several calls
-VERIFY_CALLS = 20
-MIN_PAIRS_PER_CALL = 50
 
 
 # each camera with the names of its images
@@ -29,8 +26,7 @@ CameraGroups = Sequence[tuple[pycolmap.Camera, Sequence[str]]]
 
 @dataclass(frozen=True)
 class DatabaseTask:
-    """A database with cameras and images, to be filled with matches, and the pairs of images to
-    match.
+    """A database with cameras and images, to be filled with matches of the ``pairs``.
 
     ``images`` is a folder with the names of the capture in which COLMAP can read every file.
     """
@@ -41,6 +37,27 @@ class DatabaseTask:
     pairs: list[tuple[str, str]]
     capture: Capture
     work_dir: Path
+
+
+def create_task(
+    options: ColmapOptions,
+    capture: Capture,
+    reference: pycolmap.Reconstruction | None,
+    work_dir: Path,
+) -> DatabaseTask:
+    """Create a database of the capture's images, with the cameras that ``options`` choose."""
+    ignored = options.ignores_test_photographs(reference)
+    used = capture.train_names if ignored else capture.image_names
+    images = readable_images(capture.images, used, work_dir)
+    if reference is not None and options.uses_reference_cameras:
+        groups = reference_camera_groups(reference)
+    else:
+        groups = unknown_camera_groups(
+            images, capture.image_names, options.camera, options.camera_model, options.focal_length
+        )
+    database = work_dir / "database.db"
+    names = [name for name in create_database(database, groups) if name in set(used)]
+    return DatabaseTask(database, images, names, select_pairs(names, options), capture, work_dir)
 
 
 def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
@@ -66,8 +83,7 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
 
 
 def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
-    """A folder below ``work_dir`` with links to the masks, named as COLMAP expects; None if there
-    are no masks."""
+    """A folder below ``work_dir`` of links to the masks, named as COLMAP expects; None if none."""
     if not masks:
         return None
     folder = work_dir / "masks"
@@ -82,8 +98,7 @@ def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
 def reference_camera_groups(
     reference: pycolmap.Reconstruction,
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """The reference's cameras, as known ones, each with the sorted names of its images that have a
-    pose."""
+    """The reference's cameras, as known ones, each with the sorted names of its posed images."""
     groups: dict[int, list[str]] = {}
     for image in reference.images.values():
         if image.has_pose:
@@ -128,29 +143,34 @@ def unknown_camera_groups(
     return result
 
 
+@contextmanager
+def writable(path: Path) -> Iterator[pycolmap.Database]:
+    """The open database in one transaction: all changes within the context, or none."""
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        yield database
+
+
 def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     """Create a database with cameras and images but no features; returns the image ids by name.
 
     The ids follow the sorted names. Because they are fixed here, extraction and matching give the
     same database on any number of threads. Each camera gets its own rig.
     """
+    # An interrupted run may have left one; its ids may be of other images.
     path.unlink(missing_ok=True)
-    camera_ids: dict[str, int] = {}
-    rig_ids: dict[str, int] = {}
+    ids_of: dict[str, tuple[int, int]] = {}  # of camera and rig
     image_ids: dict[str, int] = {}
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for camera, names in groups:
             camera.camera_id = database.write_camera(camera)
             rig = pycolmap.Rig()
             rig.add_ref_sensor(camera.sensor_id)
-            rig_id = database.write_rig(rig)
-            camera_ids |= dict.fromkeys(names, camera.camera_id)
-            rig_ids |= dict.fromkeys(names, rig_id)
-        for name in sorted(camera_ids):
-            image = pycolmap.Image(name=name, camera_id=camera_ids[name])
+            ids_of |= dict.fromkeys(names, (camera.camera_id, database.write_rig(rig)))
+        for name, (camera_id, rig_id) in sorted(ids_of.items()):
+            image = pycolmap.Image(name=name, camera_id=camera_id)
             image.image_id = database.write_image(image)
             frame = pycolmap.Frame()
-            frame.rig_id = rig_ids[name]
+            frame.rig_id = rig_id
             frame.add_data_id(image.data_id)
             database.write_frame(frame)
             image_ids[name] = image.image_id
@@ -161,44 +181,21 @@ def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) ->
     """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first
     pixel is (0.5, 0.5)."""
     ids = image_ids(path)
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for name, points in keypoints.items():
             database.write_keypoints(ids[name], points)
 
 
 def write_matches(path: Path, matches: Mapping[tuple[str, str], NDArray[np.uint32]]) -> None:
-    """Add ``matches`` [M, 2] by pairs of image names: indices of keypoints in the first and the
-    second image."""
+    """Add ``matches`` [M, 2] by pairs of names: indices of keypoints in both images."""
     ids = image_ids(path)
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for (first, second), indices in matches.items():
             database.write_matches(ids[first], ids[second], indices)
 
 
-def verify_pairs(
-    path: Path,
-    pairs: Sequence[tuple[str, str]],
-    options: pycolmap.TwoViewGeometryOptions,
-    progress: Progress,
-) -> None:
-    """Run COLMAP's geometric verification on the stored matches of ``pairs``."""
-    list_file = path.with_suffix(".pairs.txt")
-    size = max(len(pairs) // VERIFY_CALLS, MIN_PAIRS_PER_CALL)
-    progress("verify", 0, len(pairs))
-    with image_ids_as_names(path) as new_names:
-        for start in range(0, len(pairs), size):
-            part = pairs[start : start + size]
-            write_pairs(
-                list_file, [(new_names[first], new_names[second]) for first, second in part]
-            )
-            pycolmap.verify_matches(path, list_file, options)
-            progress("verify", start + len(part), len(pairs))
-    list_file.unlink(missing_ok=True)
-
-
 def cameras_without_prior(path: Path) -> bool:
-    """Return whether the focal length of at least one camera is neither given nor in the EXIF
-    data."""
+    """Return whether a camera's focal length is neither given nor in the EXIF data."""
     with pycolmap.Database.open(path) as database:
         return any(not camera.has_prior_focal_length for camera in database.read_all_cameras())
 
@@ -209,7 +206,7 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
     Drops the geometries that were verified before, and returns the pairs of image names that have
     matches.
     """
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for camera in database.read_all_cameras():
             if not camera.has_prior_focal_length:
                 for index in camera.focal_length_idxs():
@@ -219,17 +216,13 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
         names = {image.image_id: image.name for image in database.read_all_images()}
         pair_ids, matches = database.read_all_matches()
         database.clear_two_view_geometries()
-        ids = [
-            pycolmap.pair_id_to_image_pair(pair_id)
-            for pair_id, indices in zip(pair_ids, matches, strict=True)
-            if len(indices)
-        ]
+        matched = [pair for pair, indices in zip(pair_ids, matches, strict=True) if len(indices)]
+    ids = map(pycolmap.pair_id_to_image_pair, matched)
     return sorted((names[first], names[second]) for first, second in ids)
 
 
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Write COLMAP's list of image pairs, two names on each line; names must have no spaces
-    (`image_ids_as_names`)."""
+    """Write COLMAP's list of pairs, two names a line, without spaces (`image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 
@@ -256,21 +249,18 @@ def image_ids(path: Path) -> dict[str, int]:
 
 def rename_images(path: Path, names: Mapping[int, str]) -> None:
     """Rename the database's images; ``names`` are the new names by image id."""
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+    with writable(path) as database:
         for image in database.read_all_images():
             image.name = names[image.image_id]
             database.update_image(image)
 
 
 def strongest_descriptors(path: Path, name: str, count: int) -> NDArray[np.uint8]:
-    """The descriptors [K, 128] of the ``count`` features with the largest scales of an image,
-    largest first."""
+    """The descriptors [K, 128] of an image's ``count`` features of the largest scales, in order."""
     image_id = image_ids(path)[name]
     with pycolmap.Database.open(path) as database:
-        keypoints, descriptors = (
-            database.read_keypoints(image_id),
-            database.read_descriptors(image_id).data,
-        )
+        keypoints = database.read_keypoints(image_id)
+        descriptors = database.read_descriptors(image_id).data
     if len(keypoints) == 0:
         return np.zeros((0, descriptors.shape[1]), dtype=np.uint8)
     # The determinant of a keypoint's affine shape orders keypoints as their scales do.

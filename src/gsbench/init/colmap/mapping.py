@@ -1,5 +1,4 @@
-"""Making a COLMAP model with its report: triangulation, or mapping by the first of several
-strategies that succeeds.
+"""Cameras and points from verified matches: triangulation under known cameras, or mapping.
 
 COLMAP's defaults need an initial pair that sees points under 16 degrees. Forward-facing captures
 with a small baseline have no such pair; COLMAP's global mapper, smaller angles or assumed focal
@@ -10,27 +9,22 @@ isolated.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pycolmap
 
 from gsbench.errors import InputError
-from gsbench.init import report
-from gsbench.init.base import OWN_GAUGE_FOLDER, InitReport, Preparation, Timer, TrainingPoints
+from gsbench.init.base import REGISTERED_SHARE
 from gsbench.init.colmap import database as colmap_database
-from gsbench.init.colmap import reconstruct
-from gsbench.init.colmap.alignment import Similarity
+from gsbench.init.colmap import geometry
+from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress
 from gsbench.scene.options import MIN_IMAGES
-from gsbench.scene.types import Capture
-
-if TYPE_CHECKING:
-    from gsbench.init.sfm import ColmapInitializer
 
 SMALL_ANGLE_DEG = 2.0  # triangulation angle of the initial pair; COLMAP's default is 16
 # focal length over the longest side: lenses of 27, 36 and 50 mm on 35 mm film
@@ -38,16 +32,14 @@ FOCAL_FACTORS = (0.75, 1.0, 1.4)
 # median over points of the widest triangulation angle; below it depth is not determined
 MIN_ANGLE_DEG = 0.5
 NO_PAIR = (
-    "structure from motion found no pair of images to start from: the photos need more overlap "
-    "(60 % and more "
-    "between neighbours), more texture, or a focal length (init.focal_length, px)"
+    "structure from motion found no pair of images to start from: the photos need more overlap (60 "
+    "% and more between neighbours), more texture, or a focal length (init.focal_length, px)"
 )
 
 
 @dataclass(frozen=True)
 class MappingResult:
-    """The best model, its strategy, the number of models of that strategy, and the images that each
-    strategy placed."""
+    """The best model, its strategy with its number of models, and what each strategy placed."""
 
     model: pycolmap.Reconstruction
     models: int
@@ -68,10 +60,9 @@ class MappingResult:
 
 
 def map_images(
-    database: Path, images: Path, output: Path, options: ColmapInitializer, progress: Progress
+    database: Path, images: Path, output: Path, options: ColmapOptions, progress: Progress
 ) -> MappingResult:
-    """Estimate cameras and points from the matches in ``database``; returns the model with the most
-    images.
+    """Estimate cameras and points from the matches in ``database``: the model with the most images.
 
     With ``mapper=auto``, the strategies are COLMAP's incremental mapper, the same from a smaller
     initial angle, the global mapper, and assumed focal lengths. The first that places
@@ -89,15 +80,14 @@ def map_images(
         tried.append((strategy, 0 if largest is None else largest.num_reg_images()))
         if largest is not None and (best is None or _model_size(largest) > _model_size(best[0])):
             best = largest, len(models), strategy
-        if best is not None and best[0].num_reg_images() >= report.REGISTERED_SHARE * total:
+        if best is not None and best[0].num_reg_images() >= REGISTERED_SHARE * total:
             break
     if best is None:
         raise InputError(NO_PAIR)
     if best[0].num_reg_images() < MIN_IMAGES:
         raise InputError(
             f"structure from motion placed only {best[0].num_reg_images()} of {total} images: the "
-            "photos need more "
-            "overlap, more texture, or a focal length (init.focal_length, px)"
+            "photos need more overlap, more texture, or a focal length (init.focal_length, px)"
         )
     return MappingResult(*best, tuple(tried))
 
@@ -112,13 +102,12 @@ class _Mapper:
     database: Path
     images: Path
     output: Path
-    options: ColmapInitializer
+    options: ColmapOptions
     progress: Progress
     total: int
 
     def strategies(self) -> Iterator[tuple[str, Callable[[], Models]]]:
-        """The strategies that ``init.mapper`` allows, in the order of trying: names and
-        functions."""
+        """The strategies of ``init.mapper`` in the order of trying: names and functions."""
         mapper = self.options.mapper
         if mapper in ("auto", "incremental"):
             yield "incremental", lambda: self.incremental(self.database)
@@ -137,8 +126,7 @@ class _Mapper:
                 )
 
     def incremental(self, database: Path, initial_angle: float | None = None) -> Models:
-        """Map image by image, from a pair that sees points under ``initial_angle`` degrees (None:
-        COLMAP's default)."""
+        """Map image by image, from a pair under ``initial_angle`` degrees (None: COLMAP's)."""
         registered = 0
 
         def count_image() -> None:
@@ -146,7 +134,7 @@ class _Mapper:
             registered += 1
             self.progress("map", min(registered, self.total), self.total)
 
-        options = reconstruct.pipeline_options(self.options)
+        options = pipeline_options(self.options)
         if initial_angle is not None:
             options.mapper.init_min_tri_angle = initial_angle
         run = partial(pycolmap.incremental_mapping, database, next_image_callback=count_image)
@@ -164,17 +152,15 @@ class _Mapper:
         return self._run(partial(pycolmap.global_mapping, self.database), options)
 
     def with_assumed_focal_lengths(self, factor: float) -> Models:
-        """Map image by image after setting unknown focal lengths to ``factor`` times the longest
-        side.
+        """Map image by image, with unknown focal lengths of ``factor`` times the longest side.
 
         The pairs are verified again under these focal lengths.
         """
         copy = self.database.with_name(f"assumed-{factor:g}.db")
         shutil.copy(self.database, copy)
         pairs = colmap_database.assume_focal_lengths(copy, factor)
-        colmap_database.verify_pairs(
-            copy, pairs, reconstruct.verification_options(self.options), self.progress
-        )
+        options = geometry.verification_options(self.options)
+        geometry.verify_pairs(copy, pairs, options, self.progress)
         return self.incremental(copy, SMALL_ANGLE_DEG)
 
     def _run(
@@ -198,138 +184,89 @@ def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Return whether triangulation angles determine the depth of points; copies of one photograph
-    have none."""
-    centers = {
-        image.image_id: image.projection_center()
-        for image in model.images.values()
-        if image.has_pose
-    }
-    angles = [
-        _widest_angle(point, centers)
-        for point in model.points3D.values()
-        if point.track.length() > 1
-    ]
+    """Return whether angles determine the depth of points; copies of one photograph have none."""
+    posed = [image for image in model.images.values() if image.has_pose]
+    centers = {image.image_id: image.projection_center() for image in posed}
+    seen_twice = [point for point in model.points3D.values() if point.track.length() > 1]
+    angles = [_widest_angle(point, centers) for point in seen_twice]
     return bool(angles) and float(np.median(angles)) >= MIN_ANGLE_DEG
 
 
 def _widest_angle(point: pycolmap.Point3D, centers: dict[int, np.ndarray]) -> float:
     """The widest angle between two rays from a point to its cameras, in degrees."""
-    rays = (
-        np.array([centers[element.image_id] for element in point.track.elements]) - point.xyz
-    )  # [T, 3]
+    seen_from = np.array([centers[element.image_id] for element in point.track.elements])
+    rays = seen_from - point.xyz  # [T, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)).max()))
 
 
-@dataclass(frozen=True)
-class ReconstructionJob:
-    """Inputs of one run of an initialiser in its isolated process."""
+def triangulate(
+    database: Path,
+    images: Path,
+    output: Path,
+    reference: pycolmap.Reconstruction,
+    names: Collection[str],
+    options: ColmapOptions,
+    progress: Progress,
+) -> pycolmap.Reconstruction:
+    """Triangulate the verified matches of the images ``names`` under the reference's fixed cameras.
 
-    options: ColmapInitializer
-    capture: Capture
-    output_dir: Path
-    work_dir: Path
-    reference: Path | None
-    preparation: Preparation
-
-
-def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
-    """Make cameras, features, matches, model and report. Calls native code that can abort: run it
-    isolated."""
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
-    options, capture = job.options, job.capture
-    timer = Timer(dict(job.preparation.seconds))
-    reference = reconstruct.load_reference(capture, job.reference)
-    database = job.work_dir / "database.db"
-    used = (
-        capture.train_names if options.ignores_test_photographs(reference) else capture.image_names
-    )
-    images = colmap_database.readable_images(capture.images, used, job.work_dir)
-    if reference is not None and options.uses_reference_cameras:
-        groups = colmap_database.reference_camera_groups(reference)
-    else:
-        groups = colmap_database.unknown_camera_groups(
-            images, capture.image_names, options.camera, options.camera_model, options.focal_length
-        )
-    image_ids = colmap_database.create_database(database, groups)
-    names = [name for name in image_ids if name in set(used)]
-    pairs = reconstruct.select_pairs(names, options)
-    task = colmap_database.DatabaseTask(database, images, names, pairs, capture, job.work_dir)
-    counts = options.fill_database(task, progress, timer)
-    counts = {**job.preparation.counts, **counts, **colmap_database.database_counts(database)}
-    if counts["pairs_verified"] == 0:
-        raise InputError(
-            f"{options.name}: no pair of images shares enough matches: the photos need more "
-            "overlap or texture"
-        )
-    scratch = job.work_dir / "mapping"
-    shutil.rmtree(scratch, ignore_errors=True)
-    if options.poses == "shared" and reference is not None:
-        with timer.phase("triangulate"):
-            model = reconstruct.triangulate(
-                database, images, scratch, reference, names, options, progress
+    The other images of the database are in the model with their cameras, but see no point.
+    """
+    progress("triangulate", 0, 1)
+    posed, unused = pycolmap.Reconstruction(), []  # with the ids of the database
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for stored in opened.read_all_images():
+            pose = reference.find_image_with_name(stored.name).cam_from_world()
+            image = pycolmap.Image(
+                name=stored.name, camera_id=stored.camera_id, image_id=stored.image_id
             )
-        points = None
-        if options.ignores_test_photographs(reference):
-            points = TrainingPoints(options.points_from, model.num_points3D(), None, None)
-        return _finish(job, "shared", model, reference, None, timer, counts, points=points)
-    with timer.phase("map"):
-        mapped = map_images(database, images, scratch, options, progress)
-    points = None
-    if options.points_from == "train":
-        points = reconstruct.keep_training_points(mapped.model, capture.train_names, images)
-    similarity = None if reference is None else reconstruct.similarity_to(mapped.model, reference)
-    counts["models"] = mapped.models
-    return _finish(job, "own", mapped.model, reference, similarity, timer, counts, mapped, points)
-
-
-def _finish(
-    job: ReconstructionJob,
-    poses: str,
-    model: pycolmap.Reconstruction,
-    reference: pycolmap.Reconstruction | None,
-    similarity: Similarity | None,
-    timer: Timer,
-    counts: Mapping[str, int],
-    mapped: MappingResult | None = None,
-    points: TrainingPoints | None = None,
-) -> InitReport:
-    """Align the model if its poses were estimated, write it, and make the report."""
-    options, capture = job.options, job.capture
-    warnings = [*job.preparation.warnings, *(() if mapped is None else mapped.warnings)]
-    pose_errors, own_gauge, scale = None, None, 1.0 if poses == "shared" else None
-    if poses == "own" and reference is not None and similarity is None:
-        warnings.append(
-            "too few common cameras with the reference: poses are neither aligned nor compared"
-        )
-    if reference is not None and similarity is not None:
-        exact = capture.exact_poses and job.reference is None
-        reference_extent = report.training_extent(reference, capture)
-        pose_errors = report.compare_poses(model, reference, similarity, reference_extent, exact)
-        scale = similarity.scale
-        if options.align:
-            own_gauge = report.measure_gauge(report.training_extent(model, capture), scale)
-            reconstruct.save_reconstruction(model, job.output_dir / OWN_GAUGE_FOLDER)
-            rotation = pycolmap.Rotation3d(similarity.rotation)
-            model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
-            scale = 1.0
-    made = report.make_report(
-        options.name,
-        poses,
-        capture,
-        model,
-        scale,
-        options.packages(),
-        warnings,
-        settings={**asdict(options), **job.preparation.settings},
-        seconds=timer.rounded(),
-        own_gauge=own_gauge,
-        pose_errors=pose_errors,
-        counts=counts,
-        mapped_by=None if mapped is None else mapped.strategy,
-        training_points=points,
+            if stored.name in names:
+                posed.add_image_with_trivial_frame(image, pose)
+            else:
+                unused.append((image, pose))
+    # COLMAP has a generator for the whole process beside the seeds in its options
+    pycolmap.set_random_seed(options.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    model = pycolmap.triangulate_points(
+        posed,
+        database,
+        images,
+        output,
+        clear_points=True,
+        options=pipeline_options(options),
+        refine_intrinsics=False,
     )
-    made = options.extend(model, made)
-    report.write_result(model, made, job.output_dir)
-    return made
+    progress("triangulate", 1, 1)
+    if model.num_points3D() == 0:
+        raise InputError(
+            "no point could be triangulated under the reference cameras: the matches contradict "
+            "them (are they the "
+            "cameras of these photos?), or the photos have too little texture or overlap"
+        )
+    # On some processors the solver changes the fixed poses by a rounding error.
+    for image in model.images.values():
+        pose = reference.find_image_with_name(image.name).cam_from_world()
+        image.frame.set_cam_from_world(image.camera_id, pose)
+    for image, pose in unused:
+        model.add_image_with_trivial_frame(image, pose)
+    return model
+
+
+def pipeline_options(options: ColmapOptions) -> pycolmap.IncrementalPipelineOptions:
+    """The options of COLMAP's incremental mapper, which its triangulator reads too."""
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.num_threads = pipeline.mapper.num_threads = options.mapper_threads
+    pipeline.triangulation.ignore_two_view_tracks = not options.two_view_tracks
+    for part in (pipeline, pipeline.mapper, pipeline.triangulation):
+        part.random_seed = options.seed
+    # mapping must not stop at a first model of a few images (see map_images)
+    pipeline.multiple_models = True
+    pipeline.min_model_size = options.min_model_size
+    refine = options.intrinsics == "estimate"
+    pipeline.ba_refine_focal_length = pipeline.ba_refine_extra_params = refine
+    mapper = pipeline.mapper
+    mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = refine
+    return pipeline

@@ -1,5 +1,4 @@
-"""Pairs of images to match: all pairs, neighbours in the order of names, or pairs proposed by a
-preview.
+"""Pairs of images to match: all, neighbours in the order of names, or proposed by a preview.
 
 The preview matches only the strongest features of each image, after Wu, "Towards Linear-time
 Incremental Structure from Motion" (3DV 2013), who skips pairs in which few of the largest features
@@ -10,19 +9,17 @@ of their tracks.
 
 from collections.abc import Callable, Sequence
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Pair = tuple[int, int]
+from gsbench.init.options import ColmapOptions
 
-Pairing = Literal["exhaustive", "auto", "sequential"]
+Pair = tuple[int, int]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Pair each image with the next ``overlap`` images and those 1, 2, 4, … 2^(overlap - 1) further
-    on, as COLMAP does.
+    """Pair each image with the next ``overlap`` ones and those 1, 2, 4, … on, as COLMAP does.
 
     Examples:
         >>> sequential_pairs(6, 2)
@@ -42,8 +39,7 @@ QUANTUM = 512.0
 
 
 def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
-    """Pair each image with the ``partners`` images with the most matches; returns sorted pairs (i,
-    j), i < j.
+    """Pair each image with the ``partners`` with the most matches; returns sorted (i, j), i < j.
 
     ``descriptors`` [K, D] belong to each image's strongest features, of which at most `STRONGEST`
     are used. They are whole numbers, or floats of unit length. Among equal partners, those nearer
@@ -62,8 +58,7 @@ def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTN
 def proposed_pairs(
     names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]
 ) -> list[tuple[str, str]]:
-    """The pairs that ``pairs=auto`` matches: all pairs of up to `ALL_PAIRS_UP_TO` images, else the
-    `best_pairs`.
+    """The pairs of ``pairs=auto``: all of up to `ALL_PAIRS_UP_TO` images, else the `best_pairs`.
 
     ``strongest`` returns the descriptors of an image's strongest features.
     """
@@ -76,8 +71,7 @@ def proposed_pairs(
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
-    """Count mutual nearest neighbours that pass the ratio test between images i < j; [N, N], upper
-    triangle.
+    """Count mutual nearest neighbours that pass the ratio test, for images i < j; [N, N].
 
     Descriptors are whole numbers here, and their products stay below 2^24. They are exact in
     float32, so the counts are the same on every machine and with any number of threads.
@@ -108,3 +102,13 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
         distinct = best < SQUARED_RATIO * distances.min(axis=2)  # [S, J]
         agreements[i, i + 1 :] = np.count_nonzero(mutual & distinct.T, axis=1)
     return agreements
+
+
+def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
+    """The pairs of names to match; for ``auto`` and ``lowres`` all, of which some remain later."""
+    if options.pairs == "sequential":
+        return [
+            (names[first], names[second])
+            for first, second in sequential_pairs(len(names), options.overlap)
+        ]
+    return list(combinations(names, 2))

@@ -1,5 +1,4 @@
-"""Local features of an image, the settings that they depend on, and a store of features and matches
-on disk.
+"""Local features of an image, the settings that they depend on, and a store of them on disk.
 
 The store has one file for each image and each pair, so that an interrupted run continues from
 there. A file's name is a hash of everything that its content depends on: the image's bytes, the
@@ -11,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -61,8 +60,7 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSettings:
-    """Names and settings of an extractor and a matcher, each of which ignores the fields that it
-    does not read."""
+    """Names and settings of an extractor and a matcher, which ignore fields that are not theirs."""
 
     extractor: str
     matcher: str
@@ -74,19 +72,23 @@ class FeatureSettings:
     filter_threshold: float = 0.0  # LightGlue only
     max_ratio: float = 1.0  # mutual nearest neighbours only
 
+    @classmethod
+    def of(cls, options: object, **others: Any) -> FeatureSettings:
+        """The settings that ``options`` has under the same names, unless ``others`` has them."""
+        names = [entry.name for entry in fields(cls) if hasattr(options, entry.name)]
+        return cls(**({name: getattr(options, name) for name in names} | others))
+
     def extraction(self) -> dict[str, object]:
         """The settings that features depend on."""
         names = ["extractor", "max_image_size", "max_keypoints", "keypoint_threshold", "nms_radius"]
-        return {
-            name: getattr(self, name)
-            for name in names + ["aliked_model"] * (self.extractor == "aliked")
-        }
+        if self.extractor == "aliked":
+            names.append("aliked_model")
+        return {name: getattr(self, name) for name in names}
 
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, in addition to the features."""
-        if self.matcher == "lightglue":
-            return {"matcher": self.matcher, "filter_threshold": self.filter_threshold}
-        return {"matcher": self.matcher, "max_ratio": self.max_ratio}
+        limit = "filter_threshold" if self.matcher == "lightglue" else "max_ratio"
+        return {name: getattr(self, name) for name in ("matcher", limit)}
 
 
 KEY_DIGITS = 24
@@ -94,8 +96,7 @@ FORMAT_VERSION = 1  # to be raised when the same settings give different feature
 
 
 class FeatureStore:
-    """Store of features and matches below ``folder``: ``features/<key>.npz`` and
-    ``matches/<key>.npy``.
+    """Store of features and matches in ``folder``: ``features/<key>.npz``, ``matches/<key>.npy``.
 
     ``extraction`` and ``matching`` are the settings (plain values) that features and matches depend
     on. ``masks`` are mask files by image name.

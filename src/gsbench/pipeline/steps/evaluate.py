@@ -1,5 +1,4 @@
-"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them by the
-protocol."""
+"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ TIMED_RENDERS = 5  # of each view, to measure the speed
 
 
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
-    """The step that renders and measures the model of ``trained`` and its snapshots of earlier
-    iterations.
+    """The step that renders and measures the model of ``trained`` and its earlier snapshots.
 
     Where another program left renders instead of a model, the step measures those. ``eval.maps``
     adds a picture of the large Gaussians; ``eval.fps`` is the image size at which the speed of
@@ -72,22 +70,20 @@ def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
         for name, metric in evaluator.extra.items()
     }
     further = {"extra": own, "more": list(evaluator.more), "fps": parts.eval.fps}
-    inputs |= {name: value for name, value in further.items() if value}
     if parts.program is not None and not parts.program.leaves_model:
-        return step_of(
-            EVALUATE,
-            {"renders": trained.key} | inputs,
-            _build_from_renders(views, trained, parts),
-            user,
-        )
-    inputs |= {"train": trained.key, "maps": parts.eval.maps}
-    if parts.measured_earlier:
-        inputs["earlier"] = parts.measured_earlier
-    # the key of `trained` covers the rendering only if gsbench trained
-    if parts.program is not None:
-        background = list(parts.train.background)
-        inputs |= {"raster": rasterizer_inputs(parts.rasterizer, user), "background": background}
-    return step_of(EVALUATE, inputs, _build_from_model(views, trained, parts), user)
+        inputs["renders"] = trained.key
+        build = _build_from_renders(views, trained, parts)
+    else:
+        inputs |= {"train": trained.key, "maps": parts.eval.maps}
+        further["earlier"] = parts.measured_earlier
+        # the key of `trained` covers the rendering only if gsbench trained
+        if parts.program is not None:
+            inputs["raster"] = rasterizer_inputs(parts.rasterizer, user)
+            inputs["background"] = list(parts.train.background)
+        build = _build_from_model(views, trained, parts)
+    # Metrics that are off are left out, so that a new one changes no key of others.
+    inputs |= {name: value for name, value in further.items() if value}
+    return step_of(EVALUATE, inputs, build, user)
 
 
 def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Path], None]:
@@ -118,30 +114,23 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
         with progress("evaluate") as report:
             per_view = measure(gaussians, "views", folder / RENDERS)
             for step in parts.measured_earlier:
-                # else train.max_seconds ended it before
-                if (snapshot := training / snapshot_file(step)).exists():
-                    model = read_ply(snapshot, device)
-                    means = summarize(
-                        measure(model, f"iteration {step}", None), evaluator.unavailable
-                    )
-                    at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
+                snapshot = training / snapshot_file(step)
+                if not snapshot.exists():  # train.max_seconds ended the training before
+                    continue
+                model = read_ply(snapshot, device)
+                means = summarize(measure(model, f"iteration {step}", None), evaluator.unavailable)
+                at[str(step)] = Earlier(metrics=means, num_gaussians=len(model))
         if parts.eval.maps:
             with np.load(training / LINEAGE) as lineage:
                 causes = torch.from_numpy(lineage["causes"][lineage["ids"]])  # [N]
             first = scene.test[0]
-            picture = draw_ellipsoids(
-                read_image(folder / RENDERS / png_name(first.name)),
-                gaussians,
-                causes,
-                first.camera,
-                VOLUME_THRESHOLD,
-            )
+            render = read_image(folder / RENDERS / png_name(first.name))
+            picture = draw_ellipsoids(render, gaussians, causes, first.camera, VOLUME_THRESHOLD)
             (folder / FIGURES).mkdir(exist_ok=True)
             picture.save(folder / FIGURES / ELLIPSOIDS)
         if parts.eval.fps is not None:
-            for view, speed in measure_speed(
-                rasterizer, gaussians, scene, color, parts.eval.fps
-            ).items():
+            speeds = measure_speed(rasterizer, gaussians, scene, color, parts.eval.fps)
+            for view, speed in speeds.items():
                 per_view[view]["fps"] = speed
         _write_metrics(folder, evaluator, per_view, scene, at=at)
 
@@ -160,11 +149,9 @@ def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[
                 image = read_image(folder / RENDERS / png_name(view.name))
                 per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
                 report("views", done, len(scene.test))
-        unknown = (
-            {}
-            if parts.eval.fps is None
-            else {"fps": "another program's renders are known, not its model"}
-        )
+        unknown = {}
+        if parts.eval.fps is not None:
+            unknown["fps"] = "another program's renders are known, not its model"
         _write_metrics(folder, evaluator, per_view, scene, unknown)
 
     return build
@@ -177,8 +164,10 @@ def measure_speed(
     background: torch.Tensor,
     size: Sequence[int],
 ) -> dict[str, float]:
-    """The renders per second of each test view at ``size`` (width, height) px, after one render
-    that is not timed."""
+    """The renders per second of each test view at ``size`` (width, height) px.
+
+    The first render of a view is not timed.
+    """
     speeds = {}
 
     def now() -> float:
@@ -214,14 +203,13 @@ def _write_metrics(
     """
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
     near = nearest_training_cameras(cameras, training, scene.extent)
-    # These columns are no metrics, so they are kept apart from `per_view`, of which the means are
-    # taken.
-    facts = {view.name: distances for view, distances in zip(scene.test, near, strict=True)}
-    if any(view.mask is not None for view in [*scene.train, *scene.test]):
-        facts = {view.name: facts[view.name] | {COUNTED: view.counted} for view in scene.test}
-    write_per_view(
-        folder / PER_VIEW, {view: dict(row) | facts.get(view, {}) for view, row in per_view.items()}
-    )
+    masked = any(view.mask is not None for view in [*scene.train, *scene.test])
+    # The further columns are no metrics, so they stay out of `per_view`, whose means are taken.
+    rows = {name: dict(row) for name, row in per_view.items()}
+    for view, distances in zip(scene.test, near, strict=True):
+        counted = {COUNTED: view.counted} if masked else {}
+        rows[view.name] |= distances | counted
+    write_per_view(folder / PER_VIEW, rows)
     summary = summary_of(evaluator, per_view)
     summary = replace(
         summary,
@@ -233,8 +221,7 @@ def _write_metrics(
 
 
 def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
-    """The mean PSNR in dB of a picture in the training views' mean colour; a trained model must
-    beat it.
+    """The mean PSNR in dB of the training views' mean colour, which a trained model must beat.
 
     None without test views.
     """
@@ -246,18 +233,15 @@ def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
         sums, count = sums + pixels.sum(axis=0, dtype=np.float64), count + len(pixels)
     color = np.rint(sums / count).astype(np.uint8)
     evaluator = Evaluator(protocol, lpips=(), flip=False)
-    values = [
-        evaluator.evaluate_view(
-            np.broadcast_to(color, view.image.shape).copy(), view.image, view.mask
-        )["psnr"]
-        for view in scene.test
-    ]
+    values = []
+    for view in scene.test:
+        plain = np.broadcast_to(color, view.image.shape).copy()
+        values.append(evaluator.evaluate_view(plain, view.image, view.mask)["psnr"])
     return float(np.mean(values))
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:
-    """Summary of an evaluation: the means, the missing metrics and why, and the facts about a
-    user's metrics."""
+    """The means, the missing metrics and why, and the facts about a user's metrics."""
     return Evaluation(
         metrics=summarize(per_view, evaluator.unavailable),
         unavailable=dict(evaluator.unavailable),
@@ -268,7 +252,7 @@ def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]
 
 def write_per_view(path: Path, per_view: Mapping[str, Mapping[str, float]]) -> None:
     """Write one row for each view, in order; a metric that a view lacks is left empty."""
-    names = sorted({name for row in per_view.values() for name in row})
+    names = sorted(set().union(*per_view.values()))
     with path.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, ["view", *names])
         writer.writeheader()
@@ -292,8 +276,9 @@ def draw_ellipsoids(
     camera: Camera,
     volume_threshold: float,
 ) -> Image.Image:
-    """The view ``render`` [H, W, 3] with the outlines of the Gaussians above ``volume_threshold``
-    (cubed scene units).
+    """The view ``render`` [H, W, 3] with outlines of Gaussians above ``volume_threshold``.
+
+    The threshold is in cubed scene units.
 
     An outline is the projected ellipsoid of one standard deviation. Its colour tells the rule that
     made the Gaussian (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn. A
@@ -325,11 +310,9 @@ def draw_ellipsoids(
 
 
 def _with_legend(image: Image.Image, title: str, causes: Sequence[Cause]) -> Image.Image:
-    """The image with a legend below: the title, and each cause in its colour, wrapped to the
-    image's width."""
-    words = [(word, TEXT_COLOR) for word in title.split()] + [
-        (cause.words, cause.color) for cause in causes
-    ]
+    """The image with a legend below: title, and causes in their colours, wrapped to its width."""
+    words = [(word, TEXT_COLOR) for word in title.split()]
+    words += [(cause.words, cause.color) for cause in causes]
     font = ImageFont.load_default(FONT_SIZE)
     places: list[tuple[int, int]] = []
     x, row = 0, 0

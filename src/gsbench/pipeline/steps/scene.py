@@ -71,8 +71,7 @@ class CaptureSource:
 
     @cached_property
     def step(self) -> Step | None:
-        """The step that makes the photographs, or that makes a COLMAP model of the cameras in
-        ``transforms.json``.
+        """The step that makes the photographs, or a COLMAP model from ``transforms.json``.
 
         None for a scene whose folder can be read directly.
         """
@@ -177,8 +176,7 @@ def masked_capture(capture: Capture, folder: Path) -> Capture:
 
 
 def normalizing_step(capture: Capture) -> Step | None:
-    """The step that moves the capture's model to the coordinates of the training; None if it stays
-    where it is.
+    """The step that moves the model to the coordinates of the training; None if it stays.
 
     It comes before the initialisation, so triangulation and the reading of points work there too.
     """
@@ -222,8 +220,7 @@ class Views:
 
     @cached_property
     def scene(self) -> Scene:
-        """The undistorted and shrunk views without copies of test views in training; ``init`` must
-        be built.
+        """The undistorted, shrunk views; no copy of a test view is trained. ``init`` must be built.
 
         Prepared images are cached in the store.
         """
@@ -241,8 +238,7 @@ class Views:
 
 @cache
 def view_versions() -> dict[str, str | None]:
-    """The versions of the code that makes the views' pixels: edited parts of gsbench's source, and
-    packages.
+    """The versions of what makes the views' pixels: edited parts of gsbench, and packages.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
@@ -275,8 +271,10 @@ def init_step(
     reference: Step | None = None,
     user: UserCode = NO_USER_CODE,
 ) -> Step:
-    """The initialiser's step. ``reference`` is the step that reconstructs cameras for a capture
-    without them."""
+    """The initialiser's step.
+
+    ``reference`` is the step that reconstructs cameras for a capture without them.
+    """
     inputs = {
         "capture": capture.fingerprint,
         "test": sha256_of(list(capture.test_names)),
@@ -297,8 +295,10 @@ def init_step(
 
 
 def check_readable(capture: Capture, report: Progress) -> None:
-    """Decode every photograph once, so that a damaged file is named before hours of work. Raises
-    InputError."""
+    """Decode every photograph once, so that a damaged file is named before hours of work.
+
+    Raises InputError.
+    """
     with ThreadPoolExecutor(max_workers=available_threads()) as pool:
         made = pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)
         for done, _ in enumerate(made, 1):

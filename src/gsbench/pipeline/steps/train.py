@@ -29,6 +29,7 @@ from gsbench.external.exchange import (
 from gsbench.external.program import run_program
 from gsbench.external.settings import (
     DATA,
+    FOLDERS,
     OUTPUT,
     TEST_CAMERAS,
     External,
@@ -72,20 +73,19 @@ def train_step(views: Views, parts: Parts) -> Step:
     densifier, rasterizer, options, seed = parts.trainer, parts.rasterizer, parts.train, parts.seed
     assert isinstance(densifier, Densifier)
     device, snapshot_at, user = parts.device, parts.measured_earlier, parts.user_code
-    values = dataclasses.asdict(options)
-    train_options = {
-        key: value for key, value in values.items() if key not in WITHOUT_EFFECT_ON_MODEL
-    }
+    effective = dataclasses.asdict(options)
+    for name in WITHOUT_EFFECT_ON_MODEL:
+        del effective[name]
     inputs: dict[str, Any] = {
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of("densify", densifier, user),
         "raster": rasterizer_inputs(rasterizer, user),
-        "train": train_options,
+        "train": effective,
         "seed": seed,
     }
     if snapshot_at:
-        inputs["snapshots"] = list(snapshot_at)
+        inputs["snapshots"] = snapshot_at
 
     def build(folder: Path) -> None:
         scene = views.scene
@@ -107,11 +107,10 @@ def train_step(views: Views, parts: Parts) -> Step:
             "iterations": trainer.step,
             "num_init_points": len(initial),
             "num_gaussians": len(gaussians),
-            "scene_extent": scene.extent / views.capture.normalization.scale,
             "seconds": trainer.seconds,
             "peak_memory_mb": peak_memory_mb(device),
         }
-        _write_training(folder, summary, densifier.lineage, device, start)
+        _write_training(folder, summary, densifier.lineage, views, device, start)
 
     return step_of(TRAIN, inputs, build, user)
 
@@ -141,15 +140,13 @@ def check_points(
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
-    """Log the coordinates of the training if they are not those of the scene, and V_th in the
-    scene's own units."""
+    """Log the coordinates of the training and V_th in the scene's own units, if they differ."""
     normalization = capture.normalization
     if normalization.is_identity:
         return
     log.info(
         "scene %s: training has its cameras around the origin, at %.6g times the scale (the given "
-        "centre is %s); "
-        "results get the given coordinates",
+        "centre is %s); results get the given coordinates",
         capture.name,
         normalization.scale,
         ", ".join(f"{value:.10g}" for value in normalization.center),
@@ -167,28 +164,26 @@ def _write_training(
     folder: Path,
     summary: Mapping[str, Any],
     lineage: Lineage | None,
+    views: Views,
     device: torch.device,
     start: InitialCloud,
 ) -> None:
-    """Write the lineage of a trained model, and the ``summary`` of the training with further
-    facts."""
-    causes: dict[str, int] = {}
+    """Write a trained model's lineage, and the ``summary`` of the training with more facts."""
     if lineage is not None:
-        causes = lineage.causes_of_living()
-        arrays: dict[str, Any] = {
-            name: tensor.numpy() for name, tensor in lineage.state_dict().items()
-        }
+        arrays: dict[str, Any] = lineage.state_dict()  # of tensors, which numpy converts
         np.savez_compressed(folder / LINEAGE, **arrays)
-    machine = {"machine": describe_machine(device), "checkout": own_checkout()}
-    write_json(
-        folder / TRAINING,
-        {**summary, "causes": causes, "initial_cloud": start.to_json(), **machine},
-    )
+    facts = {
+        "causes": {} if lineage is None else lineage.causes_of_living(),
+        "scene_extent": views.scene.extent / views.capture.normalization.scale,
+        "initial_cloud": start.to_json(),
+        "machine": describe_machine(device),
+        "checkout": own_checkout(),
+    }
+    write_json(folder / TRAINING, {**summary, **facts})
 
 
 def initial_gaussians(init: Path, device: torch.device) -> Gaussians:
-    """The Gaussians that training starts from: the initialiser's own in the folder ``init``, or one
-    per point."""
+    """The Gaussians that training starts from: the initialiser's own, or one for each point."""
     if (init / GAUSSIANS_FILE).exists():
         return read_ply(init / GAUSSIANS_FILE, device)
     cloud = read_cloud(init / MODEL_FOLDER)
@@ -205,104 +200,73 @@ OWN_VARIABLES = "GSBENCH_"  # prefix of gsbench's own settings, which the progra
 
 
 def external_step(views: Views, trainer: External, parts: Parts) -> Step:
-    """The step in which ``trainer`` trains on the training views, from the cloud of the
-    initialiser.
+    """The step in which ``trainer`` trains on the training views, from the initialiser's cloud.
 
     Raises InputError for a capture with masks.
     """
     if views.capture.masks:
         raise InputError(
             f"densify={parts.values['densify']['name']}: another program gets no masks, so it "
-            "would train on "
-            "ignored pixels: leave scene.masks out, or train with gsbench"
+            "would train on ignored pixels: leave scene.masks out, or train with gsbench"
         )
-    iterations, seed, device, threads = (
-        parts.train.iterations,
-        parts.seed,
-        parts.device,
-        parts.threads,
-    )
+    iterations, device = parts.train.iterations, parts.device
+    repetition = {"iterations": iterations, "seed": parts.seed}
     inputs: dict[str, Any] = {
         "contract": CONTRACT,
         "scene": views.inputs,
         "init": views.init.key,
         "densify": options_of("densify", trainer),
-        "iterations": iterations,
-        "seed": seed,
+        **repetition,
     }
 
     def build(folder: Path) -> None:
-        scene, cloud = views.scene, read_cloud(views.store.path(views.init) / MODEL_FOLDER)
+        cloud = read_cloud(views.store.path(views.init) / MODEL_FOLDER)
         normalization = views.capture.normalization
-        start = check_points(cloud.points, cloud.colors, scene, parts, normalization)
+        start = check_points(cloud.points, cloud.colors, views.scene, parts, normalization)
         executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
-        places = {name: work / name for name in (DATA, TEST_CAMERAS, OUTPUT)}
-        values = {name: str(place.resolve()) for name, place in places.items()} | trainer.options
-        values |= {
-            "iterations": iterations,
-            "seed": seed,
-            "device": str(device),
-            "threads": threads,
-        }
-        # for the record: the build's folders vanish
-        placeholders = {name: f"{{{name}}}" for name in places}
-        command = [
-            executable,
-            *(fill_placeholders(word, values, "densify.command") for word in trainer.words[1:]),
-        ]
+        places = {name: work / name for name in FOLDERS}
+        here = {"device": str(device), "threads": parts.threads}
+        values = {name: str(place.resolve()) for name, place in places.items()}
+        values |= trainer.options | repetition | here
         environment = environment_of(trainer, values)
-        version_output = check_version(trainer, values, environment)
-        places[OUTPUT].mkdir(parents=True)
-        write_training_views(places[DATA], scene.train, cloud, normalization)
+        said = check_version(trainer, values, environment)
+        output = places[OUTPUT]
+        output.mkdir(parents=True)
+        write_training_views(places[DATA], views.scene.train, cloud, normalization)
         if trainer.needs_test_cameras:
-            write_test_cameras(places[TEST_CAMERAS], scene.test, normalization)
-        log.info("train: %s runs; its output: %s", trainer.program, log_file)
+            write_test_cameras(places[TEST_CAMERAS], views.scene.test, normalization)
+        command = [executable, *filled_command(trainer, values)[1:]]
         limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
+        log.info("train: %s runs; its output: %s", trainer.program, log_file)
         try:
-            ended = run_program(command, log_file, places[OUTPUT], environment, limit)
+            ended = run_program(command, log_file, output, environment, limit)
         finally:
             for place in (DATA, TEST_CAMERAS):
                 shutil.rmtree(places[place], ignore_errors=True)
         log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
-        pattern = fill_placeholders(trainer.result, values, "densify.result")
-        count, lineage = None, None
-        try:
-            if trainer.leaves_model:
-                count = len(
-                    collect_model(places[OUTPUT], pattern, folder / POINT_CLOUD, normalization)
-                )
-                # without causes: which rule made a Gaussian is unknown here
-                lineage = Lineage(count)
-            else:
-                collect_renders(
-                    places[OUTPUT], pattern, trainer.by_order, scene.test, folder / RENDERS
-                )
-        except TrainingError as error:
-            raise TrainingError(
-                f"{Path(trainer.program).name} ended well, but {error}; log: {log_file}"
-            ) from error
+        count = collect_result(trainer, views, output, values, folder)
         shutil.rmtree(work)
         (folder / EVENTS).write_text("")
+        # The record keeps the names of the folders in the command, since the folders vanish.
+        nameless = values | {name: f"{{{name}}}" for name in places}
         summary = {
             "evaluated_from": FROM_MODEL if trainer.leaves_model else FROM_RENDERS,
             "num_gaussians": count,
             "iterations": iterations,
             "num_init_points": len(cloud),
-            "scene_extent": scene.extent / views.capture.normalization.scale,
             "seconds": ended.seconds,
             # Only the program itself could measure its memory on a GPU.
             "peak_memory_mb": ended.peak_memory_mb if device.type == "cpu" else None,
             "trained_by": {
                 "program": trainer.program,
                 "version": trainer.version,
-                "said": version_output,
-                "command": [
-                    fill_placeholders(word, values | placeholders, "densify.command")
-                    for word in trainer.words
-                ],
+                "said": said,
+                "command": filled_command(trainer, nameless),
             },
         }
-        _write_training(folder, summary, lineage, device, start)
+        # without causes: which rule of the program made a Gaussian is unknown here
+        lineage = None if count is None else Lineage(count)
+        _write_training(folder, summary, lineage, views, device, start)
 
     # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from
     # the beginning.
@@ -310,26 +274,48 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
     return step_of(stage, inputs, build)
 
 
+def filled_command(trainer: External, values: Mapping[str, object]) -> list[str]:
+    """The words of the program's command with ``values`` in place of the placeholders."""
+    return [fill_placeholders(word, values, "densify.command") for word in trainer.words]
+
+
+def collect_result(
+    trainer: External, views: Views, output: Path, values: Mapping[str, object], folder: Path
+) -> int | None:
+    """Move the model or the renders from ``output`` to ``folder``; returns a model's Gaussians.
+
+    Raises TrainingError, with the log's path, if the program left something else.
+    """
+    pattern = fill_placeholders(trainer.result, values, "densify.result")
+    try:
+        if trainer.leaves_model:
+            normalization = views.capture.normalization
+            return len(collect_model(output, pattern, folder / POINT_CLOUD, normalization))
+        collect_renders(output, pattern, trainer.by_order, views.scene.test, folder / RENDERS)
+        return None
+    except TrainingError as error:
+        raise TrainingError(
+            f"{Path(trainer.program).name} ended well, but {error}; log: {folder / TRAINER_LOG}"
+        ) from error
+
+
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
-    """The program's environment: gsbench's without its own variables, and what
-    ``densify.environment`` adds."""
+    """The program's environment: gsbench's without its variables, and ``densify.environment``."""
     # Without SAFE_PATH, too: a train.py must find the modules beside it.
-    inherited = {
+    environment = {
         name: value
         for name, value in os.environ.items()
         if not name.startswith(OWN_VARIABLES) and (name, value) != SAFE_PATH
     }
-    return inherited | {
-        name: fill_placeholders(text, values, f"densify.environment.{name}")
-        for name, text in trainer.environment.items()
-    }
+    for name, text in trainer.environment.items():
+        environment[name] = fill_placeholders(text, values, f"densify.environment.{name}")
+    return environment
 
 
 def check_version(
     trainer: External, values: Mapping[str, object], environment: Mapping[str, str]
 ) -> str | None:
-    """Run ``densify.version_command`` and return its output on one line; None if there is no such
-    command.
+    """Run ``densify.version_command``; return its output on one line, None without a command.
 
     Raises `InputError` unless the output contains ``densify.version``.
     """
@@ -359,7 +345,7 @@ def check_version(
     if trainer.version not in output:
         raise InputError(
             f"densify.version is {trainer.version!r}, but `{' '.join(command)}` says "
-            f"{output[:MAX_OUTPUT]!r}: results "
-            "are kept by the version, so set densify.version to what it is"
+            f"{output[:MAX_OUTPUT]!r}: results are kept by the version, so set densify.version "
+            "to what it is"
         )
     return output

@@ -26,12 +26,11 @@ PASSES = 3  # over the 31 bits of a positive float32
 
 @kernel
 def sort_by_depth(begins, visible, keys, order, spare, counts):
-    """Sort the ``keys`` of all shards by depth into ``order``; shard s has ``visible[s]`` keys from
-    ``begins[s]`` on.
+    """Sort the ``keys`` of all shards by depth into ``order``.
 
-    The sort is stable. ``spare`` is as long as ``order``; ``counts`` [PASSES, BUCKETS] is scratch.
-    It is a radix sort, lowest digit first (Knuth, TAOCP 3, 5.2.5), 3 to 8 times as fast as numpy's
-    sort.
+    Shard s has ``visible[s]`` keys from ``begins[s]`` on. The sort is stable. ``spare`` is as long
+    as ``order``; ``counts`` [PASSES, BUCKETS] is scratch. It is a radix sort, lowest digit first
+    (Knuth, TAOCP 3, 5.2.5), 3 to 8 times as fast as numpy's sort.
     """
     for digit in range(PASSES):
         for bucket in range(BUCKETS):
@@ -66,10 +65,10 @@ def _put(key, digit, counts, target):
 
 @inlined
 def _columns(records, base, tile_y, first, past, reach, flatness):
-    """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches: first,
-    past-the-last.
+    """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches.
 
-    The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear dy.
+    First, past-the-last. The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear
+    dy.
     """
     shear, mean_y = np.float64(records[base + at.SHEAR]), np.float64(records[base + at.MEAN_Y])
     top = tile_y * at.TILE - mean_y - PIXEL_MARGIN
@@ -91,12 +90,11 @@ def _columns(records, base, tile_y, first, past, reach, flatness):
 def pair_shards(
     first, past, edges, keys, records, record_ints, tiles_x, cutoff, counts, pairs, made
 ):
-    """Write all pairs of tile (high word) and record, for the shards ``first`` to ``past`` of the
-    sorted ``keys``.
+    """Write all pairs of tile (high word) and record of the shards ``first`` to ``past``.
 
-    Shard s has the keys from ``edges[s]`` to ``edges[s + 1]`` and writes to ``pairs[s]``.
-    ``counts[s]`` [tiles] gets the number of pairs of each tile, ``made[s]`` the total. Pairs for
-    which ``pairs`` has no room are only counted.
+    The shards are of the sorted ``keys``. Shard s has the keys from ``edges[s]`` to ``edges[s +
+    1]`` and writes to ``pairs[s]``. ``counts[s]`` [tiles] gets the number of pairs of each tile,
+    ``made[s]`` the total. Pairs for which ``pairs`` has no room are only counted.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -136,8 +134,10 @@ def _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts, pairs
 
 @kernel
 def start_tiles(counts, starts):
-    """Replace ``counts`` [shards, tiles] by places of first entries; fill ``starts`` [tiles + 1],
-    those of tiles."""
+    """Replace ``counts`` [shards, tiles] by places of first entries.
+
+    Fill ``starts`` [tiles + 1], those of tiles.
+    """
     shards, tiles = counts.shape
     place = 0
     for tile in range(tiles):
@@ -166,8 +166,10 @@ def fill_shards(first, past, made, pairs, places, entries):
 
 @kernel
 def balance_tiles(starts, shards, bounds, tile_shard):
-    """Divide the tiles into ``shards`` runs of similar work; fill ``bounds`` [shards + 1] and
-    ``tile_shard``."""
+    """Divide the tiles into ``shards`` runs of similar work.
+
+    Fill ``bounds`` [shards + 1] and ``tile_shard``.
+    """
     tiles = len(tile_shard)
     total = starts[tiles] + TILE_WORK * tiles
     tile = 0

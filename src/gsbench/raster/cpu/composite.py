@@ -2,6 +2,15 @@
 
 A tile is 16 blocks of 4x4 pixels. The state of a block is one vector per quantity. A bit mask has
 the blocks that a record may touch; the forward pass stores it in ``masks`` for the backward pass.
+
+The formulas are those of 3DGS (Kerbl et al. 2023, eq. 2 to 4; renderCUDA in its code). With the
+density G, the opacity o and the colour c of each record, front to back,
+
+    alpha = min(0.99, o G),  skipped below 1/255
+    image = sum of c alpha T + background T_end,  T = product of (1 - alpha) of the records before
+
+and a pixel stops before the record that would lower T below 1e-4. Densities are powers of 2 here,
+because `simd.exp2` is an exponential in few instructions; numba would call one per lane.
 """
 
 import math
@@ -51,15 +60,52 @@ NEVER_STOPPED = np.float32(1e9)  # larger than the number of entries of any tile
 # ``lane_sums``.
 COVERED, VALUES, DISTANCES = at.SUM_H, at.SUM_H_T, at.SUM_H_Y
 
+BLOCKS = np.arange(LANES).reshape(-1, 1)  # [16, 1]
 LANE_X = (np.arange(LANES) % BLOCK).astype(np.float32)  # px within a block
 LANE_Y = (np.arange(LANES) // BLOCK).astype(np.float32)
 # px within a tile, by block and lane
-PIXEL_X = np.concatenate([block % BLOCK * BLOCK + LANE_X for block in range(LANES)]).astype(
-    np.float32
-)
-PIXEL_Y = np.concatenate([block // BLOCK * BLOCK + LANE_Y for block in range(LANES)]).astype(
-    np.float32
-)
+PIXEL_X = (BLOCKS % BLOCK * BLOCK + LANE_X).astype(np.float32).ravel()
+PIXEL_Y = (BLOCKS // BLOCK * BLOCK + LANE_Y).astype(np.float32).ravel()
+
+
+@inlined
+def _origin(tile, tiles_x):
+    """The column and row of the first pixel of a tile."""
+    return tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
+
+
+@inlined
+def _corner(block, left, top):
+    """The column and row of the first pixel of a block, in the tile at pixel (left, top)."""
+    return left + block % 4 * BLOCK, top + block // 4 * BLOCK
+
+
+@inlined
+def _planes(floats):
+    """The memory of red, green and blue of a tile, by block and lane."""
+    return floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :], floats[2 * at.TILE_PIXELS :]
+
+
+@inlined
+def _load_planes(planes, place):
+    return load(planes[0], place), load(planes[1], place), load(planes[2], place)
+
+
+@inlined
+def _store_planes(planes, place, red, green, blue):
+    store(planes[0], place, red)
+    store(planes[1], place, green)
+    store(planes[2], place, blue)
+
+
+@inlined
+def _log2_alpha(dx, dy, shear, curve_t, curve_y, log2_opacity):
+    """log2(alpha) before the clamp, and t; see `layout`.
+
+    All kernels call this function, so that they round alike and blend the same pixels.
+    """
+    t = fma(dy, shear, dx)
+    return fma(dy * curve_y, dy, fma(t * curve_t, t, log2_opacity)), t
 
 
 @inlined
@@ -70,9 +116,8 @@ def _touched_blocks(records, base, tile_x, tile_y, column, row):
     the mean. The maximum on a vertical or horizontal line has a closed form, which is clamped to
     the block. Lane b is block b.
     """
-    left = column + (
-        tile_x - records[base + at.MEAN_X]
-    )  # [16] dx of the first column of each block
+    # [16] dx of the first column of each block, dy of its first row
+    left = column + (tile_x - records[base + at.MEAN_X])
     top = row + (tile_y - records[base + at.MEAN_Y])
     right, bottom = left + BLOCK_SPAN, top + BLOCK_SPAN
     shear = records[base + at.SHEAR]
@@ -99,43 +144,14 @@ def composite_tiles(memory, first, past, frame, image, alpha):
     It fills ``masks``, ``processed``, ``transmittance`` and ``last`` of ``frame`` for the backward
     pass. ``last`` is `NEVER_STOPPED` for pixels that no entry stopped, and 0 outside the image.
     """
-    entries, masks, records = frame.entries, frame.masks, frame.records
-    transmittance, last = frame.transmittance, frame.last
-    tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
-    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
-    column, row = lane_x * np.float32(BLOCK), lane_y * np.float32(BLOCK)
     floats, integers = memory
-    red, green, blue = (
-        floats[: at.TILE_PIXELS],
-        floats[at.TILE_PIXELS :],
-        floats[2 * at.TILE_PIXELS :],
-    )
-    batch = floats[3 * at.TILE_PIXELS :]  # [BATCH * RECORD]
-    live, touched = (
-        integers[:LANES],
-        integers[LANES:].view(np.uint16),
-    )  # [16] pixels by block, [BATCH] blocks by entry
+    planes, batch = _planes(floats), floats[3 * at.TILE_PIXELS :]  # batch: [BATCH * RECORD]
+    # [16] pixels that have not stopped, by block; [BATCH] blocks, by entry
+    live, touched = integers[:LANES], integers[LANES:].view(np.uint16)
     for tile in range(first, past):
-        left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
-        tile_x, tile_y = np.float32(left), np.float32(top)
+        left, top = _origin(tile, frame.camera.tiles_x)
         state = tile * at.TILE_PIXELS
-        alive = np.uint64(0)  # bit b: block b has a pixel that has not stopped
-        for block in range(16):
-            place = block * LANES
-            store(red, place, splat(ZERO))
-            store(green, place, splat(ZERO))
-            store(blue, place, splat(ZERO))
-            store(transmittance, state + place, splat(ONE))
-            x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
-            live[block] = mask_bits(
-                (lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y))
-            )
-            store(
-                last, state + place, select(mask_from_bits(live[block]), splat(NEVER_STOPPED), ZERO)
-            )
-            if live[block] != 0:
-                alive |= np.uint64(1) << np.uint64(block)
-
+        alive = _start_blocks(left, top, state, frame, planes, live)
         # Entries are blended in batches, and within a batch block by block. So the state of a block
         # stays in registers for a whole batch; entry by entry, it would be loaded and stored for
         # every entry, and each load would wait for the store before it. The first loop has no
@@ -145,101 +161,139 @@ def composite_tiles(memory, first, past, frame, image, alpha):
         entry = begin
         while entry < end and alive != 0:
             count = min(BATCH, end - entry)
-            for k in range(count):
-                base = entries[entry + k] * at.RECORD
-                prefetch(records, entries[min(entry + k + BATCH_AHEAD, end - 1)] * at.RECORD)
-                blocks = _touched_blocks(records, base, tile_x, tile_y, column, row) & alive
-                touched[k] = blocks
-                masks[entry + k] = blocks
-                store(batch, k * at.RECORD, load(records, base))
-                # from mean to tile
-                batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]
-                batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
-            for k in range(count, BATCH):
-                touched[k] = 0
+            _gather_batch(entry, count, end, left, top, alive, frame, batch, touched)
             blocks = alive
             while blocks != 0:
                 block = lowest_bit(blocks)
-                bit = np.uint64(1) << block
                 blocks &= blocks - np.uint64(1)
                 # bit k: entry k of the batch touches this block
-                todo = lanes_with_bit(touched, 0, bit)
-                if todo == 0:
-                    continue
-                place = block * np.uint64(LANES)
-                pixel_x, pixel_y = load(PIXEL_X, place), load(PIXEL_Y, place)
-                before = load(transmittance, state + place)
-                r, g, b = load(red, place), load(green, place), load(blue, place)
-                lanes = mask_from_bits(live[block])
-                while todo != 0:
-                    k = lowest_bit(todo)
-                    todo &= todo - np.uint64(1)
-                    base = k * np.uint64(at.RECORD)
-                    dx = pixel_x + batch[base + np.uint64(at.MEAN_X)]
-                    dy = pixel_y + batch[base + np.uint64(at.MEAN_Y)]
-                    t = fma(dy, batch[base + np.uint64(at.SHEAR)], dx)
-                    along_t = fma(
-                        t * batch[base + np.uint64(at.CURVE_T)],
-                        t,
-                        batch[base + np.uint64(at.LOG2_OPACITY)],
+                todo = lanes_with_bit(touched, 0, np.uint64(1) << block)
+                if todo != 0:
+                    alive = _blend_batch(
+                        block, todo, entry, entry - begin, state, frame, planes, batch, live, alive
                     )
-                    # log2(alpha)
-                    power = fma(dy * batch[base + np.uint64(at.CURVE_Y)], dy, along_t)
-                    blend = (power >= LOG2_ALPHA_MIN) & lanes
-                    weight = before * minimum(exp2(power), splat(ALPHA_MAX))
-                    after = before - weight
-                    stop = blend & (after < TRANSMITTANCE_MIN)
-                    stopped = mask_bits(stop)
-                    if stopped != 0:
-                        number = np.float32(entry - begin + np.int64(k))
-                        store(
-                            last,
-                            state + place,
-                            select(stop, splat(number), load(last, state + place)),
-                        )
-                        live[block] &= ~np.int64(stopped)
-                        lanes = mask_from_bits(live[block])
-                        blend = blend & ~stop
-                        if live[block] == 0:
-                            alive &= ~bit
-                            # later entries do not change this block: the backward pass skips them
-                            while todo != 0:
-                                masks[entry + np.int64(lowest_bit(todo))] &= ~bit
-                                todo &= todo - np.uint64(1)
-                    weight = select(blend, weight, ZERO)
-                    r = fma(weight, batch[base + np.uint64(at.RED)], r)
-                    g = fma(weight, batch[base + np.uint64(at.GREEN)], g)
-                    b = fma(weight, batch[base + np.uint64(at.BLUE)], b)
-                    before = select(blend, after, before)
-                store(transmittance, state + place, before)
-                store(red, place, r)
-                store(green, place, g)
-                store(blue, place, b)
             entry += count
         frame.processed[tile] = entry
+        _write_blocks(left, top, state, frame, planes, image, alpha)
 
-        for block in range(16):
-            place = block * LANES
-            x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
-            behind = load(transmittance, state + place)
-            r = fma(behind, frame.background[0], load(red, place))
-            g = fma(behind, frame.background[1], load(green, place))
-            b = fma(behind, frame.background[2], load(blue, place))
-            if x + BLOCK <= width and y + BLOCK <= height:
-                pixel = y * width + x
-                store_colors(image, CHANNELS * pixel, CHANNELS * width, r, g, b)
-                store_block(alpha, pixel, width, ONE - behind)
-                continue
-            store(red, place, r)
-            store(green, place, g)
-            store(blue, place, b)
-            for lane in range(LANES):  # a block across the image's edge
-                if x + lane % 4 < width and y + lane // 4 < height:
-                    pixel = (y + lane // 4) * width + x + lane % 4
-                    image[CHANNELS * pixel] = red[place + lane]
-                    image[CHANNELS * pixel + 1] = green[place + lane]
-                    image[CHANNELS * pixel + 2] = blue[place + lane]
-                    alpha[pixel] = ONE - transmittance[state + place + lane]
+
+@inlined
+def _start_blocks(left, top, state, frame, planes, live):
+    """Start the blocks of a tile: T = 1, no colour; return the blocks with a pixel as bits."""
+    width, height = frame.camera.width, frame.camera.height
+    lane_x, lane_y = load(LANE_X, 0), load(LANE_Y, 0)
+    alive = np.uint64(0)
+    for block in range(16):
+        place = block * LANES
+        _store_planes(planes, place, splat(ZERO), splat(ZERO), splat(ZERO))
+        store(frame.transmittance, state + place, splat(ONE))
+        x, y = _corner(block, left, top)
+        inside = (lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y))
+        live[block] = mask_bits(inside)
+        store(frame.last, state + place, select(inside, splat(NEVER_STOPPED), ZERO))
+        if live[block] != 0:
+            alive |= np.uint64(1) << np.uint64(block)
+    return alive
+
+
+@inlined
+def _gather_batch(entry, count, end, left, top, alive, frame, batch, touched):
+    """Copy the records of ``count`` entries from ``entry``; fill ``touched`` and ``frame.masks``.
+
+    The mean of a copied record is the vector from the mean to the tile.
+    """
+    entries, records = frame.entries, frame.records
+    tile_x, tile_y = np.float32(left), np.float32(top)
+    column, row = load(LANE_X, 0) * np.float32(BLOCK), load(LANE_Y, 0) * np.float32(BLOCK)
+    for k in range(count):
+        base = entries[entry + k] * at.RECORD
+        prefetch(records, entries[min(entry + k + BATCH_AHEAD, end - 1)] * at.RECORD)
+        blocks = _touched_blocks(records, base, tile_x, tile_y, column, row) & alive
+        touched[k] = blocks
+        frame.masks[entry + k] = blocks
+        store(batch, k * at.RECORD, load(records, base))
+        batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]
+        batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
+    for k in range(count, BATCH):
+        touched[k] = 0
+
+
+@inlined
+def _blend_batch(block, todo, entry, before_batch, state, frame, planes, batch, live, alive):
+    """Blend the entries ``todo`` of the batch at ``entry`` into a block; return ``alive``.
+
+    The list of the tile has ``before_batch`` entries before the batch.
+    """
+    bit = np.uint64(1) << block
+    place = block * np.uint64(LANES)
+    pixel_x, pixel_y = load(PIXEL_X, place), load(PIXEL_Y, place)
+    before = load(frame.transmittance, state + place)
+    r, g, b = _load_planes(planes, place)
+    lanes = mask_from_bits(live[block])
+    while todo != 0:
+        k = lowest_bit(todo)
+        todo &= todo - np.uint64(1)
+        base = k * np.uint64(at.RECORD)
+        power, _ = _log2_alpha(
+            pixel_x + batch[base + np.uint64(at.MEAN_X)],
+            pixel_y + batch[base + np.uint64(at.MEAN_Y)],
+            batch[base + np.uint64(at.SHEAR)],
+            batch[base + np.uint64(at.CURVE_T)],
+            batch[base + np.uint64(at.CURVE_Y)],
+            batch[base + np.uint64(at.LOG2_OPACITY)],
+        )
+        blend = (power >= LOG2_ALPHA_MIN) & lanes
+        weight = before * minimum(exp2(power), splat(ALPHA_MAX))
+        after = before - weight
+        stop = blend & (after < TRANSMITTANCE_MIN)
+        stopped = mask_bits(stop)
+        if stopped != 0:
+            number = splat(np.float32(before_batch + np.int64(k)))
+            earlier = load(frame.last, state + place)
+            store(frame.last, state + place, select(stop, number, earlier))
+            live[block] &= ~np.int64(stopped)
+            lanes = mask_from_bits(live[block])
+            blend = blend & ~stop
+            if live[block] == 0:
+                alive &= ~bit
+                # later entries do not change this block: the backward pass skips them
+                while todo != 0:
+                    frame.masks[entry + np.int64(lowest_bit(todo))] &= ~bit
+                    todo &= todo - np.uint64(1)
+        weight = select(blend, weight, ZERO)
+        r = fma(weight, batch[base + np.uint64(at.RED)], r)
+        g = fma(weight, batch[base + np.uint64(at.GREEN)], g)
+        b = fma(weight, batch[base + np.uint64(at.BLUE)], b)
+        before = select(blend, after, before)
+    store(frame.transmittance, state + place, before)
+    _store_planes(planes, place, r, g, b)
+    return alive
+
+
+@inlined
+def _write_blocks(left, top, state, frame, planes, image, alpha):
+    """Add the background behind a tile and write its pixels to the image."""
+    width, height = frame.camera.width, frame.camera.height
+    for block in range(16):
+        place = block * LANES
+        x, y = _corner(block, left, top)
+        behind = load(frame.transmittance, state + place)
+        r, g, b = _load_planes(planes, place)
+        r = fma(behind, frame.background[0], r)
+        g = fma(behind, frame.background[1], g)
+        b = fma(behind, frame.background[2], b)
+        if x + BLOCK <= width and y + BLOCK <= height:
+            pixel = y * width + x
+            store_colors(image, CHANNELS * pixel, CHANNELS * width, r, g, b)
+            store_block(alpha, pixel, width, ONE - behind)
+            continue
+        _store_planes(planes, place, r, g, b)
+        for lane in range(LANES):  # a block across the image's edge
+            if x + lane % 4 < width and y + lane // 4 < height:
+                pixel = (y + lane // 4) * width + x + lane % 4
+                for channel in range(CHANNELS):
+                    image[CHANNELS * pixel + channel] = planes[channel][place + lane]
+                alpha[pixel] = ONE - frame.transmittance[state + place + lane]
 
 
 @inlined
@@ -250,65 +304,32 @@ def place_in_tile(x, y):
 
 @kernel
 def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_rows, want_absolute):
-    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to the rows of their
-    shards in ``all_rows`` [shards, N * 16].
+    """Add the gradient sums of the tiles ``first`` to ``past``, back to front, to ``all_rows``.
 
     c is the colour of a record, g the gradient of the pixel, T the transmittance before the record.
     U is the sum over the later records and the background of (c . g) alpha T, divided by the
     transmittance behind the record. The derivative of the loss by the record's alpha is T (c . g -
     U), and U for the previous record is U + alpha (c . g - U). So, back to front, U is a sequence
     of weighted means that starts with the background: nothing cancels, and the only division per
-    record is that for T. An empty ``g_alpha`` stands for zero. ``want_absolute`` is True or None,
-    so that numba removes its branch at compilation.
+    record is that for T.
+
+    Each shard of tiles has its rows in ``all_rows`` [shards, N * 16]. An empty ``g_alpha`` stands
+    for zero. ``want_absolute`` is True or None, so that numba removes its branch at compilation.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
-    tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     floats, _ = memory
-    red, green, blue = (
-        floats[: at.TILE_PIXELS],
-        floats[at.TILE_PIXELS :],
-        floats[2 * at.TILE_PIXELS :],
-    )
+    planes = _planes(floats)  # the gradient of the image
     # U, and T behind the current record
     behind, through = floats[3 * at.TILE_PIXELS :], floats[4 * at.TILE_PIXELS :]
     for tile in range(first, past):
         rows = all_rows[frame.tile_shard[tile]]
-        left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
+        left, top = _origin(tile, frame.camera.tiles_x)
         tile_x, tile_y = np.float32(left), np.float32(top)
         state = tile * at.TILE_PIXELS
         begin, end = frame.starts[tile], frame.processed[tile]
         if begin == end:
             continue
-        for block in range(16):
-            place = block * LANES
-            x, y = left + block % 4 * BLOCK, top + block // 4 * BLOCK
-            if x + BLOCK <= width and y + BLOCK <= height:
-                r, g, b = load_colors(g_image, CHANNELS * (y * width + x), CHANNELS * width)
-                store(red, place, r)
-                store(green, place, g)
-                store(blue, place, b)
-                continue
-            for lane in range(LANES):  # a block across the image's edge
-                red[place + lane] = green[place + lane] = blue[place + lane] = ZERO
-                if x + lane % 4 < width and y + lane // 4 < height:
-                    pixel = (y + lane // 4) * width + x + lane % 4
-                    red[place + lane] = g_image[CHANNELS * pixel]
-                    green[place + lane] = g_image[CHANNELS * pixel + 1]
-                    blue[place + lane] = g_image[CHANNELS * pixel + 2]
-        for place in range(at.TILE_PIXELS):
-            behind[place] = ZERO
-        if len(g_alpha) > 0:
-            for y in range(top, min(top + at.TILE, height)):
-                for x in range(left, min(left + at.TILE, width)):
-                    behind[place_in_tile(x - left, y - top)] = -g_alpha[y * width + x]
-        for place in range(0, at.TILE_PIXELS, LANES):
-            final = load(frame.transmittance, state + place)
-            light = fma(load(red, place), frame.background[0], load(behind, place))
-            light = fma(load(green, place), frame.background[1], light)
-            light = fma(load(blue, place), frame.background[2], light)
-            store(behind, place, light)
-            store(through, place, final)
-
+        _start_backward(left, top, state, frame, g_image, g_alpha, planes, behind, through)
         for entry in range(end - 1, begin - 1, -1):
             ahead = max(entry - AHEAD, begin)
             if masks[ahead] != 0:
@@ -318,10 +339,8 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            offset_x, offset_y = (
-                tile_x - records[base + at.MEAN_X],
-                tile_y - records[base + at.MEAN_Y],
-            )
+            offset_x = tile_x - records[base + at.MEAN_X]
+            offset_y = tile_y - records[base + at.MEAN_Y]
             number = splat(np.float32(entry - begin + 1))
             sum_r, sum_g, sum_b = splat(ZERO), splat(ZERO), splat(ZERO)
             sum_h, sum_ht, sum_hy = splat(ZERO), splat(ZERO), splat(ZERO)
@@ -333,19 +352,26 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                 place = block * np.uint64(LANES)
                 dx = load(PIXEL_X, place) + offset_x
                 dy = load(PIXEL_Y, place) + offset_y
-                t = fma(dy, records[base + at.SHEAR], dx)
-                along_t = fma(t * records[base + at.CURVE_T], t, records[base + at.LOG2_OPACITY])
-                power = fma(dy * records[base + at.CURVE_Y], dy, along_t)  # log2(alpha)
+                power, t = _log2_alpha(
+                    dx,
+                    dy,
+                    records[base + at.SHEAR],
+                    records[base + at.CURVE_T],
+                    records[base + at.CURVE_Y],
+                    records[base + at.LOG2_OPACITY],
+                )
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 raw = select(blended, exp2(power), ZERO)
                 opacity = minimum(raw, splat(ALPHA_MAX))
                 before = load(through, place) / (ONE - opacity)
                 weight = before * opacity
-                g_red, g_green, g_blue = load(red, place), load(green, place), load(blue, place)
+                g_red, g_green, g_blue = _load_planes(planes, place)
                 light = fma(g_green, records[base + at.GREEN], g_blue * records[base + at.BLUE])
-                light = fma(g_red, records[base + at.RED], light)
+                light = fma(g_red, records[base + at.RED], light)  # c . g
                 later = load(behind, place)
                 gain = light - later
+                # d loss / d log(alpha). The gradient passes the clamp to 0.99, as in 3DGS: hence
+                # the raw alpha.
                 h = before * raw * gain
                 store(behind, place, fma(opacity, gain, later))
                 store(through, place, before)
@@ -366,64 +392,77 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                     shear_a = records[base + at.SHEAR] * records[base + at.CURVE_T]
                     slope = fma(ht, shear_a, hy * records[base + at.CURVE_Y])
                     sum_abs_y += absolute(slope) * TO_PRECISION
+            moments = (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b)
             if want_absolute is not None:
-                sums = lane_sums(
-                    (
-                        sum_h,
-                        sum_ht,
-                        sum_hy,
-                        sum_htt,
-                        sum_hty,
-                        sum_hyy,
-                        sum_r,
-                        sum_g,
-                        sum_b,
-                        sum_abs_t,
-                        sum_abs_y,
-                    )
-                )
+                sums = lane_sums((*moments, sum_abs_t, sum_abs_y))
             else:
-                sums = lane_sums(
-                    (sum_h, sum_ht, sum_hy, sum_htt, sum_hty, sum_hyy, sum_r, sum_g, sum_b)
-                )
+                sums = lane_sums(moments)
             store(rows, base, load(rows, base) + sums)
+
+
+@inlined
+def _start_backward(left, top, state, frame, g_image, g_alpha, planes, behind, through):
+    """Load the gradient of a tile's pixels, and start U with the background and T with T_end."""
+    width, height = frame.camera.width, frame.camera.height
+    for block in range(16):
+        place = block * LANES
+        x, y = _corner(block, left, top)
+        if x + BLOCK <= width and y + BLOCK <= height:
+            r, g, b = load_colors(g_image, CHANNELS * (y * width + x), CHANNELS * width)
+            _store_planes(planes, place, r, g, b)
+            continue
+        for lane in range(LANES):  # a block across the image's edge
+            inside = x + lane % 4 < width and y + lane // 4 < height
+            pixel = (y + lane // 4) * width + x + lane % 4
+            for channel in range(CHANNELS):
+                value = g_image[CHANNELS * pixel + channel] if inside else ZERO
+                planes[channel][place + lane] = value
+    _place_image(g_alpha, left, top, width, height, behind)
+    for place in range(0, at.TILE_PIXELS, LANES):
+        final = load(frame.transmittance, state + place)
+        red, green, blue = _load_planes(planes, place)
+        light = fma(red, frame.background[0], -load(behind, place))
+        light = fma(green, frame.background[1], light)
+        store(behind, place, fma(blue, frame.background[2], light))
+        store(through, place, final)
+
+
+@inlined
+def _place_image(image, left, top, width, height, out):
+    """Copy the pixels of a tile from ``image`` [H * W] to ``out``, by block and lane.
+
+    Pixels outside the image are 0, as are all of an empty ``image``.
+    """
+    for pixel in range(at.TILE_PIXELS):
+        out[pixel] = ZERO
+    if len(image) > 0:
+        for y in range(top, min(top + at.TILE, height)):
+            for x in range(left, min(left + at.TILE, width)):
+                out[place_in_tile(x - left, y - top)] = image[y * width + x]
 
 
 @kernel
 def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
-    """Add the footprints of the tiles ``first`` to ``past`` to ``covered`` [N] int32, ``sums`` and
-    ``distances`` [N] of their shards.
+    """Add the footprints of the tiles ``first`` to ``past``.
 
-    An empty ``values`` [H * W] stands for zero. The arithmetic is that of the compositing kernels,
-    so that the same pixels count as blended.
+    Their shards have ``covered`` [N] int32, ``sums`` and ``distances`` [N]. An empty ``values``
+    [H * W] stands for zero.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
-    tiles_x, width, height = frame.camera.tiles_x, frame.camera.width, frame.camera.height
     floats, _ = memory
     own, row = floats[: at.TILE_PIXELS], floats[at.TILE_PIXELS :]
     for tile in range(first, past):
-        left, top = tile % tiles_x * at.TILE, tile // tiles_x * at.TILE
-        tile_x, tile_y = np.float32(left), np.float32(top)
+        left, top = _origin(tile, frame.camera.tiles_x)
         state = tile * at.TILE_PIXELS
         begin = frame.starts[tile]
-        for pixel in range(at.TILE_PIXELS):
-            own[pixel] = ZERO
-        if len(values) > 0:
-            for y in range(top, min(top + at.TILE, height)):
-                for x in range(left, min(left + at.TILE, width)):
-                    own[place_in_tile(x - left, y - top)] = values[y * width + x]
+        _place_image(values, left, top, frame.camera.width, frame.camera.height, own)
         for entry in range(begin, frame.processed[tile]):
             todo = np.uint64(masks[entry])
             if todo == 0:
                 continue
             base = entries[entry] * at.RECORD
-            shear = splat(records[base + at.SHEAR])
-            curve_t, curve_y = splat(records[base + at.CURVE_T]), splat(records[base + at.CURVE_Y])
-            log2_opacity = splat(records[base + at.LOG2_OPACITY])
-            offset_x, offset_y = (
-                tile_x - records[base + at.MEAN_X],
-                tile_y - records[base + at.MEAN_Y],
-            )
+            offset_x = np.float32(left) - records[base + at.MEAN_X]
+            offset_y = np.float32(top) - records[base + at.MEAN_Y]
             number = splat(np.float32(entry - begin + 1))
             count, total, reach = splat(ZERO), splat(ZERO), splat(ZERO)
             while todo != 0:
@@ -432,8 +471,14 @@ def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
                 place = block * np.uint64(LANES)
                 dx = load(PIXEL_X, place) + offset_x
                 dy = load(PIXEL_Y, place) + offset_y
-                t = fma(dy, shear, dx)
-                power = fma(curve_y * dy, dy, fma(curve_t * t, t, log2_opacity))
+                power, _ = _log2_alpha(
+                    dx,
+                    dy,
+                    records[base + at.SHEAR],
+                    records[base + at.CURVE_T],
+                    records[base + at.CURVE_Y],
+                    records[base + at.LOG2_OPACITY],
+                )
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 count += select(blended, splat(ONE), ZERO)
                 total += select(blended, load(own, place), ZERO)

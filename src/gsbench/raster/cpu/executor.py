@@ -1,5 +1,7 @@
-"""The compiled CPU rasterizer: the stages of the forward and the backward pass, run on several
-threads."""
+"""The compiled CPU rasterizer.
+
+The stages of the forward and the backward pass, run on several threads.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -55,11 +57,11 @@ class ForwardPass:
 
 
 class CpuRasterizer(StagedRasterizer[ForwardPass]):
-    """float32 on the CPU, compiled by numba at first use. Same bits on every run and for any number
-    of ``threads``.
+    """float32 on the CPU, compiled by numba at first use.
 
-    Each render keeps its intermediate results until its graph is freed; then their memory is
-    reused. Several threads may call it at once.
+    Same bits on every run and for any number of ``threads``. Each render keeps its intermediate
+    results until its graph is freed; then their memory is reused. Several threads may call it at
+    once.
     """
 
     name = "cpu"
@@ -91,10 +93,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
     ) -> tuple[Tensor, Tensor, Tensor, ForwardPass]:
         """Project, sort, bin, composite; see `StagedRasterizer`."""
         count, view = len(gaussians), CameraNumbers.of(request.camera)
-        image, alpha = (
-            self._tensors.empty((view.height, view.width, 3)),
-            self._tensors.empty((view.height, view.width)),
-        )
+        image = self._tensors.empty((view.height, view.width, 3))
+        alpha = self._tensors.empty((view.height, view.width))
         radii = torch.empty(count, dtype=torch.int32)
         arena = self._frames.lease(request.lifetime)
         records = arena.take("records", (count * at.RECORD,), np.float32)
@@ -154,8 +154,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         order: NDArray[np.uint64],
         records: NDArray[np.float32],
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Starts of the lists of tiles, [tiles + 1], and the records of all lists, front to
-        back."""
+        """Starts of the lists of tiles, [tiles + 1], and the records of all, front to back."""
         tiles = view.tiles_x * view.tiles_y
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
@@ -219,8 +218,10 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         rows: NDArray[np.float32],
         want_splitting: bool,
     ) -> Gradients:
-        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``, if
-        given."""
+        """Compute all gradients from the gradient sums in ``rows``.
+
+        Fill ``request.absolute``, if given.
+        """
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
@@ -232,12 +233,12 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             request.degree,
             passed.frame,
             rows.reshape(-1),
-            _arrays(gradients),
-            g_screen.numpy(),
-            np.empty((0, 2), np.float32) if request.absolute is None else request.absolute.numpy(),
-            np.empty((0, 9), np.float32)
-            if g_splitting is None
-            else g_splitting.numpy().reshape(-1, 9),
+            (
+                _arrays(gradients),
+                g_screen.numpy(),
+                _rows_or_none(request.absolute, 2),
+                _rows_or_none(g_splitting, 9),
+            ),
         )
 
         def backproject(first: int, past: int) -> None:
@@ -282,6 +283,15 @@ def _edges(count: int) -> NDArray[np.int64]:
 def _tiles(frame: at.CpuFrame, first: int, past: int) -> tuple[Any, ...]:
     """The first arguments of the kernels that process tiles, for a range of shards."""
     return at.kernel_memory(), int(frame.bounds[first]), int(frame.bounds[past]), frame
+
+
+def _rows_or_none(tensor: Tensor | None, columns: int) -> NDArray[np.float32]:
+    """``tensor`` as rows of ``columns``; no rows for None, which kernels cannot take."""
+    return np.empty((0, columns), np.float32) if tensor is None else _flat(tensor, columns)
+
+
+def _flat(tensor: Tensor, columns: int) -> NDArray[np.float32]:
+    return tensor.numpy().reshape(-1, columns)
 
 
 def _arrays(gaussians: Gaussians) -> at.Parameters:

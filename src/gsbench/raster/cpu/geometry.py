@@ -19,6 +19,7 @@ from gsbench.raster.cpu.simd import (
     load,
     maximum,
     minimum,
+    scatter,
     splat,
     square_root,
     store,
@@ -27,7 +28,7 @@ from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
 BLUR = CONSTANTS.blur
-# beyond, exp2 is undefined. The variance of a scale of 2^126 is not finite, so it is culled
+# Beyond, exp2 is undefined. The variance of a scale of 2^126 is not finite, so it is culled.
 MAX_LOG2 = 126.0
 F0, F1 = np.float32(C0), np.float32(C1)
 D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)
@@ -40,61 +41,6 @@ MATRIX = LANES * LANES
 @inlined
 def exponential(x):
     return exp2(maximum(minimum(x * LOG2_E, MAX_LOG2), -MAX_LOG2))
-
-
-@inlined
-def rotation_matrix(w, x, y, z):
-    """The rows of the rotation matrix of a unit quaternion."""
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-@inlined
-def from_camera(mean, v):
-    """The vector from the camera centre to the mean, in world axes.
-
-    It is computed first: rotating the difference loses no digits, even if the scene is far from the
-    origin.
-    """
-    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
-
-
-@inlined
-def to_view(offset, v):
-    x = offset[0] * v.r00 + offset[1] * v.r01 + offset[2] * v.r02
-    y = offset[0] * v.r10 + offset[1] * v.r11 + offset[2] * v.r12
-    z = offset[0] * v.r20 + offset[1] * v.r21 + offset[2] * v.r22
-    return x, y, z
-
-
-@inlined
-def image_axes(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped
-    slopes."""
-    slope_x = minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max)
-    slope_y = minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max)
-    first, second = image_rows(slope_x, slope_y, inverse_z, v)
-    return first, second, slope_x, slope_y
-
-
-@inlined
-def image_rows(slope_x, slope_y, inverse_z, v):
-    """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
-    jx, jy = inverse_z * v.fx, inverse_z * v.fy
-    first = (
-        jx * (v.r00 - slope_x * v.r20),
-        jx * (v.r01 - slope_x * v.r21),
-        jx * (v.r02 - slope_x * v.r22),
-    )
-    second = (
-        jy * (v.r10 - slope_y * v.r20),
-        jy * (v.r11 - slope_y * v.r21),
-        jy * (v.r12 - slope_y * v.r22),
-    )
-    return first, second
 
 
 @inlined
@@ -113,13 +59,96 @@ def times(row, matrix):
 
 
 @inlined
+def through(matrix, column):
+    """``matrix`` [3, 3] times ``column`` [3]."""
+    return dot(column, matrix[0]), dot(column, matrix[1]), dot(column, matrix[2])
+
+
+@inlined
 def scaled(row, scales):
     return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
 
 
 @inlined
+def stretched(row, factor):
+    return row[0] * factor, row[1] * factor, row[2] * factor
+
+
+@inlined
+def plus(a, factor, b):
+    """``a + factor * b`` of two vectors [3]."""
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
+
+
+@inlined
+def mixed(p, a, q, b):
+    """``p * a + q * b`` of two vectors [3]."""
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
+
+
+@inlined
+def rotation_matrix(quaternion):
+    """The rows of the rotation matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@inlined
+def view_axes(v):
+    """The rows of the camera's rotation W, from world to view."""
+    return (v.r00, v.r01, v.r02), (v.r10, v.r11, v.r12), (v.r20, v.r21, v.r22)
+
+
+@inlined
+def from_camera(mean, v):
+    """The vector from the camera centre to the mean, in world axes.
+
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the
+    origin.
+    """
+    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
+
+
+@inlined
+def clamped_slopes(slope_x, slope_y, v):
+    """x/z and y/z within the limits of the Jacobian (`raster.base.slope_limits`)."""
+    return (
+        minimum(maximum(slope_x, v.slope_x_min), v.slope_x_max),
+        minimum(maximum(slope_y, v.slope_y_min), v.slope_y_max),
+    )
+
+
+@inlined
+def image_rows(slope_x, slope_y, inverse_z, v):
+    """A = J W, the derivative of the pixel by the world position, as two rows.
+
+    J is the derivative of x fx / z and y fy / z by the position in view space, at the slopes x/z
+    and y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
+    """
+    right, down, ahead = view_axes(v)
+    first = stretched(plus(right, -slope_x, ahead), inverse_z * v.fx)
+    return first, stretched(plus(down, -slope_y, ahead), inverse_z * v.fy)
+
+
+@inlined
+def exponentials(row):
+    return exponential(row[0]), exponential(row[1]), exponential(row[2])
+
+
+@inlined
 def gather_vectors(array, indices):
     return gather(array, indices, 3, 0), gather(array, indices, 3, 1), gather(array, indices, 3, 2)
+
+
+@inlined
+def scatter_vectors(array, indices, values):
+    scatter(array, indices, 3, 0, values[0])
+    scatter(array, indices, 3, 1, values[1])
+    scatter(array, indices, 3, 2, values[2])
 
 
 @inlined
@@ -141,7 +170,7 @@ def spread(m0, m1):
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1 / square_root(yy)
-    n1 = (m1[0] * inverse, m1[1] * inverse, m1[2] * inverse)
+    n1 = stretched(m1, inverse)
     cross = (
         m0[1] * n1[2] - m0[2] * n1[1],
         m0[2] * n1[0] - m0[0] * n1[2],
@@ -155,17 +184,17 @@ def spread(m0, m1):
 def normalized(offset):
     """``offset`` scaled to length 1, and the inverse of its length."""
     inverse = 1 / square_root(dot(offset, offset))
-    return scaled(offset, (inverse, inverse, inverse)), inverse
+    return stretched(offset, inverse), inverse
 
 
 @inlined
-def fill_basis(degree, x, y, z, matrix):
-    """Write basis function k + 1 at the unit directions (x, y, z) to column k of ``matrix`` [16 *
-    16].
+def fill_basis(degree, direction, matrix):
+    """Write basis function k + 1 at the unit directions to column k of ``matrix`` [16 * 16].
 
     Each row is one Gaussian. The columns of functions above ``degree`` and the last column are
     zero.
     """
+    x, y, z = direction
     for k in range((degree + 1) * (degree + 1) - 1, LANES):
         store(matrix, k * LANES, splat(ZERO))
     if degree >= 1:
@@ -191,12 +220,13 @@ def fill_basis(degree, x, y, z, matrix):
 
 
 @inlined
-def direction_gradient(degree, x, y, z, matrix):
-    """The gradient of ``sum_k g[k] basis[k + 1]`` by (x, y, z), not yet projected to the tangent of
-    the unit sphere.
+def direction_gradient(degree, direction, matrix):
+    """The gradient of ``sum_k g[k] basis[k + 1]`` by the direction (x, y, z).
 
-    ``matrix`` [16 * 16] has g of one Gaussian in each row; this function transposes it.
+    It is not yet projected to the tangent of the unit sphere. ``matrix`` [16 * 16] has g of one
+    Gaussian in each row; this function transposes it.
     """
+    x, y, z = direction
     gx, gy, gz = splat(ZERO), splat(ZERO), splat(ZERO)
     if degree >= 1:
         transpose(matrix, 0)

@@ -39,8 +39,10 @@ SUM_ABS_T, SUM_ABS_Y = SUM_LANES[9:11]  # |h t|, |h (d power / d dy)|
 
 
 def kernel_memory() -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Scratch memory for one call of a kernel. Kernels cannot allocate memory (see
-    `gsbench.system.jit.kernel`)."""
+    """Scratch memory for one call of a kernel.
+
+    Kernels cannot allocate memory (see `gsbench.system.jit.kernel`).
+    """
     return np.empty(8 * TILE_PIXELS, np.float32), np.empty(2 * LANES, np.int64)
 
 
@@ -56,8 +58,10 @@ class Parameters(NamedTuple):
 
 
 class CpuFrame(NamedTuple):
-    """Arrays of one render: kernels of the forward pass fill them, kernels of the backward pass
-    read them."""
+    """Arrays of one render.
+
+    Kernels of the forward pass fill them, kernels of the backward pass read them.
+    """
 
     camera: CameraNumbers
     background: NDArray[np.float32]  # [3]
@@ -68,8 +72,7 @@ class CpuFrame(NamedTuple):
     masks: NDArray[np.uint16]  # [pairs] bit b: the record may touch block b of the tile
     processed: NDArray[np.int64]  # [tiles] end of the entries that compositing has read
     transmittance: NDArray[np.float32]  # [tiles * TILE_PIXELS] final, by tile, block and lane
-    last: NDArray[
-        np.float32
-    ]  # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
+    # [tiles * TILE_PIXELS] number of entries before the one that stopped the pixel
+    last: NDArray[np.float32]
     bounds: NDArray[np.int64]  # [shards + 1] first tile of each shard
     tile_shard: NDArray[np.uint8]  # [tiles] shard of each tile

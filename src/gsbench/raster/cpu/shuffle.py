@@ -1,8 +1,8 @@
-"""Rearrangement of vectors: 16x16 transposition, blocks of pixels, integers in the bits of lanes,
-harmonics.
+"""Rearrangement of vectors.
 
-Kernels hold one quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian
-(record, gradient row, coefficients) are adjacent. These functions convert between the two layouts.
+16x16 transposition, blocks of pixels, integers in the bits of lanes, harmonics. Kernels hold one
+quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian (record, gradient
+row, coefficients) are adjacent. These functions convert between the two layouts.
 """
 
 from typing import Any
@@ -55,8 +55,10 @@ def transpose(typing_context, array, index):
 
 
 def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int) -> list[Any]:
-    """Pointers to the four rows of a block: ``numbers`` float32 each, the first at ``args[1]``,
-    ``args[2]`` apart."""
+    """Pointers to the four rows of a block.
+
+    ``numbers`` float32 each, the first at ``args[1]``, ``args[2]`` apart.
+    """
     first = address(context, builder, sig, args)
     stride = context.cast(builder, args[2], sig.args[2], types.intp)
     kind = ir.VectorType(ir.FloatType(), numbers).as_pointer()
@@ -68,8 +70,10 @@ def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int)
 
 @intrinsic
 def store_block(typing_context, array, index, stride, values):
-    """Write the 16 pixels of a block to an image with one number per pixel and rows ``stride``
-    apart."""
+    """Write the 16 pixels of a block to an image with one number per pixel.
+
+    Its rows are ``stride`` apart.
+    """
 
     def codegen(context, builder, sig, args):
         for row, pointer in enumerate(_row_pointers(context, builder, sig, args, BLOCK)):
@@ -82,8 +86,10 @@ def store_block(typing_context, array, index, stride, values):
 
 @intrinsic
 def store_colors(typing_context, array, index, stride, red, green, blue):
-    """Write the 16 pixels of a block to an image with three numbers per pixel and rows ``stride``
-    numbers apart."""
+    """Write the 16 pixels of a block to an image with three numbers per pixel.
+
+    Its rows are ``stride`` numbers apart.
+    """
 
     def codegen(context, builder, sig, args):
         red, green, blue = args[3:]
@@ -122,8 +128,10 @@ def load_colors(typing_context, array, index, stride):
 
 @intrinsic
 def as_integers(typing_context, value):
-    """Convert whole numbers to int32, kept as the bits of float32 lanes: only store them, or read
-    them as int32."""
+    """Convert whole numbers to int32, kept as the bits of float32 lanes.
+
+    Only store them, or read them as int32.
+    """
 
     def codegen(context, builder, sig, args):
         return builder.bitcast(builder.fptosi(args[0], VECTOR.bits_ir), VECTOR.ir)
@@ -158,8 +166,10 @@ def index_bits(typing_context, start):
 
 @intrinsic
 def load_rest(typing_context, array, index):
-    """Load the 45 numbers ``array.flat[index : index + 45]`` as three vectors that start at
-    ``REST_STARTS``."""
+    """Load the 45 numbers ``array.flat[index .
+
+    Index + 45]`` as three vectors that start at ``REST_STARTS``.
+    """
 
     def codegen(context, builder, sig, args):
         pointer = address(context, builder, sig, args)
@@ -185,8 +195,10 @@ def store_rest(typing_context, array, index, values):
 
 @intrinsic
 def by_channel(typing_context, rest):
-    """Red, green and blue of the result of ``load_rest``: coefficient k in lane k; lane 15 repeats
-    lane 14."""
+    """Red, green and blue of the result of ``load_rest``: coefficient k in lane k.
+
+    Lane 15 repeats lane 14.
+    """
 
     def codegen(context, builder, sig, args):
         first, second, third = (builder.extract_value(args[0], k) for k in range(CHANNELS))
@@ -206,8 +218,10 @@ def by_channel(typing_context, rest):
 
 @intrinsic
 def outer_rest(typing_context, basis, red, green, blue):
-    """``basis[k]`` times a colour, in the layout of ``load_rest``; ``basis`` has coefficient k in
-    lane k."""
+    """``basis[k]`` times a colour, in the layout of ``load_rest``.
+
+    ``basis`` has coefficient k in lane k.
+    """
 
     def codegen(context, builder, sig, args):
         row, *colors = args

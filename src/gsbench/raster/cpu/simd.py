@@ -100,8 +100,10 @@ def _register_operator(
     emit: Callable[..., Any],
     gives: types.Type = VECTOR,
 ) -> None:
-    """Make numba compile ``functions`` of one of the combinations ``operands`` to ``emit(builder,
-    *operands)``."""
+    """Make numba compile ``functions`` to ``emit(builder, *operands)``.
+
+    They take any of the combinations ``operands``.
+    """
 
     class _Template(AbstractTemplate):
         def generic(self, args: Sequence[Any], kws: Any) -> Any:
@@ -119,32 +121,21 @@ def _register_operator(
             lower_builtin(function, *kinds)(lower)
 
 
-_register_operator([operator.add, operator.iadd], BINARY, lambda builder, a, b: builder.fadd(a, b))
-_register_operator([operator.sub, operator.isub], BINARY, lambda builder, a, b: builder.fsub(a, b))
-_register_operator([operator.mul, operator.imul], BINARY, lambda builder, a, b: builder.fmul(a, b))
-_register_operator(
-    [operator.truediv, operator.itruediv], BINARY, lambda builder, a, b: builder.fdiv(a, b)
-)
-_register_operator([operator.neg], [(Vector,)], lambda builder, a: builder.fneg(a))
-_register_operator(
-    [operator.lt], BINARY, lambda builder, a, b: builder.fcmp_ordered("<", a, b), MASK
-)
-_register_operator(
-    [operator.le], BINARY, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK
-)
-_register_operator(
-    [operator.gt], BINARY, lambda builder, a, b: builder.fcmp_ordered(">", a, b), MASK
-)
-_register_operator(
-    [operator.ge], BINARY, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), MASK
-)
-_register_operator(
-    [operator.and_, operator.iand], [(Mask, Mask)], lambda builder, a, b: builder.and_(a, b), MASK
-)
-_register_operator(
-    [operator.or_, operator.ior], [(Mask, Mask)], lambda builder, a, b: builder.or_(a, b), MASK
-)
-_register_operator([operator.invert], [(Mask,)], lambda builder, a: builder.not_(a), MASK)
+def _emits(instruction: str, *options: str) -> Callable[..., Any]:
+    """A function (builder, *operands) that emits one LLVM instruction."""
+    return lambda builder, *operands: getattr(builder, instruction)(*options, *operands)
+
+
+# Python's operators by their names in ``operator``, with LLVM's instruction for each.
+for _name, _instruction in (("add", "fadd"), ("sub", "fsub"), ("mul", "fmul"), ("truediv", "fdiv")):
+    _both = [getattr(operator, _name), getattr(operator, f"i{_name}")]
+    _register_operator(_both, BINARY, _emits(_instruction))
+for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
+    _register_operator([getattr(operator, _name)], BINARY, _emits("fcmp_ordered", _sign), MASK)
+_register_operator([operator.and_, operator.iand], [(Mask, Mask)], _emits("and_"), MASK)
+_register_operator([operator.or_, operator.ior], [(Mask, Mask)], _emits("or_"), MASK)
+_register_operator([operator.neg], [(Vector,)], _emits("fneg"))
+_register_operator([operator.invert], [(Mask,)], _emits("not_"), MASK)
 
 
 # Memory
@@ -154,6 +145,11 @@ def address(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Address of element ``args[1]`` of the array ``args[0]``."""
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     return builder.gep(data, [context.cast(builder, args[1], sig.args[1], types.intp)])
+
+
+def pointer_to(context: Any, builder: Any, sig: Any, args: Any, kind: ir.Type = VECTOR.ir) -> Any:
+    """`address` as a pointer to a value of the LLVM type ``kind``."""
+    return builder.bitcast(address(context, builder, sig, args), kind.as_pointer())
 
 
 def _check_array(array: Any) -> None:
@@ -174,9 +170,7 @@ def load(typing_context, array, index):
         # quarter of a kernel's time.
         builder.function.attributes.alignstack = 4 * LANES
         builder.function.attributes.add("nounwind")
-        return builder.load(
-            builder.bitcast(address(context, builder, sig, args), VECTOR.ir.as_pointer()), align=4
-        )
+        return builder.load(pointer_to(context, builder, sig, args), align=4)
 
     return VECTOR(array, index), codegen
 
@@ -190,9 +184,7 @@ def load_numbers(typing_context, array, index):
     kind = ir.VectorType(ir.IntType(8), LANES) if is_bytes else VECTOR.ir
 
     def codegen(context, builder, sig, args):
-        value = builder.load(
-            builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=1
-        )
+        value = builder.load(pointer_to(context, builder, sig, args, kind), align=1)
         return builder.uitofp(value, VECTOR.ir) if is_bytes else value
 
     return VECTOR(array, index), codegen
@@ -204,17 +196,18 @@ def store(typing_context, array, index, value):
     _check_array(array)
 
     def codegen(context, builder, sig, args):
-        pointer = builder.bitcast(address(context, builder, sig, args), VECTOR.ir.as_pointer())
         (operand,) = as_vectors(context, builder, args[2:], sig.args[2:])
-        builder.store(operand, pointer, align=4)
+        builder.store(operand, pointer_to(context, builder, sig, args), align=4)
         return context.get_dummy_value()
 
     return types.void(array, index, value), codegen
 
 
 def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
-    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k; ``args[:4]``
-    are these four."""
+    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k.
+
+    ``args[:4]`` are these four.
+    """
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     indices = context.make_array(sig.args[1])(context, builder, args[1]).data
     stride, offset = (context.cast(builder, args[k], sig.args[k], types.intp) for k in (2, 3))
@@ -225,8 +218,10 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
 
 @intrinsic
 def gather(typing_context, array, indices, stride, offset):
-    """``array.flat[indices[k] * stride + offset]`` in lane k; ``indices`` is an int64 array
-    [16]."""
+    """``array.flat[indices[k] * stride + offset]`` in lane k.
+
+    ``indices`` is an int64 array [16].
+    """
     _check_array(array)
 
     def codegen(context, builder, sig, args):
@@ -242,8 +237,10 @@ def gather(typing_context, array, indices, stride, offset):
 
 @intrinsic
 def scatter(typing_context, array, indices, stride, offset, value):
-    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``; of equal indices
-    the last wins."""
+    """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``.
+
+    Of equal indices the last wins.
+    """
     _check_array(array)
 
     def codegen(context, builder, sig, args):
@@ -265,7 +262,7 @@ def prefetch(typing_context, array, index):
         kind = ir.FunctionType(ir.VoidType(), [byte_pointer, word, word, word])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         read, keep_in_all_caches, data = (ir.Constant(word, value) for value in (0, 3, 1))
-        pointer = builder.bitcast(address(context, builder, sig, args), byte_pointer)
+        pointer = pointer_to(context, builder, sig, args, ir.IntType(8))
         builder.call(function, [pointer, read, keep_in_all_caches, data])
         return context.get_dummy_value()
 
@@ -283,8 +280,7 @@ def _call(builder: Any, name: str, *operands: Any) -> Any:
 
 
 def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
-    """An intrinsic of vectors, or vectors and numbers, that compiles to ``emit(builder,
-    *operands)``."""
+    """An intrinsic of vectors and numbers that compiles to ``emit(builder, *operands)``."""
     if not _fits(kinds):
         return None
 
@@ -292,6 +288,13 @@ def _function(emit: Callable[..., Any], *kinds: Any) -> Any:
         return emit(builder, *as_vectors(context, builder, args, sig.args))
 
     return VECTOR(*kinds), codegen
+
+
+def _choice(sign: str, a: Any, b: Any) -> Any:
+    """``a if a <sign> b else b``: one instruction of x86, where LLVM's minnum takes several."""
+    return _function(
+        lambda builder, x, y: builder.select(builder.fcmp_ordered(sign, x, y), x, y), a, b
+    )
 
 
 @intrinsic
@@ -313,17 +316,13 @@ def fma(typing_context, a, b, c):
 @intrinsic
 def minimum(typing_context, a, b):
     """``a if a < b else b``; so b if either is NaN."""
-    return _function(
-        lambda builder, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y), a, b
-    )
+    return _choice("<", a, b)
 
 
 @intrinsic
 def maximum(typing_context, a, b):
     """``a if a > b else b``; so b if either is NaN."""
-    return _function(
-        lambda builder, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y), a, b
-    )
+    return _choice(">", a, b)
 
 
 @intrinsic
@@ -382,15 +381,15 @@ def mask_from_bits(typing_context, bits):
 
 @intrinsic
 def lanes_with_bit(typing_context, masks, index, bit):
-    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0; ``masks`` is a
-    uint16 array."""
+    """A 64-bit word whose bit k is 1 if ``masks.flat[index + k] & bit`` is not 0.
+
+    ``masks`` is a uint16 array.
+    """
     lanes = 64
     kind = ir.VectorType(ir.IntType(16), lanes)
 
     def codegen(context, builder, sig, args):
-        values = builder.load(
-            builder.bitcast(address(context, builder, sig, args), kind.as_pointer()), align=2
-        )
+        values = builder.load(pointer_to(context, builder, sig, args, kind), align=2)
         wanted = broadcast(builder, context.cast(builder, args[2], sig.args[2], types.uint16), kind)
         found = builder.icmp_unsigned(
             "!=", builder.and_(values, wanted), ir.Constant(kind, [0] * lanes)
@@ -450,8 +449,10 @@ def exp2(typing_context, a):
 
 @intrinsic
 def log2(typing_context, a):
-    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|);
-    undefined elsewhere."""
+    """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|).
+
+    Undefined elsewhere.
+    """
 
     def emit(builder, x):
         # x = 2^n m with m from sqrt(1/2) to sqrt(2): n is the difference of the bits and those of
@@ -479,11 +480,11 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 
 @intrinsic
 def lane_sums(typing_context, vectors):
-    """Sum the 16 lanes of each of up to 16 vectors; the k-th sum is in lane ``SUM_LANES[k]``, other
-    lanes are 0.
+    """Sum the 16 lanes of each of up to 16 vectors.
 
-    It is a tree of shuffles and additions in which each level merges pairs of vectors. So the sums
-    of eleven vectors take about as long as three single sums.
+    The k-th sum is in lane ``SUM_LANES[k]``, other lanes are 0. It is a tree of shuffles and
+    additions in which each level merges pairs of vectors. So the sums of eleven vectors take about
+    as long as three single sums.
     """
     if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None

@@ -1,5 +1,7 @@
-"""Pools of memory. Page faults of newly allocated arrays would take longer than the kernels that
-fill the arrays."""
+"""Pools of memory.
+
+Page faults of newly allocated arrays would take longer than the kernels that fill the arrays.
+"""
 
 import threading
 import weakref
@@ -25,8 +27,10 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
 
 
 class Arena:
-    """Named scratch arrays that only grow. ``take`` returns a view with the contents of its
-    previous use."""
+    """Named scratch arrays that only grow.
+
+    ``take`` returns a view with the contents of its previous use.
+    """
 
     def __init__(self) -> None:
         self._blocks: dict[str, NDArray[np.uint8]] = {}
@@ -34,8 +38,10 @@ class Arena:
     def take(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False
     ) -> NDArray[Any]:
-        """Return an array of ``shape``. With ``zero`` it is cleared when newly allocated, and only
-        then."""
+        """Return an array of ``shape``.
+
+        With ``zero`` it is cleared when newly allocated, and only then.
+        """
         size = prod(shape) * np.dtype(dtype).itemsize
         block = self._blocks.get(name)
         if block is None or block.size < size:
@@ -69,8 +75,10 @@ class ArenaPool:
 
 
 class TensorPool:
-    """A pool of memory for float32 tensors. Memory returns to it when torch frees the last tensor
-    that uses it."""
+    """A pool of memory for float32 tensors.
+
+    Memory returns to it when torch frees the last tensor that uses it.
+    """
 
     def __init__(self) -> None:
         self._free: list[NDArray[np.uint8]] = []
@@ -99,11 +107,10 @@ class TensorPool:
 
 
 class ShardRunner:
-    """Runs the shards of a stage on ``threads`` threads. The result of a shard must not depend on
-    the thread.
+    """Runs the shards of a stage on ``threads`` threads.
 
-    A single thread runs all shards in one call, because each call of a kernel costs up to 40
-    microseconds.
+    The result of a shard must not depend on the thread. A single thread runs all shards in one
+    call, because each call of a kernel costs up to 40 microseconds.
     """
 
     def __init__(self, threads: int) -> None:
@@ -115,8 +122,10 @@ class ShardRunner:
         )
 
     def run(self, shards: int, work: Callable[[int, int], None]) -> None:
-        """Call ``work(first, past)`` for ranges of shards until all have run. On an error or an
-        interrupt, wait for the calls that have begun."""
+        """Call ``work(first, past)`` for ranges of shards until all have run.
+
+        On an error or an interrupt, wait for the calls that have begun.
+        """
         if self._executor is None:
             work(0, shards)
             return

@@ -1,2 +1,4 @@
-"""``raster=triton``: the rasterizer for GPUs. It needs only torch and the Triton that torch
-installs."""
+"""``raster=triton``: the rasterizer for GPUs.
+
+It needs only torch and the Triton that torch installs.
+"""

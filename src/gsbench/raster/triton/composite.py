@@ -1,10 +1,9 @@
-"""Compositing of blocks, forward and backward, and footprints: one program of one warp per block,
-four pixels per lane.
+"""Compositing of blocks, forward and backward, and footprints.
 
-With one warp, nothing is shared between warps: the loop over a list has no barrier, a record is
-read once for all 128 pixels, and shuffles compute gradient sums. The four pixels of a lane are in
-one row, so terms that depend only on dy are computed once for all four, and four chains of fma run
-in parallel.
+One program of one warp per block, four pixels per lane. With one warp, nothing is shared between
+warps: the loop over a list has no barrier, a record is read once for all 128 pixels, and shuffles
+compute gradient sums. The four pixels of a lane are in one row, so terms that depend only on dy are
+computed once for all four, and four chains of fma run in parallel.
 """
 
 from __future__ import annotations
@@ -48,8 +47,6 @@ UNROLL = tl.constexpr(4)  # entries between two checks whether all pixels have s
 UNROLL_BACK = tl.constexpr(2)  # entries per iteration of the backward pass's loop
 # -curve to entry of the inverse covariance, up to sign
 TO_PRECISION = tl.constexpr(2 * math.log(2.0))
-# entries of a footprint's row
-COVERED, VALUES, DISTANCES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 
 
 @triton.jit
@@ -95,11 +92,10 @@ def load_record(records, entry):
 
 @triton.jit
 def log2_alpha(record, x, y):
-    """log2(alpha) before the clamp and t, both [STEPS, LANES], and dy [LANES], at x and y of
-    ``block_pixels``.
+    """log2(alpha) before the clamp and t, both [STEPS, LANES], and dy [LANES].
 
-    Each fma is explicit, so that the forward and the backward kernel round alike and skip the same
-    pixels.
+    x and y are those of ``block_pixels``. Each fma is explicit, so that the forward and the
+    backward kernel round alike and skip the same pixels.
     """
     mean_x, mean_y, shear, curve_t, curve_y, log2_opacity, _, _, _ = record
     dy = y - mean_y
@@ -225,11 +221,10 @@ def composite(
 
 @triton.jit
 def _fold(a, b, lane, BIT: tl.constexpr):
-    """Sums over pairs of lanes that differ in ``BIT``: of ``a`` in the lanes without it, of ``b``
-    in those with it.
+    """Sums over pairs of lanes that differ in ``BIT``.
 
-    All are [LANES]. One exchange between lanes gives both sums, where two separate sums would take
-    two.
+    Of ``a`` in the lanes without it, of ``b`` in those with it. All are [LANES]. One exchange
+    between lanes gives both sums, where two separate sums would take two.
     """
     low = (lane & BIT) == 0
     return tl.where(low, a, b) + tl.gather(tl.where(low, b, a), lane ^ BIT, 0)
@@ -243,8 +238,10 @@ def _sum_over(a, lane, BIT: tl.constexpr):
 
 @triton.jit
 def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
-    """The number of the sum that ``_sums_over_lanes`` leaves in each lane, and a mask of the lanes
-    that store it."""
+    """The number of the sum that each lane has, and a mask of the lanes that store it.
+
+    They are those that ``_sums_over_lanes`` leaves.
+    """
     four, three, two, one = (lane >> 4) & 1, (lane >> 3) & 1, (lane >> 2) & 1, (lane >> 1) & 1
     if ABSOLUTE:
         further = tl.where(three == 1, 10, 8 + four)
@@ -257,8 +254,10 @@ def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
 
 @triton.jit
 def _sums_over_lanes(sums, lane, ABSOLUTE: tl.constexpr):
-    """The sums over all lanes of the nine (or eleven) ``sums``; ``_number_of_sum`` says which lane
-    has which."""
+    """The sums over all lanes of the nine (or eleven) ``sums``.
+
+    ``_number_of_sum`` says which lane has which.
+    """
     first = _fold(_fold(sums[0], sums[1], lane, 16), _fold(sums[2], sums[3], lane, 16), lane, 8)
     second = _fold(_fold(sums[4], sums[5], lane, 16), _fold(sums[6], sums[7], lane, 16), lane, 8)
     if ABSOLUTE:
@@ -272,8 +271,7 @@ def _sums_over_lanes(sums, lane, ABSOLUTE: tl.constexpr):
 
 @triton.jit
 def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
-    """The nine (or eleven) gradient sums over the pixels of each lane, [LANES], in the order of a
-    row."""
+    """The nine (or eleven) gradient sums over each lane's pixels, [LANES], as in a row."""
     ht = h * t
     sum_h, sum_ht = tl.sum(h, 0), tl.sum(ht, 0)
     sum_hy = sum_h * dy  # all pixels of a lane have the same dy
@@ -335,15 +333,14 @@ def composite_backward(
     HAS_ALPHA: tl.constexpr,
     ABSOLUTE: tl.constexpr,
 ):
-    """Write the gradient sums of the pairs of one segment to their rows in ``rows_out`` [pairs,
-    16], back to front.
+    """Write the gradient sums of one segment's pairs to ``rows_out`` [pairs, 16].
 
-    c is the colour of a Gaussian, g the gradient of the pixel, T the transmittance before the
-    Gaussian, and S the sum of (c . g) alpha T over the later Gaussians and the background. The
-    derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to front, S is a sum that
-    starts with the background and the light behind the segment, so nothing cancels. ``slots``
-    [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
-    written. ``g_alpha`` is read only if ``HAS_ALPHA``.
+    It goes back to front. c is the colour of a Gaussian, g the gradient of the pixel, T the
+    transmittance before the Gaussian, and S the sum of (c . g) alpha T over the later Gaussians and
+    the background. The derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to
+    front, S is a sum that starts with the background and the light behind the segment, so nothing
+    cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that compositing did not
+    reach are not written. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
     block, begin = _segment(order, starts, blocks, inner)
     end = tl.load(past + block)
@@ -419,11 +416,11 @@ def cover(
     rows_out,
     HAS_VALUES: tl.constexpr,
 ):
-    """Write the footprints of one block, for its entries up to ``past`` [blocks], to their rows in
-    ``rows_out`` [pairs, 16].
+    """Write the footprints of a block's entries, up to ``past`` [blocks], to ``rows_out``.
 
-    A footprint is the number of pixels that the Gaussian was blended into, and the sums over them
-    of ``values`` [H, W], read only if ``HAS_VALUES``, and of the distances to its mean, px.
+    Each entry has a row of ``rows_out`` [pairs, 16]. A footprint is the number of pixels that the
+    Gaussian was blended into, and the sums over them of ``values`` [H, W], read only if
+    ``HAS_VALUES``, and of the distances to its mean, px.
     """
     block = tl.program_id(0)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
@@ -437,9 +434,33 @@ def cover(
         dx = columns - record[0]
         distance = tl.sqrt(tl.fma(dx, dx, (dy * dy)[None, :]))
         row = rows_out + tl.load(slots + position) * ROW
-        tl.store(row + COVERED, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
-        tl.store(row + VALUES, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
-        tl.store(row + DISTANCES, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
+        tl.store(row, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
+        tl.store(row + 1, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
+        tl.store(row + 2, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
+
+
+@triton.jit
+def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
+    """The first ``NUMBERS`` of the rows of each Gaussian, summed over its ``own_rows`` units.
+
+    ``sum_units`` has summed the pairs of a unit, into the row of its first pair.
+    """
+    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
+    zero = tl.zeros_like(own_rows).to(tl.float32)
+    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
+    sums = ()
+    for _ in tl.static_range(NUMBERS):
+        sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
+    for k in range(0, tl.max(own_rows, 0)):
+        active = k < own_rows
+        width = tl.load(unit_widths + unit + k, mask=active, other=0)
+        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
+        grown = ()
+        for n in tl.static_range(NUMBERS):
+            own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
+            grown = grown + (sums[n] + own,)  # type: ignore[assignment]  # noqa: RUF005
+        sums = grown
+    return sums
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -455,21 +476,11 @@ def sum_cover(
     distances,
     GROUP: tl.constexpr,
 ):
-    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows that ``sum_units``
-    has summed."""
+    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows of units."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    own_rows = tl.load(row_counts + index, mask=index < count, other=0)
-    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
-    total = tl.zeros([GROUP], tl.float32)
-    value, distance = total, total
-    for k in range(0, tl.max(own_rows, 0)):
-        active = k < own_rows
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        place = rows + (tl.load(pair_ends + unit + k, mask=active, other=0) - width) * ROW
-        active = width > 0
-        total += tl.load(place + COVERED, mask=active, other=0.0)
-        value += tl.load(place + VALUES, mask=active, other=0.0)
-        distance += tl.load(place + DISTANCES, mask=active, other=0.0)
-    tl.store(covered + index, total.to(tl.int32), mask=index < count)
-    tl.store(sums + index, value, mask=index < count)
-    tl.store(distances + index, distance, mask=index < count)
+    inside = index < count
+    own_rows = tl.load(row_counts + index, mask=inside, other=0)
+    total, value, distance = sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, 3)
+    tl.store(covered + index, total.to(tl.int32), mask=inside)
+    tl.store(sums + index, value, mask=inside)
+    tl.store(distances + index, distance, mask=inside)

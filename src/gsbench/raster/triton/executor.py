@@ -63,8 +63,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         self._scratch = WorkspacePool()
 
     def check(self, gaussians: Gaussians) -> None:
-        """Raise ValueError if tensors are not float32, and InputError if Triton cannot use the
-        GPU."""
+        """Raise ValueError unless tensors are float32; InputError if Triton cannot use the GPU."""
         if gaussians.means.dtype != torch.float32:
             raise ValueError(f"means: raster=triton needs float32, got {gaussians.means.dtype}")
         if gaussians.means.device.type == "cuda":
@@ -73,8 +72,10 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
     def forward(
         self, gaussians: Gaussians, request: RenderRequest
     ) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
-        """Project, sort, bin, composite; see `StagedRasterizer`. Raises ValueError for bad
-        values."""
+        """Project, sort, bin, composite; see `StagedRasterizer`.
+
+        Raises ValueError for bad values.
+        """
         camera, device = request.camera, gaussians.means.device
         image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
         alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
@@ -212,12 +213,10 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
             scratch = self._scratch.lease(lifetime, gaussians.means.device)
-            units, lists, count, device = (
-                frame.units,
-                frame.lists,
-                len(gaussians),
-                gaussians.means.device,
-            )
+            units = frame.units
+            lists = frame.lists
+            count = len(gaussians)
+            device = gaussians.means.device
             covered = torch.zeros(count, dtype=torch.int32, device=device)
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()
@@ -262,8 +261,10 @@ def _project(
     radii: Tensor,
     flags: Tensor,
 ) -> Projected:
-    """Project all Gaussians; fill ``keys``, by which depth is sorted, ``radii`` and ``flags``, 1
-    for bad values."""
+    """Project all Gaussians.
+
+    Fill ``keys``, by which depth is sorted, ``radii`` and ``flags``, 1 for bad values.
+    """
     count = len(gaussians)
     projected = Projected(
         memory.take("records", (count + 1) * RECORD.value, torch.float32),

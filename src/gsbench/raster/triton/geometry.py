@@ -16,7 +16,7 @@ BLUR = tl.constexpr(CONSTANTS.blur)
 F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (tl.constexpr(value) for value in C3)
-REST = tl.constexpr(3 * NUM_SH_REST)  # numbers of one Gaussian in ``sh_rest``
+NUM_SH = tl.constexpr(NUM_SH_REST)  # vectors of one Gaussian in ``sh_rest``
 
 
 @triton.jit
@@ -31,9 +31,16 @@ def load_vector(array, index, mask):
 
 
 @triton.jit
+def store_vector(array, index, values, mask):
+    place = array + 3 * index
+    tl.store(place, values[0], mask=mask)
+    tl.store(place + 1, values[1], mask=mask)
+    tl.store(place + 2, values[2], mask=mask)
+
+
+@triton.jit
 def load_quaternion(quaternions, index, mask):
-    """The unit quaternions (w, x, y, z), and the inverse norm and the squared norm of the stored
-    ones."""
+    """The unit quaternions (w, x, y, z); the inverse and the squared norm of the stored ones."""
     place = quaternions + 4 * index
     w = tl.load(place, mask=mask, other=1.0)
     x = tl.load(place + 1, mask=mask, other=0.0)
@@ -71,8 +78,43 @@ def times(row, matrix):
 
 
 @triton.jit
+def through(matrix, column):
+    """``matrix`` [3, 3] times ``column`` [3]."""
+    return dot(column, matrix[0]), dot(column, matrix[1]), dot(column, matrix[2])
+
+
+@triton.jit
 def scaled(row, scales):
     return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
+
+
+@triton.jit
+def stretched(row, factor):
+    return row[0] * factor, row[1] * factor, row[2] * factor
+
+
+@triton.jit
+def plus(a, factor, b):
+    """``a + factor * b`` of two vectors [3]."""
+    return a[0] + b[0] * factor, a[1] + b[1] * factor, a[2] + b[2] * factor
+
+
+@triton.jit
+def minus(a, factor, b):
+    """``a - factor * b``: for Triton, ``-factor`` would be an instruction of its own."""
+    return a[0] - factor * b[0], a[1] - factor * b[1], a[2] - factor * b[2]
+
+
+@triton.jit
+def mixed(p, a, q, b):
+    """``p * a + q * b`` of two vectors [3]."""
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
+
+
+@triton.jit
+def view_axes(v):
+    """The rows of the camera's rotation W, from world to view."""
+    return (v.r00, v.r01, v.r02), (v.r10, v.r11, v.r12), (v.r20, v.r21, v.r22)
 
 
 @triton.jit
@@ -86,38 +128,22 @@ def from_camera(mean, v):
 
 
 @triton.jit
-def to_view(offset, v):
-    x = offset[0] * v.r00 + offset[1] * v.r01 + offset[2] * v.r02
-    y = offset[0] * v.r10 + offset[1] * v.r11 + offset[2] * v.r12
-    z = offset[0] * v.r20 + offset[1] * v.r21 + offset[2] * v.r22
-    return x, y, z
-
-
-@triton.jit
-def image_axes(slope_x, slope_y, inverse_z, v):
-    """A = J W, the derivative of the pixel by the world position, as two rows; and the clamped
-    slopes."""
+def clamped_slopes(slope_x, slope_y, v):
+    """x/z and y/z within the limits of the Jacobian (`raster.base.slope_limits`)."""
     slope_x = tl.minimum(tl.maximum(slope_x, v.slope_x_min), v.slope_x_max)
-    slope_y = tl.minimum(tl.maximum(slope_y, v.slope_y_min), v.slope_y_max)
-    first, second = image_rows(slope_x, slope_y, inverse_z, v)
-    return first, second, slope_x, slope_y
+    return slope_x, tl.minimum(tl.maximum(slope_y, v.slope_y_min), v.slope_y_max)
 
 
 @triton.jit
 def image_rows(slope_x, slope_y, inverse_z, v):
-    """The derivative of the pixel by the world position at given slopes x/z, y/z, as two rows."""
-    jx, jy = inverse_z * v.fx, inverse_z * v.fy
-    first = (
-        jx * (v.r00 - slope_x * v.r20),
-        jx * (v.r01 - slope_x * v.r21),
-        jx * (v.r02 - slope_x * v.r22),
-    )
-    second = (
-        jy * (v.r10 - slope_y * v.r20),
-        jy * (v.r11 - slope_y * v.r21),
-        jy * (v.r12 - slope_y * v.r22),
-    )
-    return first, second
+    """A = J W, the derivative of the pixel by the world position, as two rows.
+
+    J is the derivative of x fx / z and y fy / z by the position in view space, at the slopes x/z
+    and y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
+    """
+    right, down, ahead = view_axes(v)
+    first = stretched(minus(right, slope_x, ahead), inverse_z * v.fx)
+    return first, stretched(minus(down, slope_y, ahead), inverse_z * v.fy)
 
 
 @triton.jit
@@ -129,7 +155,7 @@ def spread(m0, m1):
     """
     xx, xy, yy = dot(m0, m0), dot(m0, m1), dot(m1, m1) + BLUR
     inverse = 1.0 / tl.sqrt(yy)
-    n1 = (m1[0] * inverse, m1[1] * inverse, m1[2] * inverse)
+    n1 = stretched(m1, inverse)
     cross = (
         m0[1] * n1[2] - m0[2] * n1[1],
         m0[2] * n1[0] - m0[0] * n1[2],
@@ -140,9 +166,16 @@ def spread(m0, m1):
 
 
 @triton.jit
+def normalized(offset):
+    """``offset`` scaled to length 1, and the inverse of its length; 0 and 1 for length 0."""
+    distance = tl.sqrt(dot(offset, offset))
+    inverse = 1.0 / tl.where(distance > 0, distance, 1.0)
+    return stretched(offset, inverse), inverse
+
+
+@triton.jit
 def basis(direction, DEGREE: tl.constexpr):
-    """The basis functions of degrees 1 to ``DEGREE`` at unit directions; ``DEGREE`` is at least
-    1."""
+    """The basis functions of degrees 1 to ``DEGREE``, at least 1, at unit directions."""
     x, y, z = direction
     values = (y * -F1, z * F1, x * -F1)
     if DEGREE >= 2:
@@ -166,29 +199,17 @@ def basis(direction, DEGREE: tl.constexpr):
 @triton.jit
 def _coefficients(sh_rest, index, k: tl.constexpr, mask):
     """The k-th coefficients of red, green and blue, counted from degree 1."""
-    place = index * REST + 3 * k
-    red = tl.load(sh_rest + place, mask=mask, other=0.0)
-    green = tl.load(sh_rest + place + 1, mask=mask, other=0.0)
-    blue = tl.load(sh_rest + place + 2, mask=mask, other=0.0)
-    return red, green, blue
-
-
-@triton.jit
-def _add(sums, coefficients, factor):
-    return (
-        sums[0] + coefficients[0] * factor,
-        sums[1] + coefficients[1] * factor,
-        sums[2] + coefficients[2] * factor,
-    )
+    return load_vector(sh_rest + 3 * k, index * NUM_SH, mask)
 
 
 @triton.jit
 def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
-    """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions, and their
-    derivatives by x, y and z of the direction, not yet projected to the tangent of the unit sphere;
-    each for red, green and blue.
+    """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions.
 
-    ``dc`` are the coefficients of degree 0.
+    Also returns their derivatives by x, y and z of the direction, not yet projected to the tangent
+    of the unit sphere; each for red, green and blue. ``dc`` are the coefficients of degree 0. Each
+    basis function k adds c_k times its value and its derivatives, which stand beside it: as in
+    computeColorFromSH of 3DGS, with the constants of `gaussians.model`.
     """
     x, y, z = direction
     rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)
@@ -197,57 +218,51 @@ def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
     if DEGREE >= 1:
         values = basis(direction, DEGREE)
         c = _coefficients(sh_rest, index, 0, mask)
-        rgb, by_y = _add(rgb, c, values[0]), _add(by_y, c, -F1)
+        rgb, by_y = plus(rgb, values[0], c), plus(by_y, -F1, c)
         c = _coefficients(sh_rest, index, 1, mask)
-        rgb, by_z = _add(rgb, c, values[1]), _add(by_z, c, F1)
+        rgb, by_z = plus(rgb, values[1], c), plus(by_z, F1, c)
         c = _coefficients(sh_rest, index, 2, mask)
-        rgb, by_x = _add(rgb, c, values[2]), _add(by_x, c, -F1)
+        rgb, by_x = plus(rgb, values[2], c), plus(by_x, -F1, c)
     if DEGREE >= 2:
         c = _coefficients(sh_rest, index, 3, mask)
-        rgb, by_x, by_y = _add(rgb, c, values[3]), _add(by_x, c, D0 * y), _add(by_y, c, D0 * x)
+        rgb, by_x, by_y = plus(rgb, values[3], c), plus(by_x, D0 * y, c), plus(by_y, D0 * x, c)
         c = _coefficients(sh_rest, index, 4, mask)
-        rgb, by_y, by_z = _add(rgb, c, values[4]), _add(by_y, c, D1 * z), _add(by_z, c, D1 * y)
+        rgb, by_y, by_z = plus(rgb, values[4], c), plus(by_y, D1 * z, c), plus(by_z, D1 * y, c)
         c = _coefficients(sh_rest, index, 5, mask)
-        rgb, by_x = _add(rgb, c, values[5]), _add(by_x, c, -2 * D2 * x)
-        by_y, by_z = _add(by_y, c, -2 * D2 * y), _add(by_z, c, 4 * D2 * z)
+        rgb, by_x = plus(rgb, values[5], c), plus(by_x, -2 * D2 * x, c)
+        by_y, by_z = plus(by_y, -2 * D2 * y, c), plus(by_z, 4 * D2 * z, c)
         c = _coefficients(sh_rest, index, 6, mask)
-        rgb, by_x, by_z = _add(rgb, c, values[6]), _add(by_x, c, D3 * z), _add(by_z, c, D3 * x)
+        rgb, by_x, by_z = plus(rgb, values[6], c), plus(by_x, D3 * z, c), plus(by_z, D3 * x, c)
         c = _coefficients(sh_rest, index, 7, mask)
-        rgb, by_x, by_y = (
-            _add(rgb, c, values[7]),
-            _add(by_x, c, 2 * D4 * x),
-            _add(by_y, c, -2 * D4 * y),
-        )
+        rgb = plus(rgb, values[7], c)
+        by_x = plus(by_x, 2 * D4 * x, c)
+        by_y = plus(by_y, -2 * D4 * y, c)
     if DEGREE >= 3:
         xx, yy, zz = x * x, y * y, z * z
         xy, yz, xz = x * y, y * z, x * z
         c = _coefficients(sh_rest, index, 8, mask)
-        rgb, by_x, by_y = (
-            _add(rgb, c, values[8]),
-            _add(by_x, c, 6 * T0 * xy),
-            _add(by_y, c, 3 * T0 * (xx - yy)),
-        )
+        rgb = plus(rgb, values[8], c)
+        by_x = plus(by_x, 6 * T0 * xy, c)
+        by_y = plus(by_y, 3 * T0 * (xx - yy), c)
         c = _coefficients(sh_rest, index, 9, mask)
-        rgb, by_x = _add(rgb, c, values[9]), _add(by_x, c, T1 * yz)
-        by_y, by_z = _add(by_y, c, T1 * xz), _add(by_z, c, T1 * xy)
+        rgb, by_x = plus(rgb, values[9], c), plus(by_x, T1 * yz, c)
+        by_y, by_z = plus(by_y, T1 * xz, c), plus(by_z, T1 * xy, c)
         c = _coefficients(sh_rest, index, 10, mask)
-        rgb, by_x = _add(rgb, c, values[10]), _add(by_x, c, -2 * T2 * xy)
-        by_y, by_z = _add(by_y, c, T2 * (4 * zz - xx - 3 * yy)), _add(by_z, c, 8 * T2 * yz)
+        rgb, by_x = plus(rgb, values[10], c), plus(by_x, -2 * T2 * xy, c)
+        by_y, by_z = plus(by_y, T2 * (4 * zz - xx - 3 * yy), c), plus(by_z, 8 * T2 * yz, c)
         c = _coefficients(sh_rest, index, 11, mask)
-        rgb, by_x = _add(rgb, c, values[11]), _add(by_x, c, -6 * T3 * xz)
-        by_y, by_z = _add(by_y, c, -6 * T3 * yz), _add(by_z, c, T3 * (6 * zz - 3 * xx - 3 * yy))
+        rgb, by_x = plus(rgb, values[11], c), plus(by_x, -6 * T3 * xz, c)
+        by_y, by_z = plus(by_y, -6 * T3 * yz, c), plus(by_z, T3 * (6 * zz - 3 * xx - 3 * yy), c)
         c = _coefficients(sh_rest, index, 12, mask)
-        rgb, by_x = _add(rgb, c, values[12]), _add(by_x, c, T4 * (4 * zz - 3 * xx - yy))
-        by_y, by_z = _add(by_y, c, -2 * T4 * xy), _add(by_z, c, 8 * T4 * xz)
+        rgb, by_x = plus(rgb, values[12], c), plus(by_x, T4 * (4 * zz - 3 * xx - yy), c)
+        by_y, by_z = plus(by_y, -2 * T4 * xy, c), plus(by_z, 8 * T4 * xz, c)
         c = _coefficients(sh_rest, index, 13, mask)
-        rgb, by_x = _add(rgb, c, values[13]), _add(by_x, c, 2 * T5 * xz)
-        by_y, by_z = _add(by_y, c, -2 * T5 * yz), _add(by_z, c, T5 * (xx - yy))
+        rgb, by_x = plus(rgb, values[13], c), plus(by_x, 2 * T5 * xz, c)
+        by_y, by_z = plus(by_y, -2 * T5 * yz, c), plus(by_z, T5 * (xx - yy), c)
         c = _coefficients(sh_rest, index, 14, mask)
-        rgb, by_x, by_y = (
-            _add(rgb, c, values[14]),
-            _add(by_x, c, 3 * T6 * (xx - yy)),
-            _add(by_y, c, -6 * T6 * xy),
-        )
+        rgb = plus(rgb, values[14], c)
+        by_x = plus(by_x, 3 * T6 * (xx - yy), c)
+        by_y = plus(by_y, -6 * T6 * xy, c)
     return rgb, by_x, by_y, by_z
 
 
@@ -257,7 +272,5 @@ def store_gradients(direction, g_rgb, g_sh_rest, index, mask, DEGREE: tl.constex
     if DEGREE >= 1:
         values = basis(direction, DEGREE)
         for k in tl.static_range(0, (DEGREE + 1) * (DEGREE + 1) - 1):
-            place = g_sh_rest + index * REST + 3 * k
-            tl.store(place, values[k] * g_rgb[0], mask=mask)
-            tl.store(place + 1, values[k] * g_rgb[1], mask=mask)
-            tl.store(place + 2, values[k] * g_rgb[2], mask=mask)
+            own = stretched(g_rgb, values[k])
+            store_vector(g_sh_rest + 3 * k, index * NUM_SH, own, mask)

@@ -15,8 +15,10 @@ OPTIONS = {"enable_fp_fusion": True}
 
 
 def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
-    """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program;
-    no launch for 0."""
+    """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program.
+
+    No launch for 0.
+    """
 
     def run(*arguments: Any, **constants: Any) -> None:
         if count:
@@ -26,8 +28,10 @@ def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
 
 
 def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
-    """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis; also
-    takes ``num_warps``."""
+    """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis.
+
+    Also takes ``num_warps``.
+    """
 
     def run(*arguments: Any, **constants: Any) -> None:
         kernel[programs](*arguments, **OPTIONS, **constants)
@@ -36,8 +40,10 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
 
 
 class Workspace:
-    """Named 1D tensors that grow by doubling. ``take`` returns a view with the contents of the last
-    use."""
+    """Named 1D tensors that grow by doubling.
+
+    ``take`` returns a view with the contents of the last use.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device

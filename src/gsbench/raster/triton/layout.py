@@ -28,11 +28,8 @@ SEGMENT = tl.constexpr(256)  # entries; a multiple of UNROLL and UNROLL_BACK
 # float32 numbers: the four quantities below of each pixel, by lane and step
 BORDER = tl.constexpr(4 * 128)
 TRANSMITTANCE = tl.constexpr(0)
-BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = (
-    tl.constexpr(128),
-    tl.constexpr(256),
-    tl.constexpr(384),
-)  # light blended behind it
+# light blended behind it
+BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = tl.constexpr(128), tl.constexpr(256), tl.constexpr(384)
 
 # A record has what compositing needs of one Gaussian: 16 float32. With d = pixel - mean and t = dx
 # + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares
@@ -50,13 +47,11 @@ COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + 6553
 FIRST_ROW = tl.constexpr(11)  # of blocks that the contour can touch
 CLAMPED = tl.constexpr(12)  # bit c: colour channel c was below 0
 
-# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32; h = d loss /
-# d log(alpha).
+# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32. With h = d
+# loss / d log(alpha) these are h, h t, h dy, h t^2, h t dy, h dy^2, red, green, blue; and if they
+# are asked for, |h t| and |h (d power / d dy)|. Or a row has a footprint: number of pixels, sum of
+# values, sum of distances.
 ROW = tl.constexpr(16)
-SUM_H, SUM_H_T, SUM_H_Y = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
-SUM_H_TT, SUM_H_TY, SUM_H_YY = tl.constexpr(3), tl.constexpr(4), tl.constexpr(5)
-SUM_RED, SUM_GREEN, SUM_BLUE = tl.constexpr(6), tl.constexpr(7), tl.constexpr(8)
-SUM_ABS_T, SUM_ABS_Y = tl.constexpr(9), tl.constexpr(10)  # |h t|, |h (d power / d dy)|
 
 # derivatives of red by x, y, z of the direction; then of green; then of blue
 COLOR_SLOPES = tl.constexpr(9)

@@ -43,8 +43,10 @@ MAX_COLUMN = tl.constexpr(1e6)  # px; beyond every image, but within int32
 
 @triton.jit
 def _span(records, place, row, first, past, mask):
-    """The block columns, within ``first`` to ``past``, that the contour reaches in ``row``: first,
-    past-the-last."""
+    """The block columns, within ``first`` to ``past``, that the contour reaches in ``row``.
+
+    First, past-the-last.
+    """
     mean_x = tl.load(records + place + MEAN_X, mask=mask, other=0.0)
     mean_y = tl.load(records + place + MEAN_Y, mask=mask, other=0.0)
     shear = tl.load(records + place + SHEAR, mask=mask, other=0.0)
@@ -122,8 +124,10 @@ def find_units(
 
 @triton.jit(do_not_specialize=["count", "capacity"])
 def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
-    """Fill ``status`` [3] int64: number of units; number of pairs (if the units fit); 1 if a value
-    is bad."""
+    """Fill ``status`` [3] int64: number of units.
+
+    Number of pairs (if the units fit); 1 if a value is bad.
+    """
     units = tl.load(unit_ends + count - 1, mask=count > 0, other=0)
     pairs = tl.load(pair_ends + capacity - 1)
     channel = tl.arange(0, 4)
@@ -138,8 +142,10 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
 def write_pairs(
     unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr
 ):
-    """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs]; one lane
-    per unit."""
+    """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs].
+
+    One lane per unit.
+    """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
     width = tl.load(unit_widths + unit, mask=inside, other=0)

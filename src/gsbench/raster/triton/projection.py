@@ -10,21 +10,29 @@ import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.staged import MIN_QUATERNION_NORM
+from gsbench.raster.triton.composite import sum_rows
 from gsbench.raster.triton.geometry import (
     F0,
+    clamped_slopes,
     colors,
     dot,
     from_camera,
-    image_axes,
     image_rows,
     load_quaternion,
     load_vector,
+    minus,
+    mixed,
+    normalized,
+    plus,
     rotation_matrix,
     scaled,
     spread,
     store_gradients,
+    store_vector,
+    stretched,
+    through,
     times,
-    to_view,
+    view_axes,
 )
 from gsbench.raster.triton.layout import (
     ALPHA_MIN,
@@ -33,7 +41,6 @@ from gsbench.raster.triton.layout import (
     BLOCK_WIDTH,
     BLUE,
     CLAMPED,
-    COLOR_SLOPES,
     COLUMNS,
     CURVE_T,
     CURVE_Y,
@@ -49,17 +56,6 @@ from gsbench.raster.triton.layout import (
     RIGHTMOST_Y,
     ROW,
     SHEAR,
-    SUM_ABS_T,
-    SUM_ABS_Y,
-    SUM_BLUE,
-    SUM_GREEN,
-    SUM_H,
-    SUM_H_T,
-    SUM_H_TT,
-    SUM_H_TY,
-    SUM_H_Y,
-    SUM_H_YY,
-    SUM_RED,
     TILE,
 )
 
@@ -79,13 +75,25 @@ INVISIBLE = tl.constexpr(-1e9)  # log2(opacity) of the invisible record
 
 @triton.jit
 def _tile_range(low, high, tiles, SIZE: tl.constexpr):
-    """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1, within
-    the grid; int32."""
-    first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), tiles)).to(tl.int32)
-    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles)).to(
-        tl.int32
-    )
-    return first, past
+    """First and past-the-last tile of ``SIZE`` px for the pixels ``low`` to ``high`` - 1; int32."""
+    first = tl.floor(tl.minimum(tl.maximum(low * (1.0 / SIZE), 0.0), tiles))
+    past = tl.floor(tl.minimum(tl.maximum((high + (SIZE - 1)) * (1.0 / SIZE), 0.0), tiles))
+    return first.to(tl.int32), past.to(tl.int32)
+
+
+@triton.jit
+def _contour_range(center, half, blocks, SIZE: tl.constexpr):
+    """The blocks of ``SIZE`` px within ``half`` px of ``center``, with a margin for rounding."""
+    half = half * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
+    return _tile_range(tl.ceil(center - half), tl.floor(center + half) + 1, blocks, SIZE)
+
+
+@triton.jit
+def _ellipse(quaternion, log_scale, axis_x, axis_y):
+    """R, the scales S, and the rows of N = A R; M = N S has the covariance M M^T (3DGS eq. 6)."""
+    matrix = rotation_matrix(quaternion)
+    scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
+    return matrix, scales, times(axis_x, matrix), times(axis_y, matrix)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -129,24 +137,23 @@ def project(
     total += squared_norm + logit + dc[0] + dc[1] + dc[2]
     bad = (squared_norm < MIN_SQUARED_NORM) | ~(tl.abs(total) < float("inf"))
 
+    # The mean on the image, px: (fx x / z + cx - 1/2, fy y / z + cy - 1/2).
     offset = from_camera(mean, v)
-    x, y, z = to_view(offset, v)
+    x, y, z = through(view_axes(v), offset)
     visible = inside & (z > NEAR)
     inverse_z = 1.0 / tl.where(visible, z, 1.0)
     column = x * inverse_z * v.fx + v.pixel_cx
     row = y * inverse_z * v.fy + v.pixel_cy
-    axis_x, axis_y, _, _ = image_axes(x * inverse_z, y * inverse_z, inverse_z, v)
-    scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
-    matrix = rotation_matrix(quaternion)
-    m0, m1 = scaled(times(axis_x, matrix), scales), scaled(times(axis_y, matrix), scales)
-    visible &= (
-        (tl.abs(column) < MAX_CENTER)
-        & (tl.abs(row) < MAX_CENTER)
-        & (dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE)
-    )
+    slope_x, slope_y = clamped_slopes(x * inverse_z, y * inverse_z, v)
+    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
+    _, scales, n0, n1 = _ellipse(quaternion, log_scale, axis_x, axis_y)
+    m0, m1 = scaled(n0, scales), scaled(n1, scales)
+    visible &= (tl.abs(column) < MAX_CENTER) & (tl.abs(row) < MAX_CENTER)
+    visible &= dot(m0, m0) + dot(m1, m1) < MAX_VARIANCE
     xx, xy, yy, a = spread(m0, m1)
+    # radius = ceil(3 sqrt(largest eigenvalue)), as preprocessCUDA of 3DGS computes it. The
+    # discriminant (trace / 2)^2 - det is written as a sum of squares, so it is never negative.
     half = (xx - yy) * 0.5
-    # The discriminant (trace / 2)^2 - det, written as a sum of squares.
     largest = (xx + yy) * 0.5 + tl.sqrt(tl.maximum(half * half + xy * xy, EIGENVALUE_FLOOR))
     radius = tl.minimum(tl.ceil(tl.sqrt(largest) * SIGMA_EXTENT), MAX_RADIUS)
     first_x, past_x = _tile_range(column - radius, column + radius, v.tiles_x, TILE)
@@ -155,43 +162,28 @@ def project(
     tl.store(radii + index, tl.where(visible, radius, 0.0).to(tl.int32), mask=inside)
 
     # Of the blocks in the tiles of the 3 sigma square, keep those that the contour alpha = 1/255
-    # can touch.
+    # can touch. The contour's squared Mahalanobis distance is 2 ln(255 opacity).
     growth = tl.exp(-logit) + 1.0
     log2_opacity = -tl.log2(growth)
-    # squared Mahalanobis distance
     reach = tl.maximum((log2_opacity - LOG2_ALPHA_MIN) * (2 / LOG2_E), 0.0)
-    half_x = tl.sqrt(reach * xx) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    half_y = tl.sqrt(reach * yy) * (1 + CONTOUR_MARGIN) + CONTOUR_MARGIN
-    blocks_x, blocks_y = (
-        tl.ceil(v.width * (1.0 / BLOCK_WIDTH)),
-        tl.ceil(v.height * (1.0 / BLOCK_HEIGHT)),
-    )
-    inner_x, outer_x = _tile_range(
-        tl.ceil(column - half_x), tl.floor(column + half_x) + 1, blocks_x, BLOCK_WIDTH
-    )
-    inner_y, outer_y = _tile_range(
-        tl.ceil(row - half_y), tl.floor(row + half_y) + 1, blocks_y, BLOCK_HEIGHT
-    )
+    blocks_x = tl.ceil(v.width * (1.0 / BLOCK_WIDTH))
+    blocks_y = tl.ceil(v.height * (1.0 / BLOCK_HEIGHT))
+    inner_x, outer_x = _contour_range(column, tl.sqrt(reach * xx), blocks_x, BLOCK_WIDTH)
+    inner_y, outer_y = _contour_range(row, tl.sqrt(reach * yy), blocks_y, BLOCK_HEIGHT)
     first_x, past_x = tl.maximum(first_x, inner_x), tl.minimum(past_x, outer_x)
-    first_y, past_y = (
-        tl.maximum(first_y * BLOCK_ROWS, inner_y),
-        tl.minimum(past_y * BLOCK_ROWS, outer_y),
-    )
+    first_y = tl.maximum(first_y * BLOCK_ROWS, inner_y)
+    past_y = tl.minimum(past_y * BLOCK_ROWS, outer_y)
     seen = visible & (growth * ALPHA_MIN < 1.0) & (first_x < past_x) & (first_y < past_y)
     tl.store(row_counts + index, tl.where(seen, past_y - first_y, 0), mask=inside)
     # The bits of positive float32 numbers sort like the numbers.
     tl.store(keys + index, tl.where(seen, z.to(tl.int32, bitcast=True), LAST_KEY), mask=inside)
 
-    distance = tl.sqrt(dot(offset, offset))
-    inverse = 1.0 / tl.where(distance > 0, distance, 1.0)
-    direction = (offset[0] * inverse, offset[1] * inverse, offset[2] * inverse)
+    direction, _ = normalized(offset)
     rgb, by_x, by_y, by_z = colors(direction, dc, sh_rest, index, seen, DEGREE)
     red, green, blue = rgb
     if DEGREE > 0:
         for c in tl.static_range(3):
-            tl.store(color_slopes + index * COLOR_SLOPES + 3 * c, by_x[c], mask=seen)
-            tl.store(color_slopes + index * COLOR_SLOPES + 3 * c + 1, by_y[c], mask=seen)
-            tl.store(color_slopes + index * COLOR_SLOPES + 3 * c + 2, by_z[c], mask=seen)
+            store_vector(color_slopes + 3 * c, 3 * index, (by_x[c], by_y[c], by_z[c]), seen)
     bad |= seen & ~(tl.abs(red + green + blue) < float("inf"))
     clamped = (red < 0).to(tl.int32) + 2 * (green < 0).to(tl.int32) + 4 * (blue < 0).to(tl.int32)
 
@@ -236,63 +228,21 @@ def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROU
 
 
 @triton.jit
-def _sum_rows(
-    index, rows_of_blocks, first_units, pair_ends, unit_widths, rows, ABSOLUTE: tl.constexpr
-):
-    """The gradient sums of each Gaussian over its units: nine, and two more if ``ABSOLUTE``."""
-    unit = tl.load(first_units + index, mask=rows_of_blocks > 0, other=0)
-    zero = tl.zeros_like(rows_of_blocks).to(tl.float32)
-    sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    for k in range(0, tl.max(rows_of_blocks, 0)):
-        active = k < rows_of_blocks
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
-        active = width > 0
-        place = rows + slot * ROW
-        sums = (
-            sums[0] + tl.load(place + SUM_H, mask=active, other=0.0),
-            sums[1] + tl.load(place + SUM_H_T, mask=active, other=0.0),
-            sums[2] + tl.load(place + SUM_H_Y, mask=active, other=0.0),
-            sums[3] + tl.load(place + SUM_H_TT, mask=active, other=0.0),
-            sums[4] + tl.load(place + SUM_H_TY, mask=active, other=0.0),
-            sums[5] + tl.load(place + SUM_H_YY, mask=active, other=0.0),
-            sums[6] + tl.load(place + SUM_RED, mask=active, other=0.0),
-            sums[7] + tl.load(place + SUM_GREEN, mask=active, other=0.0),
-            sums[8] + tl.load(place + SUM_BLUE, mask=active, other=0.0),
-            sums[9] + tl.load(place + SUM_ABS_T, mask=active & ABSOLUTE, other=0.0),
-            sums[10] + tl.load(place + SUM_ABS_Y, mask=active & ABSOLUTE, other=0.0),
-        )
-    return sums
-
-
-@triton.jit
-def _store_vector(array, index, values, mask):
-    tl.store(array + 3 * index, values[0], mask=mask)
-    tl.store(array + 3 * index + 1, values[1], mask=mask)
-    tl.store(array + 3 * index + 2, values[2], mask=mask)
-
-
-@triton.jit
 def _store_splitting(place, d00, d01, d11, shear, rows, mask):
-    """Write the splitting matrices F^T U^T (D G D - h D) U F. F = ``rows`` is the derivative of the
-    projected mean; ``d00``, ``d01`` and ``d11`` are the entries of D G D - h D.
+    """Write the splitting matrices F^T U^T (D G D - h D) U F (SteepGS, arXiv 2505.05587).
 
-    The second derivative of alpha by the projected mean is alpha (u u^T - C), with u = C (dx, dy)
-    and the conic C = U^T D U. Its sum with weights h / alpha is U^T (D G D - h D) U.
+    F = ``rows`` is the derivative of the projected mean; ``d00``, ``d01`` and ``d11`` are the
+    entries of D G D - h D. The second derivative of alpha by the projected mean is alpha
+    (u u^T - C), with u = C (dx, dy) and the conic C = U^T D U. Its sum with weights h / alpha is
+    U^T (D G D - h D) U.
     """
-    r0 = (
-        rows[0][0] + shear * rows[1][0],
-        rows[0][1] + shear * rows[1][1],
-        rows[0][2] + shear * rows[1][2],
-    )
     r1 = rows[1]
-    s0 = (d00 * r0[0] + d01 * r1[0], d00 * r0[1] + d01 * r1[1], d00 * r0[2] + d01 * r1[2])
-    s1 = (d01 * r0[0] + d11 * r1[0], d01 * r0[1] + d11 * r1[1], d01 * r0[2] + d11 * r1[2])
-    xy, xz, yz = (
-        r0[0] * s0[1] + r1[0] * s1[1],
-        r0[0] * s0[2] + r1[0] * s1[2],
-        r0[1] * s0[2] + r1[1] * s1[2],
-    )
+    r0 = plus(rows[0], shear, r1)
+    s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
+    # The matrix is symmetric: entries above the diagonal are written twice.
+    xy = r0[0] * s0[1] + r1[0] * s1[1]
+    xz = r0[0] * s0[2] + r1[0] * s1[2]
+    yz = r0[1] * s0[2] + r1[1] * s1[2]
     tl.store(place, r0[0] * s0[0] + r1[0] * s1[0], mask=mask)
     tl.store(place + 1, xy, mask=mask)
     tl.store(place + 2, xz, mask=mask)
@@ -337,9 +287,8 @@ def backproject(
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     row_count = tl.load(row_counts + index, mask=index < count, other=0)
     seen = row_count > 0
-    h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue, abs_t, abs_y = _sum_rows(
-        index, row_count, first_units, pair_ends, unit_widths, rows, ABSOLUTE
-    )
+    sums = sum_rows(index, row_count, first_units, pair_ends, unit_widths, rows, 9 + 2 * ABSOLUTE)
+    h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
     mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
     offset = from_camera(mean, v)
 
@@ -350,37 +299,27 @@ def backproject(
         tl.where(clamped & 2 != 0, 0.0, green),
         tl.where(clamped & 4 != 0, 0.0, blue),
     )
-    distance = tl.sqrt(dot(offset, offset))
-    inverse_distance = 1.0 / tl.where(distance > 0, distance, 1.0)
-    to = scaled(offset, (inverse_distance, inverse_distance, inverse_distance))
-    _store_vector(g_sh_dc, index, scaled(g_rgb, (F0, F0, F0)), seen)
-    zero = tl.zeros_like(distance)
-    pulled = (zero, zero, zero)
+    to, inverse_distance = normalized(offset)
+    store_vector(g_sh_dc, index, stretched(g_rgb, F0), seen)
+    zero = tl.zeros_like(inverse_distance)
+    turned = (zero, zero, zero)
     if DEGREE > 0:
         for c in tl.static_range(3):
-            slope = load_vector(color_slopes + 3 * c, 3 * index, seen)
-            pulled = (
-                pulled[0] + g_rgb[c] * slope[0],
-                pulled[1] + g_rgb[c] * slope[1],
-                pulled[2] + g_rgb[c] * slope[2],
-            )
+            turned = plus(turned, g_rgb[c], load_vector(color_slopes + 3 * c, 3 * index, seen))
     store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
-    radial = dot(pulled, to)
-    from_x = (pulled[0] - radial * to[0]) * inverse_distance
-    from_y = (pulled[1] - radial * to[1]) * inverse_distance
-    from_z = (pulled[2] - radial * to[2]) * inverse_distance
+    # Only what is tangent to the unit sphere turns the direction.
+    tangent = stretched(minus(turned, dot(turned, to), to), inverse_distance)
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
-    qw, qx, qy, qz = quaternion
-    matrix = rotation_matrix(quaternion)
-    x, y, z = to_view(offset, v)
+    right, down, ahead = view_axes(v)
+    x, y, z = through((right, down, ahead), offset)
     inverse_z = 1.0 / tl.where(seen, z, 1.0)
-    axis_x, axis_y, slope_x, slope_y = image_axes(x * inverse_z, y * inverse_z, inverse_z, v)
-    scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
-    n0, n1 = times(axis_x, matrix), times(axis_y, matrix)
-    m0, m1 = scaled(n0, scales), scaled(n1, scales)
-    _, xy, yy, a = spread(m0, m1)
+    free_x, free_y = x * inverse_z, y * inverse_z
+    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
+    axis_x, axis_y = image_rows(slope_x, slope_y, inverse_z, v)
+    matrix, scales, n0, n1 = _ellipse(quaternion, log_scale, axis_x, axis_y)
+    _, xy, yy, a = spread(scaled(n0, scales), scaled(n1, scales))
     e, shear = 1.0 / yy, -xy / yy  # power = -(a t^2 + e dy^2) / 2, t = dx + shear dy
 
     # Mean on the image: d power / d mean = (a t, shear a t + e dy).
@@ -390,26 +329,25 @@ def backproject(
     tl.store(g_screen + 2 * index, g_column * half_width, mask=seen)
     tl.store(g_screen + 2 * index + 1, g_row * half_height, mask=seen)
     if ABSOLUTE:
-        tl.store(g_absolute + 2 * index, a * abs_t * half_width, mask=seen)
-        tl.store(g_absolute + 2 * index + 1, abs_y * half_height, mask=seen)
+        tl.store(g_absolute + 2 * index, a * sums[9] * half_width, mask=seen)
+        tl.store(g_absolute + 2 * index + 1, sums[10] * half_height, mask=seen)
 
     # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U =
     # [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the first row of
     # U M is small, so U N is computed first, before large numbers can cancel.
     q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
     if SPLITTING:
-        free = image_rows(x * inverse_z, y * inverse_z, inverse_z, v)
+        free = image_rows(free_x, free_y, inverse_z, v)
         _store_splitting(g_splitting + 9 * index, q00 - a * h, q01, q11 - e * h, shear, free, seen)
-    u0 = (n0[0] + shear * n1[0], n0[1] + shear * n1[1], n0[2] + shear * n1[2])
-    g0 = (q00 * u0[0] + q01 * n1[0], q00 * u0[1] + q01 * n1[1], q00 * u0[2] + q01 * n1[2])
-    g1 = (q01 * u0[0] + q11 * n1[0], q01 * u0[1] + q11 * n1[1], q01 * u0[2] + q11 * n1[2])
+    u0 = plus(n0, shear, n1)
+    g0, g1 = mixed(q00, u0, q01, n1), mixed(q01, u0, q11, n1)
     variances = scaled(scales, scales)
     along = (
         u0[0] * g0[0] + n1[0] * g1[0],
         u0[1] * g0[1] + n1[1] * g1[1],
         u0[2] * g0[2] + n1[2] * g1[2],
     )
-    _store_vector(g_log_scales, index, scaled(along, variances), seen)
+    store_vector(g_log_scales, index, scaled(along, variances), seen)
 
     # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so
     # the gradient by w has differences of variances as factors. Computing these differences first
@@ -418,6 +356,7 @@ def backproject(
     w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
     w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
     w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
+    qw, qx, qy, qz = quaternion
     twice = inverse_norm + inverse_norm
     tl.store(g_quaternions + 4 * index, -(qx * w_x + qy * w_y + qz * w_z) * twice, mask=seen)
     tl.store(g_quaternions + 4 * index + 1, (qw * w_x + qy * w_z - qz * w_y) * twice, mask=seen)
@@ -425,33 +364,19 @@ def backproject(
     tl.store(g_quaternions + 4 * index + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=seen)
 
     # A = J W: d loss / d A, then by the entries of J, then by the position in view space.
-    s0, s1 = scaled(g0, variances), scaled(g1, variances)
-    s1 = (s1[0] + shear * s0[0], s1[1] + shear * s0[1], s1[2] + shear * s0[2])
-    a0 = (dot(s0, matrix[0]), dot(s0, matrix[1]), dot(s0, matrix[2]))
-    a1 = (dot(s1, matrix[0]), dot(s1, matrix[1]), dot(s1, matrix[2]))
-    j00, j02 = (
-        a0[0] * v.r00 + a0[1] * v.r01 + a0[2] * v.r02,
-        a0[0] * v.r20 + a0[1] * v.r21 + a0[2] * v.r22,
-    )
-    j11, j12 = (
-        a1[0] * v.r10 + a1[1] * v.r11 + a1[2] * v.r12,
-        a1[0] * v.r20 + a1[1] * v.r21 + a1[2] * v.r22,
-    )
+    s0 = scaled(g0, variances)
+    a0, a1 = through(matrix, s0), through(matrix, plus(scaled(g1, variances), shear, s0))
+    j00, j02, j11, j12 = dot(a0, right), dot(a0, ahead), dot(a1, down), dot(a1, ahead)
     fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
-    free_x, free_y = x * inverse_z, y * inverse_z
     # The clamp of a slope passes the gradient only within the limits.
     g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
     g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
     view_x = g_column * fx_z + g_slope_x * inverse_z
     view_y = g_row * fy_z + g_slope_y * inverse_z
-    through_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
-    view_z = -(through_focal * inverse_z + view_x * free_x + view_y * free_y)
-    g_mean = (
-        view_x * v.r00 + view_y * v.r10 + view_z * v.r20 + from_x,
-        view_x * v.r01 + view_y * v.r11 + view_z * v.r21 + from_y,
-        view_x * v.r02 + view_y * v.r12 + view_z * v.r22 + from_z,
-    )
-    _store_vector(g_means, index, g_mean, seen)
+    by_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
+    view_z = -(by_focal * inverse_z + view_x * free_x + view_y * free_y)
+    position = times((view_x, view_y, view_z), (right, down, ahead))
+    store_vector(g_means, index, plus(position, 1.0, tangent), seen)
 
     # d log(alpha) / d logit = 1 - opacity
     g_logit = h / (tl.exp(tl.load(logits + index, mask=seen, other=0.0)) + 1.0)

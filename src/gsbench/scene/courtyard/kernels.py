@@ -1,5 +1,4 @@
-"""Ray casting for the courtyard, compiled with numba; all functions are scalar and share no
-state."""
+"""Ray casting for the courtyard, compiled with numba; all functions are scalar and pure."""
 
 from math import exp, floor, inf, sqrt
 
@@ -41,6 +40,7 @@ def inverse(value):
 def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
     """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit if
     it misses."""
+    # Kay and Kajiya 1986: the ray is in the box where it is between all three pairs of planes.
     ax, bx = (lx - ox) * ix, (hx - ox) * ix
     ay, by = (ly - oy) * iy, (hy - oy) * iy
     az, bz = (lz - oz) * iz, (hz - oz) * iz
@@ -49,9 +49,9 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
 
 @inlined
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
-    """The first distance > 0 at which a ray meets a capped cylinder, solid or with a bore; inf if
-    it misses."""
+    """The first distance > 0 of a ray to a capped cylinder, solid or bored; inf for a miss."""
     best = inf
+    # The mantles x^2 + y^2 = r^2: the roots of a t^2 + 2 b t + c. A ray along the axis has a = 0.
     a = dx * dx + dy * dy
     for radius in (outer, inner):
         if radius > 0.0 and a > 1e-12:
@@ -62,6 +62,7 @@ def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
                 for t in ((-b - root) / a, (-b + root) / a):
                     if 0.0 < t < best and abs(oz + t * dz) <= half:
                         best = t
+    # The caps z = -half and z = half are rings between the bore and the mantle.
     if abs(dz) > 1e-12:
         for cap in (-half, half):
             t = (cap - oz) / dz
@@ -92,6 +93,7 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
         )
         return entry if 0.0 < entry <= exit_ else inf
     if kind == SPHERE:
+        # |o + t d| = r with |d| = 1: t^2 + 2 b t + c = 0
         b, c = ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - size[0] * size[0]
         root = b * b - c
         if root <= 0.0:
@@ -145,14 +147,15 @@ def signed_distance(kind, size, x, y, z):
     else:
         middle = 0.5 * (size[0] + size[2]) if size[2] > 0.0 else 0.0
         qx, qy, qz = abs(sqrt(x * x + y * y) - middle) - (size[0] - middle), -inf, abs(z) - size[1]
+    # Of a box, and of a ring's section, which is a box in (radius, z): the distance to its nearest
+    # corner or edge outside, and to its nearest face, negative, inside.
     outside = sqrt(max(qx, 0.0) ** 2 + max(qy, 0.0) ** 2 + max(qz, 0.0) ** 2)
     return outside + min(max(qx, qy, qz), 0.0)
 
 
 @inlined
 def nearest_surface(layout, x, y, z, limit):
-    """The smallest |distance| from a point to any surface, the ground included, if below ``limit``,
-    else ``limit``."""
+    """The smallest |distance| from a point to any surface or the ground, at most ``limit``."""
     best = min(abs(z), limit)
     for g in range(len(layout.group_low)):
         low, high = layout.group_low[g], layout.group_high[g]
@@ -161,6 +164,7 @@ def nearest_surface(layout, x, y, z, limit):
             max(low[1] - y, 0.0, y - high[1]),
             max(low[2] - z, 0.0, z - high[2]),
         )
+        # nothing in the group's box can be nearer than the box itself
         if qx * qx + qy * qy + qz * qz >= best * best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
@@ -174,40 +178,35 @@ def nearest_surface(layout, x, y, z, limit):
 
 
 @inlined
+def sign(value):
+    return 1.0 if value > 0 else -1.0
+
+
+@inlined
+def longer_first(a, b, size_a, size_b):
+    """The coordinates of a face in order: grain and planks run along its longer side."""
+    return (a, b) if size_a > size_b else (b, a)
+
+
+@inlined
 def local_normal(kind, size, x, y, z):
-    """The outward normal (3 values) at a local surface point, and coordinates (u, v) in m along the
-    face."""
+    """The outward normal (3 values) at a local surface point, and (u, v) in m along the face."""
     if kind == SPHERE:
         r = size[0]
         return x / r, y / r, z / r, (x + y) * 0.8, z + 0.4 * (x - y)
     if kind == BOX:
         qx, qy, qz = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
         if qx >= qy and qx >= qz:
-            return (
-                (1.0 if x > 0 else -1.0),
-                0.0,
-                0.0,
-                (y if size[1] > size[2] else z),
-                (z if size[1] > size[2] else y),
-            )
+            u, v = longer_first(y, z, size[1], size[2])
+            return sign(x), 0.0, 0.0, u, v
         if qy >= qz:
-            return (
-                0.0,
-                (1.0 if y > 0 else -1.0),
-                0.0,
-                (x if size[0] > size[2] else z),
-                (z if size[0] > size[2] else x),
-            )
-        return (
-            0.0,
-            0.0,
-            (1.0 if z > 0 else -1.0),
-            (x if size[0] > size[1] else y),
-            (y if size[0] > size[1] else x),
-        )
+            u, v = longer_first(x, z, size[0], size[2])
+            return 0.0, sign(y), 0.0, u, v
+        u, v = longer_first(x, y, size[0], size[1])
+        return 0.0, 0.0, sign(z), u, v
     radius = sqrt(x * x + y * y)
     if abs(abs(z) - size[1]) < min(abs(radius - size[0]), abs(radius - size[2])):
-        return 0.0, 0.0, (1.0 if z > 0 else -1.0), x, y
+        return 0.0, 0.0, sign(z), x, y
     side = 1.0 if abs(radius - size[0]) <= abs(radius - size[2]) else -1.0
     return side * x / radius, side * y / radius, 0.0, np.arctan2(y, x) * size[0], z
 
@@ -224,9 +223,15 @@ def sky(dx, dy, dz, seed):
 
 
 @inlined
+def received(channel, sun, occlusion, up):
+    """The light on a surface: the sun's, and ambient light from above (share ``up``) and below."""
+    ambient = up * SKY_LIGHT[channel] + (1 - up) * BOUNCE_LIGHT[channel]
+    return sun * SUN_LIGHT[channel] + occlusion * ambient
+
+
+@inlined
 def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
-    """The linear colour that a camera ray sees; ``pixel`` is the angle that one subsample covers,
-    in rad."""
+    """The linear colour that a camera ray sees; ``pixel`` is the angle of one subsample, in rad."""
     t, i = cast(layout, ox, oy, oz, dx, dy, dz, False)
     if i == SKY:
         return sky(dx, dy, dz, seed)
@@ -250,21 +255,23 @@ def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
         red = tint[0] * light * (1.0 + 0.30 * warmth)
         green = tint[1] * light
         blue = tint[2] * light * (1.0 - 0.30 * warmth)
+    # Ambient occlusion: less free space along the normal than the step means something is near.
     occlusion = 1.0
     for step in OCCLUSION_STEPS:
         free = nearest_surface(layout, x + step * nx, y + step * ny, z + step * nz, step)
         occlusion -= 0.38 * (1.0 - free / step)
     sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
     if sun > 0.0:
+        # from a little above the surface, which would otherwise shade itself
         sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
         _, blocker = cast(layout, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
         sun = sun if blocker == SKY else 0.0
     sun = max(sun, 0.0)
     up = 0.5 + 0.5 * nz
     return (
-        red * (sun * SUN_LIGHT[0] + occlusion * (up * SKY_LIGHT[0] + (1 - up) * BOUNCE_LIGHT[0])),
-        green * (sun * SUN_LIGHT[1] + occlusion * (up * SKY_LIGHT[1] + (1 - up) * BOUNCE_LIGHT[1])),
-        blue * (sun * SUN_LIGHT[2] + occlusion * (up * SKY_LIGHT[2] + (1 - up) * BOUNCE_LIGHT[2])),
+        red * received(0, sun, occlusion, up),
+        green * received(1, sun, occlusion, up),
+        blue * received(2, sun, occlusion, up),
     )
 
 
@@ -274,6 +281,7 @@ def encode(value):
     value = EXPOSURE * value
     if value > 0.6:
         value = 0.6 + 0.4 * (1.0 - exp(-(value - 0.6) / 0.4))
+    # IEC 61966-2-1
     srgb = 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
     return floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5)
 

@@ -37,8 +37,7 @@ def render_courtyard(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> None:
-    """Write the capture: ``output_dir/images/*.png`` and the exact COLMAP model
-    ``output_dir/sparse/0`` without points.
+    """Write the capture: ``images/*.png`` and the exact COLMAP model ``sparse/0`` without points.
 
     ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts
     views. Raises `InputError` for fewer than 3 views or images below 16 px.
@@ -62,8 +61,7 @@ def render_courtyard(
 
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
-    """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for more than 48
-    views."""
+    """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for over 48."""
     if views < MIN_IMAGES:
         raise InputError(f"scene.views must be at least {MIN_IMAGES}, got {views}")
     if min(width, height) < MIN_SIZE:
@@ -71,15 +69,12 @@ def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
             f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}"
         )
     step = min(MAX_STEP, 2 * pi / views)
-    return {
-        f"{index:04d}.png": ring_camera(index * step - 0.5 * pi, width, height)
-        for index in range(views)
-    }
+    angles = [index * step - 0.5 * pi for index in range(views)]
+    return {f"{k:04d}.png": ring_camera(angle, width, height) for k, angle in enumerate(angles)}
 
 
 def ring_camera(angle: float, width: int, height: int) -> Camera:
-    """The camera at an azimuth (rad); its height and distance are smooth, periodic functions of the
-    azimuth."""
+    """The camera at an azimuth (rad), of which its height and distance are smooth functions."""
     radius = RING_RADIUS + 0.2 * cos(2 * angle)
     center = np.array([radius * cos(angle), radius * sin(angle), 1.95 + 0.40 * sin(5 * angle)])
     forward = np.array(TARGET) - center
@@ -92,8 +87,7 @@ def ring_camera(angle: float, width: int, height: int) -> Camera:
 
 
 def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
-    """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt, so a point has one colour in
-    all views."""
+    """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt: one colour in all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     pose = np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center)
     render(layout, *pose, (camera.fx, camera.fy, camera.cx, camera.cy), image, seed)

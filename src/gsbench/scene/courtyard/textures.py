@@ -38,6 +38,7 @@ def noise2(x, y, seed):
     fx, fy = floor(x), floor(y)
     ix, iy = int(fx), int(fy)
     u, v = x - fx, y - fy
+    # Perlin 2002: 6 t^5 - 15 t^4 + 10 t^3 has no slope and no curvature at the lattice
     u, v = u * u * u * (u * (6 * u - 15) + 10), v * v * v * (v * (6 * v - 15) + 10)
     low = random_cell(ix, iy, 0, seed) * (1 - u) + random_cell(ix + 1, iy, 0, seed) * u
     high = random_cell(ix, iy + 1, 0, seed) * (1 - u) + random_cell(ix + 1, iy + 1, 0, seed) * u
@@ -56,15 +57,13 @@ def noise3(x, y, z, seed):
 
 @inlined
 def visible(cell, footprint):
-    """The weight of a detail of size ``cell`` if a pixel covers ``footprint``: 0 up to one pixel, 1
-    from two pixels."""
+    """The weight of a detail of size ``cell``: 0 up to one pixel of ``footprint``, 1 from two."""
     return min(1.0, max(0.0, cell / footprint - 1.0))
 
 
 @inlined
 def octaves2(x, y, cell, count, gain, footprint, seed):
-    """Noise octaves over the plane, about [-1, 1]; the cells of the first are ``cell`` m, each next
-    half as large."""
+    """Noise octaves over the plane, about [-1, 1]; cells of ``cell`` m, each next half as large."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -78,8 +77,7 @@ def octaves2(x, y, cell, count, gain, footprint, seed):
 
 @inlined
 def octaves3(x, y, z, cell, count, gain, footprint, seed):
-    """Noise octaves in space, about [-1, 1]; the cells of the first are ``cell`` m, each next half
-    as large."""
+    """Noise octaves in space, about [-1, 1]; cells of ``cell`` m, each next half as large."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -93,8 +91,8 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
 
 @inlined
 def pebbles(x, y, cell, seed):
-    """Cellular noise: (distance to the nearest feature point, distance to the cell's border, shade
-    of the cell)."""
+    """Cellular noise: distances to the nearest feature point and the border, shade of the cell."""
+    # Worley 1996: one feature point in each cell, so the nearest lies in the cell or beside it
     gx, gy = floor(x / cell), floor(y / cell)
     first, second, shade = 9.0, 9.0, 0.0
     for i in range(gx - 1, gx + 2):
@@ -111,8 +109,7 @@ def pebbles(x, y, cell, seed):
 
 @inlined
 def groove(position, period, width, footprint):
-    """1 on the lines between strips of ``period``, 0 elsewhere, softened to the pixel's
-    footprint."""
+    """1 on the lines between strips of ``period``, else 0, softened to the pixel's footprint."""
     offset = abs(position / period - floor(position / period + 0.5)) * period
     soft = max(width, 0.7 * footprint)
     line = max(0.0, 1.0 - offset / soft)
@@ -141,19 +138,16 @@ def ground(x, y, footprint, seed):
     tuft = noise2(x / 0.33, y / 0.33, seed + 41)
     light = 1.0 + 0.10 * patch + 0.13 * blades + 0.06 * tuft
     dry = clamp(0.35 + 0.30 * patch + 0.12 * tuft, 0.0, 1.0)
-    red, green, blue = (
-        light * (0.092 + 0.062 * dry),
-        light * (0.135 + 0.020 * dry),
-        light * (0.036 + 0.014 * dry),
-    )
+    red = light * (0.092 + 0.062 * dry)
+    green = light * (0.135 + 0.020 * dry)
+    blue = light * (0.036 + 0.014 * dry)
 
     inside = clamp(0.5 - path / edge, 0.0, 1.0)
     if inside > 0.0:
         _, border, shade = pebbles(x, y, 0.055, seed + 51)
         sharp = visible(0.055, footprint)
-        stone = 0.27 + sharp * (
-            0.26 * (shade - 0.5) - 0.15 * clamp(1.0 - 4.0 * border, 0.0, 1.0) + 0.05
-        )
+        gap = clamp(1.0 - 4.0 * border, 0.0, 1.0)
+        stone = 0.27 + sharp * (0.26 * (shade - 0.5) - 0.15 * gap + 0.05)
         stone *= 1.0 + 0.10 * octaves2(x, y, 0.9, 4, 0.7, footprint, seed + 61)
         warm = 0.06 * sharp * (2.0 * random_cell(int(shade * 4096.0), 5, 0, seed) - 1.0)
         red += inside * (stone * (1.06 + warm) - red)
@@ -170,8 +164,7 @@ def ground(x, y, footprint, seed):
 
 @inlined
 def shade_factors(material, px, py, pz, u, v, footprint, seed):
-    """(lightness, warmth) of a material at a point: local coordinates in m, and (u, v) along the
-    face."""
+    """(lightness, warmth) of a material at a local point in m, with (u, v) along the face."""
     light, warmth = 1.0, 0.0
     if material == STONE:
         row = floor(v / 0.24)
@@ -193,11 +186,9 @@ def shade_factors(material, px, py, pz, u, v, footprint, seed):
         tone = random_cell(int(plank), 4, 0, seed) - 0.5
         fibre = octaves3(u * 0.12, v, px + py + pz, 0.035, 3, 0.8, 0.7 * footprint, seed + 131)
         knots = octaves3(u, v * 2.5, pz, 0.3, 3, 0.6, footprint, seed + 141)
-        strength = 1.0 if material == WOOD else 0.25
+        strength, depth = (1.0, 0.55) if material == WOOD else (0.25, 0.0)
         light = 1.0 + strength * (0.30 * tone + 0.24 * fibre + 0.20 * knots)
-        light *= 1.0 - 0.55 * groove(v + 0.08, 0.16, 0.008, footprint) * (
-            1.0 if material == WOOD else 0.0
-        )
+        light *= 1.0 - depth * groove(v + 0.08, 0.16, 0.008, footprint)
         warmth = 0.2 * strength * (tone + knots)
     elif material == TILES:
         row = floor(v / 0.2)
@@ -212,22 +203,16 @@ def shade_factors(material, px, py, pz, u, v, footprint, seed):
         _, border, leaf = pebbles(u + 0.31 * pz, v + 0.23 * px, 0.032, seed + 161)
         sharp = visible(0.032, footprint)
         clump = octaves3(px, py, pz, 0.22, 3, 0.7, footprint, seed + 171)
-        light = (
-            0.9
-            + sharp * (0.9 * (leaf - 0.5) - 0.40 * clamp(1.0 - 5.0 * border, 0.0, 1.0))
-            + 0.40 * clump
-        )
+        gap = clamp(1.0 - 5.0 * border, 0.0, 1.0)
+        light = 0.9 + sharp * (0.9 * (leaf - 0.5) - 0.40 * gap) + 0.40 * clump
         warmth = 0.5 * sharp * (leaf - 0.5) + 0.2 * clump
     elif material == CLAY:
         light = 1.0 + 0.22 * octaves3(px, py, pz, 0.12, 4, 0.75, footprint, seed + 181)
         light *= 1.0 - 0.2 * groove(v, 0.1, 0.008, footprint)
         warmth = 0.3 * noise3(px / 0.15, py / 0.15, pz / 0.15, seed + 182)
     elif material in (WATER, GLASS):
-        light = (
-            1.0
-            + 0.35 * octaves3(px, py, pz, 0.4, 2, 0.5, footprint, seed + 191)
-            + 0.5 * clamp(v, -0.3, 0.3)
-        )
+        ripple = octaves3(px, py, pz, 0.4, 2, 0.5, footprint, seed + 191)
+        light = 1.0 + 0.35 * ripple + 0.5 * clamp(v, -0.3, 0.3)
     elif material == METAL:
         rust = octaves3(px, py, pz, 0.1, 4, 0.8, footprint, seed + 201)
         light = 1.0 + 0.4 * rust
@@ -237,9 +222,8 @@ def shade_factors(material, px, py, pz, u, v, footprint, seed):
         bark = octaves3(px * 2.0, py * 2.0, pz * 0.35, 0.06, 3, 0.8, footprint, seed + 211)
         light = 0.8 + 0.55 * bark
         if u * u + v * v < 0.1 and abs(abs(pz) - 0.45) < 1e-4:  # the sawn ends show rings
-            rings = groove(
-                radius + 0.01 * noise2(px / 0.03, py / 0.03, seed), 0.02, 0.005, footprint
-            )
+            bent = radius + 0.01 * noise2(px / 0.03, py / 0.03, seed)
+            rings = groove(bent, 0.02, 0.005, footprint)
             light = 2.2 - 0.9 * rings + 0.25 * noise2(px / 0.04, py / 0.04, seed + 5)
         warmth = 0.25 * bark
     return max(light, 0.08), warmth

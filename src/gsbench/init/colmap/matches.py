@@ -1,5 +1,4 @@
-"""COLMAP's SIFT: extraction, and matching on several cores by processes instead of threads. Run it
-isolated.
+"""COLMAP's matching of SIFT features, on several cores by processes instead of threads.
 
 COLMAP's matcher is not safe with two threads in one process. Its nearest-neighbour search (faiss)
 calls a BLAS that pycolmap's wheels build for one thread and without locks. Two simultaneous calls
@@ -18,62 +17,16 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pycolmap
 
 from gsbench.init.colmap.database import image_ids, rename_images, write_pairs
-from gsbench.init.colmap.reconstruct import verification_options
+from gsbench.init.colmap.geometry import verification_options
+from gsbench.init.options import SiftOptions
 from gsbench.logs import Progress
 from gsbench.system.isolate import run_with_progress
-
-if TYPE_CHECKING:
-    from gsbench.init.sfm import Sfm
-
-# COLMAP reports no progress within a call, so it is called for a few images at a time
-IMAGES_PER_CALL = 8
-IMAGES_PER_THREAD = 2  # least number in a call, so that all threads have work
-
-
-def extract_sift(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    sift: Sfm,
-    threads: int,
-    progress: Progress,
-    masks: Path | None = None,
-) -> None:
-    """Detect and describe keypoints in the database's images ``names``.
-
-    ``masks`` is a folder of masks, named as COLMAP expects. Black pixels get no keypoints.
-    """
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = threads
-    options.max_image_size = sift.max_image_size
-    options.sift.max_num_features = sift.max_num_features
-    options.sift.peak_threshold = sift.peak_threshold
-    options.sift.edge_threshold = sift.edge_threshold
-    options.sift.first_octave = sift.first_octave
-    reading = pycolmap.ImageReaderOptions()
-    if masks is not None:
-        reading.mask_path = masks
-    progress("extract", 0, len(names))
-    batch_size = max(IMAGES_PER_CALL, IMAGES_PER_THREAD * threads)
-    for start in range(0, len(names), batch_size):
-        batch = list(names[start : start + batch_size])
-        pycolmap.extract_features(
-            database,
-            images,
-            image_names=batch,
-            reader_options=reading,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-        progress("extract", start + len(batch), len(names))
-
 
 MAX_BLOCK = 16  # images on each side of a part; with more, progress would be reported too rarely
 PARTS_PER_PROCESS = 6  # enough that processes end at about the same time
@@ -85,8 +38,7 @@ IdPair = tuple[int, int]
 
 @dataclass(frozen=True)
 class MatchingJob:
-    """Inputs of one matching process: ``parts`` are lists of pairs of image ids, whose matches go
-    into ``result``.
+    """Inputs of a matching process: ``parts``, lists of pairs of ids, to match into ``result``.
 
     ``features`` is the database with keypoints and descriptors. ``template`` is a copy without
     them, whose images are named by their ids, because COLMAP splits the lines of its pair lists at
@@ -97,11 +49,15 @@ class MatchingJob:
     template: Path
     result: Path
     parts: list[list[IdPair]]
-    sift: Sfm
+    sift: SiftOptions
 
 
 def match_sift(
-    database: Path, pairs: Sequence[tuple[str, str]], sift: Sfm, processes: int, progress: Progress
+    database: Path,
+    pairs: Sequence[tuple[str, str]],
+    sift: SiftOptions,
+    processes: int,
+    progress: Progress,
 ) -> None:
     """Match ``pairs`` of image names and verify them.
 
@@ -112,9 +68,8 @@ def match_sift(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     ids = image_ids(database)
-    parts = divide_pairs(
-        [(ids[first], ids[second]) for first, second in pairs], _block_size(len(ids), processes)
-    )
+    id_pairs = [(ids[first], ids[second]) for first, second in pairs]
+    parts = divide_pairs(id_pairs, _block_size(len(ids), processes))
     _copy_without_features(database, folder / "empty.db")
     jobs = [
         MatchingJob(database, folder / "empty.db", folder / f"matches-{index}.db", share, sift)
@@ -131,8 +86,7 @@ def match_sift(
 
 
 def match_parts(job: MatchingJob, progress: Progress) -> None:
-    """Match and verify the parts of ``job`` one after another. Calls native code that can abort:
-    run it isolated."""
+    """Match and verify the parts in turn. Calls native code that can abort: run it isolated."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -147,12 +101,8 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
     part_database = job.result.with_suffix(".part.db")
     for part in job.parts:
         shutil.copyfile(job.template, part_database)
-        _insert(
-            part_database,
-            job.features,
-            FEATURE_TABLES,
-            sorted({image for pair in part for image in pair}),
-        )
+        images = sorted(set(chain.from_iterable(part)))
+        _insert(part_database, job.features, FEATURE_TABLES, images)
         write_pairs(pairing.match_list_path, [(str(first), str(second)) for first, second in part])
         pycolmap.match_image_pairs(
             part_database,
@@ -168,8 +118,7 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
 
 
 def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
-    """Divide ``pairs`` into parts with few images: pairs between ``block`` neighbours and ``block``
-    neighbours.
+    """Divide ``pairs`` into parts with few images, between two groups of ``block`` neighbours.
 
     Small parts are merged up to the size of a full part.
 
@@ -190,8 +139,7 @@ def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
 
 
 def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
-    """Distribute parts over processes, with about equal numbers of pairs; a process gets at least
-    one part."""
+    """Distribute parts over processes, about equally many pairs each, and at least one part."""
     shares: list[list[list[IdPair]]] = [[] for _ in range(max(1, min(processes, len(parts))))]
     for part in sorted(parts, key=len, reverse=True):
         min(shares, key=lambda share: sum(map(len, share))).append(part)
@@ -199,8 +147,7 @@ def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list
 
 
 def _block_size(images: int, processes: int) -> int:
-    """Images on each side of a part such that all pairs of ``images`` make `PARTS_PER_PROCESS`
-    parts per process."""
+    """Images on each side of a part, so that there are `PARTS_PER_PROCESS` per process."""
     # k blocks of images make k (k + 1) / 2 parts
     blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
@@ -233,8 +180,7 @@ def _copy_without_features(database: Path, target: Path) -> None:
 def _insert(
     target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None
 ) -> None:
-    """Copy the rows of ``tables`` from one database to another, of all images or only of the ids
-    ``images``."""
+    """Copy rows of ``tables`` from one database to another, of all images or of some ids."""
     condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
     with closing(sqlite3.connect(target)) as connection:
         connection.execute("ATTACH DATABASE ? AS source", (str(source),))

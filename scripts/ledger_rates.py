@@ -1,0 +1,157 @@
+"""Simulated nights of ideas: how many kept ideas are no better, and how many good ones are kept.
+
+    python scripts/ledger_rates.py                 write the table of docs/night.md (two minutes)
+    python scripts/ledger_rates.py --nights 100    print it from fewer nights
+
+A night tries forty ideas on three scenes with up to six seeds. All are compared with the same
+trainings of one baseline. Differences are in standard deviations of a pair of trainings. In an
+adaptive night, every second idea (by chance) is another try of what looked best so far, with the
+same effect and new trainings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from gsbench.analysis.statistics import error_and_degrees, look_levels, plan_looks
+from gsbench.claims.ledger import GIVE_UP
+
+IDEAS, RATE = 40, 0.1
+SCENES, SEEDS = 3, 6
+LOOKS = plan_looks(SEEDS)
+NIGHTS = 2000
+NAIVE_SEEDS = 3
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "night.md"
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+# From the differences [N, SCENES, SEEDS], the numbers of ideas kept so far [N] and the least
+# difference that matters: which are kept, and the number of seeds that were trained [N].
+Rule = Callable[[Array, NDArray[np.int64], float], tuple[Mask, NDArray[np.int64]]]
+
+
+def in_looks(
+    differences: Array, kept: NDArray[np.int64], least: float, lond: bool
+) -> tuple[Mask, NDArray[np.int64]]:
+    """The ledger's rule, restated for many nights at once; without ``lond`` Bonferroni's levels."""
+    count = len(differences)
+    level = 2 * RATE / IDEAS * ((kept + 1) if lond else np.ones(count))  # both sides
+    undecided, keep = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+    seeds = np.full(count, LOOKS[-1])
+    for number, look in enumerate(LOOKS):
+        rows = differences[:, :, :look]
+        mean = rows.mean(axis=(1, 2))
+        error, degrees = error_and_degrees(rows.var(axis=2, ddof=1), look)
+        at_look = np.array([look_levels(SCENES, LOOKS, float(one))[number] for one in level])
+        half = special.stdtrit(degrees, 1 - at_look / 2) * error
+        within = np.maximum(half - mean, half + mean) < least
+        hopeless = mean + special.stdtrit(degrees, 1 - GIVE_UP) * error < least
+        better = undecided & (mean > half) & ~within
+        ends = better | (undecided & ((mean < -half) | within | hopeless))
+        keep |= better
+        seeds[ends] = look
+        undecided &= ~ends
+    return keep, seeds
+
+
+def by_mean(
+    differences: Array, kept: NDArray[np.int64], least: float, part: float
+) -> tuple[Mask, NDArray[np.int64]]:
+    """Keep an idea if its mean over three seeds is above a ``part`` of ``least``."""
+    keep = differences[:, :, :NAIVE_SEEDS].mean(axis=(1, 2)) > part * least
+    return keep, np.full(len(keep), NAIVE_SEEDS)
+
+
+RULES: Mapping[str, Rule] = {
+    "the ledger": partial(in_looks, lond=True),
+    "Bonferroni": partial(in_looks, lond=False),
+    "mean of three seeds above 0": partial(by_mean, part=0.0),
+    "mean of three seeds above the least": partial(by_mean, part=1.0),
+}
+
+
+@dataclass(frozen=True)
+class Rates:
+    """``false``: mean share of kept ideas that are no better. ``found``: share of good ideas that
+    are kept. ``seeds``: trained for an idea."""
+
+    false: float
+    found: float
+    seeds: float
+
+
+def simulate(
+    rule: Rule, least: float, real: float, effect: float, adaptive: bool, nights: int
+) -> Rates:
+    """Nights where a share ``real`` of the ideas gains ``effect`` times ``least``, others 0."""
+    rng = np.random.default_rng([round(100 * real), round(10 * effect), adaptive])
+    baseline = rng.normal(0, 0.5**0.5, (nights, SCENES, SEEDS))
+    kept, false, good, found, trained = (np.zeros(nights, dtype=np.int64) for _ in range(5))
+    best, best_effect = np.full(nights, -np.inf), np.zeros(nights)
+    for _ in range(IDEAS):
+        own = np.where(rng.random(nights) < real, effect * least, 0.0)
+        if adaptive:
+            own = np.where((rng.random(nights) < 0.5) & np.isfinite(best), best_effect, own)
+        trainings = rng.normal(0, 0.5**0.5, (nights, SCENES, SEEDS))
+        differences = own[:, None, None] + trainings - baseline
+        keep, seeds = rule(differences, kept, least)
+        mean = differences[:, :, : LOOKS[0]].mean(axis=(1, 2))
+        ahead = (mean > best) & ~keep
+        best, best_effect = np.where(ahead, mean, best), np.where(ahead, own, best_effect)
+        kept += keep
+        false += keep & (own == 0)
+        good += own > 0
+        found += keep & (own > 0)
+        trained += seeds
+    return Rates(
+        float((false / np.maximum(kept, 1)).mean()),
+        float(found.sum() / good.sum()) if good.any() else float("nan"),
+        float(trained.mean() / IDEAS),
+    )
+
+
+def table(nights: int) -> str:
+    """The table in Markdown."""
+    heads = ["least", "good ideas", "gain", "next idea", *RULES]
+    lines = [f"| {' | '.join(heads)} |", f"|{' --- |' * len(heads)}"]
+    cases = [(0.0, 0.0), *((real, effect) for real in (0.05, 0.2) for effect in (0.5, 1.0, 2.0))]
+    for least, (real, effect), adaptive in product((0.5, 1.0), cases, (False, True)):
+        cells = [f"{least:g}", f"{100 * real:.0f} %", f"{effect:g}" if real else ""]
+        cells.append("by results" if adaptive else "any")
+        for rule in RULES.values():
+            rates = simulate(rule, least, real, effect, adaptive, nights)
+            found = f" · {100 * rates.found:.0f}" if real else ""
+            cells.append(f"{100 * rates.false:.1f}{found} · {rates.seeds:.1f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--nights", type=int)
+    nights = parser.parse_args().nights
+    text = table(nights or NIGHTS)
+    if nights:
+        print(text)
+        return
+    page = PAGE.read_text(encoding="utf-8")
+    marked = re.compile(r"(<!-- rates -->\n).*?(<!-- end of rates -->)", re.DOTALL)
+    PAGE.write_text(
+        marked.sub(lambda match: f"{match[1]}{text}\n{match[2]}", page), encoding="utf-8"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""A ledger of ideas as tables, for the terminal and the report."""
+
+import math
+
+from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.runs.experiments import display_time
+from gsbench.runs.ledger import Confirmed, Confirming, Difference, Ledger, Opened
+
+HEADS = ("against", "level", "seeds", "difference", "Gaussians", "time", "result", "why")
+
+
+def describe_ledger(ledger: Ledger) -> list[str]:
+    """Sentences on what decides, and on what is left of the planned ideas."""
+    opened = ledger.opened
+    least = f"{100 * opened.least:g} %" if opened.relative else f"{opened.least:g}"
+    better = "more" if opened.sign > 0 else "less"
+    return [
+        f"{opened.metric} decides: {better} is better, and {least} is the least that matters. "
+        f"At most {100 * opened.rate:g} % of the kept ideas are expected to be no better.",
+        f"{ledger.tried} of {opened.ideas} planned ideas were tried, and {len(ledger.kept)} kept, "
+        f"on {', '.join(opened.keys)}, with at most {len(opened.seeds)} seeds.",
+    ]
+
+
+def ledger_tables(ledger: Ledger) -> list[Table]:
+    """The table of ideas, and one for each confirmation."""
+    rows = []
+    for number, (idea, started) in enumerate(ledger.started.items(), 1):
+        ended = ledger.ended.get(idea)
+        known = ("", "", "", "", "begun", "")
+        if ended is not None:
+            known = (
+                str(ended.seeds),
+                difference_text(ledger.opened, ended.difference),
+                _times(ended.gaussians),
+                _times(ended.seconds),
+                ended.result,
+                ended.reason,
+            )
+        cells = (started.against, f"{started.level:.2g}", *known)
+        rows.append(Row((f"{number} {idea}",), tuple(map(TableEntry, cells))))
+    columns = tuple(Column("", head, ("ledger", head)) for head in HEADS)
+    tables = [Table("Ideas in the order of their tests", ("idea",), columns, tuple(rows))]
+    return tables + [_confirmation_table(ledger.opened, *one) for one in ledger.confirmations]
+
+
+def _confirmation_table(opened: Opened, asked: Confirming, results: Confirmed | None) -> Table:
+    """The gains of the kept ideas on captures that no idea has seen."""
+    rows = []
+    for idea in list(asked.keys)[1:]:
+        cells = ("", "trials are missing")
+        if results is not None:
+            difference = difference_text(opened, results.differences.get(idea))
+            cells = (difference, results.results[idea])
+        rows.append(Row((idea,), tuple(map(TableEntry, cells))))
+    scenes = ", ".join(next(iter(asked.keys.values())))
+    title = f"Confirmation on {scenes} with {len(asked.seeds)} seeds ({display_time(asked.time)})"
+    heads = ("difference from the baseline", "result")
+    columns = tuple(Column("", head, ("confirmation", head)) for head in heads)
+    return Table(title, ("idea",), columns, tuple(rows))
+
+
+def difference_text(opened: Opened, difference: Difference | None) -> str:
+    """``+0.0123 (+0.0040 to +0.0210)``, or in % for a relative question; "" without a test."""
+    if difference is None:
+        return ""
+    values = (difference.mean, difference.low, difference.high)
+    texts = [f"{100 * math.expm1(v):+.1f} %" if opened.relative else f"{v:+.4g}" for v in values]
+    mean, low, high = (text.replace("-", "−") for text in texts)
+    return f"{mean} ({low} to {high})"
+
+
+def _times(ratio: float | None) -> str:
+    return "" if ratio is None else f"×{ratio:.2f}"

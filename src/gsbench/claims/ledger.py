@@ -1,0 +1,214 @@
+"""Many ideas under one error rate: the level of each test, and what its trials show.
+
+The levels are LOND's (Javanmard and Montanari 2015, arXiv 1502.06197, eq. 3) with equal weights:
+with ``ideas`` planned tests and a false discovery rate ``rate``, the next test has the level
+``rate * (kept + 1) / ideas``. LOND controls the false discovery rate for p values with positive
+dependence (Zrnic, Ramdas and Jordan 2021, theorem 4), such as those of ideas that share the
+trainings of one baseline. Tests that run side by side count the ideas that were kept before they
+began, as the same paper does. `scripts/ledger_rates.py` simulates it (docs/night.md).
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.quantities import COSTS, relative_change
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.errors import InputError
+from gsbench.runs.experiments import Declaration, Question
+from gsbench.runs.ledger import (
+    BASELINE,
+    DROPPED,
+    KEPT,
+    UNDECIDED,
+    Confirmed,
+    Confirming,
+    Difference,
+    Ended,
+    Ledger,
+    Opened,
+    Result,
+)
+from gsbench.words import counted, listed
+
+# The chance, at each look, that an idea as good as the least difference that matters is given up.
+# It costs power and cannot make a false discovery.
+GIVE_UP = 0.05
+
+
+def next_level(ledger: Ledger) -> float:
+    """The level of the next test; raises InputError if all planned ideas were tried."""
+    opened = ledger.opened
+    if ledger.tried >= opened.ideas:
+        raise InputError(
+            f"all {opened.ideas} planned ideas were tried, so the error rate is spent: begin "
+            "another ledger, with another baseline or other captures"
+        )
+    return opened.rate * (len(ledger.kept) + 1) / opened.ideas
+
+
+def declaration_of(ledger: Ledger, idea: str) -> Declaration:
+    """The question of an idea, answered in looks.
+
+    The level is that of keeping an idea, one side of the interval. So both sides have twice the
+    level.
+    """
+    started = ledger.started[idea]
+    question = _question(
+        ledger.opened, ledger.keys_of(started.against), started.keys, ledger.opened.seeds, idea
+    )
+    return Declaration(
+        time=started.time,
+        questions=(replace(question, baseline=Arm("", started.against)),),
+        looks=plan_looks(len(question.seeds)),
+        error_rate=min(1.0, 2 * started.level),
+    )
+
+
+def confirmation_of(opened: Opened, confirming: Confirming) -> Declaration:
+    """The questions of a confirmation. All seeds are judged at once; the ideas share 5 %."""
+    questions = tuple(
+        _question(opened, confirming.keys[BASELINE], keys, confirming.seeds, idea)
+        for idea, keys in confirming.keys.items()
+        if idea != BASELINE
+    )
+    return Declaration(time=confirming.time, questions=questions)
+
+
+def _question(
+    opened: Opened,
+    baseline: Mapping[str, str],
+    idea: Mapping[str, str],
+    seeds: tuple[int, ...],
+    name: str,
+) -> Question:
+    # The baseline's trials are older than the question, as those of a gate are.
+    return Question(
+        metric=opened.metric,
+        sign=opened.sign,
+        least=opened.least,
+        relative=opened.relative,
+        baseline=Arm("", BASELINE),
+        arm=Arm("", name),
+        scenes={scene: (baseline[scene], idea[scene]) for scene in idea},
+        seeds=seeds,
+        versions=True,
+        name=name,
+    )
+
+
+def judge_idea(trials: Iterable[TrialResult], declaration: Declaration) -> Verdict:
+    """The verdict on an idea so far. It is final also once the idea is given up."""
+    (verdict,) = judge(list(trials), declaration)
+    return replace(verdict, final=verdict.final or result_of(verdict) != UNDECIDED)
+
+
+def result_of(verdict: Verdict) -> Result:
+    """``kept``, ``dropped`` or ``undecided``; an undecided idea may change with more seeds."""
+    if verdict.outcome == SUPPORTED:
+        return KEPT
+    if verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or _is_hopeless(verdict):
+        return DROPPED
+    return UNDECIDED
+
+
+def _is_hopeless(verdict: Verdict) -> bool:
+    """Return whether a gain of the least difference that matters is unlikely (`GIVE_UP`)."""
+    answer, least, sign = verdict.answer, verdict.least, verdict.question.sign
+    if answer is None or answer.test is None or least is None:
+        return False
+    interval = answer.test.interval(2 * GIVE_UP)
+    return max(sign * interval.low, sign * interval.high) < least
+
+
+def end_of(idea: str, verdict: Verdict, time: str) -> Ended:
+    """The ledger's entry for a final verdict."""
+    baseline, new = verdict.pairs.trials[::2], verdict.pairs.trials[1::2]
+    ratios = {}
+    for cost in ("gaussians", "train_time"):
+        change = relative_change(baseline, new, COSTS[cost][1])
+        ratios[cost] = None if change is None else 1 + change.of_totals
+    return Ended(
+        time=time,
+        idea=idea,
+        result=result_of(verdict),
+        reason=reason_of(verdict),
+        seeds=verdict.pairs.seeds,
+        difference=difference_of(verdict),
+        gaussians=ratios["gaussians"],
+        seconds=ratios["train_time"],
+    )
+
+
+def confirmed(number: int, verdicts: Sequence[Verdict], time: str) -> Confirmed:
+    """The ledger's entry for the verdicts of the confirmation ``number``."""
+    differences = {one.question.name: difference_of(one) for one in verdicts}
+    return Confirmed(
+        time=time,
+        number=number,
+        results={one.question.name: result_of(one) for one in verdicts},
+        differences={idea: one for idea, one in differences.items() if one is not None},
+    )
+
+
+def difference_of(verdict: Verdict) -> Difference | None:
+    """The mean difference with its interval; None without a test."""
+    if verdict.mean is None or verdict.interval is None:
+        return None
+    return Difference(mean=verdict.mean, low=verdict.interval.low, high=verdict.interval.high)
+
+
+def reason_of(verdict: Verdict) -> str:
+    """The result in a few words."""
+    least = verdict.question.least or 0.0
+    size = f"{100 * least:g} %" if verdict.question.relative else f"{least:g}"
+    if verdict.equal:
+        words = "equal to the last bit: the idea had no effect"
+    elif verdict.untestable or verdict.answer is None:
+        words = verdict.untestable or "trials are missing"
+    elif verdict.outcome in (SUPPORTED, REFUTED):
+        words = "better" if verdict.outcome == SUPPORTED else "worse"
+    elif verdict.outcome == TOO_SMALL:
+        words = f"any difference is below {size}"
+    elif _is_hopeless(verdict):
+        words = f"a gain of {size} is unlikely"
+    else:
+        words = "not decided by all seeds" if verdict.final else "not decided yet"
+    return "; ".join([words, *verdict.notes])
+
+
+def check_unknown_trials(ledger: Ledger, trials: Sequence[TrialResult]) -> None:
+    """Raise InputError for trials of the experiment that the ledger does not know.
+
+    Such trials are looks that were not counted: another command trained them, or the end of the
+    ledger was cut off.
+    """
+    unknown = sorted({trial.key for trial in trials} - ledger.all_keys())
+    if unknown:
+        raise InputError(
+            f"the ledger does not know {counted(len(unknown), 'configuration')} with trials "
+            f"({unknown[0]}): give other sweeps another name; if lines of the ledger are missing, "
+            "bring them back"
+        )
+
+
+def check_untouched(ledger: Ledger, trials: Sequence[TrialResult], asked: Confirming) -> None:
+    """Raise InputError if ``asked`` has a capture that was used before, by name or by photographs.
+
+    ``trials`` are all trials of the experiment that are done.
+    """
+    scenes, earlier = asked.keys[BASELINE], set(ledger.opened.keys)
+    for confirming, _ in ledger.confirmations:
+        if (confirming.keys, confirming.seeds) != (asked.keys, asked.seeds):
+            earlier |= confirming.keys[BASELINE].keys()
+    photographs = {trial.record.hashes.get("data") for trial in trials if trial.scene in earlier}
+    used = {scene for scene in scenes if scene in earlier}
+    for trial in trials:
+        if trial.scene in scenes and trial.record.hashes.get("data") in photographs:
+            used.add(trial.scene)
+    if used:
+        raise InputError(
+            f"{listed(sorted(used))} was seen by the ideas, or by an earlier confirmation: confirm "
+            "on other captures"
+        )

@@ -1,0 +1,189 @@
+"""Networks that find features, by name, and features of an image from one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.init.networks.features import Features, FeatureSettings
+from gsbench.scene.images import read_image, resize_image
+from gsbench.scene.options import downscaled_size
+from gsbench.system.install import install_command
+from gsbench.weights import MissingWeightsError, load_state
+
+GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
+SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
+# of SuperPoint's tensors in a LightGlue checkpoint of transformers
+LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."
+
+# Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of
+# the first pixel at (0, 0), descriptors [K, D] and scores [K].
+Found = tuple[Tensor, Tensor, Tensor]
+Extractor = Callable[[Tensor], Found]
+
+
+def extract_features(
+    path: Path, extractor: Extractor, settings: FeatureSettings, device: torch.device
+) -> Features:
+    """The strongest features of an image, shrunk to the size that ``settings`` has for the network.
+
+    Raises ``InputError`` if the image cannot be read or the device runs out of memory.
+    """
+    pixels = read_image(path)  # [H, W, 3]
+    height, width = pixels.shape[:2]
+    network_size = downscaled_size(width, height, max_size=settings.max_image_size)
+    pixels = resize_image(pixels, *network_size)
+    image = torch.from_numpy(pixels.astype(np.float32) / 255.0).permute(2, 0, 1)[None]
+    try:
+        with torch.inference_mode():
+            found = [part.float().cpu() for part in extractor(image.to(device))]
+    except torch.OutOfMemoryError as error:
+        size = f"{network_size[0]}x{network_size[1]}"
+        raise InputError(
+            f"{path.name}: {device} ran out of memory at {size} px: {GPU_MEMORY_HINT}"
+        ) from error
+    order = torch.sort(found[2], descending=True, stable=True).indices[: settings.max_keypoints]
+    keypoints, descriptors, scores = (part[order].numpy() for part in found)
+    return Features(keypoints, descriptors, scores, network_size, (width, height))
+
+
+def load_into(
+    network: torch.nn.Module, state: Mapping[str, Tensor], path: Path, device: torch.device
+) -> None:
+    """Load ``state``, with all parameters, into ``network`` on ``device``; buffers may lack."""
+    try:
+        missing, unexpected = network.load_state_dict(dict(state), strict=False)
+    except RuntimeError as error:
+        raise MissingWeightsError(
+            f"weights file {path} has tensors of other shapes than the network: replace it"
+        ) from error
+    # Buffers are constants that a network makes itself, and checkpoints of others often lack them.
+    learned = {name for name, _ in network.named_parameters()}
+    missing = sorted(learned.intersection(missing))
+    if missing or unexpected:
+        example = (missing or unexpected)[0]
+        raise MissingWeightsError(
+            f"weights file {path} is for another network ({len(missing)} tensors missing, "
+            f"{len(unexpected)} foreign, for example {example}): replace it"
+        )
+    network.to(device).eval()
+
+
+def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    try:
+        from transformers import SuperPointConfig, SuperPointForKeypointDetection
+    except ImportError as error:
+        raise InputError(
+            f"init.extractor=superpoint needs the package transformers: {install_command('dim')} "
+            "(and pip uninstall torchvision where that cannot be imported)"
+        ) from error
+
+    assert weights is not None
+    network = SuperPointForKeypointDetection(
+        SuperPointConfig(
+            keypoint_threshold=settings.keypoint_threshold,
+            nms_radius=settings.nms_radius,
+            max_keypoints=-1,
+            border_removal_distance=0,
+        )
+    )
+    state = load_state(weights)
+    prefix = LIGHTGLUE_DETECTOR_PREFIX
+    detector = [name for name in state if name.startswith(prefix)]
+    if detector:
+        state = {name.removeprefix(prefix): state[name] for name in detector}
+    load_into(network, state, weights, device)
+
+    def extract(image: Tensor) -> Found:
+        height, width = image.shape[-2:]
+        output = network(_gray(image))  # reads the first channel only
+        size = torch.tensor([width, height], device=image.device)
+        # The output is relative to the size, and keypoints are whole px, so rounding restores them.
+        # The processor of transformers truncates instead, and is one px too low in 5 % of the
+        # columns of some widths.
+        keypoints = (output.keypoints[0] * size).round()  # [K, 2]
+        # The network's own border removal is off, because it tests the right and bottom borders in
+        # the wrong unit.
+        border = SUPERPOINT_BORDER
+        inside = ((keypoints >= border) & (keypoints < size - border)).all(dim=1)
+        keep = inside & output.mask[0].bool()
+        return keypoints[keep], output.descriptors[0][keep], output.scores[0][keep]
+
+    return extract
+
+
+def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import ALIKED
+
+    assert weights is not None
+    network = ALIKED(
+        f"aliked-{settings.aliked_model}",
+        max_num_keypoints=settings.max_keypoints,
+        detection_threshold=settings.keypoint_threshold,
+        nms_radius=settings.nms_radius,
+    )
+    load_into(network, load_state(weights), weights, device)
+
+    def extract(image: Tensor) -> Found:
+        features = network(image)[0]
+        return features.keypoints, features.descriptors, features.keypoint_scores
+
+    return extract
+
+
+def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device) -> Extractor:
+    from kornia.feature import DISK
+
+    assert weights is not None
+    network = DISK()
+    load_into(network, load_state(weights, entry="extractor"), weights, device)
+
+    def extract(image: Tensor) -> Found:
+        features = network(
+            image,
+            n=settings.max_keypoints,
+            window_size=2 * settings.nms_radius + 1,
+            score_threshold=settings.keypoint_threshold,
+            pad_if_not_divisible=True,
+        )[0]
+        return features.keypoints, features.descriptors, features.detection_scores
+
+    return extract
+
+
+def _sift_kornia(
+    settings: FeatureSettings, weights: Path | None, device: torch.device
+) -> Extractor:
+    from kornia.feature import SIFTFeatureScaleSpace, laf_is_filled
+
+    network = SIFTFeatureScaleSpace(
+        settings.max_keypoints, device=device, descriptor_backend="pyramid"
+    ).eval()
+
+    def extract(image: Tensor) -> Found:
+        frames, responses, descriptors = network(_gray(image)[:, :1])
+        filled = laf_is_filled(frames)[0]  # [K]: slots stay empty in an image with few extrema
+        return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
+
+    return extract
+
+
+def _gray(image: Tensor) -> Tensor:
+    """The luma of ITU-R BT.601 in three equal channels [1, 3, H, W]."""
+    weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
+    return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)
+
+
+# Each makes an extractor with its network on a device; the path is the checked file of weights,
+# None if it needs none. They raise ``MissingWeightsError`` if the file does not fit the network.
+EXTRACTORS: dict[str, Callable[[FeatureSettings, Path | None, torch.device], Extractor]] = {
+    "superpoint": _superpoint,
+    "aliked": _aliked,
+    "disk": _disk,
+    "sift_kornia": _sift_kornia,
+}

@@ -1,0 +1,122 @@
+"""Settings of the initialisers that end in COLMAP. Each station of their way reads its own here.
+
+They stand apart from the initialisers, so that a station knows what is set but not who runs it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from annotated_types import Ge, Interval
+from pydantic import PositiveFloat, PositiveInt
+
+from gsbench.init.base import Initializer, PointsFrom, Poses, Seed
+from gsbench.scene.types import Capture
+from gsbench.settings import Fraction, Threads, check_settings
+from gsbench.system.resources import available_cores
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Pairing = Literal["exhaustive", "auto", "sequential"]
+CameraSharing = Literal["single", "per_folder", "per_image"]
+CameraModel = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+]
+ImageSize = Annotated[int, Ge(32)]  # px: detectors find nothing in smaller images
+MatchRatio = Annotated[float, Interval(gt=0, le=1)]  # distance to the best over the second-best
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapOptions(Initializer):
+    """The settings that `Sfm`, `SfmDense`, `Dim` and `SiftKornia` share.
+
+    With ``poses=shared``, points are triangulated under the reference cameras. With ``poses=own``,
+    cameras and points are estimated; if there is a reference and ``align`` is set, a similarity
+    then moves them into its gauge.
+
+    With ``points_from=train``, test views contribute no points. Under given cameras their
+    photographs are not read. If cameras are estimated, all photographs are used for the cameras,
+    and only points of training views are kept.
+
+    The reference is the ``reference`` given to `run`, else the model that came with the capture.
+    """
+
+    poses: Poses = "shared"
+    align: bool = True
+    camera: CameraSharing = "single"
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    focal_length: PositiveFloat | None = None
+    intrinsics: Literal["estimate", "reference"] = "estimate"
+    pairs: Pairing = "exhaustive"
+    overlap: Annotated[int, Interval(ge=1, le=60)] = 10
+    min_inliers: Annotated[int, Ge(7)] = 15  # a fundamental matrix needs seven
+    min_inlier_ratio: Fraction = 0.0
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    min_model_size: Annotated[int, Ge(2)] = 3
+    two_view_tracks: bool = False
+    points_from: PointsFrom = "all"
+    seed: Seed = 0
+    threads: Threads | Literal["auto"] = "auto"
+    mapper_threads: Threads = 1
+
+    def __post_init__(self) -> None:
+        check_settings(self, "init")
+
+    @property
+    def num_threads(self) -> int:
+        """``threads`` as a number; ``auto`` is the number of cores that this process may use."""
+        return available_cores() if self.threads == "auto" else self.threads
+
+    @property
+    def uses_reference_cameras(self) -> bool:
+        """Return whether at least the intrinsics are taken from the reference, if there is one."""
+        return self.poses == "shared" or self.intrinsics == "reference"
+
+    def ignores_test_photographs(self, reference: pycolmap.Reconstruction | None) -> bool:
+        """Return whether test photographs are not read at all: given cameras do not need them."""
+        return self.points_from != "all" and self.poses == "shared" and reference is not None
+
+    def select_images(
+        self, capture: Capture, reference: pycolmap.Reconstruction | None
+    ) -> list[str]:
+        """The sorted names of the images to use: those of the reference if its cameras are used."""
+        if reference is None or not self.uses_reference_cameras:
+            return sorted(capture.image_names)
+        names = {image.name for image in reference.images.values() if image.has_pose}
+        if self.ignores_test_photographs(reference):
+            names -= set(capture.test_names)
+        return sorted(names)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiftOptions(ColmapOptions):
+    """The settings of COLMAP's SIFT features and of their matching.
+
+    ``max_image_size`` is in px of the longest side. Larger images are shrunk for detection, and
+    keypoints are scaled back to the files' size.
+    """
+
+    max_image_size: ImageSize = 1600
+    max_num_features: PositiveInt = 8192
+    peak_threshold: PositiveFloat = 0.02 / 3  # COLMAP's default, as is the next
+    edge_threshold: PositiveFloat = 10.0
+    first_octave: Annotated[int, Interval(ge=-1, le=5)] = -1
+    max_ratio: MatchRatio = 0.8
+    cross_check: bool = True
+    guided_matching: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions(ColmapOptions):
+    """The settings of features and matches from outside COLMAP.
+
+    ``max_image_size`` is in px of the longest side.
+    """
+
+    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # SIFT has no "lowres"
+    max_keypoints: PositiveInt = 2048
+    max_image_size: ImageSize = 1600
+    max_ratio: MatchRatio = 0.95
+    device: str = "cpu"

@@ -1,0 +1,270 @@
+"""The ledger of many ideas, ``<runs>/<experiment>/ledger.jsonl``: what was tried, in which order.
+
+The file grows by whole lines. Each line has the sha256 of the line before it, so a line that was
+edited, moved or dropped is found when the file is read (`read_ledger`).
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from gsbench.errors import InputError
+from gsbench.files import require_no_links, write_text
+from gsbench.parsing import (
+    Amount,
+    Count,
+    DamagedError,
+    Number,
+    Record,
+    Text,
+    parse_typed,
+    read_bytes,
+)
+from gsbench.runs.experiments import TrialKey
+from gsbench.runs.layout import LEDGER
+from gsbench.system.locks import hold
+
+BASELINE = "baseline"  # the name of the ledger's own baseline among the ideas
+
+Result = Literal["kept", "dropped", "undecided", "failed"]
+KEPT: Result = "kept"
+DROPPED: Result = "dropped"
+UNDECIDED: Result = "undecided"
+FAILED: Result = "failed"
+Seeds = Annotated[tuple[Count, ...], Field(min_length=2)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opened(Record):
+    """The first line: what decides, on which trials, and how many ideas share the error rate.
+
+    ``least`` is the least difference in ``metric`` that matters, a fraction of the baseline's value
+    if ``relative``. ``rate`` is the false discovery rate. ``words`` are the baseline's settings,
+    ``keys`` its trials by scene.
+    """
+
+    kind: Literal["opened"] = "opened"
+    time: Text
+    metric: Text
+    sign: Literal[-1, 1]
+    least: Amount
+    relative: bool = False
+    ideas: Annotated[int, Field(ge=1, le=10_000)]
+    rate: Annotated[float, Field(gt=0, lt=1)]
+    seeds: Seeds
+    words: tuple[str, ...]
+    keys: dict[Text, TrialKey]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Started(Record):
+    """An idea and the ``level`` of its test, written before its first trial.
+
+    ``against`` is the idea that it is compared with. ``identity`` is the hash of its settings and
+    code without names: equal hashes are the same idea.
+    """
+
+    kind: Literal["started"] = "started"
+    time: Text
+    idea: Text
+    against: Text
+    level: Annotated[float, Field(gt=0, lt=1)]
+    identity: Text
+    words: tuple[str, ...]
+    keys: dict[Text, TrialKey]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference(Record):
+    """A mean difference with its interval; for a relative question all three are logarithms."""
+
+    mean: Number
+    low: Number
+    high: Number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ended(Record):
+    """The result of an idea; "failed" if it ended without any result, which may be tried again.
+
+    ``gaussians`` and ``seconds`` are the ratios of its numbers of Gaussians and training times to
+    those of what it was compared with.
+    """
+
+    kind: Literal["ended"] = "ended"
+    time: Text
+    idea: Text
+    result: Result
+    reason: str
+    seeds: Count
+    difference: Difference | None = None
+    gaussians: Amount | None = None
+    seconds: Amount | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Confirming(Record):
+    """Captures and seeds that no idea has seen, chosen before their first trial.
+
+    ``keys`` are the trials of the baseline and of each idea by scene.
+    """
+
+    kind: Literal["confirming"] = "confirming"
+    time: Text
+    seeds: Seeds
+    keys: dict[Text, dict[Text, TrialKey]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Confirmed(Record):
+    """The results of the confirmation ``number`` (from 0): each idea's difference."""
+
+    kind: Literal["confirmed"] = "confirmed"
+    time: Text
+    number: Count
+    results: dict[Text, Result]
+    differences: dict[Text, Difference]
+
+
+Entry = Opened | Started | Ended | Confirming | Confirmed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line(Record):
+    """An entry with the sha256 of the line before it, "" for the first."""
+
+    before: str
+    entry: Annotated[Entry, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The entries of a ledger; the first one is `Opened`."""
+
+    entries: tuple[Entry, ...]
+    head: str = field(repr=False)  # sha256 of the last line
+
+    @property
+    def opened(self) -> Opened:
+        first = self.entries[0]
+        assert isinstance(first, Opened)  # `read_ledger` has checked it
+        return first
+
+    @cached_property
+    def started(self) -> dict[str, Started]:
+        """The ideas in the order of their tests."""
+        return {one.idea: one for one in self.entries if isinstance(one, Started)}
+
+    @cached_property
+    def ended(self) -> dict[str, Ended]:
+        return {one.idea: one for one in self.entries if isinstance(one, Ended)}
+
+    @property
+    def tried(self) -> int:
+        """The number of tests that count: an idea without any result tells nothing."""
+        failed = sum(one.result == FAILED for one in self.ended.values())
+        return len(self.started) - failed
+
+    @property
+    def kept(self) -> list[str]:
+        """The ideas that were kept."""
+        return [one.idea for one in self.ended.values() if one.result == KEPT]
+
+    @property
+    def confirmations(self) -> list[tuple[Confirming, Confirmed | None]]:
+        """Each confirmation with its results, None while trials are missing."""
+        begun = [one for one in self.entries if isinstance(one, Confirming)]
+        done = {one.number: one for one in self.entries if isinstance(one, Confirmed)}
+        return [(one, done.get(number)) for number, one in enumerate(begun)]
+
+    def number_of(self, asked: Confirming) -> int | None:
+        """The number of the confirmation with the same trials, None if there is none."""
+        same = (asked.keys, asked.seeds)
+        begun = [(one.keys, one.seeds) for one, _ in self.confirmations]
+        return begun.index(same) if same in begun else None
+
+    def words_of(self, idea: str) -> tuple[str, ...]:
+        """The settings of an idea, or of the baseline."""
+        return self.opened.words if idea == BASELINE else self.started[idea].words
+
+    def keys_of(self, idea: str) -> dict[str, str]:
+        """The trials of an idea, or of the baseline, by scene."""
+        return self.opened.keys if idea == BASELINE else self.started[idea].keys
+
+    def all_keys(self) -> set[str]:
+        """The keys of all trials that the ledger knows."""
+        keys = set(self.opened.keys.values())
+        for started in self.started.values():
+            keys |= set(started.keys.values())
+        for confirming, _ in self.confirmations:
+            keys |= {key for own in confirming.keys.values() for key in own.values()}
+        return keys
+
+
+def read_ledger(home: Path) -> Ledger:
+    """The ledger of the experiment in ``home``.
+
+    Raises InputError, one line: there is none, or a line is damaged, edited, moved or missing.
+    """
+    path = home / LEDGER
+    try:
+        lines = read_bytes(path).splitlines(keepends=True)
+    except FileNotFoundError:
+        raise InputError(
+            f"{home.name} has no ledger: gsbench ledger new {home.name} --metric … begins one"
+        ) from None
+    head, entries = "", list[Entry]()
+    for number, content in enumerate(lines, 1):
+        try:
+            line = parse_typed(content, Line, path)
+        except DamagedError as error:
+            raise InputError(f"{path}: line {number} {error.reason}: {MEND}") from None
+        if line.before != head or isinstance(line.entry, Opened) != (number == 1):
+            raise InputError(
+                f"{path}: line {number} does not follow the line before it: one of them was "
+                f"edited, moved or taken out: {MEND}"
+            )
+        entries.append(line.entry)
+        head = hashlib.sha256(content).hexdigest()
+    if not entries:
+        raise InputError(f"{path} is empty: {MEND}")
+    return Ledger(tuple(entries), head)
+
+
+MEND = "bring back the file as gsbench wrote it, or begin another ledger"
+
+
+def begin_ledger(home: Path, opened: Opened) -> Ledger:
+    """Write the first line of a new ledger in ``home``, or return the ledger that has this line."""
+    require_no_links(home.parent, home)
+    with hold(home / f".{LEDGER}.lock", "the ledger"):
+        if (home / LEDGER).exists():
+            return read_ledger(home)
+        _write(home, "", "", opened)
+        return read_ledger(home)
+
+
+def append(home: Path, make: Callable[[Ledger], Entry | None]) -> Ledger:
+    """Append the entry that ``make`` gives for the present ledger; None appends nothing.
+
+    Other processes cannot append meanwhile, so ``make`` sees all entries before its own.
+    """
+    with hold(home / f".{LEDGER}.lock", "the ledger"):
+        ledger = read_ledger(home)
+        entry = make(ledger)
+        if entry is None:
+            return ledger
+        _write(home, read_bytes(home / LEDGER).decode(), ledger.head, entry)
+        return read_ledger(home)
+
+
+def _write(home: Path, text: str, head: str, entry: Entry) -> None:
+    """Replace the file as a whole, so that a kill leaves the old file or the new one."""
+    values = {"before": head, "entry": {"kind": entry.kind} | entry.to_json()}
+    write_text(home / LEDGER, f"{text}{json.dumps(values, ensure_ascii=False)}\n")

@@ -1,0 +1,425 @@
+"""``gsbench ledger``: many ideas under one false discovery rate (docs/night.md)."""
+
+import argparse
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.judgement import judge
+from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables
+from gsbench.analysis.results import read_experiment
+from gsbench.analysis.statistics import FIRST_LOOK
+from gsbench.analysis.table_formats import to_markdown
+from gsbench.app.command import compose_trials, run_trials
+from gsbench.claims import ledger as rules
+from gsbench.claims.gate import asked_difference
+from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
+from gsbench.config.command_words import key_of, typed_permissions
+from gsbench.config.compose import Trial
+from gsbench.errors import GsbenchError, InputError
+from gsbench.eval.options import EvalConfig
+from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.runs import ledger as records
+from gsbench.runs.experiments import STAMP, make_home
+from gsbench.runs.keys import config_hash
+from gsbench.runs.layout import IN_RUNS, LEDGER
+from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
+from gsbench.settings import is_folder_name
+from gsbench.verbs.arguments import ArgumentParser, names
+from gsbench.words import did_you_mean, listed
+
+EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
+IDEAS, RATE = 40, 0.1  # the defaults of a night
+MOST_IDEAS = 10_000
+OWN = ("name", "runs", "eval.primary")  # settings that the ledger gives itself
+# An idea may change how a model is made, not what it is measured on.
+OF_IDEAS = ("densify", "init", "train", "raster", "allow_targets", "launch", "device", "threads")
+
+Trials = dict[KeyAndSeed, Trial]
+
+
+def ledger(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: 0 kept (or nothing was tried), 1 dropped or failed, 3 undecided."""
+    options = _parser().parse_args(argv)
+    if not is_folder_name(options.name) or options.name in IN_RUNS:
+        raise InputError(f"ledger: {options.name!r} cannot be the name of an experiment")
+    action, own = ACTIONS[options.action]
+    for option, flag in FLAGS.items():
+        if getattr(options, option) and option not in own:
+            raise InputError(f"ledger {options.action} takes no {flag}")
+    return action(options, runs / options.name)
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(
+        "ledger",
+        "`new` declares metric, baseline, captures, seeds and error rate. `try` trains one idea, "
+        "seed by seed until it is decided; exit code 0: kept, 1: dropped, or its trials fail, 3: "
+        "undecided, 2: bad input. `confirm` trains what was kept on other captures. `show` lists "
+        "all (docs/night.md).",
+    )
+    parser.add_argument("action", choices=list(ACTIONS))
+    parser.add_argument("name", help="the ledger, which is an experiment in the runs folder")
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep")
+    parser.add_argument("--metric", help="new: decides, such as lpips_squeeze (psnr)")
+    parser.add_argument(
+        "--least", help="new: the least difference that matters, as 0.1 or 10%% (the metric's)"
+    )
+    parser.add_argument(
+        "--ideas", type=_planned, help=f"new: the most ideas that will be tried ({IDEAS})"
+    )
+    parser.add_argument(
+        "--fdr", type=_rate, help=f"new: the false discovery rate, from 0 to 1 ({RATE})"
+    )
+    parser.add_argument("--against", help="try: a kept idea to start from (default: the baseline)")
+    parser.add_argument("--as", dest="idea", help="try: the idea's name (default: densify.name)")
+    parser.add_argument("--only", type=names, help="confirm: these ideas (default: all kept)")
+    parser.add_argument("--json", action="store_true", help="try, show: print JSON")
+    return parser
+
+
+def new(options: argparse.Namespace, home: Path) -> int:
+    """Declare a ledger; the same command again changes nothing."""
+    trials = _compose(options.name, options.settings)
+    keys, seeds = _keys(trials, options.name), _seeds(trials)
+    values = next(iter(trials.values())).values
+    metric = options.metric or "psnr"
+    sign, least = asked_difference(metric, options.least, values)
+    EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
+    opened = records.Opened(
+        time=_now(),
+        metric=metric,
+        sign=1 if sign > 0 else -1,
+        least=least.size,
+        relative=least.relative,
+        ideas=options.ideas or IDEAS,
+        rate=options.fdr or RATE,
+        seeds=seeds,
+        words=tuple(options.settings),
+        keys=keys,
+    )
+    make_runs_folder(checked_runs_folder(str(home.parent)))
+    if home.is_dir() and not (home / LEDGER).exists() and read_experiment(home).trials:
+        raise InputError(f"{home.name} has trials already: give the ledger another name")
+    make_home(home)
+    begun = records.begin_ledger(home, opened)
+    if begun.opened.to_json() | {"time": ""} != opened.to_json() | {"time": ""}:
+        raise InputError(f"{home.name} is another ledger already: give this one another name")
+    print("\n".join(describe_ledger(begun)))
+    return 0
+
+
+def try_idea(options: argparse.Namespace, home: Path) -> int:
+    """Run one idea until it is decided; an idea that was decided before is only shown."""
+    book = records.read_ledger(home)
+    rules.check_unknown_trials(book, read_experiment(home).trials)
+    against = options.against or BASELINE
+    if against != BASELINE and against not in book.kept:
+        kept = listed([BASELINE, *book.kept])
+        raise InputError(f"--against {against}: there is {kept}{did_you_mean(against, book.kept)}")
+    _check_words(options.settings)
+    start = _permitted(book, against, options.settings)
+    trials = _compose(home.name, start)
+    if _keys(trials, home.name) != book.keys_of(against):
+        raise InputError(
+            f"the settings or the code of {against} have changed since its trials ran: bring them "
+            "back"
+        )
+    own = _compose(home.name, _merged(start, options.settings))
+    idea, book = _start(home, own, against, options)
+    if (ended := book.ended.get(idea)) is None or ended.result == FAILED:
+        trials |= own
+        book = _run(home, book, idea, trials)
+    _print_idea(book, idea, options.json)
+    return EXIT_CODES[book.ended[idea].result]
+
+
+def _start(
+    home: Path, trials: Trials, against: str, options: argparse.Namespace
+) -> tuple[str, Ledger]:
+    """The name of the idea in the ledger, which has its level from now on."""
+    keys, values = _keys(trials, home.name), next(iter(trials.values())).values
+    nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
+    identity = config_hash(nameless)
+    chosen: list[str] = []
+
+    def make(book: Ledger) -> records.Started | None:
+        same = [
+            one
+            for one in book.started.values()
+            if (one.identity, one.against) == (identity, against)
+        ]
+        if keys in (book.opened.keys, book.keys_of(against)):
+            raise InputError(f"the idea is {against} itself: give it other settings or code")
+        if same:
+            chosen.append(same[0].idea)
+            ended = book.ended.get(same[0].idea)
+            if ended is not None and ended.result == FAILED:
+                rules.next_level(book)  # raises if other ideas have taken its place
+            return None
+        level = rules.next_level(book)
+        name = options.idea or values["densify"]["name"]
+        if name in (*book.started, BASELINE):
+            if options.idea:
+                raise InputError(f"--as {name}: another idea has this name: give another")
+            name = f"{name}-{len(book.started) + 1}"
+        chosen.append(name)
+        return records.Started(
+            time=_now(),
+            idea=name,
+            against=against,
+            level=level,
+            identity=identity,
+            words=tuple(_merged(book.words_of(against), options.settings)),
+            keys=keys,
+        )
+
+    book = records.append(home, make)
+    return chosen[0], book
+
+
+def _run(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
+    """Train the idea and what it is compared with, look by look, and write its result."""
+    declaration = rules.declaration_of(book, idea)
+    fails = ""
+
+    def run(planned: Sequence[KeyAndSeed]) -> None:
+        nonlocal fails
+        try:
+            code = run_trials([trials[key] for key in planned])
+        except GsbenchError as error:
+            fails = str(error)
+        else:
+            fails = "its trials fail" if code else ""
+
+    def judged() -> list[Any]:
+        return [rules.judge_idea(finished_trials(home, list(trials.values())), declaration)]
+
+    (verdict,) = run_looks(declaration, judged, run)
+    ended = rules.end_of(idea, verdict, _now())
+    if fails and not verdict.final:
+        own = set(book.keys_of(idea).values())
+        failed = {key for key, trial in trials.items() if trial.files.has_failed()}
+        done = {one.key for one in finished_trials(home, list(trials.values()))}
+        if own & done or not {key for key, _ in failed} <= own:
+            raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
+        reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
+        ended = records.Ended(time=_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
+
+    def make(now: Ledger) -> records.Ended | None:
+        before = now.ended.get(idea)  # by a process that ran the same command
+        return None if before is not None and before.result != FAILED else ended
+
+    return records.append(home, make)
+
+
+def confirm(options: argparse.Namespace, home: Path) -> int:
+    """Train the baseline and the kept ideas on captures that no idea has seen."""
+    book = records.read_ledger(home)
+    rules.check_unknown_trials(book, read_experiment(home).trials)
+    ideas = list(options.only or book.kept)
+    if missing := [idea for idea in ideas if idea not in book.kept]:
+        raise InputError(f"--only {missing[0]}: kept were {listed(book.kept) or 'no ideas'}")
+    if not ideas:
+        raise InputError("no idea was kept, so there is nothing to confirm")
+    if not any(key_of(word) == "scene" for word in options.settings):
+        raise InputError("confirm needs captures that no idea has seen: scene=…")
+    by_idea = {
+        idea: _compose(
+            home.name, _merged(_permitted(book, idea, options.settings), options.settings)
+        )
+        for idea in (BASELINE, *ideas)
+    }
+    keys = {idea: _keys(trials, home.name) for idea, trials in by_idea.items()}
+    asked = records.Confirming(time=_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
+
+    def make(now: Ledger) -> records.Confirming | None:
+        if now.number_of(asked) is not None:
+            return None
+        rules.check_untouched(now, read_experiment(home).trials, asked)
+        return asked
+
+    book = records.append(home, make)
+    number = book.number_of(asked)
+    assert number is not None  # `make` has just added it
+    if book.confirmations[number][1] is None:
+        book = _run_confirmation(home, book, number, by_idea)
+    print(to_markdown(ledger_tables(book)[1 + number]))
+    return 0
+
+
+def _run_confirmation(
+    home: Path, book: Ledger, number: int, by_idea: Mapping[str, Trials]
+) -> Ledger:
+    """Train all trials of a confirmation, and write its results."""
+    asked, _ = book.confirmations[number]
+    first = {key: trial for key, trial in by_idea[BASELINE].items() if key[1] == asked.seeds[0]}
+    _run_all(first)
+    # Only now are the photographs' hashes known, which show a copy under another name.
+    rules.check_untouched(book, read_experiment(home).trials, asked)
+    trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
+    _run_all(trials)
+    declaration = rules.confirmation_of(book.opened, asked)
+    verdicts = judge(finished_trials(home, list(trials.values())), declaration)
+
+    def make(now: Ledger) -> records.Confirmed | None:
+        if now.confirmations[number][1] is not None:  # by a process that ran the same command
+            return None
+        return rules.confirmed(number, verdicts, _now())
+
+    return records.append(home, make)
+
+
+def show(options: argparse.Namespace, home: Path) -> int:
+    """Print the ledger."""
+    book = records.read_ledger(home)
+    rules.check_unknown_trials(book, read_experiment(home).trials)
+    if options.json:
+        ideas = [_facts(book, idea) for idea in book.started]
+        confirmations = [one.to_json() for pair in book.confirmations for one in pair if one]
+        values = {"opened": book.opened.to_json(), "ideas": ideas, "confirmations": confirmations}
+        print(json.dumps(values | _left(book), indent=1))
+        return 0
+    print("\n".join([*describe_ledger(book), "", *map(to_markdown, ledger_tables(book))]))
+    return 0
+
+
+FLAGS = {
+    "settings": "settings",
+    "metric": "--metric",
+    "least": "--least",
+    "ideas": "--ideas",
+    "fdr": "--fdr",
+    "against": "--against",
+    "idea": "--as",
+    "only": "--only",
+    "json": "--json",
+}
+ACTIONS = {  # with the options that each of them takes
+    "new": (new, ("settings", "metric", "least", "ideas", "fdr")),
+    "try": (try_idea, ("settings", "against", "idea", "json")),
+    "confirm": (confirm, ("settings", "only")),
+    "show": (show, ("json",)),
+}
+
+
+# ---- trials of the ledger's words
+
+
+def _compose(name: str, words: Sequence[str]) -> Trials:
+    """The trials of words by key and seed; raises InputError for settings that the ledger gives."""
+    for word in words:
+        if key_of(word) in OWN:
+            raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
+    trials = compose_trials([*words, f"name={name}"], multirun=True)
+    if not trials[0].values["launch"]["wait"]:
+        raise InputError("ledger needs results to go on: leave launch.wait=false out")
+    return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
+
+
+def _keys(trials: Trials, name: str) -> dict[str, str]:
+    """The key of the one arm on each scene."""
+    keys: dict[str, set[str]] = {}
+    for (key, _), trial in trials.items():
+        keys.setdefault(trial.values["scene"]["name"], set()).add(key)
+    if any(len(own) > 1 for own in keys.values()):
+        raise InputError(f"{name} compares one arm at a time: only scene and seed may list values")
+    return {scene: own.pop() for scene, own in keys.items()}
+
+
+def _seeds(trials: Trials) -> tuple[int, ...]:
+    seeds = tuple(dict.fromkeys(seed for _, seed in trials))
+    if len(seeds) < FIRST_LOOK:
+        raise InputError(f"a ledger needs at least {FIRST_LOOK} seeds, such as seed=0,1,2,3,4,5")
+    return seeds
+
+
+def _permitted(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]:
+    """The recorded settings of an idea, or of the baseline.
+
+    Raises InputError if they would run code that the ``typed`` words do not allow: the ledger is a
+    file, and may be somebody else's.
+    """
+    words = book.words_of(idea)
+    needed = set(typed_permissions(words)) - set(typed_permissions(typed))
+    if needed:
+        names = ",".join(sorted(needed | set(typed_permissions(typed))))
+        raise InputError(f"{idea} runs code of yours: add allow_targets=[{names}]")
+    return words
+
+
+def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
+    """The words with changes: a word gives way to one of the same key, ``~KEY`` takes it away."""
+    given, changed = set(map(key_of, words)), set(map(key_of, changes))
+    kept = [word for word in words if key_of(word) not in changed]
+    return kept + [word for word in changes if not (word.startswith("~") and key_of(word) in given)]
+
+
+def _check_words(words: Sequence[str]) -> None:
+    """Raise InputError for a setting that is not an idea's to change."""
+    for key in map(key_of, words):
+        if key.partition(".")[0].partition("/")[0] not in OF_IDEAS:
+            raise InputError(f"{key}: an idea may change {listed(OF_IDEAS[:4])}, not what decides")
+    if not words:
+        raise InputError("ledger try needs the idea's settings, such as densify=volumetric")
+
+
+def _run_all(trials: Mapping[KeyAndSeed, Trial]) -> None:
+    if code := run_trials(list(trials.values())):
+        raise (InputError if code == 2 else GsbenchError)("trials fail: nothing is confirmed")
+
+
+# ---- what is printed
+
+
+def _print_idea(book: Ledger, idea: str, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(_facts(book, idea) | _left(book)))
+        return
+    ended = book.ended[idea]
+    difference = difference_text(book.opened, ended.difference)
+    costs = [
+        f"{ratio:.2f} times the {what}"
+        for ratio, what in ((ended.gaussians, "Gaussians"), (ended.seconds, "training time"))
+        if ratio is not None
+    ]
+    facts = [f"{book.opened.metric} {difference}"] * bool(difference) + costs
+    print("; ".join([f"{idea}: {ended.result}: {ended.reason}", *facts]))
+    print(describe_ledger(book)[1])
+
+
+def _facts(book: Ledger, idea: str) -> dict[str, Any]:
+    """What is known of an idea, for programs."""
+    started, ended = book.started[idea], book.ended.get(idea)
+    facts = {"idea": idea, "against": started.against, "level": started.level}
+    if ended is None:
+        return facts | {"result": "begun"}
+    return facts | {
+        key: value for key, value in ended.to_json().items() if key not in ("idea", "time")
+    }
+
+
+def _left(book: Ledger) -> dict[str, Any]:
+    return {"tried": book.tried, "planned": book.opened.ideas, "kept": book.kept}
+
+
+def _now() -> str:
+    return time.strftime(STAMP, time.gmtime())
+
+
+def _planned(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= MOST_IDEAS:
+        raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_IDEAS}, got {text!r}")
+    return int(text)
+
+
+def _rate(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < 1:
+        raise argparse.ArgumentTypeError(f"must be above 0 and below 1, got {text!r}")
+    return rate

@@ -1,0 +1,110 @@
+"""What tests of densifiers share: Gaussians in training, made-up renders, refinements, and one check of a round."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsbench.densify import Densifier, RefineEvent, Refinement
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import RenderOutput
+from tests.densify import restatement
+from tests.densify.restatement import Row
+
+EXTENT = 4.0
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def trained(gaussians: Gaussians, extent: float = EXTENT) -> TrainableGaussians:
+    return TrainableGaussians(gaussians, LearningRates(), extent)
+
+
+def with_moments(gaussians: Gaussians) -> TrainableGaussians:
+    """After a step of Adam, so that an edit has moments to keep."""
+    trainable = trained(gaussians)
+    for tensor in trainable.values.tensors().values():
+        tensor.grad = torch.full_like(tensor, 1e-3)
+    trainable.optimizer_step()
+    return trainable
+
+
+def at(step: int, trainable: Any, seed: int = 0) -> Refinement:
+    return Refinement(step, trainable, generator(seed), RefineEvent(step, len(trainable)))
+
+
+def rendered(gradient: Any, radii: Any = None, absolute: Any = None, **more: Any) -> RenderOutput:
+    """A render without pixels, of Gaussians with these screen gradients [N, 2], all visible."""
+    points = torch.zeros(len(gradient), 2, dtype=torch.float64, requires_grad=True)
+    points.grad = torch.as_tensor(gradient, dtype=torch.float64)
+    seen = torch.ones(len(gradient)) if radii is None else torch.as_tensor(radii)
+    none = torch.empty(0)
+    return RenderOutput(none, none, seen.to(torch.int32), points, absolute, **more)
+
+
+def gathered(densifier: Densifier, gradient: Any, absolute: Any = None) -> None:
+    """As if one iteration had seen all, with these gradients [N]."""
+    densifier.statistics["gradient_sum"] = torch.as_tensor(gradient)
+    densifier.statistics["visible_count"][:] = 1
+    if absolute is not None:
+        densifier.statistics["absolute_sum"] = torch.as_tensor(absolute)
+
+
+def to_rows(trainable: TrainableGaussians) -> list[Row]:
+    tensors = dict(trainable.values.tensors())
+    for name, state in trainable.adam.items():
+        tensors |= {f"first {name}": state.first, f"second {name}": state.second}
+    return [
+        {name: tensor[i].detach().numpy().copy() for name, tensor in tensors.items()}
+        for i in range(len(trainable))
+    ]
+
+
+def noise_of(seed: int, *counts: int) -> Any:
+    """The normal draws of the real code: one batch of [2 S, 3] per rule that splits S parents."""
+    rng = generator(seed)
+    draws = [torch.randn(2 * s, 3, generator=rng, dtype=torch.float64).numpy() for s in counts]
+    return iter([row for batch in draws for row in batch])
+
+
+def assert_same(trainable: TrainableGaussians, rows: list[Row]) -> None:
+    found = to_rows(trainable)
+    assert len(found) == len(rows)
+    for real, expected in zip(found, rows, strict=True):
+        assert real.keys() == expected.keys()
+        for name, value in real.items():
+            np.testing.assert_allclose(value, expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
+            apart = np.abs(value - expected[name]) / np.maximum(1, np.abs(expected[name]))
+            restatement.DIFFERENCES.append(float(apart.max(initial=0)))
+
+
+class Round:
+    """A real round at ``step``, with what was there before it; ``check`` compares the end."""
+
+    def __init__(
+        self, densifier: Densifier, trainable: TrainableGaussians, step: int, seed: int = 0
+    ) -> None:
+        self.densifier, self.trainable, self.step = densifier, trainable, step
+        self.rows, self.counts = to_rows(trainable), dict[str, int]()
+        forecast = getattr(densifier, "forecast", None)
+        capped = getattr(densifier, "cap", "soft") not in ("soft", "freeze", "governor")
+        self.foreseen = None if forecast is None or capped else forecast(at(step, trainable))
+        event = densifier.refine(step, trainable, generator(seed))
+        assert event is not None
+        self.event = event
+
+    def check(self, rows: list[Row], pruned: bool = False) -> None:
+        """``rows`` are restated: to be pruned as ADC does, unless they are ``pruned`` already."""
+        if not pruned:
+            rows = restatement.prune(rows, self.step, EXTENT, self.counts)
+        assert_same(self.trainable, rows)
+        assert self.counts == {name: getattr(self.event, name) for name in self.counts}
+        assert self.event.balances()
+        assert self.event.after == len(rows) == len(self.densifier.lineage.ids)
+        assert self.foreseen in (None, self.event.after)

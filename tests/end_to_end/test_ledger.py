@@ -1,0 +1,110 @@
+"""A ledger with real trainings: two ideas at once, a kill in the middle, and ideas of one's own."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from gsbench.runs.ledger import Ended, Started, read_ledger
+from tests.end_to_end.conftest import SMALL, Run, start
+
+pytestmark = pytest.mark.slow
+
+TINY = [
+    *SMALL,
+    "train.iterations=60",
+    "train.densify_start=10",
+    "train.densify_interval=10",
+    "train.densify_stop=55",
+    "init.count=500",
+    "scene.width=48",
+    "scene.height=36",
+    "eval.lpips=[]",
+    "eval.flip=false",
+    "tracking=none",
+    "raster=cpu",
+]
+NEW = ["ledger", "new", "night", "--metric", "psnr", "--least", "0.1", *TINY, "densify=adc"]
+CLASS = """\
+from gsbench.densify import ADC
+
+class Idea(ADC):
+    def grow_by_gradient(self, refinement):
+        {body}
+"""
+OWN = ["densify._target_=mine.Idea", "densify.name=mine", "allow_targets=[mine]"]
+
+
+def do(gsbench: Run, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return gsbench(*words, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
+
+
+def attempt(environment: dict[str, str], folder: Path, *words: str) -> subprocess.Popen[str]:
+    return start(environment, folder, folder / "runs", "ledger", "try", "night", *words)
+
+
+def test_two_ideas_at_once_share_the_baseline(
+    gsbench: Run, environment: dict[str, str], tmp_path: Path
+) -> None:
+    do(gsbench, tmp_path, *NEW, "seed=0,1,2")
+    words = (["densify=volumetric"], ["densify.split_size=0.1"])
+    both = [attempt(environment, tmp_path, *own) for own in words]
+    ends = [process.communicate(timeout=300) for process in both]
+    assert {process.returncode for process in both} <= {0, 1, 3}, ends
+    ledger = read_ledger(tmp_path / "runs" / "night")
+    assert len(ledger.started) == len(ledger.ended) == 2
+    assert {one.level for one in ledger.started.values()} <= {0.1 / 40, 0.2 / 40}
+    baselines = list(
+        (tmp_path / "runs" / "night").glob("courtyard/random-adc/*-seed0/results.json")
+    )
+    assert len(baselines) == 2  # that of the ledger, and that of the second idea
+
+
+def test_a_killed_try_goes_on_with_its_level(
+    gsbench: Run, environment: dict[str, str], tmp_path: Path
+) -> None:
+    do(gsbench, tmp_path, *NEW, "seed=0,1,2")
+    home = tmp_path / "runs" / "night"
+    killed = attempt(environment, tmp_path, "densify=volumetric")
+    deadline = time.monotonic() + 120
+    while not list(home.glob("*/*/*/results.json")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    (level,) = [one.level for one in read_ledger(home).started.values()]
+    assert not read_ledger(home).ended
+    code = do(gsbench, tmp_path, "ledger", "try", "night", "densify=volumetric")
+    assert code.returncode in (0, 1, 3)
+    entries = read_ledger(home).entries
+    assert [one.level for one in entries if isinstance(one, Started)] == [level]
+    assert len([one for one in entries if isinstance(one, Ended)]) == 1
+
+
+def test_edited_code_is_another_idea_and_broken_code_gives_its_place_back(
+    gsbench: Run, tmp_path: Path
+) -> None:
+    do(gsbench, tmp_path, *NEW, "seed=0,1")
+    results = []
+    for body in ("raise RuntimeError('typing error')", "pass", "pass  # again", "return None"):
+        (tmp_path / "mine.py").write_text(CLASS.format(body=body))
+        done = do(gsbench, tmp_path, "ledger", "try", "night", *OWN, "--json")
+        results.append(json.loads(done.stdout))
+    assert [one["result"] == "failed" for one in results] == [True, False, False, False]
+    assert "typing error" in results[0]["reason"]
+    assert [one["tried"] for one in results] == [0, 1, 2, 3]
+    assert [one["idea"] for one in results] == ["mine", "mine-2", "mine-3", "mine-4"]
+
+
+def test_the_ledger_is_in_the_archive(gsbench: Run, tmp_path: Path) -> None:
+    do(gsbench, tmp_path, *NEW, "seed=0,1")
+    do(gsbench, tmp_path, "ledger", "try", "night", "densify=none")
+    do(gsbench, tmp_path, "export", "--results", "night")
+    with zipfile.ZipFile(tmp_path / "night.zip") as archive:
+        ledger = (tmp_path / "runs" / "night" / "ledger.jsonl").read_bytes()
+        assert archive.read("ledger.jsonl") == ledger

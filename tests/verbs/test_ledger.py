@@ -1,0 +1,416 @@
+"""``gsbench ledger`` with trainings that are made up: results by idea, seed and scene."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench.analysis.results import read_experiment
+from gsbench.app.command import compose_trials
+from gsbench.cli import run
+from gsbench.config.compose import Trial
+from gsbench.runs import ledger as records
+from gsbench.runs.layout import LEDGER
+from gsbench.runs.ledger import Ended, Started, read_ledger
+from gsbench.verbs import ledger as verb
+from scripts import ledger_rates
+from tests.finished import write_results
+
+SETTINGS = ["scene=courtyard", "init=random", "densify=adc", "tracking=none", "eval.lpips=[]"]
+NEW = ["new", "night", "--metric", "psnr", "--least", "0.5", *SETTINGS, "seed=0,1,2,3"]
+SPLIT = "densify.split_size"  # its value chooses a made-up effect
+
+
+class Trainings:
+    """Writes the results of trials in place of training them."""
+
+    def __init__(self) -> None:
+        self.effects = {0.01: 0.0, 0.02: 3.0, 0.03: 6.0, 0.04: -3.0, 0.05: 0.1, 0.06: 0.0}  # dB
+        self.noise = 0.2
+        self.fails: set[float] = set()
+        self.trained: list[Path] = []
+        self.data = ""
+
+    def __call__(self, trials: Sequence[Trial]) -> int:
+        code = 0
+        for trial in trials:
+            size, seed = trial.values["densify"]["split_size"], trial.values["seed"]
+            if size in self.fails:
+                code = 1
+            elif not (trial.folder / "results.json").exists():
+                self.trained.append(trial.folder)
+                noise = np.random.default_rng([seed, round(1000 * size)]).normal(0, self.noise)
+                write_results(
+                    trial.folder,
+                    trial.values,
+                    metrics={"psnr": 20 + self.effects[size] + noise},
+                    num_gaussians=round(1000 * (1 + size)),
+                    hashes={"data": self.data or trial.values["scene"]["name"]},
+                )
+                (trial.folder / "config.yaml").write_text(trial.yaml)
+        return code
+
+
+@pytest.fixture
+def trainings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trainings:
+    made = Trainings()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setattr(verb, "compose_trials", composed)
+    monkeypatch.setattr(verb, "run_trials", made)
+    monkeypatch.setattr(verb, "finished_trials", lambda home, trials: _finished(home, trials))
+    return made
+
+
+@cache
+def _composed_once(words: tuple[str, ...]) -> list[Trial]:
+    return compose_trials(words, multirun=True)
+
+
+def composed(words: Sequence[str], multirun: bool) -> list[Trial]:
+    """The trials of words in this test's runs folder; Hydra composes equal words only once."""
+    runs = os.environ["GSBENCH_RUNS"]
+    return [Trial(one.values | {"runs": runs}, one.overrides) for one in _composed_once((*words,))]
+
+
+def _finished(home: Path, trials: Sequence[Trial]) -> list[Any]:
+    folders = {trial.folder for trial in trials}
+    return [one for one in read_experiment(home).trials if one.path in folders]
+
+
+@pytest.fixture
+def home(trainings: Trainings, tmp_path: Path) -> Path:
+    assert run(["ledger", *NEW]) == 0
+    return tmp_path / "runs" / "night"
+
+
+def attempt(*words: str) -> int:
+    return run(["ledger", "try", "night", *words])
+
+
+def entries(home: Path, kind: type) -> list[Any]:
+    return [one for one in read_ledger(home).entries if isinstance(one, kind)]
+
+
+def test_a_good_idea_is_kept_and_a_bad_one_is_dropped(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert attempt(f"{SPLIT}=0.02") == 0
+    assert "adc: kept: better; psnr +3" in capsys.readouterr().out
+    assert attempt(f"{SPLIT}=0.04") == 1
+    assert "adc-2: dropped: a gain of 0.5 is unlikely" in capsys.readouterr().out
+    first, second = entries(home, Started)
+    assert (first.level, second.level) == (0.1 / 40, 2 * 0.1 / 40)  # LOND: one was kept before
+    good, bad = entries(home, Ended)
+    assert (good.result, bad.result) == ("kept", "dropped")
+    assert good.gaussians == pytest.approx(1.02 / 1.01, abs=1e-3)
+
+
+def test_an_idea_stops_at_the_first_look_that_decides(home: Path, trainings: Trainings) -> None:
+    attempt(f"{SPLIT}=0.04")
+    assert len(trainings.trained) == 2 * 2  # two seeds of both
+
+
+def test_an_equal_idea_is_not_paid_twice(home: Path, trainings: Trainings) -> None:
+    attempt(f"{SPLIT}=0.02")
+    before = len(trainings.trained), (home / LEDGER).read_bytes()
+    assert attempt(f"{SPLIT}=0.02", "densify.name=another") == 0
+    assert (len(trainings.trained), (home / LEDGER).read_bytes()) == before
+
+
+def test_a_kept_idea_may_be_the_next_baseline(home: Path) -> None:
+    attempt(f"{SPLIT}=0.02", "--as", "one")
+    assert attempt(f"{SPLIT}=0.03", "--as", "two", "--against", "one") == 0
+    assert entries(home, Ended)[1].difference.mean == pytest.approx(3, abs=0.5)
+    assert attempt(f"{SPLIT}=0.03", "--as", "three") == 0  # another question: the own baseline
+    assert entries(home, Ended)[2].difference.mean == pytest.approx(6, abs=0.5)
+
+
+def test_an_idea_whose_trials_fail_gives_its_place_back(
+    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainings.fails = {0.02}
+    assert attempt(f"{SPLIT}=0.02", "--json") == 1
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["result"], shown["tried"], shown["kept"]) == ("failed", 0, [])
+    trainings.fails = set()
+    assert attempt(f"{SPLIT}=0.02") == 0
+    assert [one.result for one in entries(home, Ended)] == ["failed", "kept"]
+    assert len(entries(home, Started)) == 1
+
+
+def test_an_idea_that_fails_after_a_result_keeps_its_place(
+    home: Path, trainings: Trainings, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    trainings.noise = 30.0  # undecided at the first look
+    whole, calls = trainings.__call__, []
+
+    def second_look_fails(trials: Sequence[Trial]) -> int:
+        calls.append(len(trials))
+        return whole(trials) if len(calls) == 1 else 1
+
+    monkeypatch.setattr(verb, "run_trials", second_look_fails)
+    assert attempt(f"{SPLIT}=0.02") == 1
+    assert "to go on, give the same command again" in capsys.readouterr().err
+    assert not entries(home, Ended)
+    assert read_ledger(home).tried == 1
+
+
+def test_a_baseline_that_fails_is_not_the_ideas_fault(home: Path, trainings: Trainings) -> None:
+    trainings.fails = {0.01, 0.02}
+    assert attempt(f"{SPLIT}=0.02") == 1
+    assert entries(home, Ended)[0].result == "failed"  # nothing was measured: it may come again
+
+
+def test_when_all_ideas_were_tried_no_level_is_left(
+    trainings: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(["ledger", *NEW, "--ideas", "1"])
+    assert attempt(f"{SPLIT}=0.04") == 1
+    assert attempt(f"{SPLIT}=0.02") == 2
+    assert "all 1 planned ideas were tried" in capsys.readouterr().err
+    assert attempt(f"{SPLIT}=0.04") == 1  # it is only shown
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["scene.views=12"], "scene.views: an idea may change densify, init, train and raster"),
+        (["seed=7"], "seed: an idea may change"),
+        (["eval.flip=false"], "eval.flip: an idea may change"),
+        (["name=x", f"{SPLIT}=0.02"], "name: an idea may change"),
+        ([], "needs the idea's settings"),
+        ([f"{SPLIT}=0.02", "--least", "0.01"], "ledger try takes no --least"),
+        ([f"{SPLIT}=0.02", "--fdr", "0.2"], "ledger try takes no --fdr"),
+        (["densify=adc"], "the idea is baseline itself"),
+        ([f"{SPLIT}=0.02", "--against", "nobody"], "--against nobody: there is baseline"),
+        ([f"{SPLIT}=0.02,0.03"], "compares one arm at a time"),
+        (["densify=nothing_like_it"], "nothing_like_it"),
+    ],
+)
+def test_what_an_idea_cannot_be_is_refused_and_leaves_no_line(
+    home: Path, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (home / LEDGER).read_bytes()
+    assert attempt(*words) == 2
+    assert reason in capsys.readouterr().err
+    assert (home / LEDGER).read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["seed=0"], "needs at least 2 seeds"),
+        (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
+        (["seed=0,1", "--metric", "psmr"], "there is no such metric"),
+        (["seed=0,1", "--fdr", "1"], "must be above 0 and below 1"),
+        (["seed=0,1", "--ideas", "0"], "must be from 1 to"),
+        (["seed=0,1", "eval.primary=psnr"], "eval.primary follows from the ledger"),
+        (["seed=0,1", "launch.wait=false"], "launch.wait=false"),
+    ],
+)
+def test_a_ledger_that_could_not_decide_is_refused(
+    trainings: Trainings, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["ledger", "new", "night", *SETTINGS, *words]) == 2
+    assert reason in capsys.readouterr().err
+    assert not Path("runs/night").exists()
+
+
+def test_a_ledger_is_declared_once(
+    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["ledger", *NEW]) == 0
+    assert run(["ledger", *NEW, "--fdr", "0.2"]) == 2
+    assert "is another ledger already" in capsys.readouterr().err
+    assert run(["ledger", "show", "other"]) == 2
+    assert "has no ledger" in capsys.readouterr().err
+
+
+def test_trials_that_the_ledger_does_not_know_are_named(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    attempt(f"{SPLIT}=0.02")
+    whole = (home / LEDGER).read_text().splitlines(keepends=True)
+    (home / LEDGER).write_text(whole[0])  # the end is cut off
+    assert attempt(f"{SPLIT}=0.03") == 2
+    assert "the ledger does not know 1 configuration with trials" in capsys.readouterr().err
+
+
+def test_edited_code_of_the_baseline_is_noticed(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("gsbench.runs.trial_folder.config_hash", lambda values: "f" * 64)
+    assert attempt(f"{SPLIT}=0.02") == 2
+    assert "the code of baseline have changed" in capsys.readouterr().err
+
+
+def test_a_ledger_of_somebody_else_runs_no_code(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text("from gsbench.densify import ADC\nclass Mine(ADC): pass\n")
+    own = ["densify._target_=mine.Mine", "densify.name=mine", "allow_targets=[mine]"]
+    assert attempt(*own, f"{SPLIT}=0.02") == 0
+    assert attempt(f"{SPLIT}=0.03", "--against", "mine") == 2
+    assert "mine runs code of yours: add allow_targets=[mine]" in capsys.readouterr().err
+    assert attempt(f"{SPLIT}=0.03", "--against", "mine", "allow_targets=[mine]") == 0
+
+
+def test_a_kill_between_any_two_lines_changes_nothing(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same command continues; the ledger is the one of a night without kills."""
+    write = records._write
+
+    def commands() -> None:
+        for size in (0.02, 0.04, 0.05):
+            attempt(f"{SPLIT}={size}")
+        run(["ledger", "confirm", "night", "scene=photos", "scene.path=/park", "seed=0,1,2"])
+
+    kills = 0
+    for allowed in range(9):
+        left = [allowed]
+
+        def killed(*arguments: Any, left: list[int] = left) -> None:
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+            write(*arguments)
+
+        monkeypatch.setattr(records, "_write", killed)
+        commands()
+        kills += not left[0]
+    monkeypatch.setattr(records, "_write", write)
+    commands()
+    killed_night = [one.to_json() | {"time": ""} for one in read_ledger(home).entries]
+    assert kills
+    (home / LEDGER).unlink()
+    for folder in home.glob("*/*/*"):
+        (folder / "results.json").unlink()
+    run(["ledger", *NEW])
+    commands()
+    assert [one.to_json() | {"time": ""} for one in read_ledger(home).entries] == killed_night
+
+
+# ---- confirmation
+
+
+def confirm(*words: str) -> int:
+    return run(["ledger", "confirm", "night", *words])
+
+
+PARK = ["scene=photos", "scene.path=/captures/park", "seed=5,6,7"]
+
+
+def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(
+    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for size in (0.02, 0.04, 0.03):
+        attempt(f"{SPLIT}={size}")
+    trainings.effects[0.03] = 0.0  # it was luck
+    trainings.noise = 0.01
+    capsys.readouterr()
+    assert confirm(*PARK) == 0
+    shown = capsys.readouterr().out
+    assert "Confirmation on park with 3 seeds" in shown
+    ((asked, results),) = read_ledger(home).confirmations
+    assert list(asked.keys) == ["baseline", "adc", "adc-3"]
+    assert results is not None
+    assert results.results == {"adc": "kept", "adc-3": "dropped"}
+    assert results.differences["adc"].mean == pytest.approx(3, abs=0.1)
+    count = len(trainings.trained)
+    assert confirm(*PARK) == 0  # shown again
+    assert len(trainings.trained) == count
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["seed=5,6"], "needs captures that no idea has seen"),
+        (["scene=courtyard", "seed=5,6"], "courtyard was seen by the ideas"),
+        ([*PARK, "--only", "adc-2"], "kept were adc"),
+    ],
+)
+def test_a_confirmation_that_confirms_nothing_is_refused(
+    home: Path, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    attempt(f"{SPLIT}=0.02")
+    attempt(f"{SPLIT}=0.04")
+    assert confirm(*words) == 2
+    assert reason in capsys.readouterr().err
+
+
+def test_a_copy_of_a_capture_under_another_name_is_not_fresh(
+    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    attempt(f"{SPLIT}=0.02")
+    trainings.data = "courtyard"  # the same photographs
+    before = len(trainings.trained)
+    assert confirm(*PARK) == 2
+    assert "park was seen by the ideas" in capsys.readouterr().err
+    assert len(trainings.trained) == before + 1  # one training showed it
+
+
+def test_a_second_confirmation_needs_other_captures(home: Path, capsys: Any) -> None:
+    attempt(f"{SPLIT}=0.02")
+    assert confirm(*PARK) == 0
+    assert confirm(*PARK[:2], "seed=8,9") == 2
+    assert "by an earlier confirmation" in capsys.readouterr().err
+
+
+# ---- the report, the archive, and the simulated rule
+
+
+def test_report_and_archive_have_the_ledger(home: Path, trainings: Trainings) -> None:
+    attempt(f"{SPLIT}=0.02", "--as", "larger splits")
+    assert run(["report", "night"]) == 0
+    page = (home / "report.html").read_text()
+    assert 'id="ledger"' in page
+    assert "1 larger splits" in page
+    assert "1 of 40 planned ideas were tried, and 1 kept" in page
+
+
+def test_show_prints_all_for_programs(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    attempt(f"{SPLIT}=0.02")
+    capsys.readouterr()
+    assert run(["ledger", "show", "night", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert [one["result"] for one in shown["ideas"]] == ["kept"]
+    assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
+
+
+def test_the_simulated_rule_is_the_ledgers(
+    trainings: Trainings, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The rates of docs/night.md are those of the program: the same draws, the same decisions."""
+    monkeypatch.setattr(ledger_rates, "SCENES", 1)
+    run(["ledger", *NEW[:-1], "seed=0,1,2,3,4,5"])
+    draws = np.random.default_rng(1).normal(0.6, 1, (6, 6))
+    for number, row in enumerate(draws):
+        size = 0.1 + 0.01 * number
+        values = dict(enumerate(20 + row))
+
+        def training(trials: Sequence[Trial], size: float = size, values: Any = values) -> int:
+            for trial in trials:
+                own = trial.values["densify"]["split_size"] == pytest.approx(size)
+                psnr = values[trial.values["seed"]] if own else 20.0
+                write_results(trial.folder, trial.values, metrics={"psnr": psnr}, hashes={})
+                (trial.folder / "config.yaml").write_text(trial.yaml)
+            return 0
+
+        monkeypatch.setattr(verb, "run_trials", training)
+        attempt(f"{SPLIT}={size:.2f}")
+    kept = 0
+    for row, ended in zip(draws, entries(tmp_path / "runs" / "night", Ended), strict=True):
+        keep, seeds = ledger_rates.in_looks(
+            row[None, None, :], np.array([kept]), least=0.5, lond=True
+        )
+        assert (ended.result == "kept", ended.seeds) == (keep[0], seeds[0])
+        kept += bool(keep[0])
