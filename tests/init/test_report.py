@@ -248,6 +248,21 @@ def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None
     np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)  # one unit
 
 
+def test_a_line_shows_where_a_camera_looks(tmp_path: Path) -> None:
+    """All stand in the plane z = 0 and look along +x, which is upwards in the picture."""
+    sideways = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    places = [(0, 0, 0), (4, 0, 0), (0, 4, 0), (4, 4, 0), (2, 2, 0)]
+    draw_cloud(
+        model_with({f"{x} {y}": camera_at([x, y, z], sideways) for x, y, z in places}),
+        tmp_path / "cloud.png",
+        "hand-made",
+    )
+    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
+    red = np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8
+    assert red[480 - 40, 478:483].any()  # of the camera in the middle
+    assert not red[480 + 40, 478:483].any()
+
+
 def test_points_are_drawn_smaller_the_more_there_are(tmp_path: Path) -> None:
     """Most of them stand in one place; the other is drawn alone."""
     inked = []
