@@ -149,8 +149,7 @@ def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(
 
 
 def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
-    """A model moved by a similarity has no error; one camera displaced by 0.3 shows it, and only
-    it."""
+    """A model moved by a similarity has no error; one that is tilted has an angle alone."""
     turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
     reference = model_of(CENTERS)
     model = model_of(CENTERS)
