@@ -15,8 +15,7 @@ from tests.datasets.server import Server, serve
 
 
 def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[str, bytes]:
-    """Files of a scene as the archives have them: images in four sizes, a model, and what nobody
-    wants."""
+    """Files of a scene as the archives have them: four sizes, a model, and what nobody wants."""
     rng = np.random.default_rng([seed, *scene_folder.encode()])
     files = {}
     sizes = {"images": 40_000, "images_2": 20_000, "images_4": 9_000, "images_8": 3_000}

@@ -1,5 +1,4 @@
-"""A file server on loopback whose manners can be chosen: what a real one on a bad day does, on
-purpose."""
+"""A file server on loopback whose manners can be chosen: a real one on a bad day."""
 
 from __future__ import annotations
 
@@ -17,8 +16,7 @@ RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 @dataclass
 class Manners:
-    """How the server behaves. ``cut_every`` and ``stall_every``: after so many bytes of a body,
-    again and again."""
+    """How the server behaves; ``…_every``: after so many bytes of a body, again and again."""
 
     ranges: bool = True
     cut_every: int | None = None

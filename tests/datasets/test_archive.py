@@ -198,8 +198,7 @@ def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) 
 
 
 def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:
-    """The real archive has 12.5 GB: its entries need zip64. A sparse file of the same kind takes no
-    space."""
+    """The real archive has 12.5 GB and needs zip64. A sparse file of its kind takes no space."""
     file = tmp_path / "large.zip"
     with file.open("wb") as stream:
         stream.truncate(5 << 30)

@@ -1,5 +1,4 @@
-"""`gsbench fetch`: what arrives is what the archive has, only what is wanted, whole or not at
-all."""
+"""`gsbench fetch`: what the archive has, only what is wanted, whole or not at all."""
 
 from __future__ import annotations
 

@@ -112,8 +112,7 @@ def rewritten(path: Path, old: bytes, new: bytes) -> Path:
 
 @pytest.mark.parametrize(("text", "bytes_each"), [(False, 61 * 4 + 8), (True, 62 * 2)])
 def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes_each: int) -> None:
-    """Its header alone says so: of 62 numbers, one of double precision; in text each takes two
-    characters or more."""
+    """Its header alone says so: of 62 numbers, one double; in text two characters each or more."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
     path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
     many = b"comment a property float b\nelement vertex 1000000"

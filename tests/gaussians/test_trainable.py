@@ -23,8 +23,7 @@ def step_with(trainable: TrainableGaussians, seed: int, **arguments: object) -> 
 
 
 def test_steps_are_those_of_torchs_adam() -> None:
-    """To the last bit, with the fused kernel; a parameter without a gradient stays as it is and
-    counts no step."""
+    """To the last bit; a parameter without a gradient stays as it is and counts no step."""
     ours = TrainableGaussians(random_gaussians(6, dtype=torch.float32), LearningRates(), 2.0)
     theirs = ours.values.map(lambda tensor: tensor.detach().clone().requires_grad_(True)).tensors()
     groups = [{"params": [tensor], "lr": ours.adam[name].rate} for name, tensor in theirs.items()]

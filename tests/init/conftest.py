@@ -1,5 +1,4 @@
-"""A small capture with exact poses, and networks without training that still find and match
-features."""
+"""A small capture with exact poses, and networks without training that still match features."""
 
 from __future__ import annotations
 

@@ -108,8 +108,7 @@ def test_carved_says_when_nobody_sees_anything(courtyard: Capture, tmp_path: Pat
 
 
 def test_copies_lie_about_their_points(tmp_path: Path) -> None:
-    """A grid of two spacings: shifts are normal and in proportion to the distance to the
-    neighbour."""
+    """A grid of two spacings: shifts are normal and in proportion to the neighbour's distance."""
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
     points = np.concatenate([grid, 100 + 10 * grid])
     copies = shifted_copies(points, 3, 0.5, seed=1)

@@ -1,5 +1,4 @@
-"""Deep image matching without training: coordinates, store, errors; and what it relies on in the
-libraries."""
+"""Deep image matching without training, and the contracts of its libraries."""
 
 from __future__ import annotations
 
@@ -224,8 +223,7 @@ class TestContracts:
     def test_lightglue_reads_the_published_names(
         self, untrained_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ):
-        """cvg/LightGlue's files say self_attn.0.… where the network says
-        transformers.0.self_attn.…"""
+        """cvg/LightGlue's files say self_attn.0.…, the network transformers.0.self_attn.…"""
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
         published = {}
         for name, value in state.items():
@@ -284,8 +282,7 @@ class TestContracts:
 def test_detection_settings_are_the_extractors_own_unless_given(
     extractor: str, threshold: float, radius: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As deep-image-matching and the authors have them; the files are those of the networks in
-    use."""
+    """As deep-image-matching and the authors have them; the files are of the networks in use."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)  # type: ignore[arg-type]
     found = own.feature_settings()
     assert (found.keypoint_threshold, found.nms_radius) == (threshold, radius)

@@ -1,5 +1,4 @@
-"""Features from outside COLMAP: the same model as COLMAP's own path, and coordinates that are
-right."""
+"""Features from outside COLMAP: the same model as COLMAP's own, and right coordinates."""
 
 from __future__ import annotations
 
@@ -100,8 +99,7 @@ def extract(path: Path, max_image_size: int) -> Features:
 def test_kornia_keypoints_coincide_with_colmaps(
     own_path: Path, bare_photos: Capture, max_image_size: int
 ):
-    """Two implementations of SIFT find the same points; a half-pixel or scale error would shift all
-    of them."""
+    """Two implementations of SIFT find the same points; an error would shift all of them."""
     name = bare_photos.image_names[0]
     with pycolmap.Database.open(own_path) as database:
         colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]

@@ -1,5 +1,4 @@
-"""Clouds of points from files of every kind, checked against arrays that were written and
-pycolmap's projection."""
+"""Clouds of points from files of every kind, against written arrays and pycolmap."""
 
 from __future__ import annotations
 
@@ -84,8 +83,7 @@ def test_a_table_may_have_a_mark_and_line_ends_of_windows(tmp_path: Path, suffix
 
 
 def test_colours_of_gaussians_are_those_of_their_constant_harmonic(tmp_path: Path):
-    """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: the colour that 3DGS gives a Gaussian without view
-    dependence."""
+    """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: 3DGS's colour without view dependence."""
     properties = [(name, "f4") for name in (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2")]
     dc = (RGB / 255 - 0.5) * 2 * np.sqrt(np.pi)
     dc[0], dc[1] = 9.0, -9.0

@@ -149,8 +149,7 @@ def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(
 
 
 def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
-    """A model moved by a similarity has no error; one camera displaced by 0.3 shows it, and only
-    it."""
+    """A model moved by a similarity has no error; one that is tilted has an angle alone."""
     turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
     reference = model_of(CENTERS)
     model = model_of(CENTERS)
@@ -246,6 +245,21 @@ def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None
     assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
     bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
     np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)  # one unit
+
+
+def test_a_line_shows_where_a_camera_looks(tmp_path: Path) -> None:
+    """All stand in the plane z = 0 and look along +x, which is upwards in the picture."""
+    sideways = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    places = [(0, 0, 0), (4, 0, 0), (0, 4, 0), (4, 4, 0), (2, 2, 0)]
+    draw_cloud(
+        model_with({f"{x} {y}": camera_at([x, y, z], sideways) for x, y, z in places}),
+        tmp_path / "cloud.png",
+        "hand-made",
+    )
+    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
+    red = np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8
+    assert red[480 - 40, 478:483].any()  # of the camera in the middle
+    assert not red[480 + 40, 478:483].any()
 
 
 def test_points_are_drawn_smaller_the_more_there_are(tmp_path: Path) -> None:

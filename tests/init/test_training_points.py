@@ -29,8 +29,7 @@ def quick_sfm(**options: Any) -> Sfm:
 
 @pytest.fixture(scope="module")
 def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """The courtyard with a model whose points all views made, its images numbered against their
-    names."""
+    """The courtyard with points that all views made, its images numbered against their names."""
     folder = tmp_path_factory.mktemp("points")
     quick_sfm().run(courtyard, folder)
     model, turned = read_model(folder / MODEL_FOLDER), pycolmap.Reconstruction()

@@ -1,5 +1,4 @@
-"""Predictions of nerfbaselines, as its version 1.2.12 writes them: folder, .tar.gz, and published
-zip."""
+"""Predictions of nerfbaselines 1.2.12: folder, .tar.gz, and published zip."""
 
 from __future__ import annotations
 

@@ -21,8 +21,7 @@ from .conftest import smooth_image
 
 
 def reprojection_errors(model: pycolmap.Reconstruction) -> list[float]:
-    """|projected 3D point - stored 2D point| in px, by pycolmap's own camera model, over all
-    observations."""
+    """|projected 3D point - stored 2D point| in px, by pycolmap's own camera model, of all."""
     errors = []
     for point in model.points3D.values():
         for element in point.track.elements:
@@ -133,8 +132,7 @@ def test_written_cameras_project_alike(tmp_path: Path):
 
 
 def test_models_of_cameras_are_those_of_colmap() -> None:
-    """Their numbers, how many parameters they have, and that the first ones are the focal
-    lengths."""
+    """Their numbers, how many parameters they have, and that focal lengths come first."""
     known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
     known.pop("INVALID")
     assert {name: number for number, (name, _) in _MODELS.items()} == known
@@ -154,8 +152,7 @@ LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}
 
 
 def sound_model() -> list[tuple[str, tuple]]:
-    """The calls of `ModelChecks` for a model with two images and two points, each with numbers at
-    both ends."""
+    """The calls of `ModelChecks` for a model with numbers at both ends."""
     return [
         ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
         ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, -20, 15, 0, -0.1, 0, 0))),
@@ -249,8 +246,7 @@ def test_a_rig_without_a_sensor_has_no_reference(rigs: Path) -> None:
 def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
     rigs: Path, stem: str, start: int, at: int, said: str
 ) -> None:
-    """``start`` of a pose: behind the count, ids and, in a rig, the reference, the sensor and a
-    mark."""
+    """``start`` of a pose: behind the count, ids and, in a rig, the reference and the sensor."""
     (file,) = rigs.glob(f"{stem}.*")
     if file.suffix == ".bin":
         data = file.read_bytes()

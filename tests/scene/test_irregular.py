@@ -1,5 +1,4 @@
-"""Captures that hold what is no photograph: pipes, devices, links in circles, other formats, names
-of any length."""
+"""Captures that hold what is no photograph: pipes, devices, circles of links, other formats."""
 
 from __future__ import annotations
 

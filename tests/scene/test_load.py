@@ -1,5 +1,4 @@
-"""From capture and model to a scene: undistortion of every camera model, sizes, cache, missing
-poses."""
+"""From capture and model to a scene: undistortion, sizes, cache, missing poses."""
 
 from __future__ import annotations
 

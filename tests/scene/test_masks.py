@@ -1,5 +1,4 @@
-"""Masks: which file belongs to which photograph, what is not a mask, and what is left of what they
-hide."""
+"""Masks: whose they are, what is not a mask, and what is left of what they hide."""
 
 from __future__ import annotations
 
@@ -194,8 +193,7 @@ def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> No
 
 
 def test_between_two_pixels_the_filling_is_linear() -> None:
-    """Blocks of two pixels have the values 0 and 100; a finer pixel lies a quarter of a block from
-    its middle."""
+    """Blocks of two pixels are 0 and 100; a finer pixel lies a quarter of one from its middle."""
     row = np.array([[0, 7, 9, 100]], dtype=np.uint8)[..., None].repeat(3, 2)
     counts = np.array([[True, False, False, True]])
     assert fill_ignored(row, counts)[0, :, 0].tolist() == [0, 25, 75, 100]
@@ -234,8 +232,7 @@ def test_a_photograph_that_stays_as_it_is_is_copied(
 
 @pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
 def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int) -> None:
-    """In its area is what has its centre there; what has it on the edge may belong to either
-    side."""
+    """In its area is what has its centre there; on the edge it may belong to either side."""
     counts = np.random.default_rng(1).random((36, 50)) > 0.05
     found = resize_mask(counts, width, height)
 
@@ -275,8 +272,7 @@ def test_views_have_their_masks_at_the_final_size(make_scene: MakeScene, tmp_pat
 
 
 def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_path: Path) -> None:
-    """A photograph that is as its mask, white and black, stays so: a pixel counts where it is
-    white."""
+    """A photograph that is as its mask, white and black, stays so: what is white counts."""
     root = make_scene(size=(120, 90), model="SIMPLE_RADIAL", params=(100, 60, 45, 0.15))
     for k, path in enumerate((root / "images").iterdir()):
         disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20 + k

@@ -115,6 +115,7 @@ def test_of_several_models_the_one_with_the_most_images_is_read(
     beside = [sparse for sparse in models if sparse.split("/")[0] == chosen.split("/")[0]]
     others = [sparse for sparse in beside if sparse != chosen]
     assert ("scene.sparse chooses another" in caplog.text) is bool(others)
+    assert (f"has {len(beside)} COLMAP models" in caplog.text) is bool(others)
     assert all(f"{other}: {models[other]} image" in caplog.text for other in others)
     assert read_colmap("toy", root, sparse=chosen).model == root / chosen
     assert missing_model("toy", root, None) == ""

@@ -112,8 +112,7 @@ def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
 
 
 def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
-    """All directions in which it looks and their means are exact here, so that it is above to the
-    last digit."""
+    """All directions in which it looks are exact here, so it is above to the last digit."""
     around = np.array([[3.0, 0, 0], [0, 3, 0], [-3, 0, 0], [0, -3, 0]])
     level = [looking(place, np.zeros(3)) for place in around]
     above = np.array([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])

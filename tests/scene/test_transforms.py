@@ -1,5 +1,4 @@
-"""transforms.json: cameras by the documented formulas, restated here; what is missing, damaged or
-not understood."""
+"""transforms.json: cameras by the documented formulas; what is missing, damaged or odd."""
 
 from __future__ import annotations
 
@@ -29,8 +28,7 @@ SHARED = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.5, "cy": 15.5}
 
 
 def looking_at_origin(eye: np.ndarray) -> np.ndarray:
-    """Camera to world [4, 4] in OpenGL's axes: x right, y up, looking along -z; the world's up is
-    z."""
+    """Camera to world [4, 4] in OpenGL's axes: x right, y up, looking along -z; z is up."""
     back = eye / np.linalg.norm(eye)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -78,8 +76,7 @@ def project(model: pycolmap.Reconstruction, name: str, point: np.ndarray) -> np.
 
 
 def test_a_point_falls_where_the_formulas_of_the_format_say(tmp_path: Path) -> None:
-    """In the camera's axes x right, y up, z towards the viewer: column cx + fl_x x/-z, row cy -
-    fl_y y/-z."""
+    """x is right, y up, z towards the viewer: column cx + fl_x x/-z, row cy - fl_y y/-z."""
     capture = capture_of(write(tmp_path / "in"), tmp_path / "made")
     model = read_model(capture.model)  # type: ignore[arg-type]
     for k, eye in enumerate(EYES):
@@ -157,8 +154,7 @@ def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, pa
 
 
 def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: Path) -> None:
-    """NeRF's synthetic scenes: focal = .5 w / tan(.5 angle), a centre in the middle,
-    transforms_test.json held out."""
+    """NeRF's synthetic scenes: focal = .5 w / tan(.5 angle); transforms_test.json held out."""
     angle = 0.6911112070083618
     for part, count in (("train", 5), ("test", 3), ("val", 2)):
         frames = []
@@ -361,8 +357,7 @@ def test_every_way_to_give_a_field_of_view(
     "said", [{"k3": 0.05}, {"camera_model": "FULL_OPENCV", "k3": 0.05, "k4": 0.02, "k6": 0.01}]
 )
 def test_higher_coefficients_distort_as_in_opencv(tmp_path: Path, said: dict[str, Any]) -> None:
-    """OpenCV's documented formula: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6
-    r^6)."""
+    """OpenCV: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
     capture = capture_of(write(tmp_path / "in", k1=0.1, k2=-0.02, **said), tmp_path / "made")
     model = read_model(capture.model)  # type: ignore[arg-type]
     k = {key: said.get(key, 0.0) for key in ("k3", "k4", "k6")}

@@ -1,5 +1,4 @@
-"""``gsbench export TRIAL --out page.html``: its cameras, and the command to type where npx is
-missing or fails."""
+"""``gsbench export TRIAL --out page.html``: its cameras, and the command where npx fails."""
 
 from __future__ import annotations
 

@@ -136,8 +136,7 @@ def test_what_is_no_camera_is_not_drawn(name: str, value: object) -> None:
 
 
 def painter() -> TrialPainter:
-    """A model of 40 Gaussians in front of `make_view`, nine of them large, and a cloud of four
-    points."""
+    """A model of 40 Gaussians in front of `make_view`, nine of them large, and four points."""
     gaussians = random_gaussians(40, seed=1, dtype=torch.float32)
     volumes = np.linspace(-3.0, 0.9, 40)
     causes = np.array([Cause.CLONE, Cause.SPLIT_VOLUME] * 20, np.uint8)

@@ -1,5 +1,4 @@
-"""Which requests the viewer answers: those of its own page and of programs, and of no other web
-page."""
+"""Which requests the viewer answers: of its own page and of programs, and of no other page."""
 
 from __future__ import annotations
 

@@ -43,15 +43,9 @@ MAX_LOGIT = 23 * math.log(2)  # 1 - 2^-23
 TYPICAL_SCALE = 0.02  # of a model's size: the median of Gaussians trained here is .009 to .035
 MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
 # bytes of PLY's types; all others have 1
-SIZES = {
-    name: size
-    for size, names in {
-        2: "short ushort int16 uint16",
-        4: "int uint int32 uint32 float float32",
-        8: "double float64",
-    }.items()
-    for name in names.split()
-}
+SIZES = dict.fromkeys(["short", "ushort", "int16", "uint16"], 2)
+SIZES |= dict.fromkeys(["int", "uint", "int32", "uint32", "float", "float32"], 4)
+SIZES |= dict.fromkeys(("double", "float64"), 8)
 
 
 def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = IDENTITY) -> None:

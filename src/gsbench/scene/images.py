@@ -402,7 +402,8 @@ def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
 
 def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
     """``image`` [H, W, 3] with twice as many pixels along ``axis``, interpolated linearly."""
-    ends = [(1, 1) if dimension == axis else (0, 0) for dimension in range(image.ndim)]
+    ends = [(0, 0)] * image.ndim
+    ends[axis] = (1, 1)
     padded = np.pad(image, ends, mode="edge")
     length = image.shape[axis]
     before, after = (np.take(padded, range(start, start + length), axis) for start in (0, 2))

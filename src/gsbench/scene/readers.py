@@ -4,6 +4,7 @@ import hashlib
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 
@@ -249,10 +250,10 @@ def _make_capture(
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
     lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)
-    left_out = copies_by_name(names, {name for wanted in lists for name in wanted or ()})
+    left_out = copies_by_name(names, set(chain.from_iterable(filter(None, lists))))
     report_left_out(folder, left_out, "of the same name")
     names = [name for name in names if name not in left_out]
-    train, test = (None if wanted is None else _resolve(wanted, names, folder) for wanted in lists)
+    train, test = (_resolve(wanted, names, folder) for wanted in lists)
     if train is not None and test is not None:
         names = sorted({*train, *test})
     held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
@@ -280,8 +281,10 @@ def _make_capture(
     )
 
 
-def _resolve(wanted: Sequence[str], names: Sequence[str], folder: Path) -> list[str]:
+def _resolve(wanted: Sequence[str] | None, names: Sequence[str], folder: Path) -> list[str] | None:
     """The image files that a split list names; extensions may lack or differ."""
+    if wanted is None:
+        return None
     matches = match_names(wanted, names)
     if unknown := [name for name in wanted if name not in matches]:
         raise InputError(
@@ -295,9 +298,8 @@ def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[st
     """The training and the test list; ``split=list`` alone reads those of nerfbaselines."""
     train, test = split.train_list, split.test_list
     if split.split == "list" and train is None and test is None:
-        train, test = (
-            name if (root / name).is_file() else None for name in (TRAIN_LIST, TEST_LIST)
-        )
+        train = TRAIN_LIST if (root / TRAIN_LIST).is_file() else None
+        test = TEST_LIST if (root / TEST_LIST).is_file() else None
         if train is None and test is None:
             raise InputError(
                 f"scene.split=list: neither {TRAIN_LIST} nor {TEST_LIST} is in {root}: name the "

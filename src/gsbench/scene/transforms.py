@@ -348,9 +348,8 @@ def _distortion(
     names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     # A frame with a coefficient of its own uses none of the file's.
     own = any(getattr(frame, name) is not None for name in names)
-    k1, k2, k3, k4, k5, k6, p1, p2 = (
-        getattr(frame if own else record, name) or 0.0 for name in names
-    )
+    source: Intrinsics = frame if own else record
+    k1, k2, k3, k4, k5, k6, p1, p2 = (getattr(source, name) or 0.0 for name in names)
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
     model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
     if model == FISHEYE:

@@ -221,16 +221,18 @@ def nearest_training_cameras(
     """
     if not cameras or not training:
         return [{} for _ in cameras]
-    directions, training_directions = (
-        np.array([camera.rotation[2] for camera in group]) for group in (cameras, training)
-    )
-    centers, training_centers = (
-        np.array([camera.center for camera in group]) for group in (cameras, training)
-    )
-    angles = angles_between(directions, training_directions).min(axis=1)  # [V]
+
+    def directions(group: Sequence[Camera]) -> Array:
+        return np.array([camera.rotation[2] for camera in group])
+
+    def centers(group: Sequence[Camera]) -> Array:
+        return np.array([camera.center for camera in group])
+
+    angles = angles_between(directions(cameras), directions(training)).min(axis=1)  # [V]
     measured = [{ANGLE: float(angle)} for angle in angles]
     if extent > 0:
-        apart = np.linalg.norm(centers[:, None] - training_centers[None], axis=-1)  # [V, W]
+        offsets = centers(cameras)[:, None] - centers(training)[None]  # [V, W, 3]
+        apart = np.linalg.norm(offsets, axis=-1)  # [V, W]
         for values, distance in zip(measured, apart.min(axis=1), strict=True):
             values[DISTANCE] = float(distance) / extent
     return measured

@@ -1,5 +1,4 @@
-"""COLMAP's database as pycolmap reads it back: who shares a camera, which features are strongest,
-what is counted."""
+"""COLMAP's database as pycolmap reads it back: shared cameras, strongest features, counts."""
 
 from __future__ import annotations
 
@@ -144,8 +143,7 @@ def test_guessed_focal_lengths_become_known_ones(database: Path) -> None:
 def test_verification_tells_its_progress_in_parts(
     database: Path, monkeypatch: pytest.MonkeyPatch, count: int, each: int
 ) -> None:
-    """Of fifty pairs, or of a twentieth of them; each pair is listed once, by the ids of its
-    images."""
+    """Of fifty pairs, or of a twentieth of them; each is listed once, by its images' ids."""
     pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
 
     def verify(path: Path, file: Path, options: object) -> None:

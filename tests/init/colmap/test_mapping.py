@@ -1,5 +1,4 @@
-"""Captures that COLMAP's defaults refuse: exact matches of a forward-facing rig whose cameras are
-known to the test."""
+"""Captures that COLMAP's defaults refuse: exact matches of a rig whose cameras are known."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ VERIFICATION = verification_options(Sfm())
 def small_baseline(
     folder: Path, spread: float = 0.2, turn: float = 0.0
 ) -> tuple[Path, dict[str, np.ndarray]]:
-    """A database of exact matches between nine cameras side by side, looking ahead; and the true
-    camera centres.
+    """A database of exact matches of nine cameras side by side, looking ahead; the true centres.
 
     ``spread`` is half the width of the rig, for points 3 to 9 away; at 0.2 no two cameras see one
     under 11 degrees.
@@ -229,8 +227,7 @@ def test_mapping_tells_its_progress_from_none_to_all(
 
 @pytest.mark.parametrize(("share", "plausible"), [(0.9, False), (1.1, True)])
 def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible: bool) -> None:
-    """Two cameras on either side of points at a distance of one; a third stands beside the
-    first."""
+    """Two cameras on either side of points at a distance of one; a third beside the first."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
     model = model_with(
         {f"{x} {k}": camera_at([x, 0, 0]) for k, x in enumerate((-half, half, -half))}, 3

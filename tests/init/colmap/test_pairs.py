@@ -1,5 +1,4 @@
-"""Pairs of neighbours and of a preview: against a slow restatement in whole numbers, and on
-photographs."""
+"""Pairs of neighbours and of a preview: against a slow restatement in whole numbers."""
 
 from __future__ import annotations
 

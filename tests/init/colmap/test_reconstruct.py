@@ -1,5 +1,4 @@
-"""Triangulation under given cameras, the options handed to COLMAP, and the poses of two models, on
-exact matches."""
+"""Triangulation under given cameras, and the poses of two models, on exact matches."""
 
 from __future__ import annotations
 

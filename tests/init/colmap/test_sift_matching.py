@@ -117,8 +117,7 @@ def test_matches_are_those_of_colmap_on_one_thread(
 def test_colmaps_matcher_never_gets_a_second_thread(
     features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Two threads of it in one process can spoil each other's matches, too rarely for a test to
-    see."""
+    """Two threads in one process can spoil each other's matches, too rarely for a test."""
     database, pairs = features
     shutil.copy(database, tmp_path / "database.db")
     threads = []
@@ -143,8 +142,7 @@ def test_auto_leaves_out_what_a_preview_does_not_propose(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """Few images: all pairs, to the bit. More than that (here: more than five): each with its best
-    partners."""
+    """Few images: all pairs, to the bit. More than (here) five: each with its best partners."""
     exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")
     auto = Sfm(threads=1, pairs="auto").run(bare_photos, tmp_path / "auto")
     assert auto.counts["pairs_left_out"] == 0

@@ -1,5 +1,4 @@
-"""The distance of points from the surfaces of the courtyard, which tests of geometry are held
-against; and a digest."""
+"""The distance of points from the courtyard's surfaces, for tests of geometry; and a digest."""
 
 from __future__ import annotations
 
@@ -16,8 +15,7 @@ from gsbench.scene.courtyard.layout import build_layout
 def surface_distance(
     points: NDArray[np.float64], seed: int = 0, limit: float = 1e3
 ) -> NDArray[np.float64]:
-    """The distance in m from points [P, 3] (world coordinates) to the nearest true surface, at most
-    ``limit``; [P].
+    """The distance in m from points [P, 3] to the nearest true surface, at most ``limit``; [P].
 
     Exact outside all solids; inside, the distance to the nearest surface of any primitive, hidden
     ones included.
@@ -29,8 +27,7 @@ def surface_distance(
 
 
 def fingerprint(values: NDArray[Any]) -> float:
-    """One number that changes with any of ``values`` and with their order, and hardly with their
-    last digits."""
+    """One number that changes with ``values`` and their order, hardly with their last digits."""
     flat = np.asarray(values, dtype=np.float64).ravel()
     return float(flat @ (1 + np.arange(len(flat)) % 7) / len(flat))
 

@@ -67,8 +67,7 @@ def test_neighbouring_views_are_close(views: int):
 
 
 def test_a_surface_point_looks_alike_from_two_views():
-    """Project lawn points by the pinhole formula alone into two neighbouring views: the colours
-    agree."""
+    """Project lawn points by the pinhole formula alone into two views: the colours agree."""
     layout = build_layout(0)
     a, b = list(courtyard_cameras(48, 400, 300).values())[10:12]
     images = [render_view(layout, camera, 0).astype(float) for camera in (a, b)]

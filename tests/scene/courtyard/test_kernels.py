@@ -1,5 +1,4 @@
-"""What a ray meets, against dense samples of it and against trying every primitive; and the pinned
-textures.
+"""What a ray meets, against samples and against trying every primitive; pinned textures.
 
 The functions run as plain Python here: nothing is compiled, and the pinned values are the same on
 every processor.
@@ -171,8 +170,7 @@ PINNED = {
 
 @pytest.mark.parametrize("name", PINNED)
 def test_textures_are_those_of_this_version(name: str) -> None:
-    """Lightness and warmth, or a colour, at points near and far: raise the courtyard's VERSION
-    where they change."""
+    """Lightness and warmth, near and far: raise the courtyard's VERSION where they change."""
     rng = np.random.default_rng(6)
     values = []
     for footprint in (0.0005, 0.004, 0.015, 0.05, 0.2):

@@ -64,10 +64,11 @@ def proposed_pairs(
     """
     if len(names) <= ALL_PAIRS_UP_TO:
         return list(combinations(names, 2))
-    return [
-        (names[first], names[second])
-        for first, second in best_pairs([strongest(name) for name in names])
-    ]
+    return _named(best_pairs([strongest(name) for name in names]), names)
+
+
+def _named(pairs: Sequence[Pair], names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(names[first], names[second]) for first, second in pairs]
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
@@ -107,8 +108,5 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
 def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
     """The pairs of names to match; for ``auto`` and ``lowres`` all, of which some remain later."""
     if options.pairs == "sequential":
-        return [
-            (names[first], names[second])
-            for first, second in sequential_pairs(len(names), options.overlap)
-        ]
+        return _named(sequential_pairs(len(names), options.overlap), names)
     return list(combinations(names, 2))

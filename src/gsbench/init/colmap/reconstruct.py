@@ -37,10 +37,13 @@ def common_poses(
     """Centres [N, 3] and rotations [N, 3, 3] of model, then reference, for images posed in both."""
     model_poses, reference_poses = poses_by_name(model), poses_by_name(reference)
     names = sorted(model_poses.keys() & reference_poses.keys())
-    poses = [source[name] for source in (model_poses, reference_poses) for name in names]
-    centers = np.array([center for center, _ in poses]).reshape(2, -1, 3)
-    rotations = np.array([rotation for _, rotation in poses]).reshape(2, -1, 3, 3)
-    return centers[0], rotations[0], centers[1], rotations[1]
+
+    def stacked(poses: dict[str, tuple[Array, Array]]) -> tuple[Array, Array]:
+        # the shapes hold without a common image, too
+        centers = np.array([poses[name][0] for name in names]).reshape(-1, 3)
+        return centers, np.array([poses[name][1] for name in names]).reshape(-1, 3, 3)
+
+    return *stacked(model_poses), *stacked(reference_poses)
 
 
 def keep_training_points(

@@ -42,19 +42,16 @@ def lightglue_matcher(
 
     # Without a name of features, kornia does not download weights.
     no_name: Any = None
-    layout = {
-        key: value for key, value in LightGlue.features[extractor].items() if key != "weights"
-    }
+    layout = dict(LightGlue.features[extractor])
+    layout.pop("weights", None)
     network = LightGlue(no_name, filter_threshold=filter_threshold, **layout)
     state = load_state(weights)
     # The published files name a layer "self_attn.0", kornia's network "transformers.0.self_attn".
     for layer in range(network.conf.n_layers):
         for kind in ("self_attn", "cross_attn"):
             old, new = f"{kind}.{layer}.", f"transformers.{layer}.{kind}."
-            state = {
-                name.replace(old, new) if name.startswith(old) else name: tensor
-                for name, tensor in state.items()
-            }
+            for name in [name for name in state if name.startswith(old)]:
+                state[name.replace(old, new)] = state.pop(name)
     load_into(network, state, weights, device)
 
     def inputs(features: Features) -> dict[str, torch.Tensor]:
