@@ -25,6 +25,7 @@ SOURCES = (
     "raster/cpu",
     "raster/base.py",
     "raster/staged.py",
+    "raster/vectors.py",
     "gaussians/model.py",
     "eval/ssim.py",
     "train/loss_cpu.py",
