@@ -355,7 +355,7 @@ FAULTS = {
     ),
     "a missing term of the splitting matrix": (PROJECTION, "q11 - e * h", "q11"),
     "a factor in harmonics of degree 3": (GEOMETRY, "8 * T2 * yz", "4 * T2 * yz"),
-    "a swapped axis": ("raster/vectors.py", "(v.r10, v.r11, v.r12)", "(v.r11, v.r10, v.r12)"),
+    "a swapped axis": (GEOMETRY, "(v.r10, v.r11, v.r12)", "(v.r11, v.r10, v.r12)"),
     "a weight of the loss": (
         "train/loss_triton.py",
         "(W0, W1, W2, W3, W4, W5)[k]",

@@ -25,7 +25,6 @@ SOURCES = (
     "raster/cpu",
     "raster/base.py",
     "raster/staged.py",
-    "raster/vectors.py",
     "gaussians/model.py",
     "eval/ssim.py",
     "train/loss_cpu.py",

@@ -10,7 +10,6 @@ import math
 import numpy as np
 
 from gsbench.gaussians.model import C0, C1, C2, C3
-from gsbench.raster import vectors
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.cpu.shuffle import transpose
 from gsbench.raster.cpu.simd import (
@@ -39,27 +38,79 @@ ZERO = np.float32(0)
 MATRIX = LANES * LANES
 
 
-dot = inlined(vectors.dot)
-times = inlined(vectors.times)
-scaled = inlined(vectors.scaled)
-stretched = inlined(vectors.stretched)
-plus = inlined(vectors.plus)
-minus = inlined(vectors.minus)
-mixed = inlined(vectors.mixed)
-rotation_matrix = inlined(vectors.rotation_matrix)
-view_axes = inlined(vectors.view_axes)
-from_camera = inlined(vectors.from_camera)
-
-
 @inlined
 def exponential(x):
     return exp2(maximum(minimum(x * LOG2_E, MAX_LOG2), -MAX_LOG2))
 
 
 @inlined
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def times(row, matrix):
+    """``row`` [3] times ``matrix`` [3, 3]."""
+    return (
+        row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
+        row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
+        row[0] * matrix[0][2] + row[1] * matrix[1][2] + row[2] * matrix[2][2],
+    )
+
+
+@inlined
 def through(matrix, column):
     """``matrix`` [3, 3] times ``column`` [3]."""
     return dot(column, matrix[0]), dot(column, matrix[1]), dot(column, matrix[2])
+
+
+@inlined
+def scaled(row, scales):
+    return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
+
+
+@inlined
+def stretched(row, factor):
+    return row[0] * factor, row[1] * factor, row[2] * factor
+
+
+@inlined
+def plus(a, factor, b):
+    """``a + factor * b`` of two vectors [3]."""
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
+
+
+@inlined
+def mixed(p, a, q, b):
+    """``p * a + q * b`` of two vectors [3]."""
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
+
+
+@inlined
+def rotation_matrix(quaternion):
+    """The rows of the rotation matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@inlined
+def view_axes(v):
+    """The rows of the camera's rotation W, from world to view."""
+    return (v.r00, v.r01, v.r02), (v.r10, v.r11, v.r12), (v.r20, v.r21, v.r22)
+
+
+@inlined
+def from_camera(mean, v):
+    """The vector from the camera centre to the mean, in world axes.
+
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the
+    origin.
+    """
+    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
 
 @inlined
@@ -79,8 +130,8 @@ def image_rows(slope_x, slope_y, inverse_z, v):
     and y/z (EWA splatting, Zwicker et al. 2001; computeCov2D in 3DGS).
     """
     right, down, ahead = view_axes(v)
-    first = stretched(minus(right, slope_x, ahead), inverse_z * v.fx)
-    return first, stretched(minus(down, slope_y, ahead), inverse_z * v.fy)
+    first = stretched(plus(right, -slope_x, ahead), inverse_z * v.fx)
+    return first, stretched(plus(down, -slope_y, ahead), inverse_z * v.fy)
 
 
 @inlined

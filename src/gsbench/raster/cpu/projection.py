@@ -24,7 +24,6 @@ from gsbench.raster.cpu.geometry import (
     gather_quaternions,
     gather_vectors,
     image_rows,
-    minus,
     mixed,
     normalized,
     plus,
@@ -434,7 +433,7 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     s0 = scaled(g0, variances)
     a0, a1 = through(matrix, s0), through(matrix, plus(scaled(g1, variances), shear, s0))
     position = _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
-    tangent = stretched(minus(turned, dot(turned, to), to), inverse_distance)
+    tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
     scatter_vectors(gradients.means, indices, plus(position, ONE, tangent))
 
     # d log(alpha) / d logit = 1 - opacity

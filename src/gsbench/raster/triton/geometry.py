@@ -10,7 +10,6 @@ import triton
 import triton.language as tl
 
 from gsbench.gaussians.model import C0, C1, C2, C3, NUM_SH_REST
-from gsbench.raster import vectors
 from gsbench.raster.base import CONSTANTS
 
 BLUR = tl.constexpr(CONSTANTS.blur)
@@ -18,18 +17,6 @@ F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (tl.constexpr(value) for value in C3)
 NUM_SH = tl.constexpr(NUM_SH_REST)  # vectors of one Gaussian in ``sh_rest``
-
-
-dot = triton.jit(vectors.dot)
-times = triton.jit(vectors.times)
-scaled = triton.jit(vectors.scaled)
-stretched = triton.jit(vectors.stretched)
-plus = triton.jit(vectors.plus)
-minus = triton.jit(vectors.minus)
-mixed = triton.jit(vectors.mixed)
-rotation_matrix = triton.jit(vectors.rotation_matrix)
-view_axes = triton.jit(vectors.view_axes)
-from_camera = triton.jit(vectors.from_camera)
 
 
 @triton.jit
@@ -65,9 +52,79 @@ def load_quaternion(quaternions, index, mask):
 
 
 @triton.jit
+def rotation_matrix(q):
+    """The rows of the rotation matrix of a unit quaternion."""
+    w, x, y, z = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@triton.jit
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def times(row, matrix):
+    """``row`` [3] times ``matrix`` [3, 3]."""
+    return (
+        row[0] * matrix[0][0] + row[1] * matrix[1][0] + row[2] * matrix[2][0],
+        row[0] * matrix[0][1] + row[1] * matrix[1][1] + row[2] * matrix[2][1],
+        row[0] * matrix[0][2] + row[1] * matrix[1][2] + row[2] * matrix[2][2],
+    )
+
+
+@triton.jit
 def through(matrix, column):
     """``matrix`` [3, 3] times ``column`` [3]."""
     return dot(column, matrix[0]), dot(column, matrix[1]), dot(column, matrix[2])
+
+
+@triton.jit
+def scaled(row, scales):
+    return row[0] * scales[0], row[1] * scales[1], row[2] * scales[2]
+
+
+@triton.jit
+def stretched(row, factor):
+    return row[0] * factor, row[1] * factor, row[2] * factor
+
+
+@triton.jit
+def plus(a, factor, b):
+    """``a + factor * b`` of two vectors [3]."""
+    return a[0] + b[0] * factor, a[1] + b[1] * factor, a[2] + b[2] * factor
+
+
+@triton.jit
+def minus(a, factor, b):
+    """``a - factor * b``: for Triton, ``-factor`` would be an instruction of its own."""
+    return a[0] - factor * b[0], a[1] - factor * b[1], a[2] - factor * b[2]
+
+
+@triton.jit
+def mixed(p, a, q, b):
+    """``p * a + q * b`` of two vectors [3]."""
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
+
+
+@triton.jit
+def view_axes(v):
+    """The rows of the camera's rotation W, from world to view."""
+    return (v.r00, v.r01, v.r02), (v.r10, v.r11, v.r12), (v.r20, v.r21, v.r22)
+
+
+@triton.jit
+def from_camera(mean, v):
+    """The vector from the camera centre to the mean, in world axes.
+
+    It is computed first: rotating the difference loses no digits, even if the scene is far from the
+    origin.
+    """
+    return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
 
 @triton.jit
