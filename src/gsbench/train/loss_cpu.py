@@ -156,9 +156,9 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             mean_y = _blur_column(ring, part, i, center, length)
             square = _blur_column(ring, 2 * part, i, center, length)
             product = _blur_column(ring, 3 * part, i, center, length)
-            # SSIM = a1 a2 / (b1 b2) (Wang et al. 2004, eq. 13), where a1 = 2 mx my + C1, a2 = 2 cov +
-            # C2, b1 = mx^2 + my^2 + C1 and b2 = vx + vy + C2. With E[.] for the blur, cov = E[xy] -
-            # mx my and vx + vy = E[x^2 + y^2] - mx^2 - my^2.
+            # SSIM = a1 a2 / (b1 b2) (Wang et al. 2004, eq. 13), where a1 = 2 mx my + C1, a2 = 2 cov
+            # + C2, b1 = mx^2 + my^2 + C1 and b2 = vx + vy + C2. With E[.] for the blur, cov = E[xy]
+            # - mx my and vx + vy = E[x^2 + y^2] - mx^2 - my^2.
             a1 = fma(mean_x * mean_y, TWO, F_C1)
             a2 = fma(product - mean_x * mean_y, TWO, F_C2)
             means = mean_x * mean_x + mean_y * mean_y
