@@ -141,10 +141,8 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
                 l1 += absolute(a - b)
             if begin <= row < end:
                 sums[row, 1] = _sum(l1, scratch)
-            _blur_row(x, 0, ring, slot, numbers)
-            _blur_row(y, 0, ring, part + slot, numbers)
-            _blur_row(squares, 0, ring, 2 * part + slot, numbers)
-            _blur_row(products, 0, ring, 3 * part + slot, numbers)
+            for m in range(MAPS):
+                _blur_row(memory, m * padded, ring, m * part + slot, numbers)
         else:
             for m in range(MAPS):
                 for i in range(0, length, LANES):
@@ -158,6 +156,9 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             mean_y = _blur_column(ring, part, i, center, length)
             square = _blur_column(ring, 2 * part, i, center, length)
             product = _blur_column(ring, 3 * part, i, center, length)
+            # SSIM = a1 a2 / (b1 b2) (Wang et al. 2004, eq. 13), where a1 = 2 mx my + C1, a2 = 2 cov
+            # + C2, b1 = mx^2 + my^2 + C1 and b2 = vx + vy + C2. With E[.] for the blur, cov = E[xy]
+            # - mx my and vx + vy = E[x^2 + y^2] - mx^2 - my^2.
             a1 = fma(mean_x * mean_y, TWO, F_C1)
             a2 = fma(product - mean_x * mean_y, TWO, F_C2)
             means = mean_x * mean_x + mean_y * mean_y
@@ -168,6 +169,8 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
             value = select(inside, a1 * a2 * inverse, ZERO)
             similarity += value
             if len(derivatives) > 0:
+                # By mx: 2 (my (a2 - a1) - SSIM mx (b2 - b1)) / (b1 b2). By E[x^2]: -SSIM / b2. By
+                # E[xy]: 2 a1 / (b1 b2).
                 at = center * padded + PAD + i
                 d_mean = (mean_y * (a2 - a1) - value * mean_x * (b2 - b1)) * inverse * TWO
                 store(derivatives, at, select(inside, d_mean, ZERO))
@@ -229,6 +232,7 @@ def gradient_rows(
             d_mean = _blur_column(ring, 0, i, center, length)
             d_square = _blur_column(ring, part, i, center, length)
             d_product = _blur_column(ring, 2 * part, i, center, length)
+            # By x: the blur of the derivative by mx, + 2 x that by E[x^2], + y that by E[xy].
             similarity = fma(d_square * TWO, a, fma(d_product, b, d_mean))
             sign = select(a > b, splat(l1_factor), select(a < b, splat(-l1_factor), ZERO))
             store(line, i, fma(similarity, -ssim_factor, sign))

@@ -151,6 +151,8 @@ def measure_similarity(
 
         center = row - RADIUS
         inside = (center >= first) & (number < numbers)
+        # SSIM = a1 a2 / (b1 b2) (Wang et al. 2004, eq. 13); `loss_cpu` has it in full, with its
+        # derivatives by the blurred image, its blurred square and the blurred product.
         mx, my = mean_x[0], mean_y[0]
         means = mx * mx + my * my
         a1 = 2 * mx * my + F_C1
@@ -230,6 +232,7 @@ def differentiate(
         inside = (center >= first) & (number < numbers)
         x = tl.load(image + center * numbers + number, mask=inside, other=0.0)
         y = tl.load(target + center * numbers + number, mask=inside, other=0).to(tl.float32) * scale
+        # By x: the blur of the derivative by mx, + 2 x that by E[x^2], + y that by E[xy].
         similarity = d_mean[0] + 2 * d_square[0] * x + d_product[0] * y
         sign = tl.where(x > y, l1_factor, tl.where(x < y, -l1_factor, 0.0))
         tl.store(gradient + center * numbers + number, sign - ssim_factor * similarity, mask=inside)

@@ -122,7 +122,7 @@ def project_shards(
 def _project(memory, begin, end, gaussians, degree, v, outputs):
     records, record_ints, keys, radii, flags = outputs
     floats, indices = memory
-    basis, rows, scratch = floats[:MATRIX], floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
+    rows, scratch = floats[MATRIX : 2 * MATRIX], floats[2 * MATRIX :]
     out = begin
     bad = splat(ZERO)  # sum of 0 * value: 0 if every value is finite, else NaN
     short = np.uint64(0)
@@ -190,23 +190,10 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
         # Colour = SH + 1/2, clamped to at least 0 (3DGS, computeColorFromSH).
         red, green, blue = dc[0] * F0 + HALF, dc[1] * F0 + HALF, dc[2] * F0 + HALF
         if degree > 0:
-            to, _ = normalized(offset)
-            fill_basis(degree, to, basis)
-            left = todo
-            while left != 0:
-                lane = lowest_bit(left)
-                left &= left - np.uint64(1)
-                place = lane * np.uint64(LANES)
-                own = load(basis, place)
-                by_red, by_green, by_blue = by_channel(
-                    load_rest(gaussians.sh_rest, (start + np.int64(lane)) * REST)
-                )
-                store(rows, place, own * by_red)
-                store(scratch, place, own * by_green)
-                store(scratch, MATRIX + place, own * by_blue)
-            red += _row_sums(rows, 0)
-            green += _row_sums(scratch, 0)
-            blue += _row_sums(scratch, MATRIX)
+            further = _harmonics(degree, offset, todo, start, gaussians.sh_rest, floats)
+            red += further[0]
+            green += further[1]
+            blue += further[2]
         bad += select(seen, (red + green + blue) * ZERO, ZERO)
         clamped = select(red < ZERO, splat(ONE), ZERO)
         clamped += select(green < ZERO, splat(TWO), ZERO) + select(blue < ZERO, splat(FOUR), ZERO)
@@ -246,6 +233,29 @@ def _project(memory, begin, end, gaussians, degree, v, outputs):
 @inlined
 def _zero_if_finite(vector):
     return vector[0] * ZERO + vector[1] * ZERO + vector[2] * ZERO
+
+
+@inlined
+def _harmonics(degree, offset, todo, start, sh_rest, memory):
+    """Red, green and blue of the harmonics above degree 0, for the lanes ``todo`` from ``start``.
+
+    A Gaussian's coefficients are adjacent, so each is a row of three 16x16 matrices, one of a
+    channel, times the row of its basis. The sums of all rows are taken at once.
+    """
+    basis, red, green = memory[:MATRIX], memory[MATRIX:], memory[2 * MATRIX :]
+    blue = memory[3 * MATRIX :]
+    to, _ = normalized(offset)
+    fill_basis(degree, to, basis)
+    while todo != 0:
+        lane = lowest_bit(todo)
+        todo &= todo - np.uint64(1)
+        place = lane * np.uint64(LANES)
+        own = load(basis, place)
+        by_red, by_green, by_blue = by_channel(load_rest(sh_rest, (start + np.int64(lane)) * REST))
+        store(red, place, own * by_red)
+        store(green, place, own * by_green)
+        store(blue, place, own * by_blue)
+    return _row_sums(red, 0), _row_sums(green, 0), _row_sums(blue, 0)
 
 
 @inlined
@@ -418,10 +428,28 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     scatter(g_quaternions, indices, 4, 2, (qw * w_y + qz * w_x - qx * w_z) * twice)
     scatter(g_quaternions, indices, 4, 3, (qw * w_z + qx * w_y - qy * w_x) * twice)
 
-    # A = J W: d loss / d A, then by the entries of J, then by the position in view space.
-    right, down, ahead = view_axes(v)
+    # Mean: through A = J W and the position on the image, and through the view direction of the
+    # colour, whose gradient is projected to the tangent of the sphere.
     s0 = scaled(g0, variances)
     a0, a1 = through(matrix, s0), through(matrix, plus(scaled(g1, variances), shear, s0))
+    position = _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v)
+    tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
+    scatter_vectors(gradients.means, indices, plus(position, ONE, tangent))
+
+    # d log(alpha) / d logit = 1 - opacity
+    growth = exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
+    scatter(gradients.logits, indices, 1, 0, h / growth)
+
+
+@inlined
+def _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v):
+    """The gradient by the mean in world axes, of its covariance and its position on the image.
+
+    ``a0`` and ``a1`` are the gradients by the rows of A = J W. They go on to the entries of J, then
+    to the position in view space, then to the world.
+    """
+    right, down, ahead = view_axes(v)
+    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
     j00, j02, j11, j12 = dot(a0, right), dot(a0, ahead), dot(a1, down), dot(a1, ahead)
     fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
     # The clamp of a slope passes the gradient only within the limits.
@@ -431,16 +459,7 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     view_y = g_row * fy_z + g_slope_y * inverse_z
     by_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
     view_z = -(by_focal * inverse_z + view_x * free_x + view_y * free_y)
-
-    # Mean: through the image position, and through the view direction of the colour, whose
-    # gradient is projected to the tangent of the sphere.
-    tangent = stretched(plus(turned, -dot(turned, to), to), inverse_distance)
-    position = times((view_x, view_y, view_z), (right, down, ahead))
-    scatter_vectors(gradients.means, indices, plus(position, ONE, tangent))
-
-    # d log(alpha) / d logit = 1 - opacity
-    growth = exponential(gather(gaussians.logits, indices, 1, 0)) + ONE
-    scatter(gradients.logits, indices, 1, 0, h / growth)
+    return times((view_x, view_y, view_z), (right, down, ahead))
 
 
 @inlined

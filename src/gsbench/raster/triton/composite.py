@@ -1,9 +1,17 @@
 """Compositing of blocks, forward and backward, and footprints.
 
-One program of one warp per block, four pixels per lane. With one warp, nothing is shared between
-warps: the loop over a list has no barrier, a record is read once for all 128 pixels, and shuffles
-compute gradient sums. The four pixels of a lane are in one row, so terms that depend only on dy are
-computed once for all four, and four chains of fma run in parallel.
+The formulas are those of 3DGS (Kerbl et al. 2023, eq. 2 to 4; renderCUDA in its code). With the
+density G, the opacity o and the colour c of each Gaussian, front to back,
+
+    alpha = min(0.99, o G),  skipped below 1/255
+    image = sum of c alpha T + background T_end,  T = product of (1 - alpha) of those before
+
+and a pixel stops before the Gaussian that would lower T below 1e-4.
+
+One program of one warp composites a block, four pixels per lane. With one warp, nothing is shared
+between warps: the loop over a list has no barrier, a record is read once for all 128 pixels, and
+shuffles compute gradient sums. The four pixels of a lane are in one row, so terms that depend only
+on dy are computed once for all four, and four chains of fma run in parallel.
 """
 
 from __future__ import annotations
@@ -105,6 +113,27 @@ def log2_alpha(record, x, y):
     return power, t, dy
 
 
+@triton.jit
+def _leave_light_behind(first_border, crossed, red, green, blue):
+    """Replace the light of segments in ``crossed`` borders by that behind each; return all light.
+
+    The colours given are those of the last segment. Adding segment by segment, back to front, gives
+    the light behind each border without a subtraction.
+    """
+    for k in range(0, crossed):
+        place = first_border + (crossed - 1 - k) * BORDER
+        before = (
+            tl.load(place + BEHIND_RED),
+            tl.load(place + BEHIND_GREEN),
+            tl.load(place + BEHIND_BLUE),
+        )
+        tl.store(place + BEHIND_RED, red)
+        tl.store(place + BEHIND_GREEN, green)
+        tl.store(place + BEHIND_BLUE, blue)
+        red, green, blue = red + before[0], green + before[1], blue + before[2]
+    return red, green, blue
+
+
 @triton.jit(do_not_specialize=["closing", "width", "height", "blocks_x"])
 def composite(
     order,
@@ -191,20 +220,8 @@ def composite(
             red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
             crossed += 1
 
-    # Now the colours are those of the last segment. Adding segment by segment, back to front, gives
-    # the light behind each border without a subtraction.
     tl.debug_barrier()
-    for k in range(0, crossed):
-        place = first_border + (crossed - 1 - k) * BORDER
-        before = (
-            tl.load(place + BEHIND_RED),
-            tl.load(place + BEHIND_GREEN),
-            tl.load(place + BEHIND_BLUE),
-        )
-        tl.store(place + BEHIND_RED, red)
-        tl.store(place + BEHIND_GREEN, green)
-        tl.store(place + BEHIND_BLUE, blue)
-        red, green, blue = red + before[0], green + before[1], blue + before[2]
+    red, green, blue = _leave_light_behind(first_border, crossed, red, green, blue)
 
     light = tl.abs(light)
     state = block * BLOCK_PIXELS + places

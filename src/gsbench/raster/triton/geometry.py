@@ -1,7 +1,8 @@
 """Projection geometry and spherical harmonics for both passes, float32, one lane per Gaussian.
 
 Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see
-``spread``).
+``spread``). The functions of vectors are those of `raster.cpu.geometry` once more: Triton's
+interpreter takes no function of a module that does not import Triton.
 """
 
 from __future__ import annotations

@@ -254,6 +254,56 @@ def _store_splitting(place, d00, d01, d11, shear, rows, mask):
     tl.store(place + 8, r0[2] * s0[2] + r1[2] * s1[2], mask=mask)
 
 
+@triton.jit
+def _color_gradients(offset, g_rgb, color_slopes, g_sh_rest, index, mask, DEGREE: tl.constexpr):
+    """Store the gradients by ``sh_rest``; return that by the mean, through the view direction."""
+    to, inverse_distance = normalized(offset)
+    zero = tl.zeros_like(inverse_distance)
+    turned = (zero, zero, zero)
+    if DEGREE > 0:
+        for c in tl.static_range(3):
+            turned = plus(turned, g_rgb[c], load_vector(color_slopes + 3 * c, 3 * index, mask))
+    store_gradients(to, g_rgb, g_sh_rest, index, mask, DEGREE)
+    # Only what is tangent to the unit sphere turns the direction.
+    return stretched(minus(turned, dot(turned, to), to), inverse_distance)
+
+
+@triton.jit
+def _store_turn(place, quaternion, turn, twice, mask):
+    """Write the gradient by the stored quaternion q, which changes by q (0, w) / 2.
+
+    ``turn`` is the gradient by w, ``twice`` is two over the norm of the stored quaternion.
+    """
+    qw, qx, qy, qz = quaternion
+    w_x, w_y, w_z = turn
+    tl.store(place, -(qx * w_x + qy * w_y + qz * w_z) * twice, mask=mask)
+    tl.store(place + 1, (qw * w_x + qy * w_z - qz * w_y) * twice, mask=mask)
+    tl.store(place + 2, (qw * w_y + qz * w_x - qx * w_z) * twice, mask=mask)
+    tl.store(place + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=mask)
+
+
+@triton.jit
+def _position_gradient(a0, a1, g_column, g_row, x, y, inverse_z, v):
+    """The gradient by the mean in world axes, of its covariance and its position on the image.
+
+    ``a0`` and ``a1`` are the gradients by the rows of A = J W. They go on to the entries of J, then
+    to the position in view space, then to the world.
+    """
+    right, down, ahead = view_axes(v)
+    free_x, free_y = x * inverse_z, y * inverse_z
+    slope_x, slope_y = clamped_slopes(free_x, free_y, v)
+    j00, j02, j11, j12 = dot(a0, right), dot(a0, ahead), dot(a1, down), dot(a1, ahead)
+    fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
+    # The clamp of a slope passes the gradient only within the limits.
+    g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
+    g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
+    view_x = g_column * fx_z + g_slope_x * inverse_z
+    view_y = g_row * fy_z + g_slope_y * inverse_z
+    by_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
+    view_z = -(by_focal * inverse_z + view_x * free_x + view_y * free_y)
+    return times((view_x, view_y, view_z), (right, down, ahead))
+
+
 @triton.jit(do_not_specialize=["count"])
 def backproject(
     means,
@@ -292,28 +342,19 @@ def backproject(
     mean, log_scale = load_vector(means, index, seen), load_vector(log_scales, index, seen)
     offset = from_camera(mean, v)
 
-    # Colour, and the gradient of the mean through the view direction of the colour.
+    # Colour. A channel below 0 was clamped and has no gradient.
     clamped = tl.load(record_ints + index * RECORD + CLAMPED, mask=seen, other=0)
     g_rgb = (
         tl.where(clamped & 1 != 0, 0.0, red),
         tl.where(clamped & 2 != 0, 0.0, green),
         tl.where(clamped & 4 != 0, 0.0, blue),
     )
-    to, inverse_distance = normalized(offset)
     store_vector(g_sh_dc, index, stretched(g_rgb, F0), seen)
-    zero = tl.zeros_like(inverse_distance)
-    turned = (zero, zero, zero)
-    if DEGREE > 0:
-        for c in tl.static_range(3):
-            turned = plus(turned, g_rgb[c], load_vector(color_slopes + 3 * c, 3 * index, seen))
-    store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)
-    # Only what is tangent to the unit sphere turns the direction.
-    tangent = stretched(minus(turned, dot(turned, to), to), inverse_distance)
+    tangent = _color_gradients(offset, g_rgb, color_slopes, g_sh_rest, index, seen, DEGREE)
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
-    right, down, ahead = view_axes(v)
-    x, y, z = through((right, down, ahead), offset)
+    x, y, z = through(view_axes(v), offset)
     inverse_z = 1.0 / tl.where(seen, z, 1.0)
     free_x, free_y = x * inverse_z, y * inverse_z
     slope_x, slope_y = clamped_slopes(free_x, free_y, v)
@@ -352,30 +393,17 @@ def backproject(
     # Rotation by small angles w about the Gaussian's own axes changes R S^2 R^T by a commutator, so
     # the gradient by w has differences of variances as factors. Computing these differences first
     # makes the gradient of a sphere exactly 0; otherwise rounding errors remain, which Adam scales
-    # to full steps. The quaternion changes by q (0, w) / 2.
+    # to full steps.
     w_x = (u0[1] * g0[2] + n1[1] * g1[2]) * (scales[1] - scales[2]) * (scales[1] + scales[2])
     w_y = (u0[2] * g0[0] + n1[2] * g1[0]) * (scales[2] - scales[0]) * (scales[2] + scales[0])
     w_z = (u0[0] * g0[1] + n1[0] * g1[1]) * (scales[0] - scales[1]) * (scales[0] + scales[1])
-    qw, qx, qy, qz = quaternion
-    twice = inverse_norm + inverse_norm
-    tl.store(g_quaternions + 4 * index, -(qx * w_x + qy * w_y + qz * w_z) * twice, mask=seen)
-    tl.store(g_quaternions + 4 * index + 1, (qw * w_x + qy * w_z - qz * w_y) * twice, mask=seen)
-    tl.store(g_quaternions + 4 * index + 2, (qw * w_y + qz * w_x - qx * w_z) * twice, mask=seen)
-    tl.store(g_quaternions + 4 * index + 3, (qw * w_z + qx * w_y - qy * w_x) * twice, mask=seen)
+    turn = (w_x, w_y, w_z)
+    _store_turn(g_quaternions + 4 * index, quaternion, turn, inverse_norm + inverse_norm, seen)
 
-    # A = J W: d loss / d A, then by the entries of J, then by the position in view space.
+    # The mean: through A = J W and the position on the image, and through the colour.
     s0 = scaled(g0, variances)
     a0, a1 = through(matrix, s0), through(matrix, plus(scaled(g1, variances), shear, s0))
-    j00, j02, j11, j12 = dot(a0, right), dot(a0, ahead), dot(a1, down), dot(a1, ahead)
-    fx_z, fy_z = inverse_z * v.fx, inverse_z * v.fy
-    # The clamp of a slope passes the gradient only within the limits.
-    g_slope_x = tl.where((free_x >= v.slope_x_min) & (free_x <= v.slope_x_max), -fx_z * j02, 0.0)
-    g_slope_y = tl.where((free_y >= v.slope_y_min) & (free_y <= v.slope_y_max), -fy_z * j12, 0.0)
-    view_x = g_column * fx_z + g_slope_x * inverse_z
-    view_y = g_row * fy_z + g_slope_y * inverse_z
-    by_focal = fx_z * (j00 - slope_x * j02) + fy_z * (j11 - slope_y * j12)
-    view_z = -(by_focal * inverse_z + view_x * free_x + view_y * free_y)
-    position = times((view_x, view_y, view_z), (right, down, ahead))
+    position = _position_gradient(a0, a1, g_column, g_row, x, y, inverse_z, v)
     store_vector(g_means, index, plus(position, 1.0, tangent), seen)
 
     # d log(alpha) / d logit = 1 - opacity
