@@ -1,7 +1,7 @@
 """Mutation testing: plant small faults one at a time in a copy, and see whether the quick tests
 notice them.
 
-    python scripts/mutants.py # 160 faults over all rooms below, two at a time
+    python scripts/mutants.py # 160 faults over all rooms, two at a time
     python scripts/mutants.py --rooms densify eval --count 40 --seed 3
 
 A fault is one of these:
@@ -41,28 +41,21 @@ from queue import Queue
 
 ROOT = Path(__file__).parents[1]
 SOURCE = "src/gsbench"
-ROOMS = [
-    "analysis",
-    "claims",
-    "densify",
-    "eval",
-    "gaussians",
-    "init",
-    "pipeline",
-    "raster",
-    "runs",
-    "scene",
-    "train",
-]
+GROUND = "ground"  # the single files of the package
+ROOMS = [GROUND, *sorted(path.name for path in (ROOT / SOURCE).iterdir() if path.is_dir())]
+ROOMS = [room for room in ROOMS if not room.startswith("_")]
 YAML = ["tests/config/test_yaml_defaults.py"]  # the defaults of classes
 FURTHER_TESTS = {
+    "app": ["tests/end_to_end/test_smoke.py"],
     "claims": ["tests/app/test_sweeps.py"],
+    "verbs": ["tests/claims", "tests/app"],
     "pipeline": ["tests/end_to_end/test_smoke.py"],
     "densify": YAML,
     "eval": YAML,
     "init": YAML,
     "train": YAML,
 }
+TESTS = {"bench": "benchmarks"}  # where the folder has another name
 LEFT_OUT = "triton"  # files with this in their path
 # Swapped arguments change nothing in calls of these.
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add", "ssim_map", "similarity", "fma", "dot"}
@@ -106,7 +99,8 @@ class Fault:
 
     @property
     def room(self) -> str:
-        return Path(self.file).relative_to(SOURCE).parts[0]
+        parts = Path(self.file).relative_to(SOURCE).parts
+        return parts[0] if len(parts) > 1 else GROUND
 
 
 def describe(fault: Fault) -> str:
@@ -213,6 +207,13 @@ def faults_of(path: Path) -> list[Fault]:
     return faults
 
 
+def files_of(room: str) -> list[Path]:
+    """The source files of a room."""
+    if room == GROUND:
+        return sorted((ROOT / SOURCE).glob("*.py"))
+    return sorted((ROOT / SOURCE / room).rglob("*.py"))
+
+
 def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
     """Choose about ``count`` faults, by the square root of the rooms' sizes; all kinds are equally
     likely."""
@@ -220,7 +221,7 @@ def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
     by_room = {
         room: [
             fault
-            for path in sorted((ROOT / SOURCE / room).rglob("*.py"))
+            for path in files_of(room)
             if LEFT_OUT not in path.as_posix()
             for fault in faults_of(path)
         ]
@@ -264,20 +265,30 @@ def tests_of(fault: Fault, place: Path) -> list[str]:
     module = Path(fault.file).relative_to("src").with_suffix("").as_posix().replace("/", ".")
     parent, _, name = module.rpartition(".")
     imports = re.compile(rf"{re.escape(module)}\b|from {re.escape(parent)} import .*\b{name}\b")
-    room = place / "tests" / fault.room
-    named = sorted(room.rglob(f"test_{Path(fault.file).stem}.py"))
+    own = [place / name for name in tests_of_room(fault.room, place)]
+    every = sorted((place / "tests").rglob("test_*.py"))
+    named = [path for path in every if path.stem == f"test_{Path(fault.file).stem}"]
     elsewhere = [
         path
-        for path in sorted((place / "tests").rglob("test_*.py"))
-        if not path.is_relative_to(room) and imports.search(path.read_text())
+        for path in every
+        if not any(path.is_relative_to(folder) for folder in own)
+        and imports.search(path.read_text())
     ]
-    return [path.relative_to(place).as_posix() for path in [*named, room, *elsewhere]]
+    chosen = dict.fromkeys([*named, *own, *elsewhere])
+    return [path.relative_to(place).as_posix() for path in chosen]
+
+
+def tests_of_room(room: str, place: Path) -> list[str]:
+    """The folder of a room's tests; for the ground floor, the files beside the folders."""
+    if room == GROUND:
+        return [path.relative_to(place).as_posix() for path in (place / "tests").glob("test_*.py")]
+    return [f"tests/{TESTS.get(room, room)}"]
 
 
 def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
     """Plant the fault in the copy, run its tests, and remove it again. Without a fault, run the
     room's tests."""
-    tests = [f"tests/{room}"]
+    tests = tests_of_room(room, place)
     original = b""
     if fault is not None:
         tests = tests_of(fault, place)

@@ -81,9 +81,8 @@ def find_normalization(centers: ArrayLike) -> Normalization:
 
     Splits and selections of images do not change it, and a few cameras far off hardly do.
     """
-    ordered = np.sort(
-        np.asarray(centers, dtype=np.float64).reshape(-1, 3), axis=0
-    )  # [V, 3], each axis by itself
+    places = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+    ordered = np.sort(places, axis=0)  # [V, 3], each axis by itself
     # COLMAP leaves out none of up to ten cameras. Here a single camera far off must not decide.
     left_out = max(1, round(TRIMMED * len(ordered))) if len(ordered) >= MIN_TRIMMED else 0
     kept = ordered[left_out : len(ordered) - left_out]

@@ -216,9 +216,8 @@ def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str
     (unless ``infinite``) and at most ``most`` values, where a YAML alias counts each time it is
     used.
     """
-    containers: deque[tuple[tuple[Any, ...], Any]] = deque(
-        [((), [value])]
-    )  # with their places: the keys that lead there
+    # with their places: the keys that lead there
+    containers: deque[tuple[tuple[Any, ...], Any]] = deque([((), [value])])
     count = 0
     while containers:
         place, container = containers.popleft()

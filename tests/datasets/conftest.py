@@ -19,12 +19,8 @@ def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[s
     wants."""
     rng = np.random.default_rng([seed, *scene_folder.encode()])
     files = {}
-    for images, size in (
-        ("images", 40_000),
-        ("images_2", 20_000),
-        ("images_4", 9_000),
-        ("images_8", 3_000),
-    ):
+    sizes = {"images": 40_000, "images_2": 20_000, "images_4": 9_000, "images_8": 3_000}
+    for images, size in sizes.items():
         for index in range(photos):
             files[f"{scene_folder}/{images}/IMG_{index:04d}.JPG"] = rng.bytes(size + index)
     for name in ("cameras", "images", "points3D"):

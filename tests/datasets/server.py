@@ -107,11 +107,8 @@ def serve(folder: Path) -> Iterator[Server]:
                     if manners.damage is not None:
                         data = manners.damage(path, position, data)
                     limit = manners.cut_every or manners.stall_every
-                    stop = (
-                        limit is not None
-                        and position + len(data) - first > limit
-                        and manners.cuts > 0
-                    )
+                    beyond = limit is not None and position + len(data) - first > limit
+                    stop = beyond and manners.cuts > 0
                     if stop:
                         data = data[: max(0, limit - (position - first))]
                     try:
@@ -129,9 +126,7 @@ def serve(folder: Path) -> Iterator[Server]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
     state = Server(folder, f"http://127.0.0.1:{server.server_port}", Manners())
-    threading.Thread(
-        target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True
-    ).start()
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     try:
         yield state
     finally:

@@ -50,15 +50,16 @@ def test_an_archive_of_a_later_version_is_refused(version: int, tmp_path: Path) 
         open_archive(io.BytesIO(data), "x.zip")
 
 
-@pytest.mark.parametrize(
-    ("offset", "layout", "value"), [(42, "<I", 5), (42, "<I", 10**9), (42, "<I", 2**32 - 2)]
-)
-def test_a_wrong_offset_is_damage(offset: int, layout: str, value: int, tmp_path: Path) -> None:
-    data = patched(packed("s/images/a.jpg"), DIRECTORY, offset, layout, value)
-    with open_archive(io.BytesIO(data), "x.zip") as archive:
-        (member,) = wanted_members(archive, "s", ["images"], "x.zip").values()
-        with pytest.raises(DamagedMemberError):
-            extract(archive, member, tmp_path / "a.jpg", lambda count: None)
+def extract_only(archive: zipfile.ZipFile, target: Path, which: int = 0) -> None:
+    member = list(wanted_members(archive, "s", ["images"], "x.zip").values())[which]
+    extract(archive, member, target, lambda count: None)
+
+
+@pytest.mark.parametrize("value", [5, 10**9, 2**32 - 2])
+def test_a_wrong_offset_is_damage(value: int, tmp_path: Path) -> None:
+    data = patched(packed("s/images/a.jpg"), DIRECTORY, 42, "<I", value)
+    with open_archive(io.BytesIO(data), "x.zip") as archive, pytest.raises(DamagedMemberError):
+        extract_only(archive, tmp_path / "a.jpg")
     assert not (tmp_path / "a.jpg").exists()
 
 
@@ -97,13 +98,12 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
     begin = data.index(b"a.jpg") + 5
     for place in range(begin, begin + 200):
         damaged = data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :]
-        with open_archive(io.BytesIO(damaged), "x.zip") as archive:
-            (member,) = wanted_members(archive, "s", ["images"], "x.zip").values()
-            with contextlib.suppress(DamagedMemberError, InputError):
-                extract(archive, member, tmp_path / "a.jpg", lambda count: None)
-                # the byte was one that no reader looks at
-                assert (tmp_path / "a.jpg").read_bytes() == content
-                (tmp_path / "a.jpg").unlink()
+        damage = contextlib.suppress(DamagedMemberError, InputError)
+        with open_archive(io.BytesIO(damaged), "x.zip") as archive, damage:
+            extract_only(archive, tmp_path / "a.jpg")
+            # the byte was one that no reader looks at
+            assert (tmp_path / "a.jpg").read_bytes() == content
+            (tmp_path / "a.jpg").unlink()
     assert not (tmp_path / "a.jpg").exists()
 
 
@@ -111,9 +111,8 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
 def served(tmp_path: Path) -> Iterator[Server]:
     with zipfile.ZipFile(tmp_path / "file.zip", "w") as archive:
         for name in ("first", "second"):
-            archive.writestr(
-                f"s/images/{name}.jpg", np.random.default_rng(len(name)).bytes(300_000)
-            )
+            content = np.random.default_rng(len(name)).bytes(300_000)
+            archive.writestr(f"s/images/{name}.jpg", content)
     with serve(tmp_path) as running:
         yield running
 
@@ -122,8 +121,7 @@ def fetched(server: Server, target: Path) -> bytes:
     """The bytes of the second member."""
     url = f"{server.url}/file.zip"
     with open_archive_at(url, PATIENT) as archive:
-        (_, member) = wanted_members(archive, "s", ["images"], url).values()
-        with_retries(lambda: extract(archive, member, target, lambda count: None), url, PATIENT)
+        with_retries(lambda: extract_only(archive, target, 1), url, PATIENT)
     return target.read_bytes()
 
 
@@ -136,7 +134,6 @@ def fetched(server: Server, target: Path) -> bytes:
         Manners(fail_first=2),
         Manners(redirect=True),
     ],
-    ids=["good", "cuts", "stalls", "503 at first", "redirect"],
 )
 def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners: Manners) -> None:
     served.manners = manners
@@ -148,11 +145,7 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
 @pytest.mark.parametrize(
     ("manners", "kind", "said"),
     [
-        (
-            Manners(cut_every=100),
-            FetchError,
-            r"3 failures in a row .*cut.*give the same command again",
-        ),
+        (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*same command again"),
         (Manners(stall_every=1), FetchError, "no answer in time"),
         (Manners(status={"/file.zip": 403}), InputError, r"403 Forbidden.*--mirror"),
         (Manners(status={"/file.zip": 503}), FetchError, r"3 failures in a row .*503"),
@@ -161,7 +154,7 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
         (Manners(shift=7), DamagedMemberError, None),
     ],
 )
-def test_says_what_the_server_did(
+def test_what_the_server_did_is_said(
     served: Server, tmp_path: Path, manners: Manners, kind: type[Exception], said: str | None
 ) -> None:
     served.manners = manners
@@ -170,7 +163,7 @@ def test_says_what_the_server_did(
     assert not (tmp_path / "out").exists()
 
 
-def test_no_server_at_all() -> None:
+def test_a_server_that_is_not_there_is_said() -> None:
     with (
         pytest.raises(FetchError, match="Connection refused"),
         open_archive_at("http://127.0.0.1:9/file.zip", PATIENT),
@@ -181,34 +174,27 @@ def test_no_server_at_all() -> None:
 def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path) -> None:
     url = f"{served.url}/file.zip"
     with open_archive_at(url, PATIENT) as archive:
-        (_, member) = wanted_members(archive, "s", ["images"], url).values()
         content = bytearray((served.folder / "file.zip").read_bytes())
         content[400_000:400_010] = bytes(10)
         (served.folder / "file.zip").write_bytes(content)
         with pytest.raises(DamagedMemberError, match="CRC-32"):
-            extract(archive, member, tmp_path / "out", lambda count: None)
+            extract_only(archive, tmp_path / "out", 1)
         os.truncate(served.folder / "file.zip", 1000)
         with pytest.raises(InputError, match="416"):
-            with_retries(
-                lambda: extract(archive, member, tmp_path / "out", lambda count: None), url, PATIENT
-            )
+            with_retries(lambda: extract_only(archive, tmp_path / "out", 1), url, PATIENT)
 
 
 def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) -> None:
     served.manners = Manners(ranges=False, cut_every=300_000, cuts=2)
     seen: list[tuple[int, int | None]] = []
-    download(
-        f"{served.url}/file.zip",
-        tmp_path / "copy",
-        PATIENT,
-        lambda done, total: seen.append((done, total)),
-    )
+    url, target = f"{served.url}/file.zip", tmp_path / "copy"
+    download(url, target, PATIENT, lambda *state: seen.append(state))
     content = (served.folder / "file.zip").read_bytes()
-    assert (tmp_path / "copy").read_bytes() == content
+    assert target.read_bytes() == content
     assert seen[-1] == (len(content), len(content))
     served.manners = Manners(ranges=False, cut_every=300_000)
     with pytest.raises(FetchError, match="cut"):
-        download(f"{served.url}/file.zip", tmp_path / "copy", PATIENT, lambda *_: None)
+        download(url, target, PATIENT, lambda *_: None)
 
 
 def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:

@@ -33,9 +33,8 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def fetch(server: Server, data: Path, monkeypatch: pytest.MonkeyPatch) -> Fetch:
-    monkeypatch.setattr(
-        "gsbench.verbs.fetch.PATIENCE", RetryPolicy(timeout=0.3, tries=3, pause=0.01)
-    )
+    patience = RetryPolicy(timeout=0.3, tries=3, pause=0.01)
+    monkeypatch.setattr("gsbench.verbs.fetch.PATIENCE", patience)
 
     def call(*words: str) -> int:
         return run(["fetch", *words, "--mirror", server.url])
@@ -44,11 +43,8 @@ def fetch(server: Server, data: Path, monkeypatch: pytest.MonkeyPatch) -> Fetch:
 
 
 def files_below(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def wanted(place: str, images: str) -> dict[str, bytes]:
@@ -65,12 +61,8 @@ def test_every_scene_of_the_catalogue_is_a_scene_file_at_the_same_place() -> Non
     for dataset in read_catalog().values():
         for archive in dataset.archives:
             known |= dict(archive.scenes)
-    public = {
-        path.stem
-        for path in (conf_dir() / "scene").glob("*.yaml")
-        if "GSBENCH_DATA" in path.read_text()
-    }
-    assert set(known) == public
+    files = (conf_dir() / "scene").glob("*.yaml")
+    assert set(known) == {path.stem for path in files if "GSBENCH_DATA" in path.read_text()}
     for scene, folder in known.items():
         assert wanted_files(scene).folder == folder
 
@@ -79,21 +71,15 @@ def test_brings_what_the_scene_file_wants_and_nothing_else(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert fetch("mipnerf360", "garden", "room", "flowers") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_4")
-    assert files_below(data / "room") == wanted("room", "images_2")
-    assert files_below(data / "flowers") == wanted("flowers", "images_4")
-    assert {path.name for path in data.iterdir() if path.is_dir()} <= {
-        "garden",
-        "room",
-        "flowers",
-        ".fetch",
-    }
+    images = {"garden": "images_4", "room": "images_2", "flowers": "images_4"}
+    for scene, folder in images.items():
+        assert files_below(data / scene) == wanted(scene, folder)
+    assert {path.name for path in data.iterdir() if path.is_dir()} <= {*images, ".fetch"}
     text = capsys.readouterr().out
     assert "licence: none is stated" in text
     assert "please cite: Barron" in text
-    whole = sum(
-        (server.folder / name).stat().st_size for name in ("360_v2.zip", "360_extra_scenes.zip")
-    )
+    archives = ("360_v2.zip", "360_extra_scenes.zip")
+    whole = sum((server.folder / name).stat().st_size for name in archives)
     assert server.sent < 0.6 * whole  # the tails of small archives count much
 
     assert fetch("tandt_db", "truck", "playroom") == 0
@@ -131,20 +117,9 @@ def test_goes_on_where_it_was_stopped(fetch: Fetch, server: Server, data: Path) 
     assert not (data / ".fetch" / "garden").exists()
 
 
-@pytest.mark.parametrize(
-    "manners",
-    [
-        Manners(cut_every=6_000, cuts=2),
-        Manners(stall_every=6_000, cuts=2),
-        Manners(fail_first=2),
-        Manners(redirect=True),
-    ],
-    ids=["cuts", "stalls", "503", "redirect"],
-)
-def test_bad_manners_leave_the_same_files(
-    fetch: Fetch, server: Server, data: Path, manners: Manners
-) -> None:
-    server.manners = manners
+def test_bad_manners_leave_the_same_files(fetch: Fetch, server: Server, data: Path) -> None:
+    """Each kind of them alone: test_archive.py."""
+    server.manners = Manners(cut_every=6_000, cuts=1, fail_first=1, redirect=True)
     assert fetch("mipnerf360", "garden", "stump") == 0
     assert files_below(data / "garden") == wanted("garden", "images_4")
     assert files_below(data / "stump") == wanted("stump", "images_4")
@@ -181,16 +156,17 @@ def test_a_folder_may_be_the_mirror(
     assert "360_v2.zip cannot be read" in capsys.readouterr().err
 
 
-def test_another_image_folder(fetch: Fetch, data: Path) -> None:
+def test_another_image_folder_comes_beside_the_first(fetch: Fetch, data: Path) -> None:
     assert fetch("mipnerf360", "garden", "--images", "images_8") == 0
     assert files_below(data / "garden") == wanted("garden", "images_8")
     assert fetch("mipnerf360", "garden") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_8") | wanted(
-        "garden", "images_4"
-    )
+    both = wanted("garden", "images_8") | wanted("garden", "images_4")
+    assert files_below(data / "garden") == both
 
 
-def test_the_list(fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_says_what_is_here(
+    fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     fetch("mipnerf360", "garden")
     capsys.readouterr()
     assert run(["fetch", "--list"]) == 0
@@ -209,20 +185,14 @@ def test_the_list(fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]) 
         (["mipnerf"], "no data set 'mipnerf'; did you mean mipnerf360?"),
         (["garden"], "garden is a scene: gsbench fetch mipnerf360 garden"),
         (["mipnerf360", "gardn"], "has no scene 'gardn'; did you mean garden?"),
-        (
-            ["mipnerf360", "garden", "--mirror", "ftp://x"],
-            "neither an http(s) address nor a folder",
-        ),
         (["mipnerf360", "garden", "--images", "images_16"], "no files below garden/images_16"),
-        (
-            ["mipnerf360", "garden", "--mirror", "http://[::1"],
-            "neither an http(s) address nor a folder",
+        *(
+            (["mipnerf360", "garden", "--mirror", place], "neither an http(s) address nor a folder")
+            for place in ("ftp://x", "http://[::1", "a\0b")
         ),
-        (["mipnerf360", "garden", "--mirror", "a\0b"], "neither an http(s) address nor a folder"),
     ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_requests(
+def test_a_request_for_what_is_not_there_is_refused(
     archives: Path, data: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
 ) -> None:
     mirror = [] if "--mirror" in words else ["--mirror", str(archives)]
@@ -248,27 +218,18 @@ def test_a_data_folder_that_cannot_be_made(
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("garden/images_4/up\\x.JPG", "unsafe name"), ("garden/images_4//etc/x.JPG", "unsafe name")],
-)
+@pytest.mark.parametrize("name", ["garden/images_4/up\\x.JPG", "garden/images_4//etc/x.JPG"])
 def test_names_that_lead_elsewhere_are_refused(
-    fetch: Fetch,
-    server: Server,
-    data: Path,
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    said: str,
+    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     content = archive_content("garden") | {name: b"x", "garden/images_4/../../../escaped.JPG": b"x"}
     write_archive(server.folder / "360_v2.zip", content)
     assert fetch("mipnerf360", "garden") == BAD_INPUT
-    assert said in capsys.readouterr().err
-    assert not list(data.parent.rglob("*x.JPG"))
-    assert not list(data.parent.rglob("escaped.JPG"))
+    assert "unsafe name" in capsys.readouterr().err
+    assert not [path for path in data.parent.rglob("*.JPG") if not path.name.startswith("IMG_")]
 
 
-def test_not_a_zip(
+def test_what_is_no_zip_is_refused(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (server.folder / "360_v2.zip").write_text("<html>this file has moved</html>")

@@ -43,13 +43,11 @@ def front_camera(
     rotation = np.array(
         [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     )
-    return Camera(
-        width=width,
-        height=height,
-        fx=0.9 * width,
-        fy=0.95 * width,
-        cx=width / 2 + shift[0],
-        cy=height / 2 + shift[1],
-        rotation=rotation,
-        translation=np.array([0.1, -0.05, 0.2]),
-    )
+    intrinsics = (0.9 * width, 0.95 * width, width / 2 + shift[0], height / 2 + shift[1])
+    return Camera(width, height, *intrinsics, rotation, np.array([0.1, -0.05, 0.2]))
+
+
+def differences(one: Gaussians, other: Gaussians) -> list[str]:
+    """The parameters in which two sets are not equal to the last bit."""
+    others = other.tensors()
+    return [name for name, value in one.tensors().items() if not torch.equal(value, others[name])]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import gzip
 import math
-import os
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,21 @@ from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from gsbench.init.placed import read_points
 from gsbench.normalization import Normalization
-from tests.gaussians.helpers import random_gaussians
+from tests.gaussians.helpers import differences, random_gaussians
+
+
+def table_of(path: Path, count: int = 4) -> np.ndarray:
+    write_ply(random_gaussians(count), path)
+    return PlyData.read(str(path))["vertex"].data.copy()
+
+
+def with_type(table: np.ndarray, column: str, kind: str) -> np.ndarray:
+    return table.astype([(name, kind if name == column else "f4") for name in table.dtype.names])
+
+
+def save(table: np.ndarray, path: Path) -> Path:
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+    return path
 
 
 def test_first_scales_are_the_root_mean_square_of_three_neighbours() -> None:
@@ -48,23 +62,18 @@ def test_too_few_or_broken_points_are_refused() -> None:
 def test_ply_round_trip_is_exact(tmp_path: Path) -> None:
     gaussians = random_gaussians(20, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "a.ply")
-    back = read_ply(tmp_path / "a.ply")
-    for a, b in zip(gaussians.tensors().values(), back.tensors().values(), strict=True):
-        assert torch.equal(a, b)
+    assert not differences(read_ply(tmp_path / "a.ply"), gaussians)
 
 
 @pytest.mark.parametrize("text", [False, True])
 def test_an_element_without_rows_is_no_damage(tmp_path: Path, text: bool) -> None:
     """As programs that know meshes write them: no faces."""
-    gaussians = random_gaussians(3, dtype=torch.float32)
-    write_ply(gaussians, tmp_path / "a.ply")
-    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    table = table_of(tmp_path / "a.ply")
     faces = PlyElement.describe(np.empty(0, dtype=[("a", "i4"), ("b", "i4"), ("c", "i4")]), "face")
+    vertex = PlyElement.describe(table, "vertex")
     PlyData([vertex, faces], text=text).write(str(tmp_path / "b.ply"))
-    for a, b in zip(
-        gaussians.tensors().values(), read_ply(tmp_path / "b.ply").tensors().values(), strict=True
-    ):
-        assert torch.allclose(a, b)
+    found, wanted = (read_ply(tmp_path / name).tensors() for name in ("b.ply", "a.ply"))
+    torch.testing.assert_close(found, wanted)
 
 
 def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
@@ -73,35 +82,15 @@ def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
     write_ply(gaussians, tmp_path / "a.ply")
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     names = [p.name for p in vertex.properties]
-    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    assert names[9:54] == [f"f_rest_{i}" for i in range(45)]
-    assert names[54:] == [
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-    ]
+    rest = [f"f_rest_{i}" for i in range(45)]
+    first, last = (
+        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2",
+        "scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3",
+    )
+    assert names == [*first.split(), *rest, "opacity", *last.split()]
     assert vertex["f_rest_15"][2] == gaussians.sh_rest[2, 0, 1].item()  # first coefficient of green
     assert vertex["f_rest_1"][2] == gaussians.sh_rest[2, 1, 0].item()  # second coefficient of red
     assert vertex["rot_0"][1] == gaussians.quaternions[1, 0].item()  # w first
-
-
-def test_a_file_that_is_no_ply_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "b.ply"
-    path.write_text("not a ply")
-    with pytest.raises(InputError, match=r"b\.ply"):
-        read_ply(path)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_is_no_ply_and_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "model.ply")
-    with pytest.raises(InputError, match=r"model\.ply: not a readable PLY"):
-        read_ply(tmp_path / "model.ply")
 
 
 def test_a_torn_ply_is_named(tmp_path: Path) -> None:
@@ -127,14 +116,12 @@ def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes
     characters or more."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
     path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
-    path = rewritten(
-        path, b"element vertex 4", b"comment a property float b\nelement vertex 1000000"
-    )
+    many = b"comment a property float b\nelement vertex 1000000"
+    rewritten(path, b"element vertex 4", many)
     if text:
-        path = rewritten(path, b"format binary_little_endian", b"format ascii")
-    with pytest.raises(
-        InputError, match=f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"
-    ):
+        rewritten(path, b"format binary_little_endian", b"format ascii")
+    said = f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"
+    with pytest.raises(InputError, match=said):
         check_ply(path)
     check_ply(rewritten(path, b"element vertex 1000000", b"element vertex 2"))
     with pytest.raises(InputError, match="counts below zero"):
@@ -168,9 +155,8 @@ def test_coefficients_become_colours_again() -> None:
 @pytest.mark.parametrize(("degree", "stored"), [(0, 0), (1, 3), (2, 8), (3, 15)])
 def test_fewer_harmonics_are_read(tmp_path: Path, degree: int, stored: int) -> None:
     """Other programs store fewer coefficients, channel by channel; the others are zero."""
-    gaussians = random_gaussians(4, dtype=torch.float32)
-    write_ply(gaussians, tmp_path / "a.ply")
-    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    table = table_of(tmp_path / "a.ply")
+    gaussians = read_ply(tmp_path / "a.ply")
     places = [15 * channel + k for channel in range(3) for k in range(stored)]  # in the full table
     names = [name for name in table.dtype.names if not name.startswith("f_rest_")]
     kind = [(name, "f4") for name in [*names, *(f"f_rest_{k}" for k in range(len(places)))]]
@@ -179,33 +165,16 @@ def test_fewer_harmonics_are_read(tmp_path: Path, degree: int, stored: int) -> N
         small[name] = table[name]
     for k, place in enumerate(places):
         small[f"f_rest_{k}"] = table[f"f_rest_{place}"]
-    PlyData([PlyElement.describe(small, "vertex")]).write(str(tmp_path / "b.ply"))
-    back = read_ply(tmp_path / "b.ply")
+    back = read_ply(save(small, tmp_path / "b.ply"))
     assert torch.equal(back.sh_rest[:, :stored], gaussians.sh_rest[:, :stored])
     assert not back.sh_rest[:, stored:].any()
     assert torch.equal(back.means, gaussians.means)
 
 
-SIZES = {
-    "char": 1,
-    "int8": 1,
-    "uchar": 1,
-    "uint8": 1,
-    "short": 2,
-    "ushort": 2,
-    "int16": 2,
-    "uint16": 2,
-}
-SIZES |= {
-    "int": 4,
-    "int32": 4,
-    "uint": 4,
-    "uint32": 4,
-    "float": 4,
-    "float32": 4,
-    "double": 8,
-    "float64": 8,
-}
+SIZES = dict.fromkeys(["char", "int8", "uchar", "uint8"], 1)
+SIZES |= dict.fromkeys(["short", "ushort", "int16", "uint16"], 2)
+SIZES |= dict.fromkeys(["int", "int32", "uint", "uint32", "float", "float32"], 4)
+SIZES |= dict.fromkeys(["double", "float64"], 8)
 
 
 @pytest.mark.parametrize("kind", SIZES)
@@ -226,14 +195,10 @@ def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> N
 def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     for length, fits in ((60_000, True), (66_000, False)):
-        path.write_text(
-            f"ply\nformat ascii 1.0\ncomment {'x' * length}\nelement vertex 0\nend_header\n"
-        )
-        if fits:
+        comment = f"comment {'x' * length}"
+        path.write_text(f"ply\nformat ascii 1.0\n{comment}\nelement vertex 0\nend_header\n")
+        with nullcontext() if fits else pytest.raises(InputError, match="it has no header"):
             check_ply(path)
-        else:
-            with pytest.raises(InputError, match="it has no header"):
-                check_ply(path)
 
 
 @pytest.mark.parametrize(
@@ -247,65 +212,43 @@ def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
 def test_values_without_meaning_are_named(
     tmp_path: Path, name: str, value: float, said: str
 ) -> None:
-    write_ply(random_gaussians(3), tmp_path / "a.ply")
-    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data.copy()
-    for column in table.dtype.names:
-        if column.startswith(name) and (name == "rot_" or column == name):
-            table[column][1] = value
-    PlyData([PlyElement.describe(table, "vertex")]).write(str(tmp_path / "b.ply"))
+    table = table_of(tmp_path / "a.ply")
+    for column in [f"rot_{k}" for k in range(4)] if name == "rot_" else [name]:
+        table[column][1] = value
     with pytest.raises(InputError, match=rf"b\.ply: {said}"):
-        read_ply(tmp_path / "b.ply")
+        read_ply(save(table, tmp_path / "b.ply"))
 
 
 def test_a_model_without_gaussians_or_without_a_property_is_refused(tmp_path: Path) -> None:
-    write_ply(random_gaussians(3), tmp_path / "a.ply")
-    table = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
-    PlyData([PlyElement.describe(table[:0].copy(), "vertex")]).write(str(tmp_path / "b.ply"))
+    nothing = save(table_of(tmp_path / "a.ply")[:0].copy(), tmp_path / "b.ply")
     with pytest.raises(InputError, match="missing or odd properties: all, since it is empty"):
-        read_ply(tmp_path / "b.ply")
+        read_ply(nothing)
     with pytest.raises(InputError, match=r"missing or odd properties: opacity$"):
         read_ply(rewritten(tmp_path / "a.ply", b" opacity\n", b" opaqueness\n"))
-
-
-def table_of(path: Path, count: int = 4) -> np.ndarray:
-    write_ply(random_gaussians(count), path)
-    return PlyData.read(str(path))["vertex"].data.copy()
-
-
-def save(table: np.ndarray, path: Path) -> Path:
-    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
-    return path
 
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("change", ["utf-8", "latin-1", "mark", "crlf"])
 def test_headers_of_other_programs_are_read(tmp_path: Path, change: str, text: bool) -> None:
     table = table_of(tmp_path / "a.ply")
-    PlyData([PlyElement.describe(table, "vertex")], text=text, comments=["made by hand"]).write(
-        str(tmp_path / "b.ply")
-    )
+    vertex = PlyElement.describe(table, "vertex")
+    PlyData([vertex], text=text, comments=["made by hand"]).write(str(tmp_path / "b.ply"))
     header, end, body = (tmp_path / "b.ply").read_bytes().partition(b"end_header\n")
     if change == "mark":
         changed = b"\xef\xbb\xbf" + header + end + body
     elif change == "crlf":
-        changed = (header + end).replace(b"\n", b"\r\n") + (
-            body.replace(b"\n", b"\r\n") if text else body
-        )
+        body = body.replace(b"\n", b"\r\n") if text else body
+        changed = (header + end).replace(b"\n", b"\r\n") + body
     else:
         changed = header.replace(b"made by", "gemäß".encode(change)) + end + body
     (tmp_path / "b.ply").write_bytes(changed)
     wanted = read_ply(tmp_path / "a.ply")
-    for one, other in zip(
-        read_ply(tmp_path / "b.ply").tensors().values(), wanted.tensors().values(), strict=True
-    ):
-        assert torch.equal(one, other)
+    assert not differences(read_ply(tmp_path / "b.ply"), wanted)
     np.testing.assert_array_equal(read_points(tmp_path / "b.ply")[0], wanted.means.double())
 
 
-COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
-COMPRESSED += b"property uint packed_position\nproperty uint packed_rotation\nend_header\n" + bytes(
-    12
-)
+COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
+COMPRESSED += b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
 
 
 @pytest.mark.parametrize(
@@ -324,11 +267,9 @@ def test_other_formats_are_named_with_the_command_that_unpacks_them(
     tmp_path: Path, name, content, said: str
 ) -> None:
     (tmp_path / name).write_bytes(content)
+    mend = f"{said}: unpack it with npx @playcanvas/splat-transform {name} out.ply"
     for read in (read_ply, check_ply, *((read_points,) if name.endswith("ply") else ())):
-        with pytest.raises(
-            InputError,
-            match=f"{said}: unpack it with npx @playcanvas/splat-transform {name} out.ply",
-        ):
+        with pytest.raises(InputError, match=mend):
             read(tmp_path / name)
 
 
@@ -336,30 +277,23 @@ def test_other_formats_are_named_with_the_command_that_unpacks_them(
 def test_opacities_of_zero_and_one_are_read(
     tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    table = table_of(tmp_path / "a.ply")
-    table = table.astype(
-        [(name, kind if name == "opacity" else "f4") for name in table.dtype.names]
-    )
+    table = with_type(table_of(tmp_path / "a.ply"), "opacity", kind)
     table["opacity"] = [np.inf, -np.inf, 0.3, np.inf]
     opacities = torch.sigmoid(read_ply(save(table, tmp_path / "b.ply")).opacity_logits)
     assert opacities.tolist() == pytest.approx([1, 0, 1 / (1 + np.exp(-0.3)), 1], abs=2e-7)
     assert ((opacities > 0) & (opacities < 1)).all()  # so that they can be trained
     assert "3 Gaussians have an opacity of exactly 0 or 1" in caplog.text
     table["opacity"][2] = np.nan
-    with pytest.raises(
-        InputError,
-        match="opacity is not a finite number everywhere: it is nan in row 2 and in 0 more",
-    ):
+    said = "opacity is not a finite number everywhere: it is nan in row 2 and in 0 more"
+    with pytest.raises(InputError, match=said):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
 def test_what_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
-    table = table_of(tmp_path / "a.ply")
-    table = table.astype([(name, "f8" if name == "x" else "f4") for name in table.dtype.names])
+    table = with_type(table_of(tmp_path / "a.ply"), "x", "f8")
     table["x"][1] = 1e300
-    with pytest.raises(
-        InputError, match=r"x is not a finite number everywhere: it is 1e\+300 in row 1"
-    ):
+    said = r"x is not a finite number everywhere: it is 1e\+300 in row 1"
+    with pytest.raises(InputError, match=said):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
@@ -415,18 +349,15 @@ def test_lengths_are_told_from_logarithms_in_any_unit(
 def test_a_normalized_model_is_written_in_its_own_coordinates_and_read_back(
     tmp_path: Path, center: tuple[float, float, float], scale: float, kind: str
 ) -> None:
-    normalization, gaussians = (
-        Normalization(center, scale),
-        random_gaussians(50, dtype=torch.float32),
-    )
+    normalization = Normalization(center, scale)
+    gaussians = random_gaussians(50, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "own.ply", normalization)
     table = PlyData.read(str(tmp_path / "own.ply"))["vertex"].data
     assert table["x"].dtype == np.dtype(kind)
     own = np.array(center) + gaussians.means.double().numpy() / scale
     np.testing.assert_allclose(np.column_stack([table[axis] for axis in "xyz"]), own, rtol=2e-7)
-    np.testing.assert_allclose(
-        np.exp(table["scale_1"]), gaussians.log_scales[:, 1].exp() / scale, rtol=1e-5
-    )
+    scales = gaussians.scales[:, 1] / scale
+    np.testing.assert_allclose(np.exp(table["scale_1"]), scales, rtol=1e-5)
     again = read_ply(tmp_path / "own.ply", normalization=normalization)
     torch.testing.assert_close(again.means, gaussians.means, atol=1e-5, rtol=0)
     torch.testing.assert_close(again.log_scales, gaussians.log_scales, atol=1e-5, rtol=0)

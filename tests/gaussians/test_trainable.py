@@ -8,13 +8,17 @@ import torch
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
-from tests.gaussians.helpers import random_gaussians
+from tests.gaussians.helpers import differences, random_gaussians
 
 
-def step_with(trainable: TrainableGaussians, seed: int, **arguments: object) -> None:
+def give_gradients(trainable: TrainableGaussians, seed: int) -> None:
     rng = torch.Generator().manual_seed(seed)
     for tensor in trainable.values.tensors().values():
         tensor.grad = torch.randn(tensor.shape, generator=rng, dtype=tensor.dtype)
+
+
+def step_with(trainable: TrainableGaussians, seed: int, **arguments: object) -> None:
+    give_gradients(trainable, seed)
     trainable.optimizer_step(**arguments)  # type: ignore[arg-type]
 
 
@@ -28,13 +32,12 @@ def test_steps_are_those_of_torchs_adam() -> None:
     for seed in range(4):
         rng = torch.Generator().manual_seed(seed)
         for name, tensor in ours.values.tensors().items():
-            tensor.grad = (
-                None if seed == 2 and name == "means" else torch.randn(tensor.shape, generator=rng)
-            )
+            if seed != 2 or name != "means":
+                tensor.grad = torch.randn(tensor.shape, generator=rng)
             theirs[name].grad = None if tensor.grad is None else tensor.grad.clone()
         ours.optimizer_step()
         adam.step()
-    assert all(torch.equal(tensor, theirs[name]) for name, tensor in ours.values.tensors().items())
+    assert not differences(ours.values, Gaussians(**theirs))
 
 
 def test_visible_only_equals_adam_where_all_are_visible() -> None:
@@ -43,8 +46,9 @@ def test_visible_only_equals_adam_where_all_are_visible() -> None:
     for seed in range(4):
         step_with(whole, seed)
         step_with(sparse, seed, visible=torch.ones(6, dtype=torch.bool))
-    for a, b in zip(whole.values.tensors().values(), sparse.values.tensors().values(), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        whole.values.tensors(), sparse.values.tensors(), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_visible_only_leaves_the_others_alone() -> None:
@@ -62,42 +66,35 @@ def test_idle_harmonics_count_their_steps_as_adam_would() -> None:
     plain = TrainableGaussians(random_gaussians(5), LearningRates(), 1.0)
     for seed in range(3):
         step_with(quick, seed, sh_degree=0)
-        rng = torch.Generator().manual_seed(seed)
-        for name, tensor in plain.values.tensors().items():
-            tensor.grad = torch.randn(tensor.shape, generator=rng, dtype=tensor.dtype)
-            if name == "sh_rest":
-                tensor.grad = torch.zeros_like(tensor)
+        give_gradients(plain, seed)
+        plain.values.sh_rest.grad.zero_()  # type: ignore[union-attr]
         plain.optimizer_step()
     step_with(quick, 9)
     step_with(plain, 9)
-    for a, b in zip(quick.values.tensors().values(), plain.values.tensors().values(), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        quick.values.tensors(), plain.values.tensors(), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_load_restores_parameters_and_moments() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
-    trainable.edit(
-        keep=torch.tensor([True, True, False, True, True]), append=random_gaussians(2, seed=4)
-    )
+    keep = torch.tensor([True, True, False, True, True])
+    trainable.edit(keep, random_gaussians(2, seed=4))
     copy = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 3.0)  # type: ignore[arg-type]
     for seed in (1, 2):
         step_with(trainable, seed)
         step_with(copy, seed)
-    for a, b in zip(
-        trainable.values.tensors().values(), copy.values.tensors().values(), strict=True
-    ):
-        assert torch.equal(a, b)
+    assert not differences(trainable.values, copy.values)
 
 
 def test_all_tensors_stay_in_step() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     trainable.edit(append=random_gaussians(3, seed=1))
-    values = trainable.values
-    assert isinstance(Gaussians(**values.tensors()), Gaussians)  # checks all shapes
-    shapes = {name: tensor.shape for name, tensor in values.tensors().items()}
-    assert {name: state.first.shape for name, state in trainable.adam.items()} == shapes
-    assert {name: state.second.shape for name, state in trainable.adam.items()} == shapes
+    tensors = trainable.values.tensors()
+    assert len(Gaussians(**tensors)) == 8  # checks all shapes
+    for name, state in trainable.adam.items():
+        assert state.first.shape == state.second.shape == tensors[name].shape
 
 
 def test_values_of_another_shape_are_refused() -> None:
@@ -109,42 +106,41 @@ def test_values_of_another_shape_are_refused() -> None:
 def test_overwriting_forgets_the_moments_where_it_is_said() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
-    before = trainable.adam["means"].second.clone()
+    means = trainable.adam["means"]
+    before = means.second.clone()
     where = torch.tensor([True, False, False, True, False])
     values = torch.full((5, 3), 2.0, dtype=torch.float64)
     trainable.overwrite("means", values, where)
     assert torch.equal(trainable.values.means, values)
     assert trainable.values.means.requires_grad
-    assert not trainable.adam["means"].second[where].any()
-    assert torch.equal(trainable.adam["means"].second[~where], before[~where])
-    assert trainable.adam["means"].first[~where].all()
+    assert not means.second[where].any()
+    assert torch.equal(means.second[~where], before[~where])
+    assert means.first[~where].all()
     trainable.overwrite("means", values + 1)
-    assert not trainable.adam["means"].first.any()
-    assert not trainable.adam["means"].second.any()
+    assert not means.first.any()
+    assert not means.second.any()
     assert trainable.adam["sh_dc"].second.all()
-    assert trainable.adam["means"].step == 1
+    assert means.step == 1
 
 
 def test_an_edit_keeps_moments_and_appends_zeros() -> None:
     trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 3.0)
     step_with(trainable, 0)
     old, added = trainable.values.detach(), random_gaussians(2, seed=1)
-    second = trainable.adam["quaternions"].second.clone()
+    state = trainable.adam["quaternions"]
+    second = state.second.clone()
     trainable.edit(keep=torch.tensor([True, False, True, True]), append=added)
     assert len(trainable) == 5
     assert torch.equal(trainable.values.means, torch.cat([old.means[[0, 2, 3]], added.means]))
-    assert torch.equal(trainable.adam["quaternions"].second[:3], second[[0, 2, 3]])
-    assert not trainable.adam["quaternions"].second[3:].any()
-    assert not trainable.adam["quaternions"].first[3:].any()
+    assert torch.equal(state.second[:3], second[[0, 2, 3]])
+    assert not state.second[3:].any()
+    assert not state.first[3:].any()
 
 
 def test_the_rate_of_the_means_falls_log_linearly() -> None:
     rates = LearningRates()
-    steps = [0, 15_000, 30_000, 60_000]
-    assert [rates.position(step) for step in steps] == pytest.approx(
-        [1.6e-4, 1.6e-5, 1.6e-6, 1.6e-6]
-    )
-    assert rates.position(-10) == pytest.approx(1.6e-4)
+    wanted = {-10: 1.6e-4, 0: 1.6e-4, 15_000: 1.6e-5, 30_000: 1.6e-6, 60_000: 1.6e-6}
+    assert {step: rates.position(step) for step in wanted} == pytest.approx(wanted)
     assert rates.sh_rest == pytest.approx(1.25e-4)
     trainable = TrainableGaussians(random_gaussians(2), rates, 3.0)
     assert trainable.position_rate == pytest.approx(4.8e-4)

@@ -3,12 +3,12 @@ libraries."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,15 +30,10 @@ from gsbench.init.networks.matchers import build_matcher, match, mutual_nearest_
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 from gsbench.weights import MissingWeightsError, load_state
+from tests.init.models import digest
 from tests.scene.courtyard.surfaces import surface_distance
 
 CPU = torch.device("cpu")
-
-
-def digest(model: Path) -> str:
-    return hashlib.sha256(
-        b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))
-    ).hexdigest()
 
 
 @pytest.fixture(autouse=True)
@@ -54,6 +49,18 @@ def few(courtyard: Capture) -> Capture:
 
 def superpoint(weights: Path, **options: object) -> Dim:
     return Dim(weights=weights, download=False, **{"max_keypoints": 400, "threads": 1, **options})
+
+
+def features_of(descriptors: np.ndarray) -> Features:
+    """Features at one place of a picture of nine pixels a side."""
+    count, own = len(descriptors), descriptors.astype(np.float32)
+    return Features(
+        np.zeros((count, 2), np.float32), own, np.ones(count, np.float32), (9, 9), (9, 9)
+    )
+
+
+def no_gpu(*_: object) -> Any:
+    raise torch.OutOfMemoryError("CUDA out of memory")
 
 
 class TestUntrained:
@@ -82,14 +89,8 @@ class TestUntrained:
     def test_lightglue_on_the_same_path(
         self, few: Capture, untrained_weights: Path, tmp_path: Path, caplog
     ):
-        init = superpoint(
-            untrained_weights,
-            max_keypoints=256,
-            filter_threshold=0.0,
-            pairs="sequential",
-            overlap=1,
-        )
-        report = init.run(few, tmp_path)
+        own = {"max_keypoints": 256, "filter_threshold": 0.0, "pairs": "sequential", "overlap": 1}
+        report = superpoint(untrained_weights, **own).run(few, tmp_path)
         assert report.counts["pairs_selected"] == 3
         assert report.counts["inlier_matches"] > 30
         assert len(report.settings["weights_sha256"]) == 2
@@ -156,20 +157,18 @@ class TestStore:
             store = FeatureStore(tmp_path / "work", images, extraction, matching)
             return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
 
-        changed = tmp_path / "changed"
-        shutil.copytree(courtyard.images, changed)
+        same, changed = courtyard.images, tmp_path / "changed"
+        shutil.copytree(same, changed)
         shutil.copy(changed / "0005.png", changed / "0000.png")
-        base = paths({"n": 1}, {"r": 0.9}, courtyard.images)
-        assert paths({"n": 1}, {"r": 0.9}, courtyard.images) == base
-        for other in (
-            paths({"n": 2}, {"r": 0.9}, courtyard.images),
-            paths({"n": 1}, {"r": 0.9}, changed),
+        base = paths({"n": 1}, {"r": 0.9}, same)
+        for n, r, images, is_equal in (
+            (1, 0.9, same, (True, True)),
+            (2, 0.9, same, (False, False)),
+            (1, 0.9, changed, (False, False)),
+            (1, 0.8, same, (True, False)),
         ):
-            assert other[0] != base[0]
-            assert other[1] != base[1]
-        other = paths({"n": 1}, {"r": 0.8}, courtyard.images)
-        assert other[0] == base[0]
-        assert other[1] != base[1]
+            found = paths({"n": n}, {"r": r}, images)
+            assert (found[0] == base[0], found[1] == base[1]) == is_equal
 
 
 class TestContracts:
@@ -180,29 +179,23 @@ class TestContracts:
         self, untrained_weights: Path, width: int, height: int
     ):
         settings = superpoint(untrained_weights, max_keypoints=10**6).feature_settings()
-        extract = EXTRACTORS[settings.extractor](
-            settings, untrained_weights / "superpoint.safetensors", CPU
-        )
+        weights = untrained_weights / "superpoint.safetensors"
+        extract = EXTRACTORS[settings.extractor](settings, weights, CPU)
         transformers = pytest.importorskip("transformers")
-        network = transformers.SuperPointForKeypointDetection(
-            transformers.SuperPointConfig(nms_radius=3)
-        ).eval()
-        network.load_state_dict(load_state(untrained_weights / "superpoint.safetensors"))
+        config = transformers.SuperPointConfig(nms_radius=3)
+        network = transformers.SuperPointForKeypointDetection(config).eval()
+        network.load_state_dict(load_state(weights))
         image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
         with torch.inference_mode():
             keypoints, descriptors, scores = extract(image)
-            gray = (image * torch.tensor([0.299, 0.587, 0.114])[None, :, None, None]).sum(
-                1, keepdim=True
-            )
+            luma = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
+            gray = (image * luma).sum(1, keepdim=True)
             encoded = network.encoder(gray).last_hidden_state
             score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
-        expected = {
-            (x, y)
-            for y, x in torch.nonzero(score_map > 0.0005).tolist()
-            if SUPERPOINT_BORDER <= x < width - SUPERPOINT_BORDER
-            and SUPERPOINT_BORDER <= y < height - SUPERPOINT_BORDER
-        }
-        assert {(int(x), int(y)) for x, y in keypoints} == expected
+        border = SUPERPOINT_BORDER
+        inner = score_map[border : height - border, border : width - border]
+        expected = torch.nonzero(inner > 0.0005).flip(1) + border  # x, y
+        assert set(map(tuple, keypoints.int().tolist())) == set(map(tuple, expected.tolist()))
         assert len(keypoints) > 10
         assert torch.equal(keypoints, keypoints.round())
         for (x, y), score in zip(keypoints[:20].int().tolist(), scores[:20], strict=True):
@@ -245,11 +238,12 @@ class TestContracts:
         settings = superpoint(untrained_weights).feature_settings()
         networks: list[torch.nn.Module] = []
         load_into = matchers.load_into
-        monkeypatch.setattr(
-            matchers,
-            "load_into",
-            lambda network, *rest: (networks.append(network), load_into(network, *rest)),
-        )
+
+        def note(network: torch.nn.Module, *rest: Any) -> None:
+            networks.append(network)
+            load_into(network, *rest)
+
+        monkeypatch.setattr(matchers, "load_into", note)
         build_matcher(settings, tmp_path / "published.pth", CPU)
         loaded = networks[0].state_dict()
         assert all(torch.equal(loaded[name], value) for name, value in state.items())
@@ -270,13 +264,10 @@ class TestContracts:
         from kornia.feature import DISK
 
         torch.manual_seed(0)
-        torch.save(
-            {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}},
-            tmp_path / "depth-save.pth",
-        )
-        settings = Dim(
-            extractor="disk", matcher="mutual_nearest", max_keypoints=50
-        ).feature_settings()
+        content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
+        torch.save(content, tmp_path / "depth-save.pth")
+        disk = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50)
+        settings = disk.feature_settings()
         extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
         with torch.inference_mode():
             keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
@@ -316,18 +307,10 @@ def test_detection_settings_are_the_extractors_own_unless_given(
     )
     assert ("transformers" in own.packages()) == (extractor == "superpoint")
     for one in (found, given):  # what features depend on, and no more, makes other features
-        model = {"aliked_model": "n16"} if extractor == "aliked" else {}
-        assert (
-            one.extraction()
-            == {
-                "extractor": extractor,
-                "max_image_size": 1600,
-                "max_keypoints": 2048,
-                "keypoint_threshold": one.keypoint_threshold,
-                "nms_radius": one.nms_radius,
-            }
-            | model
-        )
+        expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
+        expected |= {"keypoint_threshold": one.keypoint_threshold, "nms_radius": one.nms_radius}
+        expected |= {"aliked_model": "n16"} if extractor == "aliked" else {}
+        assert one.extraction() == expected
     assert found.matching() == {"matcher": "mutual_nearest", "max_ratio": 0.95}
     light = replace(own, matcher="lightglue").feature_settings().matching()
     assert light == {"matcher": "lightglue", "filter_threshold": 0.1}
@@ -387,39 +370,18 @@ class TestErrors:
             SiftKornia().run(capture, tmp_path / "blank")
 
     def test_out_of_gpu_memory_in_matching_says_so(self):
-        features = Features(
-            np.zeros((1000, 2), np.float32),
-            np.zeros((1000, 8), np.float32),
-            np.ones(1000, np.float32),
-            (9, 9),
-            (9, 9),
-        )
-
-        def no_gpu(first: Features, second: Features) -> np.ndarray:
-            raise torch.OutOfMemoryError("CUDA out of memory")
-
-        with pytest.raises(
-            InputError, match=r"1000 keypoints ran out of memory: lower init.max_image_size"
-        ):
+        features = features_of(np.zeros((1000, 8)))
+        said = r"1000 keypoints ran out of memory: lower init.max_image_size"
+        with pytest.raises(InputError, match=said):
             match(no_gpu, features, features)
 
     def test_out_of_gpu_memory_in_extraction_says_so(self, courtyard: Capture):
-        def no_gpu(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-            raise torch.OutOfMemoryError("CUDA out of memory")
-
+        settings = SiftKornia().feature_settings()
         with pytest.raises(InputError, match=r"0000.png: cpu ran out of memory at 320x240 px"):
-            extract_features(
-                courtyard.images / "0000.png", no_gpu, SiftKornia().feature_settings(), CPU
-            )
+            extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
 
     def test_an_empty_image_has_no_matches(self):
-        some = Features(
-            np.zeros((3, 2), np.float32),
-            np.eye(3, 8, dtype=np.float32),
-            np.ones(3, np.float32),
-            (9, 9),
-            (9, 9),
-        )
+        some = features_of(np.eye(3, 8))
         assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
 
     @pytest.mark.parametrize(
@@ -452,14 +414,7 @@ class TestErrors:
 
 def test_mutual_nearest_by_brute_force():
     rng = np.random.default_rng(2)
-    sides = []
-    for _ in range(2):
-        descriptors = rng.normal(size=(60, 6)).astype(np.float32)
-        sides.append(
-            Features(
-                np.zeros((60, 2), np.float32), descriptors, np.ones(60, np.float32), (9, 9), (9, 9)
-            )
-        )
+    sides = [features_of(rng.normal(size=(60, 6))) for _ in range(2)]
     distance = np.linalg.norm(sides[0].descriptors[:, None] - sides[1].descriptors[None], axis=2)
     expected = []
     for i in range(60):

@@ -3,6 +3,7 @@ right."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from gsbench.init import Sfm
 from gsbench.init.colmap.database import (
     create_database,
     database_counts,
+    image_ids,
     unknown_camera_groups,
     write_keypoints,
     write_matches,
@@ -29,48 +31,49 @@ from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 
+Pair = tuple[str, str]
 SIFT = FeatureSettings(
     extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
 )
 
 
 def new_database(path: Path, capture: Capture) -> list[str]:
-    return list(
-        create_database(
-            path,
-            unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0),
-        )
-    )
+    groups = unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0)
+    return list(create_database(path, groups))
+
+
+def rewritten(own: Path, path: Path, capture: Capture, options: Sfm) -> dict[Pair, np.ndarray]:
+    """Write the features and matches of one database to another, as if they were foreign.
+
+    Returns the matches of all pairs.
+    """
+    names = new_database(path, capture)
+    with pycolmap.Database.open(own) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        keypoints = {name: database.read_keypoints(ids[name])[:, :2] for name in names}
+        pairs = list(itertools.combinations(names, 2))
+        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
+    write_keypoints(path, keypoints)
+    write_matches(path, matches)
+    verify_pairs(path, pairs, verification_options(options), no_progress)
+    return matches
 
 
 @pytest.fixture(scope="module")
-def own_path(
-    bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, list[tuple[str, str]]]:
-    """A database that COLMAP filled by itself, and its pairs."""
+def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database that COLMAP filled by itself."""
     path = tmp_path_factory.mktemp("own") / "database.db"
     names = new_database(path, bare_photos)
-    pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     extract_sift(path, bare_photos.images, names, Sfm(), 1, no_progress)
-    match_sift(path, pairs, Sfm(), 1, no_progress)
-    return path, pairs
+    match_sift(path, list(itertools.combinations(names, 2)), Sfm(), 1, no_progress)
+    return path
 
 
 def test_sift_through_the_external_path_gives_the_same_model(
-    own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path
+    own_path: Path, bare_photos: Capture, tmp_path: Path
 ):
-    own, pairs = own_path
-    with pycolmap.Database.open(own) as database:
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        keypoints = {
-            name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()
-        }
-        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
-    external = tmp_path / "external.db"
-    new_database(external, bare_photos)
-    write_keypoints(external, keypoints)
-    write_matches(external, matches)
-    verify_pairs(external, pairs, verification_options(Sfm()), no_progress)
+    own, external = own_path, tmp_path / "external.db"
+    rewritten(own, external, bare_photos, Sfm())
     assert database_counts(external) == database_counts(own)
 
     first, second = (
@@ -95,12 +98,12 @@ def extract(path: Path, max_image_size: int) -> Features:
 
 @pytest.mark.parametrize("max_image_size", [320, 213])
 def test_kornia_keypoints_coincide_with_colmaps(
-    own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, max_image_size: int
+    own_path: Path, bare_photos: Capture, max_image_size: int
 ):
     """Two implementations of SIFT find the same points; a half-pixel or scale error would shift all
     of them."""
     name = bare_photos.image_names[0]
-    with pycolmap.Database.open(own_path[0]) as database:
+    with pycolmap.Database.open(own_path) as database:
         colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]
     features = extract(bare_photos.images / name, max_image_size)
     assert features.network_size == (max_image_size, round(max_image_size * 0.75))
@@ -117,9 +120,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, floa
     """Coordinates in which the first pixel covers 0 to 1: the blob is drawn, and found, in them."""
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
-    Image.fromarray(np.repeat(blob[..., None], 3, axis=2).round().astype(np.uint8)).save(
-        tmp_path / "blob.png"
-    )
+    Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
     features = extract(tmp_path / "blob.png", 1600)
     np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
 
@@ -136,7 +137,7 @@ def test_keypoints_scale_with_each_side():
 
 
 def test_a_pair_must_keep_a_share_of_its_matches(
-    own_path: tuple[Path, list[tuple[str, str]]], bare_photos: Capture, tmp_path: Path
+    own_path: Path, bare_photos: Capture, tmp_path: Path
 ):
     """Pairs below the ratio are dropped, those above stay.
 
@@ -144,28 +145,19 @@ def test_a_pair_must_keep_a_share_of_its_matches(
     pair may be kept by another one than without the ratio, with other inliers; by the same one, it
     is what it was.
     """
-    with pycolmap.Database.open(own_path[0]) as database:
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        keypoints = {
-            name: database.read_keypoints(image_id)[:, :2] for name, image_id in ids.items()
-        }
-        matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in own_path[1]}
-    geometries: dict[float, dict[tuple[str, str], pycolmap.TwoViewGeometry]] = {}
+    geometries: dict[float, dict[Pair, pycolmap.TwoViewGeometry]] = {}
     for ratio in (0.0, 0.8):
         path = tmp_path / f"{ratio}.db"
-        new_database(path, bare_photos)
-        write_keypoints(path, keypoints)
-        write_matches(path, matches)
-        verify_pairs(
-            path, own_path[1], verification_options(Sfm(min_inlier_ratio=ratio)), no_progress
-        )
+        matches = rewritten(own_path, path, bare_photos, Sfm(min_inlier_ratio=ratio))
+        ids = image_ids(path)
         with pycolmap.Database.open(path) as database:
             geometries[ratio] = {
-                pair: database.read_two_view_geometry(ids[pair[0]], ids[pair[1]])
-                for pair in own_path[1]
+                (a, b): database.read_two_view_geometry(ids[a], ids[b]) for a, b in matches
             }
-    verified = {pair for pair, geometry in geometries[0.0].items() if len(geometry.inlier_matches)}
-    kept = {pair for pair, geometry in geometries[0.8].items() if len(geometry.inlier_matches)}
+    verified, kept = (
+        {pair for pair, geometry in found.items() if len(geometry.inlier_matches)}
+        for found in geometries.values()
+    )
     assert set() < kept < verified
     for pair in kept:
         free, asked = geometries[0.0][pair], geometries[0.8][pair]

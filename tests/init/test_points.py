@@ -18,6 +18,7 @@ from gsbench.init.base import PointCloud
 from gsbench.init.placed import GREY, points_in_view, read_points, seen_colors
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
+from tests.init.models import camera_at, model_with
 from tests.init.test_report import CENTERS, model_of
 
 RNG = np.random.default_rng(0)
@@ -52,18 +53,9 @@ def write(
 def test_ply_of_any_order_and_type(
     tmp_path: Path, text: bool, order: str, names, kind: str, scale: float
 ):
-    properties = [
-        (names[2], kind),
-        ("z", "f8"),
-        ("nx", "f4"),
-        ("x", "f4"),
-        (names[0], kind),
-        ("y", "f8"),
-        (names[1], kind),
-    ]
-    values = dict(zip("xyz", XYZ.T, strict=True)) | {
-        name: RGB[:, i] * scale for i, name in enumerate(names)
-    }
+    red, green, blue = ((name, kind) for name in names)
+    properties = [blue, ("z", "f8"), ("nx", "f4"), ("x", "f4"), red, ("y", "f8"), green]
+    values = dict(zip((*"xyz", *names), [*XYZ.T, *RGB.T * scale], strict=True))
     points, colors = read_points(write(tmp_path / "cloud.ply", properties, values, text, order))
     np.testing.assert_allclose(points, XYZ, rtol=1e-6)
     np.testing.assert_array_equal(colors, RGB)
@@ -71,16 +63,13 @@ def test_ply_of_any_order_and_type(
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
 @pytest.mark.parametrize("colored", [False, True])
-def test_tables(tmp_path: Path, suffix: str, colored: bool):
+def test_a_table_has_coordinates_and_maybe_colours(tmp_path: Path, suffix: str, colored: bool):
     table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
     points, colors = read_points(path)
     np.testing.assert_array_equal(points, XYZ)
-    if colored:
-        np.testing.assert_array_equal(colors, RGB)
-    else:
-        assert colors is None
+    np.testing.assert_array_equal(colors, RGB if colored else None)
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
@@ -216,12 +205,8 @@ def test_a_cloud_takes_rows_of_three_coordinates_alone(shape: tuple[int, ...], k
 
 
 def test_a_picture_has_its_upper_and_left_border_and_nothing_behind_the_camera() -> None:
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=100, height=80, params=[50, 50, 50, 40], camera_id=1)
-    )
-    pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [0, 0, 0]]))
-    model.add_image_with_trivial_frame(pycolmap.Image(name="a", camera_id=1, image_id=1), pose)
+    wide = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 100, 80)
+    model = model_with({"a": camera_at([0, 0, 0])}, camera=wide)
     points = np.array(
         [
             [-1.0, 0, 1],  # at column 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -22,14 +21,10 @@ from gsbench.init.base import (
     WORK_FOLDER,
     InitReport,
 )
+from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.scene.types import Capture
+from tests.init.models import camera_at, digest, model_with
 from tests.scene.courtyard.surfaces import surface_distance
-
-
-def digest(model: Path) -> str:
-    return hashlib.sha256(
-        b"".join(file.read_bytes() for file in sorted(model.glob("*.bin")))
-    ).hexdigest()
 
 
 def picture(path: Path, pixels: np.ndarray) -> None:
@@ -61,9 +56,7 @@ def shared(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[InitReport, Path]:
     output = tmp_path_factory.mktemp("shared")
-    return Sfm().run(
-        courtyard, output, lambda phase, done, total, note="": told.append((phase, done, total))
-    ), output
+    return Sfm().run(courtyard, output, lambda *state: told.append(state[:3])), output
 
 
 @pytest.mark.slow
@@ -101,27 +94,24 @@ def test_jittered_is_sfm_with_copies_nearby(
 
 def test_own_model_is_written_in_both_gauges(own: tuple[InitReport, Path], courtyard: Capture):
     report, output = own
-    aligned, raw = (
-        pycolmap.Reconstruction(output / MODEL_FOLDER),
-        pycolmap.Reconstruction(output / OWN_GAUGE_FOLDER),
+    aligned, raw, exact = (
+        {
+            name: center
+            for name, (center, _) in poses_by_name(pycolmap.Reconstruction(folder)).items()
+        }
+        for folder in (output / MODEL_FOLDER, output / OWN_GAUGE_FOLDER, courtyard.model)
     )
     scale = report.own_gauge.scale_to_reference
     assert report.gauge.scale_to_reference == 1.0
-    first, second = (
-        {image.name: image.projection_center() for image in model.images.values()}
-        for model in (aligned, raw)
+    apart, apart_raw = (
+        np.linalg.norm(centers["0000.png"] - centers["0007.png"]) for centers in (aligned, raw)
     )
-    ratio = np.linalg.norm(first["0000.png"] - first["0007.png"]) / np.linalg.norm(
-        second["0000.png"] - second["0007.png"]
-    )
-    assert ratio == pytest.approx(scale, rel=1e-9)
-    assert report.gauge.scene_extent == pytest.approx(
-        report.own_gauge.scene_extent * scale, rel=1e-9
-    )
+    assert apart / apart_raw == pytest.approx(scale, rel=1e-9)
+    extent = report.own_gauge.scene_extent * scale
+    assert report.gauge.scene_extent == pytest.approx(extent, rel=1e-9)
     assert report.own_gauge.threshold_in_reference == pytest.approx(0.03 * scale**3, rel=1e-12)
-    exact = pycolmap.Reconstruction(courtyard.model)
-    for image in exact.images.values():
-        np.testing.assert_allclose(first[image.name], image.projection_center(), atol=0.02)
+    for name, center in exact.items():
+        np.testing.assert_allclose(aligned[name], center, atol=0.02)
 
 
 def test_known_poses_give_points_on_the_true_surfaces(
@@ -132,10 +122,8 @@ def test_known_poses_give_points_on_the_true_surfaces(
     assert report.pose_errors is None
     # m; a pixel covers 0.015 m
     assert np.median(surface_distance(read_cloud(output / MODEL_FOLDER).points)) < 0.02
-    model, exact = (
-        pycolmap.Reconstruction(output / MODEL_FOLDER),
-        pycolmap.Reconstruction(courtyard.model),
-    )
+    model = pycolmap.Reconstruction(output / MODEL_FOLDER)
+    exact = pycolmap.Reconstruction(courtyard.model)
     for image in exact.images.values():  # the cameras are the reference's, to the bit
         np.testing.assert_array_equal(
             model.find_image_with_name(image.name).cam_from_world().matrix(),
@@ -195,12 +183,7 @@ def test_whose_cameras_are_taken_and_which_photographs_are_used(
     """Of four photographs, b is a test view and a is not in the reference."""
     options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)  # type: ignore[arg-type]
     capture = Capture("x", Path("x"), ("a", "b", "c", "d"), ("b",), None, False, "0")
-    made = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=3, num_points3D=3
-    )
-    reference = pycolmap.synthesize_dataset(made)
-    for image, name in zip(reference.images.values(), "dcb", strict=True):
-        image.name = name
+    reference = model_with({name: camera_at([0, 0, 0]) for name in "dcb"})
     assert options.select_images(capture, reference) == list(names)
     assert options.select_images(capture, None) == list("abcd")
     assert options.needs_reference(capture) == needed
@@ -248,11 +231,9 @@ def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path:
     assert report.num_registered >= 7
     model = pycolmap.Reconstruction(tmp_path / "out" / MODEL_FOLDER)
     for image in model.images.values():  # one camera for each size, the size of the file
+        camera = model.cameras[image.camera_id]
         with Image.open(images / image.name) as file:
-            assert (
-                model.cameras[image.camera_id].width,
-                model.cameras[image.camera_id].height,
-            ) == file.size
+            assert (camera.width, camera.height) == file.size
     assert len(model.cameras) == 2
 
 
@@ -261,12 +242,9 @@ def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path)
     """COLMAP cannot read WebP; lossless copies must lead to the same points."""
     images = tmp_path / "images"
     images.mkdir()
-    names = [
-        f"{Path(name).stem}{'.webp' if index % 2 else '.png'}"
-        for index, name in enumerate(courtyard.image_names)
-    ]
-    for name, new in zip(courtyard.image_names, names, strict=True):
-        Image.open(courtyard.images / name).save(images / new, lossless=True)
+    for index, name in enumerate(courtyard.image_names):
+        target = (images / name).with_suffix(".webp" if index % 2 else ".png")
+        Image.open(courtyard.images / name).save(target, lossless=True)
     Sfm().run(capture_of(images), tmp_path / "webp")
     Sfm().run(replace(courtyard, model=None), tmp_path / "png")
     first, second = (read_cloud(tmp_path / kind / MODEL_FOLDER) for kind in ("webp", "png"))
@@ -298,14 +276,14 @@ def test_wrong_reference_is_noticed(courtyard: Capture, tmp_path: Path):
     assert any("degrees against the true ones" in warning for warning in report.warnings)
 
 
-def test_photos_without_texture(tmp_path: Path):
+def test_photos_without_texture_are_refused(tmp_path: Path):
     for index in range(4):
         picture(tmp_path / f"{index}.png", np.full((60, 80, 3), 40 * index))
     with pytest.raises(InputError, match="no keypoint in any image"):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-def test_photos_without_overlap(tmp_path: Path):
+def test_photos_without_overlap_are_refused(tmp_path: Path):
     rng = np.random.default_rng(0)
     for index in range(4):
         picture(tmp_path / f"{index}.png", rng.integers(0, 255, (120, 160, 3)))
@@ -314,7 +292,7 @@ def test_photos_without_overlap(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_photos_from_one_place(courtyard: Capture, tmp_path: Path):
+def test_photos_from_one_place_are_refused(courtyard: Capture, tmp_path: Path):
     """Copies of one photograph match perfectly and have no depth."""
     for index in range(4):
         shutil.copy(courtyard.images / "0000.png", tmp_path / f"{index}.png")
@@ -322,7 +300,7 @@ def test_photos_from_one_place(courtyard: Capture, tmp_path: Path):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-def test_too_few_photos(courtyard: Capture, tmp_path: Path):
+def test_two_photos_are_too_few(courtyard: Capture, tmp_path: Path):
     with pytest.raises(InputError, match="has 2 images: sfm needs at least 3"):
         Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
 

@@ -18,9 +18,8 @@ from gsbench.raster.base import Rasterizer
 from gsbench.raster.contract import (
     CASES,
     FOOTPRINT_TOLERANCE,
-    GRADIENT_TOLERANCE,
-    VALUE_TOLERANCE,
     Case,
+    departures,
     footprint_errors,
     render_with_gradients,
 )
@@ -63,22 +62,17 @@ def rasterizer(request: pytest.FixtureRequest, device: str) -> Rasterizer:
 def test_values_and_gradients_match_the_reference(
     rasterizer: Rasterizer, device: str, case: Case
 ) -> None:
-    expected, expected_gradients = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
+    """`departures` has tests of its own, which plant each kind of departure."""
+    assert departures(rasterizer, device, (case,)) == []
+    expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
-
-    assert expected.visible.sum() > case.count / 4
-    assert output.image.shape == (case.height, case.width, 3)
-    assert (output.image.cpu().double() - expected.image).abs().max() < VALUE_TOLERANCE
-    assert (output.alpha.cpu().double() - expected.alpha).abs().max() < VALUE_TOLERANCE
-    assert output.radii.dtype == torch.int32
     assert torch.equal(output.radii.cpu(), expected.radii)
-    for name, reference in expected_gradients.items():
-        error = (gradients[name] - reference).abs().max() / reference.abs().max().clamp_min(1e-30)
-        assert error < GRADIENT_TOLERANCE, f"{name}: relative error {error:.2e}"
+    assert expected.visible.sum() > case.count / 4
+    for name, reference in references.items():  # or else nothing was compared
         if not (name == "sh_rest" and case.sh_degree == 0):
             assert reference.abs().max() > 0, name
     assert find_executor(rasterizer.name).has_footprint
-    assert offers(rasterizer.name, "has_splitting_matrix")  # so it was compared
+    assert offers(rasterizer.name, "has_splitting_matrix")
     assert "splitting_probe" in gradients
     # asked after the backward pass
     assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE
@@ -174,18 +168,17 @@ def test_values_that_are_not_finite_are_named(
 
 def test_inputs_that_cannot_be_used_are_named(rasterizer: Rasterizer, device: str) -> None:
     gaussians, black = _one_gaussian(device), torch.zeros(3, device=device)
-    with pytest.raises(ValueError, match="sh_degree"):
-        rasterizer.render(gaussians, _camera(16, 16), 4, black)
-    with pytest.raises(ValueError, match="background"):
-        rasterizer.render(gaussians, _camera(16, 16), 0, torch.zeros(4, device=device))
-    with pytest.raises(ValueError, match="background"):
-        rasterizer.render(gaussians, _camera(16, 16), 0, black.double())
-    with pytest.raises(ValueError, match="background"):
-        rasterizer.render(gaussians, _camera(16, 16), 0, black + math.nan)
-    with pytest.raises(ValueError, match="width"):
-        rasterizer.render(gaussians, _camera(20_000, 16), 0, black)
-    with pytest.raises(ValueError, match="fx"):
-        rasterizer.render(gaussians, _camera(16, 16, focal=1e-6), 0, black)
+    camera = _camera(16, 16)
+    for word, view, degree, background in (
+        ("sh_degree", camera, 4, black),
+        ("background", camera, 0, torch.zeros(4, device=device)),
+        ("background", camera, 0, black.double()),
+        ("background", camera, 0, black + math.nan),
+        ("width", _camera(20_000, 16), 0, black),
+        ("fx", _camera(16, 16, focal=1e-6), 0, black),
+    ):
+        with pytest.raises(ValueError, match=word):
+            rasterizer.render(gaussians, view, degree, background)
     gaussians.quaternions[:] = 0
     with pytest.raises(ValueError, match="quaternions"):
         rasterizer.render(gaussians, _camera(16, 16), 0, black)

@@ -20,8 +20,6 @@ import pytest
 import torch
 from numba import types
 
-from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import RenderOutput
 from gsbench.raster.cpu import (
     CpuRasterizer,
     binning,
@@ -33,48 +31,28 @@ from gsbench.raster.cpu import (
     workspace,
 )
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
-from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
+from gsbench.raster.reference import project, tile_rectangles
+from tests.raster.promises import BLACK, PROMISES, Subject, bits_of, leaves
 from tests.raster.strategies import Case, render_with_gradients
 
-BLACK = torch.zeros(3)
 CASE = Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1))
 MANY = Case(150, 110, 4000, sh_degree=3, log_scale=-3.0)
+SUBJECT = Subject(lambda: CpuRasterizer(threads=1), CASE, MANY, 2e-5)
 
 
-def _bits(output: RenderOutput, gradients: dict[str, torch.Tensor]) -> list[bytes]:
-    tensors = [output.image, output.alpha, output.radii, *gradients.values()]
-    return [tensor.detach().numpy().tobytes() for tensor in tensors]
+@pytest.mark.parametrize("promise", PROMISES)
+def test_it_keeps_the_promise_that(promise: str) -> None:
+    PROMISES[promise](SUBJECT)
 
 
 def test_the_same_bits_on_every_run_and_for_any_number_of_threads() -> None:
     one = CpuRasterizer(threads=1)
-    expected = _bits(*render_with_gradients(one, MANY, torch.float32))
-    # memory that was used before
-    assert _bits(*render_with_gradients(one, MANY, torch.float32)) == expected
+    expected = bits_of(one, MANY)
+    assert bits_of(one, MANY) == expected  # memory that was used before
     for threads in (2, 4):
         rasterizer = CpuRasterizer(threads=threads)
         for _ in range(3):
-            assert _bits(*render_with_gradients(rasterizer, MANY, torch.float32)) == expected
-
-
-def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
-    gaussians = Gaussians(
-        torch.tensor([[0.3, 0.2, 3.0]] * 5),
-        torch.full((5, 3), -1.0),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 5),
-        torch.ones(5),
-        torch.eye(5)[:, :3] * 3,
-        torch.zeros(5, 15, 3),
-    )
-    camera = CASE.camera()
-    image = CpuRasterizer(threads=2).render(gaussians, camera, 0, BLACK).image
-    reference = (
-        ReferenceRasterizer()
-        .render(gaussians.map(torch.Tensor.double), camera, 0, BLACK.double())
-        .image
-    )
-    assert (image - reference).abs().max() < 1e-5
-    assert reference.max() > 0.5
+            assert bits_of(rasterizer, MANY) == expected
 
 
 def test_depths_are_sorted_as_numpy_sorts_them() -> None:
@@ -125,11 +103,9 @@ def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndar
     left, upper = low_x - mean_x, low_y - mean_y  # [R, S]
     right, lower = left + size, upper + size
     best = at(np.clip(0, left, right), np.clip(0, upper, lower))
+    slope = -curve_t * shear / (curve_t * shear**2 + curve_y)
     for dx in (left, right):
-        best = np.maximum(
-            best,
-            at(dx, np.clip(-curve_t * shear * dx / (curve_t * shear**2 + curve_y), upper, lower)),
-        )
+        best = np.maximum(best, at(dx, np.clip(slope * dx, upper, lower)))
     for dy in (upper, lower):
         best = np.maximum(best, at(np.clip(-shear * dy, left, right), dy))
     return best
@@ -144,15 +120,10 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
     passed = output.footprint.args[0]  # type: ignore[union-attr]
     frame, edges = passed.frame, executor._edges(case.count)
     assert (frame.last == composite.NEVER_STOPPED).all()
-    numbers = np.concatenate(
-        [
-            np.arange(edge, edge + seen)
-            for edge, seen in zip(edges[:-1], passed.visible, strict=True)
-        ]
-    )
-    records, integers = (
-        array.reshape(-1, 16)[numbers] for array in (frame.records, frame.record_ints)
-    )
+    shards = zip(edges[:-1], passed.visible, strict=True)
+    numbers = np.concatenate([np.arange(edge, edge + seen) for edge, seen in shards])
+    records = frame.records.reshape(-1, 16)[numbers]
+    integers = frame.record_ints.reshape(-1, 16)[numbers]
     place = {number: k for k, number in enumerate(numbers.tolist())}
     listed, masks = np.zeros((len(numbers), 24), bool), np.zeros((len(numbers), 24), int)
     for tile in range(24):
@@ -222,104 +193,13 @@ def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -
     assert skipped > 100
 
 
-def test_needles_keep_their_gradients() -> None:
-    """Long thin Gaussians.
-
-    The determinant of their 2D covariance loses its digits in float32 as ac - b^2.
-    """
-    gaussians = Case(90, 70, 40, sh_degree=0).gaussians()
-    gaussians.log_scales[:, 0] = 0.5
-    gaussians.log_scales[:, 1:] = -9.0
-    errors = []
-    for rasterizer, dtype in (
-        (CpuRasterizer(threads=1), torch.float32),
-        (ReferenceRasterizer(), torch.float64),
-    ):
-        leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-        rasterizer.render(leaves, CASE.camera(), 0, BLACK.to(dtype)).image.square().sum().backward()
-        errors.append(leaves.log_scales.grad.double())
-    assert errors[1].abs().max() > 0
-    assert (errors[0] - errors[1]).abs().max() < 2e-5 * errors[1].abs().max()
-
-
-def test_turning_a_ball_has_no_gradient() -> None:
-    """Not even a rounding error: Adam would turn 1e-13 into a full step.
-
-    What is nearly a ball has a true one.
-    """
-    for stretch in (0.0, 0.01):
-        gaussians = MANY.gaussians()
-        gaussians.log_scales[:] = gaussians.log_scales[:, :1]
-        gaussians.log_scales[:, 1] += stretch
-        found = []
-        for rasterizer, dtype in (
-            (CpuRasterizer(threads=1), torch.float32),
-            (ReferenceRasterizer(), torch.float64),
-        ):
-            leaves = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-            rasterizer.render(
-                leaves, MANY.camera(), 3, BLACK.to(dtype)
-            ).image.square().sum().backward()
-            found.append(leaves.quaternions.grad.double())
-        assert bool(found[0].any()) == (stretch > 0)
-        assert (found[0] - found[1]).abs().max() < 1e-3 * found[1].abs().max() + 1e-12
-
-
-def test_renders_may_be_differentiated_late_and_twice() -> None:
-    """Two graphs at once, in the opposite order, and one of them twice.
-
-    None may use the memory of another.
-    """
-    rasterizer = CpuRasterizer(threads=1)
-    cases = (CASE, MANY)
-    alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
-    leaves = [
-        case.gaussians().map(lambda tensor: tensor.float().requires_grad_()) for case in cases
-    ]
-    background = torch.tensor([0.2, 0.5, 0.9])
-    outputs = [
-        rasterizer.render(g, case.camera(), 3, background)
-        for g, case in zip(leaves, cases, strict=True)
-    ]
-    for k in (1, 0, 0):
-        case = cases[k]
-        weights = torch.randn(
-            case.height,
-            case.width,
-            4,
-            generator=torch.Generator().manual_seed(7),
-            dtype=torch.float64,
-        ).float()
-        leaves[k].means.grad = None
-        loss = (outputs[k].image * weights[..., :3]).sum() + (
-            outputs[k].alpha * weights[..., 3]
-        ).sum()
-        loss.backward(retain_graph=True)
-        assert torch.equal(leaves[k].means.grad.double(), alone[k])
-
-
-def test_results_that_are_kept_are_not_overwritten() -> None:
-    rasterizer = CpuRasterizer(threads=1)
-    output, gradients = render_with_gradients(rasterizer, CASE, torch.float32)
-    image = output.image.detach()
-    kept = image.clone()
-    del output
-    for _ in range(3):
-        render_with_gradients(rasterizer, CASE, torch.float32)
-        rasterizer.render(
-            Case(60, 60, 90, 0).gaussians().map(torch.Tensor.float), CASE.camera(), 0, BLACK
-        )
-    assert torch.equal(image, kept)
-    assert gradients["means"].isfinite().all()
-
-
 def test_gradients_accumulate() -> None:
-    leaves = CASE.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+    own = leaves(CASE)
     rasterizer = CpuRasterizer(threads=1)
-    rasterizer.render(leaves, CASE.camera(), 3, BLACK).image.sum().backward()
-    once = leaves.sh_rest.grad.clone()
-    rasterizer.render(leaves, CASE.camera(), 3, BLACK).image.sum().backward()
-    assert torch.equal(leaves.sh_rest.grad, 2 * once)
+    rasterizer.render(own, CASE.camera(), 3, BLACK).image.sum().backward()
+    once = own.sh_rest.grad.clone()
+    rasterizer.render(own, CASE.camera(), 3, BLACK).image.sum().backward()
+    assert torch.equal(own.sh_rest.grad, 2 * once)
 
 
 def test_an_interrupted_backward_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -338,23 +218,7 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_strided_parameters_and_the_gradient_of_the_background() -> None:
-    gaussians = CASE.gaussians().map(torch.Tensor.float)
-    strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], -1)[..., 0])
-    assert not strided.means.is_contiguous()
-    rasterizer = CpuRasterizer(threads=1)
-    background = torch.tensor([0.1, 0.5, 0.7], requires_grad=True)
-    output = rasterizer.render(strided, CASE.camera(), 3, background)
-    assert torch.equal(
-        output.image, rasterizer.render(gaussians, CASE.camera(), 3, background).image
-    )
-    output.image.sum().backward()
-    assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
-
-
-def test_float64_is_refused() -> None:
-    with pytest.raises(ValueError, match="float32"):
-        CpuRasterizer(threads=1).render(CASE.gaussians(), CASE.camera(), 0, BLACK.double())
+def test_no_threads_are_refused() -> None:
     with pytest.raises(ValueError, match="threads"):
         CpuRasterizer(threads=0)
 

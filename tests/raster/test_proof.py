@@ -123,13 +123,19 @@ def test_bits_that_differ_between_runs_are_caught_where_they_are_promised() -> N
 # ---- once for what it depends on
 
 
+def count_proofs(made: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def prove(raster: str, device: str) -> RasterProof:
+        made.append(raster)
+        return passing(raster)
+
+    monkeypatch.setattr(module, "prove_apart", prove)
+
+
 def test_a_proof_is_kept_and_made_again_for_another_version(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[str] = []
-    monkeypatch.setattr(
-        module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster)
-    )
+    count_proofs(made, monkeypatch)
     assert known_proof("cpu", CPU) is None
     for _ in range(2):
         assert proof_of("cpu", CPU).passed
@@ -173,9 +179,7 @@ def test_a_cache_that_cannot_be_written_proves_each_time_and_says_so(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     made: list[str] = []
-    monkeypatch.setattr(
-        module, "prove_apart", lambda raster, device: made.append(raster) or passing(raster)
-    )
+    count_proofs(made, monkeypatch)
     cache.parent.mkdir(parents=True)
     cache.write_text("a file where the folder should be")
     for _ in range(2):
@@ -341,7 +345,7 @@ FAULTS = {
     ),
     "a missing term of the position's gradient": (
         PROJECTION,
-        "view_z = -(through_focal * inverse_z + ",
+        "view_z = -(by_focal * inverse_z + ",
         "view_z = -(",
     ),
     "a sign of the quaternion's gradient": (
@@ -351,11 +355,7 @@ FAULTS = {
     ),
     "a missing term of the splitting matrix": (PROJECTION, "q11 - e * h", "q11"),
     "a factor in harmonics of degree 3": (GEOMETRY, "8 * T2 * yz", "4 * T2 * yz"),
-    "a swapped axis": (
-        GEOMETRY,
-        "offset[0] * v.r10 + offset[1] * v.r11",
-        "offset[0] * v.r11 + offset[1] * v.r10",
-    ),
+    "a swapped axis": (GEOMETRY, "(v.r10, v.r11, v.r12)", "(v.r11, v.r10, v.r12)"),
     "a weight of the loss": (
         "train/loss_triton.py",
         "(W0, W1, W2, W3, W4, W5)[k]",

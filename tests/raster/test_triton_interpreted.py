@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import json
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,35 +34,33 @@ from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 from tests.gaussians.helpers import random_gaussians
+from tests.raster.promises import BLACK, PROMISES, Subject, bits, bits_of, leaves
+from tests.train.conftest import orbit_camera
+from tests.train.test_loss import _images as picture
 
 pytestmark = pytest.mark.slow
 
-BLACK = torch.zeros(3)
 TINY = Case(7, 5, 20, sh_degree=3)
 SMALL = Case(33, 49, 50, sh_degree=3)
+SUBJECT = Subject(TritonRasterizer, TINY, SMALL, 1e-4)
 
 
-def bits(output: RenderOutput, gradients: dict[str, Tensor]) -> list[bytes]:
-    tensors = [output.image, output.alpha, output.radii, *gradients.values()]
-    return [tensor.detach().numpy().tobytes() for tensor in tensors]
+@pytest.mark.parametrize("promise", PROMISES)
+def test_it_keeps_the_promise_that(promise: str) -> None:
+    PROMISES[promise](SUBJECT)
 
 
-def leaves(case: Case) -> Gaussians:
-    return case.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+def test_the_same_bits_on_every_run() -> None:
+    rasterizer = TritonRasterizer()
+    expected = bits_of(rasterizer, SMALL)
+    assert bits_of(rasterizer, SMALL) == expected  # memory that was used before
+    assert bits_of(TritonRasterizer(), SMALL) == expected
 
 
 def shorten_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lists of the tests' scenes have many segments then."""
     for module in (layout, composite):
         monkeypatch.setattr(module, "SEGMENT", tl.constexpr(8))
-
-
-def test_the_same_bits_on_every_run() -> None:
-    rasterizer = TritonRasterizer()
-    expected = bits(*render_with_gradients(rasterizer, SMALL, torch.float32))
-    # memory that was used before
-    assert bits(*render_with_gradients(rasterizer, SMALL, torch.float32)) == expected
-    assert bits(*render_with_gradients(TritonRasterizer(), SMALL, torch.float32)) == expected
 
 
 def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(
@@ -172,64 +171,6 @@ def test_segments_change_nothing_but_the_last_digits(
     assert max(errors.values()) < 1e-5
 
 
-def test_equal_depths_are_blended_in_the_order_of_the_index() -> None:
-    gaussians = Gaussians(
-        torch.tensor([[0.3, 0.2, 3.0]] * 5),
-        torch.full((5, 3), -1.0),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 5),
-        torch.ones(5),
-        torch.eye(5)[:, :3] * 3,
-        torch.zeros(5, 15, 3),
-    )
-    camera = SMALL.camera()
-    image = TritonRasterizer().render(gaussians, camera, 0, BLACK).image
-    reference = (
-        ReferenceRasterizer().render(gaussians.map(Tensor.double), camera, 0, BLACK.double()).image
-    )
-    assert (image - reference).abs().max() < 1e-5
-    assert reference.max() > 0.5
-
-
-def test_needles_keep_their_gradients() -> None:
-    """Long thin Gaussians, in float32 throughout: nothing cancels."""
-    gaussians = Case(50, 40, 20, sh_degree=0).gaussians()
-    gaussians.log_scales[:, 0] = 0.5
-    gaussians.log_scales[:, 1:] = -9.0
-    results = []
-    for rasterizer, dtype in (
-        (TritonRasterizer(), torch.float32),
-        (ReferenceRasterizer(), torch.float64),
-    ):
-        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-        rasterizer.render(
-            copy, Case(50, 40, 20, 0).camera(), 0, BLACK.to(dtype)
-        ).image.square().sum().backward()
-        results.append(copy.log_scales.grad.double())
-    assert results[1].abs().max() > 0
-    assert (results[0] - results[1]).abs().max() < 1e-4 * results[1].abs().max()
-
-
-@pytest.mark.parametrize("stretch", [0.0, 0.01])
-def test_turning_a_ball_has_no_gradient(stretch: float) -> None:
-    """Not even a rounding error: Adam would turn 1e-13 into a full step.
-
-    What is nearly a ball has a true one.
-    """
-    gaussians = SMALL.gaussians()
-    gaussians.log_scales[:] = gaussians.log_scales[:, :1]
-    gaussians.log_scales[:, 1] += stretch
-    found = []
-    for rasterizer, dtype in (
-        (TritonRasterizer(), torch.float32),
-        (ReferenceRasterizer(), torch.float64),
-    ):
-        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-        rasterizer.render(copy, SMALL.camera(), 3, BLACK.to(dtype)).image.square().sum().backward()
-        found.append(copy.quaternions.grad.double())
-    assert bool(found[0].any()) == (stretch > 0)
-    assert (found[0] - found[1]).abs().max() < 1e-3 * found[1].abs().max() + 1e-12
-
-
 def test_far_from_the_origin_nothing_is_lost() -> None:
     """A scene and its camera moved by 1,000 units, by amounts that float32 holds exactly."""
     shift = torch.tensor([1024.0, -512.0, 256.0])
@@ -255,50 +196,6 @@ def test_far_from_the_origin_nothing_is_lost() -> None:
     assert images[0].std() > 0.01
 
 
-def test_renders_may_be_differentiated_late_and_twice() -> None:
-    """Two graphs at once, in the opposite order, and one of them twice.
-
-    None may use the memory of another.
-    """
-    rasterizer = TritonRasterizer()
-    cases = (TINY, SMALL)
-    alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
-    parameters = [leaves(case) for case in cases]
-    background = torch.tensor([0.2, 0.5, 0.9])
-    outputs = [
-        rasterizer.render(g, case.camera(), 3, background)
-        for g, case in zip(parameters, cases, strict=True)
-    ]
-    for k in (1, 0, 0):
-        case = cases[k]
-        weights = torch.randn(
-            case.height,
-            case.width,
-            4,
-            generator=torch.Generator().manual_seed(7),
-            dtype=torch.float64,
-        ).float()
-        parameters[k].means.grad = None
-        loss = (outputs[k].image * weights[..., :3]).sum() + (
-            outputs[k].alpha * weights[..., 3]
-        ).sum()
-        loss.backward(retain_graph=True)
-        assert torch.equal(parameters[k].means.grad.double(), alone[k])
-
-
-def test_results_that_are_kept_are_not_overwritten() -> None:
-    rasterizer = TritonRasterizer()
-    output, gradients = render_with_gradients(rasterizer, TINY, torch.float32)
-    kept = bits(output, gradients)
-    image = output.image.detach()
-    before = image.clone()
-    render_with_gradients(rasterizer, TINY, torch.float32)
-    assert bits(output, gradients) == kept
-    del output
-    rasterizer.render(leaves(SMALL), TINY.camera(), 0, BLACK)
-    assert torch.equal(image, before)
-
-
 def test_a_render_for_inference_does_not_spoil_the_memory_for_training() -> None:
     rasterizer = TritonRasterizer()
     with torch.inference_mode():
@@ -307,20 +204,6 @@ def test_a_render_for_inference_does_not_spoil_the_memory_for_training() -> None
     output, gradients = render_with_gradients(rasterizer, TINY, torch.float32)
     assert image.shape == output.image.shape
     assert torch.equal(gradients["means"], expected["means"])
-
-
-def test_strided_parameters_and_the_gradient_of_the_background() -> None:
-    gaussians = TINY.gaussians().map(Tensor.float)
-    strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], -1)[..., 0])
-    assert not strided.means.is_contiguous()
-    rasterizer = TritonRasterizer()
-    background = torch.tensor([0.1, 0.5, 0.7], requires_grad=True)
-    output = rasterizer.render(strided, TINY.camera(), 3, background)
-    assert torch.equal(
-        output.image, rasterizer.render(gaussians, TINY.camera(), 3, background).image
-    )
-    output.image.sum().backward()
-    assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
 
 
 def test_a_step_leaves_nothing_alive() -> None:
@@ -380,9 +263,9 @@ def test_more_rows_than_were_expected() -> None:
 
 
 def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32))
+    expected = bits_of(TritonRasterizer(), TINY)
     monkeypatch.setattr(lists, "MAX_INT16", 0)
-    assert bits(*render_with_gradients(TritonRasterizer(), TINY, torch.float32)) == expected
+    assert bits_of(TritonRasterizer(), TINY) == expected
 
 
 @pytest.mark.parametrize(
@@ -422,11 +305,6 @@ def test_more_pairs_than_can_be_sorted_are_refused(monkeypatch: pytest.MonkeyPat
         TritonRasterizer().render(leaves(TINY), TINY.camera(), 0, BLACK)
 
 
-def test_float64_is_refused() -> None:
-    with pytest.raises(ValueError, match="float32"):
-        TritonRasterizer().render(SMALL.gaussians(), SMALL.camera(), 0, BLACK.double())
-
-
 def test_a_background_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a device it is not looked at before the kernels do."""
     monkeypatch.setattr(staged, "check_settings", lambda *_: None)
@@ -436,18 +314,10 @@ def test_a_background_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatc
         )
 
 
-def orbit_camera(angle: float) -> Camera:
-    center = np.array([4 * np.sin(angle), 0.0, 4 - 4 * np.cos(angle)])
-    forward = (np.array([0.0, 0.0, 4.0]) - center) / 4
-    right = np.cross(np.array([0.0, 1.0, 0.0]), forward)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(18, 14, 18.0, 18.0, 9.0, 7.0, rotation, -rotation @ center)
-
-
 def tiny_scene(truth: Gaussians) -> Scene:
     views = []
     for i, angle in enumerate((-0.4, 0.0, 0.4)):
-        camera = orbit_camera(angle)
+        camera = replace(orbit_camera(angle, 18, 14), fx=18.0, fy=18.0)
         image = ReferenceRasterizer().render(truth, camera, 0, BLACK).image
         views.append(
             View(f"{i}.png", camera, (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
@@ -491,15 +361,6 @@ def test_a_training_equals_the_references(tmp_path: Path) -> None:
     assert losses[20:] == pytest.approx(expected_losses[20:], rel=5e-3)
     assert losses[-1] < 0.8 * losses[0]
     assert len(gaussians) == len(expected) > len(truth)
-
-
-def picture(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A smooth picture with noise and, as target, an 8-bit picture like it."""
-    generator = torch.Generator().manual_seed(height)
-    y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
-    smooth = torch.stack([x.sin(), y.cos(), (x + y).sin()], -1) * 0.3 + 0.5
-    image = (smooth + 0.1 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1.2)
-    return image, (smooth.clamp(0, 1) * 255).to(torch.uint8)
 
 
 @pytest.mark.parametrize(

@@ -12,25 +12,18 @@ from gsbench.renders.measure import Destination, ReferenceImages, find_destinati
 COURTYARD = ReferenceImages(
     {}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm"
 )
+OWN = ("store", "Store", "mlartifacts")
 FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})
 
 
 @pytest.mark.parametrize(
     ("word", "scene", "seed", "truth", "said"),
     [
-        (
-            "table1:mine",
-            "garden",
-            0,
-            COURTYARD,
-            r"--scene garden: the photographs are .* of the scene courtyard",
-        ),
+        ("table1:mine", "garden", 0, COURTYARD, "--scene garden: .* of the scene courtyard"),
         ("table1:mine", None, -1, COURTYARD, "--seed -1: must be 0 or more"),
         ("table1:mine", "../x", 0, FOLDER, r"--scene \.\./x: must be a plain folder name"),
         ("table1:mine", None, 0, FOLDER, "give it with --scene"),
-        ("store:arm", None, 0, COURTYARD, "store is gsbench's own folder"),
-        ("Store:arm", None, 0, COURTYARD, "Store is gsbench's own folder"),
-        ("mlartifacts:arm", None, 0, COURTYARD, "mlartifacts is gsbench's own folder"),
+        *((f"{own}:arm", None, 0, COURTYARD, f"{own} is gsbench's own folder") for own in OWN),
         (".jobs:arm", None, 0, COURTYARD, "is not EXPERIMENT:ARM"),
     ],
 )

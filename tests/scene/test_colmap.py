@@ -13,7 +13,6 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
 from gsbench.scene.colmap_files import _MODELS, ModelChecks, check_model
-from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
 from tests.scene.cameras import cameras_of
@@ -54,16 +53,12 @@ def test_cameras_follow_smaller_files(make_scene, model, params):
     )
     assert fitted.num_points3D() == 9
     assert max(reprojection_errors(fitted)) < 1e-9
-    assert (
-        fitted.points3D[1].color.tolist()
-        == read_model(root / "sparse/0").points3D[1].color.tolist()
-    )
+    original = read_model(root / "sparse/0")
+    assert fitted.points3D[1].color.tolist() == original.points3D[1].color.tolist()
 
 
 def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
-    fitted = read_reference(
-        read_colmap("toy", make_scene(), max_images=3, split=SplitRule(test_every=0))
-    )
+    fitted = read_reference(read_colmap("toy", make_scene(), max_images=3))
     assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
     assert {point.track.length() for point in fitted.points3D.values()} == {3}
     assert max(reprojection_errors(fitted)) < 1e-9
@@ -85,7 +80,7 @@ def test_points_of_fewer_than_two_kept_images_go(make_scene):
     assert sorted(fitted.points3D) == list(range(2, 10))
 
 
-def test_files_of_one_camera_with_two_sizes(make_scene):
+def test_each_size_of_the_files_of_one_camera_has_a_camera(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(80, 60)).save(root / "images/02.png")
     cameras = cameras_of(read_reference(read_colmap("toy", root)))
@@ -93,12 +88,11 @@ def test_files_of_one_camera_with_two_sizes(make_scene):
     assert (cameras["03.png"].width, cameras["03.png"].fx) == (40, 50.0)
 
 
-def test_size_that_disagrees(make_scene):
+def test_an_image_of_another_shape_than_its_camera_is_refused(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(40, 26)).save(root / "images/01.png")
-    with pytest.raises(
-        InputError, match=r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"
-    ):
+    said = r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"
+    with pytest.raises(InputError, match=said):
         read_reference(read_colmap("toy", root))
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -124,34 +118,26 @@ def test_written_cameras_project_alike(tmp_path: Path):
     for k in range(4):
         rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         rotation *= np.sign(np.linalg.det(rotation))
-        cameras[f"{k}.png"] = Camera(
-            64, 48, 60.0 + (k > 1), 61.0, 31.0, 25.0, rotation, rng.normal(size=3)
-        )
+        intrinsics = (64, 48, 60.0 + (k > 1), 61.0, 31.0, 25.0)
+        cameras[f"{k}.png"] = Camera(*intrinsics, rotation, rng.normal(size=3))
     write_model(tmp_path / "model", cameras)
     model = pycolmap.Reconstruction(tmp_path / "model")
     assert model.num_cameras() == 2
     for name, camera in cameras.items():
         point = camera.rotation.T @ (np.array([0.3, -0.2, 2.0]) - camera.translation)
         expected = [camera.fx * 0.15 + camera.cx, camera.fy * -0.1 + camera.cy]
-        np.testing.assert_allclose(
-            model.find_image_with_name(name).project_point(point), expected, atol=1e-9
-        )
-        back = cameras_of(model)[name]
+        image, back = model.find_image_with_name(name), cameras_of(model)[name]
+        np.testing.assert_allclose(image.project_point(point), expected, atol=1e-9)
         np.testing.assert_allclose(back.rotation, camera.rotation, atol=1e-12)
-        np.testing.assert_allclose(
-            back.center, model.find_image_with_name(name).projection_center(), atol=1e-12
-        )
+        np.testing.assert_allclose(back.center, image.projection_center(), atol=1e-12)
 
 
 def test_models_of_cameras_are_those_of_colmap() -> None:
     """Their numbers, how many parameters they have, and that the first ones are the focal
     lengths."""
-    known = {
-        int(number): name
-        for name, number in pycolmap.CameraModelId.__members__.items()
-        if name != "INVALID"
-    }
-    assert {number: name for number, (name, _) in _MODELS.items()} == known
+    known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
+    known.pop("INVALID")
+    assert {name: number for number, (name, _) in _MODELS.items()} == known
     for name, length in _MODELS.values():
         camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
         assert len(camera.params) == length
@@ -229,10 +215,7 @@ def rigs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
         num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=9
     )
     model = pycolmap.synthesize_dataset(options)
-    if request.param == "bin":
-        model.write_binary(tmp_path)
-    else:
-        model.write_text(tmp_path)
+    (model.write_binary if request.param == "bin" else model.write_text)(tmp_path)
     return tmp_path
 
 

@@ -25,7 +25,7 @@ def cameras(names: Sequence[str]) -> list[Camera]:
     return ring([15.0 * int(name[:2]) for name in names])
 
 
-def test_every_nth_is_what_it_was() -> None:
+def test_every_eighth_name_is_held_out_by_default() -> None:
     found = hold_out(NAMES, SplitRule())
     assert found.test == ("00.png", "08.png", "16.png")
     assert found.description == "every 8th image"
@@ -98,19 +98,15 @@ def test_validation_of_lists_takes_every_nth_of_the_training_list() -> None:
 
 def test_a_put_away_view_is_no_part_of_the_capture(make_scene: Callable[..., Path]) -> None:
     root = make_scene(names=NAMES[:9])
-    plain, judged = (
-        read_colmap("toy", root, split=SplitRule(test_every=3, validation=v)) for v in (False, True)
-    )
+    rules = [SplitRule(test_every=3, validation=judged) for judged in (False, True)]
+    plain, judged = (read_colmap("toy", root, split=rule) for rule in rules)
     assert plain.test_names == ("00.png", "03.png", "06.png")
     assert judged.image_names == tuple(name for name in NAMES[:9] if name not in plain.test_names)
     assert judged.test_names == ("01.png", "05.png")
-    fingerprint = judged.fingerprint
     (root / "images" / "00.png").write_bytes((root / "images" / "01.png").read_bytes())
-    assert (
-        read_colmap("toy", root, split=SplitRule(test_every=3, validation=True)).fingerprint
-        == fingerprint
-    )
-    assert read_colmap("toy", root, split=SplitRule(test_every=3)).fingerprint != plain.fingerprint
+    other, same = (read_colmap("toy", root, split=rule) for rule in rules)
+    assert same.fingerprint == judged.fingerprint
+    assert other.fingerprint != plain.fingerprint
 
 
 def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(
@@ -173,14 +169,15 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
 @pytest.mark.parametrize(
     ("name", "least", "most"),
     [
-        *[
-            ("max_images", 3, 10**6),
-            ("test_every", 2, 999),
-            ("sectors", 2, 999),
-            ("sector", 0, 7),
-            ("downscale", 1, 99),
-        ],
-        *[("max_size", 16, 10**6), ("views", 3, 9999), ("width", 16, 16384), ("height", 16, 16384)],
+        ("max_images", 3, 10**6),
+        ("test_every", 2, 999),
+        ("sectors", 2, 999),
+        ("sector", 0, 7),
+        ("downscale", 1, 99),
+        ("max_size", 16, 10**6),
+        ("views", 3, 9999),
+        ("width", 16, 16384),
+        ("height", 16, 16384),
         ("seed", 0, 2**31 - 1),
     ],
 )

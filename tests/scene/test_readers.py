@@ -20,7 +20,7 @@ from gsbench.scene.readers import missing_model, read_colmap, read_photos
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
-def test_colmap_folder(make_scene, text: bool, sparse: str):
+def test_a_colmap_folder_gives_photographs_and_model(make_scene, text: bool, sparse: str):
     root = make_scene(text=text, sparse=sparse)
     capture = read_colmap("toy", root, split=SplitRule(test_every=3))
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
@@ -38,21 +38,13 @@ def test_the_older_three_file_layout(make_scene):
 
 
 def test_photos_in_images_or_directly_or_nested(make_scene):
-    root = make_scene(
-        names=("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "z.tif", "y.webp", "x.bmp")
-    )
+    names = ("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "x.bmp", "y.webp", "z.tif")
+    root = make_scene(names=names[::-1])
     (root / "images" / ".hidden.png").write_bytes(b"no image")
     (root / "images" / "notes.txt").write_text("no image")
     for path in (root, root / "images"):
         capture = read_photos("toy", path)
-        assert capture.image_names == (
-            "cam1/01.PNG",
-            "cam1/02.png",
-            "cam2/01.JPEG",
-            "x.bmp",
-            "y.webp",
-            "z.tif",
-        )
+        assert capture.image_names == names
         assert capture.model is None
     assert read_photos("toy", root, images="images/cam1/..").images == root / "images/cam1/.."
 
@@ -120,11 +112,8 @@ def test_of_several_models_the_one_with_the_most_images_is_read(
     capture = read_colmap("toy", root)
     assert capture.model == root / chosen
     assert len(capture.image_names) == models[chosen]
-    others = [
-        sparse
-        for sparse in models
-        if sparse != chosen and sparse.split("/")[0] == chosen.split("/")[0]
-    ]
+    beside = [sparse for sparse in models if sparse.split("/")[0] == chosen.split("/")[0]]
+    others = [sparse for sparse in beside if sparse != chosen]
     assert ("scene.sparse chooses another" in caplog.text) is bool(others)
     assert all(f"{other}: {models[other]} image" in caplog.text for other in others)
     assert read_colmap("toy", root, sparse=chosen).model == root / chosen
@@ -135,9 +124,8 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
     root = make_scene()
     make_scene(sparse="sparse/1")
     (root / "sparse/0/images.bin").write_bytes(b"\1")
-    with pytest.raises(
-        InputError, match=r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"
-    ):
+    said = r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"
+    with pytest.raises(InputError, match=said):
         read_colmap("toy", root)
     assert read_colmap("toy", root, sparse="sparse/1").model == root / "sparse/1"
 
@@ -157,9 +145,8 @@ def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(
     model = read_model(root / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == names
     (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)
-    assert read_colmap("toy", root, split=SplitRule(test_list="tests.txt")).test_names == (
-        names[3],
-    )
+    split = SplitRule(test_list="tests.txt")
+    assert read_colmap("toy", root, split=split).test_names == (names[3],)
 
 
 @pytest.mark.parametrize(
@@ -195,42 +182,50 @@ def test_selection_is_even_and_comes_before_the_split(make_scene):
     assert capture.test_names == ("00.png", "04.png")
 
 
-def test_split_lists(make_scene):
+LISTS = {  # name of a file: what it lists
+    "test": "01.JPG\n\n# a comment\n03\n",
+    "train": "00.png\n02.png\n",
+    "last": "05.png\n",
+    "bad": "00.png\n99.png\n",
+    "first": "00.png\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "trained_on", "tested_on"),
+    [
+        (None, "test", (0, 2, 4, 5), (1, 3)),
+        ("train", "test", (0, 2), (1, 3)),
+        ("train", None, (0, 2), (1, 3, 4, 5)),
+        (None, "bad", r"split lists name 99\.png", None),
+        ("first", "last", "2 images in the split lists, but at least 3 are needed", None),
+        ("train", "first", r"00\.png for training and for testing", None),
+    ],
+)
+def test_lists_say_what_is_trained_on_and_tested(make_scene, train, test, trained_on, tested_on):
     root = make_scene()
-    (root / "test.txt").write_text("01.JPG\n\n# a comment\n03\n")
-    (root / "train.txt").write_text("00.png\n02.png\n")
-    capture = read_colmap("toy", root, split=SplitRule(test_list="test.txt"))
-    assert capture.test_names == ("01.png", "03.png")
-    assert len(capture.train_names) == 4
-    both = read_colmap("toy", root, split=SplitRule(test_list="test.txt", train_list="train.txt"))
-    assert both.image_names == ("00.png", "01.png", "02.png", "03.png")
-    assert read_colmap("toy", root, split=SplitRule(train_list="train.txt")).test_names == (
-        "01.png",
-        "03.png",
-        "04.png",
-        "05.png",
-    )
-    (root / "last.txt").write_text("05.png\n")
-    (root / "bad.txt").write_text("00.png\n99.png\n")
-    with pytest.raises(InputError, match=r"split lists name 99\.png"):
-        read_colmap("toy", root, split=SplitRule(test_list="bad.txt"))
-    (root / "one.txt").write_text("00.png\n")
-    with pytest.raises(InputError, match=r"2 images in the split lists, but at least 3 are needed"):
-        read_colmap("toy", root, split=SplitRule(train_list="one.txt", test_list="last.txt"))
-    (root / "both.txt").write_text("00.png\n")
-    with pytest.raises(InputError, match=r"00\.png for training and for testing"):
-        read_photos("toy", root, split=SplitRule(train_list="train.txt", test_list="both.txt"))
+    for name, text in LISTS.items():
+        (root / f"{name}.txt").write_text(text)
+    train, test = (None if name is None else f"{name}.txt" for name in (train, test))
+    rule = SplitRule(train_list=train, test_list=test)
+    if tested_on is None:
+        with pytest.raises(InputError, match=trained_on):
+            read_colmap("toy", root, split=rule)
+        return
+    capture = read_colmap("toy", root, split=rule)
+    assert capture.train_names == tuple(f"{k:02d}.png" for k in trained_on)
+    assert capture.test_names == tuple(f"{k:02d}.png" for k in tested_on)
 
 
-def test_splits_without_views():
+def test_a_split_without_views_is_refused():
     names = [str(k) for k in range(5)]
-    assert split_names(names, test_every=0) == (names, [])
-    with pytest.raises(InputError, match="no training view"):
-        split_names(names, test_every=1)
-    with pytest.raises(InputError, match="no test view"):
-        split_names(names, test=[])
-    with pytest.raises(InputError, match="test_every"):
-        split_names(names, test_every=-1)
+    for options, said in (
+        ({"test_every": 1}, "no training view"),
+        ({"test": []}, "no test view"),
+        *(({"test_every": every}, "test_every must be positive") for every in (0, -1)),
+    ):
+        with pytest.raises(InputError, match=said):
+            split_names(names, **options)
 
 
 def test_fingerprint_follows_content_not_place(make_scene, tmp_path: Path):
@@ -245,7 +240,7 @@ def test_fingerprint_follows_content_not_place(make_scene, tmp_path: Path):
     assert read_colmap("toy", copy).fingerprint != first.fingerprint
 
 
-def test_bad_folders(make_scene, tmp_path: Path):
+def test_a_folder_that_lacks_something_is_named(make_scene, tmp_path: Path):
     with pytest.raises(InputError, match="does not exist"):
         read_photos("toy", tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"scene\.path is not set"):
@@ -255,9 +250,8 @@ def test_bad_folders(make_scene, tmp_path: Path):
     with pytest.raises(InputError, match="0 images"):
         read_photos("toy", empty)
     root = make_scene()
-    with pytest.raises(
-        InputError, match=r"images_8: no such folder; set scene\.images to one of: images, sparse"
-    ):
+    said = r"images_8: no such folder; set scene\.images to one of: images, sparse"
+    with pytest.raises(InputError, match=said):
         read_colmap("toy", root, images="images_8")
     for name in list_images(root / "images")[2:]:
         (root / "images" / name).unlink()
@@ -284,19 +278,15 @@ def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(
 ) -> None:
     assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
     assert SceneConfig(name=None, kind="photos", path="/").name == "scene"
-    assert missing_model("fern", tmp_path, None).startswith(
-        f"scene fern: {tmp_path}: no COLMAP model in"
-    )
+    said = missing_model("fern", tmp_path, None)
+    assert said.startswith(f"scene fern: {tmp_path}: no COLMAP model in")
     root = make_scene(sparse="model")
     assert missing_model("fern", root, "model") == ""
-    assert missing_model("fern", root, "other").startswith(
-        f"scene fern: {root / 'other'}: no COLMAP model here"
-    )
+    said = missing_model("fern", root, "other")
+    assert said.startswith(f"scene fern: {root / 'other'}: no COLMAP model here")
 
 
 def test_a_list_that_is_not_there_is_said_in_few_words(make_scene):
-    with pytest.raises(
-        InputError,
-        match=r"scene\.test_list: .*cannot be read \(No such file or directory\): name a",
-    ):
+    said = r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"
+    with pytest.raises(InputError, match=said):
         read_colmap("toy", make_scene(), split=SplitRule(test_list="\\n"))

@@ -19,22 +19,10 @@ SOUND: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *[
-            ("width", 0),
-            ("height", 0),
-            ("fx", 0.0),
-            ("fy", 0.0),
-            ("fx", -1.0),
-            ("fy", np.inf),
-            ("fx", np.nan),
-        ],
-        *[("cx", np.inf), ("cy", np.nan)],
-        *[
-            ("rotation", 1.01 * np.eye(3)),
-            ("rotation", np.eye(4)),
-            ("rotation", np.full((3, 3), np.nan)),
-        ],
-        *[("translation", np.zeros(2)), ("translation", np.array([0.0, np.nan, 0.0]))],
+        *(("width", 0), ("height", 0), ("cx", np.inf), ("cy", np.nan)),
+        *((focal, value) for focal in ("fx", "fy") for value in (0.0, -1.0, np.inf, np.nan)),
+        *(("rotation", value) for value in (1.01 * np.eye(3), np.eye(4), np.full((3, 3), np.nan))),
+        *(("translation", value) for value in (np.zeros(2), np.array([0.0, np.nan, 0.0]))),
     ],
 )
 def test_only_what_is_no_camera_is_refused(name: str, value: object) -> None:
@@ -44,9 +32,8 @@ def test_only_what_is_no_camera_is_refused(name: str, value: object) -> None:
 
 
 def test_numbers_of_any_type_become_float64() -> None:
-    camera = Camera(
-        **(SOUND | {"rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "translation": [1, 2, 3]})
-    )
+    turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    camera = Camera(**(SOUND | {"rotation": turn, "translation": [1, 2, 3]}))
     assert camera.rotation.dtype == camera.translation.dtype == np.float64
     assert camera.center.tolist() == [-2, 1, -3]
 

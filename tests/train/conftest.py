@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from gsbench.gaussians.model import Gaussians
+from gsbench.raster import create_rasterizer
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera, Scene, View
 from tests.gaussians.helpers import random_gaussians
+from tests.train.lab import CPU, Lab
 
 
 def orbit_camera(angle: float, width: int = 40, height: int = 32) -> Camera:
@@ -47,3 +51,8 @@ def tiny_scene(truth: Gaussians) -> Scene:
         train=tuple(view for i, view in enumerate(views) if i not in test),
         test=tuple(view for i, view in enumerate(views) if i in test),
     )
+
+
+@pytest.fixture
+def lab(tiny_scene: Scene, truth: Gaussians, tmp_path: Path) -> Lab:
+    return Lab(tiny_scene, truth, create_rasterizer("cpu", CPU, threads=1), tmp_path)

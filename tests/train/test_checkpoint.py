@@ -32,6 +32,11 @@ def state(step: int) -> dict[str, object]:
     }
 
 
+def kept(folder: Path) -> list[int]:
+    """The iterations of the checkpoints in ``folder``, where nothing else may be."""
+    return sorted(int(path.name[len("checkpoint-") : -len(".pt")]) for path in folder.iterdir())
+
+
 def equal(first: object, second: object) -> bool:
     if isinstance(first, torch.Tensor):
         return torch.equal(first, second)  # type: ignore[arg-type]
@@ -46,10 +51,7 @@ def test_newest_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     for step in (10, 20, 30):
         save_checkpoint(tmp_path, step, state(step))
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "checkpoint-00000020.pt",
-        "checkpoint-00000030.pt",
-    ]
+    assert kept(tmp_path) == [20, 30]
     loaded = load_checkpoint(tmp_path)
     assert equal(loaded, state(30))
 
@@ -110,18 +112,18 @@ def test_nothing_in_a_checkpoint_is_run_as_code(tmp_path: Path) -> None:
     assert not (tmp_path / "hacked").exists()
 
 
+def full(*arguments: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
 def test_failed_write_leaves_the_old_one_and_no_temporary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_checkpoint(tmp_path, 10, state(10))
-
-    def full(*arguments: object) -> None:
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OSError, match="No space left"):
         save_checkpoint(tmp_path, 20, state(20))
-    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint-00000010.pt"]
+    assert kept(tmp_path) == [10]
 
 
 def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> None:
@@ -138,10 +140,7 @@ def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> No
         writer.save(step, live)
         live["nested"][0]["tensor"].fill_(-1)  # type: ignore[index]
     writer.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "checkpoint-00000002.pt",
-        "checkpoint-00000003.pt",
-    ]
+    assert kept(tmp_path) == [2, 3]
     loaded = load_checkpoint(tmp_path)
     assert loaded is not None
     assert loaded["step"] == 3
@@ -156,20 +155,13 @@ def test_an_error_in_the_background_is_raised_and_not_lost(
     writer.save(10, state(10))
     writer.finish()
     with monkeypatch.context() as patch:
-        patch.setattr(
-            torch,
-            "save",
-            lambda *arguments: (_ for _ in ()).throw(OSError(28, "No space left on device")),
-        )
+        patch.setattr(torch, "save", full)
         writer.save(20, state(20))
         with pytest.raises(OSError, match="No space left"):
             writer.save(30, state(30))
     writer.save(40, state(40))
     writer.close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "checkpoint-00000010.pt",
-        "checkpoint-00000040.pt",
-    ]
+    assert kept(tmp_path) == [10, 40]
 
 
 def test_a_state_goes_to_another_device_whole() -> None:

@@ -5,20 +5,13 @@ One count at the end, equal numbers of rounds, thresholds on record.
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+from typing import Any
 
 import pytest
-import torch
 
 from gsbench.densify import ADC, MCMC, PixelGS, Volumetric
 from gsbench.densify.budget import Budgeted
-from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians
-from gsbench.raster import create_rasterizer
-from gsbench.scene.types import Scene
-from gsbench.train.trainer import Trainer
-from tests.train.test_trainer import options
+from tests.train.lab import EVENTS, Lab
 
 LIMIT = 400
 WINDOW = {"start": 20, "stop": 240, "interval": 20, "max_gaussians": LIMIT, "cap": "governor"}
@@ -39,23 +32,13 @@ ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
 
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.slow
-def test_arms_end_within_two_percent_of_one_count(
-    arm: str, tiny_scene: Scene, truth: Gaussians, tmp_path: Path
-) -> None:
+def test_arms_end_within_two_percent_of_one_count(arm: str, lab: Lab) -> None:
     kind, own = ARMS[arm]
     if kind is not MCMC:
         own = own | {"opacity_reset_interval": 120}  # in the middle of the window
-    densifier = kind(**(WINDOW | own))  # type: ignore[arg-type]
-    initial = gaussians_from_cloud(
-        truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy()
-    )
-    rasterizer = create_rasterizer("cpu", torch.device("cpu"), threads=1)
-    trained = Trainer(tiny_scene, initial, densifier, rasterizer, options(iterations=260), 0).run(
-        tmp_path
-    )
+    trained = lab.train(kind(**(WINDOW | own)), iterations=260)  # type: ignore[arg-type]
     assert len(trained) == pytest.approx(LIMIT, rel=0.02)
-    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
-    rounds = [event for event in events if "target" in event]
+    rounds = [event for event in lab.records(EVENTS) if "target" in event]
     assert [event["step"] for event in rounds] == list(range(40, 240, 20))
     assert rounds[-1]["target"] == LIMIT
     strictness = [event["strictness"] for event in rounds]
@@ -63,22 +46,12 @@ def test_arms_end_within_two_percent_of_one_count(
     assert all(1e-3 <= factor <= 1e3 for factor in strictness)
 
 
-def trained(
-    densifier: Budgeted, scene: Scene, truth: Gaussians, folder: Path
-) -> list[dict[str, float]]:
-    """The rounds of a training of 260 iterations."""
-    initial = gaussians_from_cloud(
-        truth.means.double().numpy(), torch.full((len(truth), 3), 127).byte().numpy()
-    )
-    rasterizer = create_rasterizer("cpu", torch.device("cpu"), threads=1)
-    Trainer(scene, initial, densifier, rasterizer, options(iterations=260), 0).run(folder)
-    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
-    return [event for event in events if event["step"] % 20 == 0]
+def rounds_of(lab: Lab, densifier: Budgeted) -> list[dict[str, Any]]:
+    lab.train(densifier, iterations=260)
+    return [event for event in lab.records(EVENTS) if event["step"] % 20 == 0]
 
 
-def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(
-    tiny_scene: Scene, truth: Gaussians, tmp_path: Path
-) -> None:
+def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(lab: Lab) -> None:
     """A threshold in other units than the scene's.
 
     A thousandth of it and a thousand times it select everybody.
@@ -89,21 +62,19 @@ def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(
         "opacity_reset_interval": 1000,
         "max_gaussians": 120,
     }
-    rounds = trained(Volumetric(**(WINDOW | own)), tiny_scene, truth, tmp_path)  # type: ignore[arg-type]
+    rounds = rounds_of(lab, Volumetric(**(WINDOW | own)))  # type: ignore[arg-type]
     culled = [event for event in rounds if event["cull"] > 1]
     assert culled
     for event in culled:
         assert event["strictness"] == pytest.approx(1e3)
         assert event["cull"] <= 10
         assert event["pruned_opacity"] > 0
-        assert event["after"] == event["before"] + event["split_volume"] + event[
-            "split_gradient"
-        ] + event["cloned"] - (event["pruned_opacity"] + event["pruned_size"])
+        grown = event["split_volume"] + event["split_gradient"] + event["cloned"]
+        pruned = event["pruned_opacity"] + event["pruned_size"]
+        assert event["after"] == event["before"] + grown - pruned
 
 
-def test_a_frozen_training_changes_nothing_more(
-    tiny_scene: Scene, truth: Gaussians, tmp_path: Path
-) -> None:
+def test_a_frozen_training_changes_nothing_more(lab: Lab) -> None:
     """Only the first round beyond the limit acts; later ones say what they would add."""
     own = {
         "cap": "freeze",
@@ -111,14 +82,11 @@ def test_a_frozen_training_changes_nothing_more(
         "gradient_threshold": 1e-6,
         "opacity_reset_interval": 1000,
     }
-    rounds = trained(ADC(**(WINDOW | own)), tiny_scene, truth, tmp_path)  # type: ignore[arg-type]
+    rounds = rounds_of(lab, ADC(**(WINDOW | own)))  # type: ignore[arg-type]
     beyond = [event for event in rounds if event["before"] > 100]
     assert len(beyond) > 3
-    assert (
-        {event["before"] for event in beyond}
-        == {event["after"] for event in beyond}
-        == {rounds[0]["after"]}
-    )
+    counts = {event[when] for event in beyond for when in ("before", "after")}
+    assert counts == {rounds[0]["after"]}
     assert all(event["blocked_by_cap"] > 0 for event in beyond)
     assert not any(
         event["pruned_opacity"] + event["cloned"] + event["split_gradient"] for event in beyond

@@ -5,10 +5,8 @@ Small pictures, the count that follows, and resuming.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,22 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from gsbench.analysis.differences import ingredients
-from gsbench.densify import (
-    ADC,
-    GNS,
-    MCMC,
-    MRNF,
-    Densifier,
-    DensifyContext,
-    EdgeAware,
-    FastGS,
-    Refinement,
-    SteepGS,
-)
+from gsbench.densify import EdgeAware, Refinement
 from gsbench.events import RefineEvent
-from gsbench.gaussians.model import Gaussians
-from gsbench.raster import create_rasterizer
-from gsbench.raster.base import Rasterizer
 from gsbench.runs.keys import config_hash
 from gsbench.scene.types import Scene, View
 from gsbench.train.options import TrainConfig
@@ -42,14 +26,24 @@ from gsbench.train.resolution import (
     _window_energies,
     scale_schedule,
 )
-from gsbench.train.trainer import Status, Trainer
 from gsbench.train.views import Targets
 from tests.config.test_schema import composed
-from tests.gaussians.helpers import random_gaussians
 from tests.train.conftest import orbit_camera
-from tests.train.test_trainer import CPU, cloud, options, records, same, small
+from tests.train.lab import (
+    CPU,
+    EVENTS,
+    METRICS,
+    STATEFUL,
+    Lab,
+    StopError,
+    options,
+    same,
+    small,
+    stop_at,
+)
 
 SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
+BOTH = "pictures_and_count"
 
 
 def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArray[np.uint8]]:
@@ -75,9 +69,7 @@ def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
     def window(spectrum: NDArray[np.float64], scale: float) -> float:
         tall, wide = int(height / scale) // 2, int(width / scale) // 2
         return float(
-            spectrum[
-                height // 2 - tall : height // 2 + tall, width // 2 - wide : width // 2 + wide
-            ].sum()
+            spectrum[height // 2 - tall :, width // 2 - wide :][: 2 * tall, : 2 * wide].sum()
         )
 
     def solve(spectrum: NDArray[np.float64], share: float) -> float:
@@ -190,19 +182,16 @@ def test_a_picture_keeps_a_pixel_at_least() -> None:
     assert targets.get(0).tolist() == [[[7, 7, 7]]]
 
 
-def test_rounds_tell_the_schedule_of_their_candidates(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
-) -> None:
-    settings = options(resolution_schedule="pictures_and_count", iterations=50, **SHORT)
-    trainer, told = Trainer(tiny_scene, cloud(truth), small(), rasterizer, settings, 0), []
-    assert trainer.resolution is not None
-    trainer.resolution.observe = told.append  # type: ignore[method-assign]
-    trainer.run(tmp_path)
+def test_rounds_tell_the_schedule_of_their_candidates(lab: Lab) -> None:
+    training, told = lab.new(small(), resolution_schedule=BOTH, iterations=50, **SHORT), []
+    assert training.resolution is not None
+    training.resolution.observe = told.append  # type: ignore[method-assign]
+    training.run(lab.folder)
     assert [event.step for event in told] == [40]
 
 
-def scheduled(scene: Scene, kind: str = "pictures_and_count", **changes: object) -> Resolution:
-    return Resolution(options(resolution_schedule=kind, **(SHORT | changes)), scene.train, 100)
+def scheduled(scene: Scene) -> Resolution:
+    return Resolution(options(resolution_schedule=BOTH, **SHORT), scene.train, 100)
 
 
 def test_sizes_change_after_rounds_and_rates_wait_for_them(tiny_scene: Scene) -> None:
@@ -246,82 +235,22 @@ def test_the_count_that_a_round_may_reach(tiny_scene: Scene) -> None:
     assert resolution.momentum == int(0.98 * 40_000_000 + 1_000_000)
 
 
-def test_caps_of_a_curve_of_their_own_keep_it() -> None:
-    limits: list[int | None] = []
-
-    def limit(refinement: Refinement, most: int | None) -> int:
-        limits.append(most)
-        return 7
-
-    for cap, allowed, asked in (
-        ("soft", 2, [None]),
-        ("hard", 2, [9]),
-        ("curve", 0, []),
-        ("governor", None, []),
-    ):
-        densifier = ADC(max_gaussians=9, cap=cap)  # type: ignore[arg-type]
-        gaussians = random_gaussians(5, 0)
-        densifier.begin(gaussians, DensifyContext(1.0, limit=limit))
-        event = RefineEvent(step=500, before=5)
-        limits.clear()
-        assert densifier.allowance(Refinement(500, gaussians, torch.Generator(), event)) == allowed  # type: ignore[arg-type]
-        assert limits == asked
-
-
-@pytest.fixture(scope="module")
-def rasterizer() -> Rasterizer:
-    return create_rasterizer("cpu", CPU, threads=1)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        small,
-        lambda: small(FastGS, error_threshold=0.05, least_count=0.0, max_gaussians=200),
-        lambda: small(SteepGS),
-        lambda: small(EdgeAware, max_gaussians=200, cap="root"),
-        lambda: MCMC(start=20, stop=110, interval=20),
-        lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
-        lambda: GNS(
-            start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0
-        ),
-    ],
-    ids=["adc", "fastgs", "steepgs", "edgeaware", "mcmc", "mrnf", "gns"],
-)
+@pytest.mark.parametrize("kind", [*STATEFUL, "edgeaware"])
 @pytest.mark.slow
-def test_interrupted_in_the_middle_it_ends_in_the_same_bits(
-    make, tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
-) -> None:  # type: ignore[no-untyped-def]
-    settings = options(resolution_schedule="pictures_and_count", checkpoint_every=30, **SHORT)
-
-    def trainer(densifier: Densifier) -> Trainer:
-        return Trainer(tiny_scene, cloud(truth), densifier, rasterizer, settings, 0)
-
-    for name in ("whole", "broken"):
-        (tmp_path / name).mkdir()
-    whole = trainer(make()).run(tmp_path / "whole")
-
-    class StopError(Exception):
-        pass
-
-    def stop_at_70(status: Status) -> None:
-        if status.step == 70:
-            raise StopError
-
+def test_interrupted_in_the_middle_it_ends_in_the_same_bits(kind: str, lab: Lab) -> None:
+    make = STATEFUL.get(kind, lambda: small(EdgeAware, max_gaussians=200, cap="root"))
+    settings = {"resolution_schedule": BOTH, "checkpoint_every": 30, **SHORT}
+    whole = lab.train(make(), "whole", **settings)
     with pytest.raises(StopError):
-        trainer(make()).run(tmp_path / "broken", stop_at_70)
-    again = trainer(make())
-    assert same(whole, again.run(tmp_path / "broken"))
-    for name in ("events.jsonl",):
-        assert (tmp_path / "broken" / name).read_text() == (tmp_path / "whole" / name).read_text()
-    sizes = {record["scale"] for record in records(tmp_path / "whole" / "metrics.jsonl")}
-    assert 1 in sizes
+        lab.train(make(), "broken", stop_at(70), **settings)
+    assert same(whole, lab.train(make(), "broken", **settings))
+    assert lab.text(EVENTS, "broken") == lab.text(EVENTS, "whole")
+    sizes = {record["scale"] for record in lab.records(METRICS, "whole")}
+    assert min(sizes) == 1
     assert max(sizes) >= 2
 
 
-def test_masks_are_as_small_as_their_pictures(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
-) -> None:
+def test_masks_are_as_small_as_their_pictures(lab: Lab) -> None:
     """What a mask ignores has no part in a small picture either.
 
     Whatever stands there, the training is the same.
@@ -329,42 +258,36 @@ def test_masks_are_as_small_as_their_pictures(
     trained = []
     for value in (0, 255):
         views = []
-        for view in tiny_scene.train:
+        for view in lab.scene.train:
             counts = np.ones(view.image.shape[:2], bool)
             counts[:24, :28] = False
             image = view.image.copy()
             image[:3, :3] = value  # at half the size farther away than two windows of SSIM reach
             views.append(replace(view, image=image, mask=counts))
-        scene = replace(tiny_scene, train=tuple(views))
-        folder = tmp_path / str(value)
-        folder.mkdir()
-        settings = options(
-            resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT
+        own = lab.with_views(train=tuple(views))
+        training = own.new(
+            small(), resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT
         )
-        trainer = Trainer(scene, cloud(truth), small(), rasterizer, settings, 0)
-        trainer.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))  # type: ignore[union-attr]
-        assert trainer.scaled_views.at(2)[1].mask(0).shape == (16, 20, 1)  # type: ignore[union-attr]
-        trained.append(trainer.run(folder))
+        assert training.resolution is not None
+        training.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))
+        mask = training.scaled_views.at(2)[1].mask(0)
+        assert mask is not None
+        assert mask.shape == (16, 20, 1)
+        (lab.folder / str(value)).mkdir()
+        trained.append(training.run(lab.folder / str(value)))
     assert same(*trained)
 
 
-def test_pictures_alone_leave_the_count_to_the_densifier(
-    tiny_scene: Scene, truth: Gaussians, rasterizer: Rasterizer, tmp_path: Path
-) -> None:
+def test_pictures_alone_leave_the_count_to_the_densifier(lab: Lab) -> None:
     counts = {}
-    for kind in ("none", "pictures", "pictures_and_count"):
-        folder = tmp_path / kind
-        folder.mkdir()
-        settings = options(resolution_schedule=kind, **SHORT)
-        Trainer(tiny_scene, cloud(truth), small(), rasterizer, settings, 0).run(folder)
-        counts[kind] = [
-            json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()
-        ]
-    assert any(event["blocked_by_cap"] for event in counts["pictures_and_count"])
+    for kind in ("none", "pictures", BOTH):
+        lab.train(small(), kind, resolution_schedule=kind, **SHORT)
+        counts[kind] = lab.records(EVENTS, kind)
+    assert any(event["blocked_by_cap"] for event in counts[BOTH])
     assert not any(event["blocked_by_cap"] for event in counts["pictures"] + counts["none"])
-    for event in counts["pictures_and_count"]:
+    for event in counts[BOTH]:
         assert event["after"] <= 1.2 * event["before"]
-    assert "scale" not in records(tmp_path / "none" / "metrics.jsonl")[0]
+    assert "scale" not in lab.records(METRICS, "none")[0]
 
 
 def test_it_is_an_ingredient_of_its_own_and_in_the_hash() -> None:

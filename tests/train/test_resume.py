@@ -11,75 +11,32 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
-from gsbench.densify import ADC, MCMC, Densifier, EdgeAware, PixelGS, Taming, Volumetric
-from gsbench.gaussians.model import Gaussians
-from gsbench.raster import create_rasterizer
-from gsbench.scene.types import Scene
+from gsbench.densify import Densifier, EdgeAware, PixelGS, ResGS, Taming, Volumetric
 from gsbench.system.stopping import Stopped, stop_on_signals
-from gsbench.train.trainer import Status, Trainer, drop_after
-from tests.train.test_trainer import cloud, options, records, same
+from gsbench.train.trainer import Status, drop_after
+from tests.train.lab import EVENTS, METRICS, STATEFUL, Lab, StopError, same, small, stop_at
 
 ITERATIONS = 120
-MAKERS: dict[str, Callable[[], Densifier]] = {
-    "adc": lambda: ADC(start=20, stop=110, interval=20, opacity_reset_interval=60),
-    "volumetric": lambda: Volumetric(
-        start=20, stop=110, interval=20, opacity_reset_interval=60, volume_threshold=0.01
-    ),
-    "capped": lambda: ADC(
-        start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=120, cap="hard"
-    ),
-    "pixelgs": lambda: PixelGS(
-        start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=150, cap="hard"
-    ),
-    "edgeaware": lambda: EdgeAware(
-        start=20,
-        stop=110,
-        interval=20,
-        gradient="absolute",
-        opacity_reset_interval=60,
-        max_gaussians=150,
-        cap="curve",
-    ),
-    "taming": lambda: Taming(
-        start=20, stop=110, interval=20, opacity_reset_interval=60, max_gaussians=150
-    ),
-    "mcmc": lambda: MCMC(start=20, stop=110, interval=20),
+MAKERS: dict[str, Callable[[], Densifier]] = STATEFUL | {
+    "volumetric": lambda: small(Volumetric, volume_threshold=0.01),
+    "capped": lambda: small(max_gaussians=120, cap="hard"),
+    "pixelgs": lambda: small(PixelGS, max_gaussians=150, cap="hard"),
+    "edgeaware": lambda: small(EdgeAware, gradient="absolute", max_gaussians=150, cap="curve"),
+    "resgs": lambda: small(ResGS, phase_ends=[0.3, 0.6], fade_interval=15, fade_stop=100),
+    "taming": lambda: small(Taming, max_gaussians=150),
 }
 
 
-def run(
-    scene: Scene,
-    truth: Gaussians,
-    folder: Path,
-    name: str,
-    on_status: Callable[[Status], None] = lambda s: None,
-    **changes: object,
-) -> Gaussians:
-    folder.mkdir(exist_ok=True)
-    settings = options(log_every=1, iterations=ITERATIONS, **changes)
-    rasterizer = create_rasterizer("cpu", torch.device("cpu"), threads=1)
-    return Trainer(scene, cloud(truth), MAKERS[name](), rasterizer, settings, 0).run(
-        folder, on_status
-    )
-
-
-class CrashError(Exception):
-    """Stands for a kill: nothing is saved on the way out."""
-
-
 @pytest.mark.parametrize("name", list(MAKERS))
-def test_crashes_and_signals_at_random_iterations(
-    name: str, tiny_scene: Scene, truth: Gaussians, tmp_path: Path
-) -> None:
-    whole = run(tiny_scene, truth, tmp_path / "whole", name)
+def test_crashes_and_signals_at_random_iterations(name: str, lab: Lab) -> None:
+    make = MAKERS[name]
+    whole = lab.train(make(), "whole", log_every=1)
     rng = random.Random(name)
-    broken = tmp_path / "broken"
     crashes = stops = 0
-    for _ in range(12):
+    for attempt in range(12):
         moment = rng.randrange(1, 45)
-        crash = rng.random() < 0.5
+        crash = attempt % 2 == 0
         seen: list[int] = []
 
         def interrupt(
@@ -88,67 +45,50 @@ def test_crashes_and_signals_at_random_iterations(
             seen.append(status.step)
             if len(seen) == moment:
                 if crash:
-                    raise CrashError
+                    raise StopError
                 signal.raise_signal(signal.SIGTERM)
 
         try:
             with stop_on_signals():
-                broken_result = run(tiny_scene, truth, broken, name, interrupt, checkpoint_every=13)
+                settings = {"log_every": 1, "checkpoint_every": 13}
+                broken_result = lab.train(make(), "broken", interrupt, **settings)
             break
-        except CrashError:
+        except StopError:
             crashes += 1
         except Stopped:
             stops += 1
-            assert (broken / f"checkpoint-{seen[-1]:08d}.pt").exists()
+            assert seen[-1] in lab.checkpoints("broken")
     else:
-        broken_result = run(tiny_scene, truth, broken, name)
+        broken_result = lab.train(make(), "broken", log_every=1)
     assert crashes >= 1
     assert stops >= 1
     assert same(whole, broken_result)
-    for file in ("events.jsonl", "volume_histograms.jsonl"):
-        assert (broken / file).read_text() == (tmp_path / "whole" / file).read_text()
+    for file in (EVENTS, "volume_histograms.jsonl"):
+        assert lab.text(file, "broken") == lab.text(file, "whole")
     timeless = [
-        [{k: v for k, v in r.items() if k != "seconds"} for r in records(f / "metrics.jsonl")]
-        for f in (broken, tmp_path / "whole")
+        [record | {"seconds": 0} for record in lab.records(METRICS, folder)]
+        for folder in ("broken", "whole")
     ]
     assert timeless[0] == timeless[1]
 
 
-def test_checkpoints_come_by_the_clock_too(
-    tiny_scene: Scene, truth: Gaussians, tmp_path: Path
-) -> None:
-    def crash(status: Status) -> None:
-        if status.step == 5:
-            raise CrashError
-
-    with pytest.raises(CrashError):
-        run(
-            tiny_scene,
-            truth,
-            tmp_path,
-            "adc",
-            crash,
-            checkpoint_every=10**6,
-            checkpoint_minutes=1e-9,
-        )
-    assert sorted(path.name for path in tmp_path.glob("*.pt")) == [
-        "checkpoint-00000003.pt",
-        "checkpoint-00000004.pt",
-    ]
+def test_checkpoints_come_by_the_clock_too(lab: Lab) -> None:
+    settings = {"log_every": 1, "checkpoint_every": 10**6, "checkpoint_minutes": 1e-9}
+    with pytest.raises(StopError):
+        lab.train(small(), "", stop_at(5), **settings)
+    assert lab.checkpoints() == [3, 4]
 
 
-def test_a_stop_in_the_last_iteration_loses_nothing(
-    tiny_scene: Scene, truth: Gaussians, tmp_path: Path
-) -> None:
-    whole = run(tiny_scene, truth, tmp_path / "whole", "adc")
+def test_a_stop_in_the_last_iteration_loses_nothing(lab: Lab) -> None:
+    whole = lab.train(small(), "whole")
 
     def stop(status: Status) -> None:
         if status.step == ITERATIONS:
             signal.raise_signal(signal.SIGTERM)
 
     with pytest.raises(Stopped), stop_on_signals():
-        run(tiny_scene, truth, tmp_path / "broken", "adc", stop)
-    assert same(whole, run(tiny_scene, truth, tmp_path / "broken", "adc"))
+        lab.train(small(), "broken", stop)
+    assert same(whole, lab.train(small(), "broken"))
 
 
 def test_records_later_than_the_checkpoint_and_a_torn_line_are_dropped(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Scene
 from gsbench.train.loss import photometric_loss
 from gsbench.train.trainer import Trainer
-from tests.train.test_trainer import cloud, options
+from tests.train.lab import cloud, options
 
 
 def test_views_are_rendered_and_measured_as_in_training(

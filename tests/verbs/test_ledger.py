@@ -187,6 +187,8 @@ def test_when_all_ideas_were_tried_no_level_is_left(
         (["eval.flip=false"], "eval.flip: an idea may change"),
         (["name=x", f"{SPLIT}=0.02"], "name: an idea may change"),
         ([], "needs the idea's settings"),
+        ([f"{SPLIT}=0.02", "--least", "0.01"], "ledger try takes no --least"),
+        ([f"{SPLIT}=0.02", "--fdr", "0.2"], "ledger try takes no --fdr"),
         (["densify=adc"], "the idea is baseline itself"),
         ([f"{SPLIT}=0.02", "--against", "nobody"], "--against nobody: there is baseline"),
         ([f"{SPLIT}=0.02,0.03"], "compares one arm at a time"),

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-FLAGS = (
+FLAGS = [
     "--headless",
     "--no-sandbox",
     "--disable-gpu",
@@ -32,7 +32,7 @@ FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--remote-debugging-port=0",
-)
+]
 SECONDS = 300  # within which a page that stays as it is is told from a slow machine
 SECONDS_BETWEEN_LOOKS = 0.5
 
@@ -41,11 +41,8 @@ class Browser:
     """A window of ``size`` on the page ``url``; the test is skipped where there is no Chromium."""
 
     def __init__(self, url: str, profile: Path, size: tuple[int, int] = (1200, 600)) -> None:
-        chromium = (
-            shutil.which("chromium")
-            or shutil.which("chromium-browser")
-            or shutil.which("google-chrome")
-        )
+        found = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
+        chromium = next(filter(None, found), None)
         if chromium is None:
             pytest.skip("needs a headless Chromium")
         sockets = pytest.importorskip(

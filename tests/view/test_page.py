@@ -35,9 +35,8 @@ def test_the_page_has_every_test_view(
     works: str, small_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
-    monkeypatch.setenv(
-        "PATH", f"{stand_in(tmp_path / 'bin', works)}{os.pathsep}{os.environ['PATH']}"
-    )
+    npx = stand_in(tmp_path / "bin", works)
+    monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 0
     settings = json.loads((tmp_path / "page.html").read_text())
     trial = find_trial(ADDRESS, small_runs)
@@ -53,11 +52,14 @@ def test_the_page_has_every_test_view(
         np.testing.assert_allclose(np.array(shown["position"]) * (-1, -1, 1), camera.center)
         assert np.tan(np.radians(shown["fov"] / 2)) * 2 * camera.fx == pytest.approx(camera.width)
     (track,) = settings["animTracks"]
-    assert (
-        len(track["keyframes"]["values"]["position"])
-        == 3 * len(track["keyframes"]["times"])
-        == 3 * (len(views) + 1)
-    )
+    frames = track["keyframes"]
+    shown = [one["camera"]["initial"] for one in settings["annotations"]]
+    stops = [*shown, shown[0]]
+    assert len(frames["times"]) == len(stops)
+    for key, size in (("position", 3), ("target", 3), ("fov", 1)):
+        wanted = np.ravel([stop[key] for stop in stops])
+        assert frames["values"][key] == wanted.tolist()
+        assert len(wanted) == size * len(stops)
 
 
 @pytest.mark.parametrize(
@@ -72,9 +74,8 @@ def test_without_npx_the_command_to_type_is_said(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
-    monkeypatch.setenv(
-        "PATH", f"{stand_in(tmp_path / 'bin', works)}:/bin" if works else str(tmp_path)
-    )
+    place = f"{stand_in(tmp_path / 'bin', works)}:/bin" if works else str(tmp_path)
+    monkeypatch.setenv("PATH", place)
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 1
     said = capsys.readouterr().err
     assert cause in said

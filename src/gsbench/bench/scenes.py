@@ -40,17 +40,13 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
     and a margin around it.
     """
     generator = _generator(count, seed)
-    depth = FIRST_DEPTH * torch.exp(
-        torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)
-    )  # [N]
-    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * torch.tensor(
-        [1.4, 1.05]
-    )  # [N, 2] x/z, y/z
+    depth = FIRST_DEPTH * (torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)).exp()
+    fields = torch.tensor([1.4, 1.05])
+    slopes = (torch.rand(count, 2, generator=generator) - 0.5) * fields  # [N, 2] x/z, y/z
     spread = torch.exp(SIGMA_SPREAD * torch.randn(count, generator=generator))
     sigma = MEDIAN_SIGMA * (100_000 / count) ** SIGMA_EXPONENT * spread * depth
-    shape = 0.5 * torch.randn(count, 3, generator=generator) - torch.tensor(
-        [0.0, 0.0, 1.5]
-    )  # [N, 3] flat
+    flat = torch.tensor([0.0, 0.0, 1.5])
+    shape = 0.5 * torch.randn(count, 3, generator=generator) - flat  # [N, 3]
     return Gaussians(
         means=torch.cat([slopes * depth[:, None], depth[:, None]], 1),
         log_scales=sigma.log()[:, None] + shape,
@@ -89,9 +85,8 @@ def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
     gaussians = trained_like_gaussians(count, seed)
     generator = _generator(count, seed + 1)
     weights = 1 / torch.arange(1, SPOTS + 1)  # Zipf's
-    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * torch.tensor(
-        [1.0, 0.7]
-    )  # [S, 2] x/z, y/z
+    fields = torch.tensor([1.0, 0.7])
+    spots = (torch.rand(SPOTS, 2, generator=generator) - 0.5) * fields  # [S, 2] x/z, y/z
     chosen = torch.multinomial(weights, count, replacement=True, generator=generator)  # [N]
     slopes = spots[chosen] + SPOT_RADIUS * torch.randn(count, 2, generator=generator)  # [N, 2]
     moved = torch.rand(count, generator=generator) < SPOT_SHARE  # [N]

@@ -23,6 +23,9 @@ from gsbench.files import CHUNK, MAX_NAME_BYTES, atomic, require_regular
 from gsbench.logs import Progress
 from gsbench.words import counted, readable_bytes
 
+# raised by zipfile for a file that is no archive, or only its beginning
+NO_ARCHIVE = (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error)
+
 
 class DamagedMemberError(Exception):
     """Raised for a member whose content does not match the archive's directory."""
@@ -73,7 +76,7 @@ def _remote(url: str, policy: RetryPolicy) -> Iterator[zipfile.ZipFile]:
     with requests.Session() as session:
         try:
             archive = with_retries(once, url, policy)
-        except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+        except NO_ARCHIVE as error:
             if isinstance(error, InputError):
                 raise
             raise _no_archive(url, error) from error
@@ -85,7 +88,7 @@ def open_archive(file: IO[bytes], where: str) -> zipfile.ZipFile:
     """Open the zip archive in ``file``; raises `InputError` naming ``where`` if it is none."""
     try:
         return zipfile.ZipFile(file)
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, struct.error) as error:
+    except NO_ARCHIVE as error:
         raise _no_archive(where, error) from error
 
 
@@ -114,6 +117,7 @@ def wanted_members(
             raise InputError(
                 f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
             )
+        # A surrogate is what a damaged name decodes to.
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
             raise InputError(
                 f"{where}: the member {name!r:.80} has a name that no file can have: give another "

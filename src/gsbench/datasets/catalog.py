@@ -15,6 +15,7 @@ from gsbench.errors import InputError
 from gsbench.system.install import conf_dir
 
 DATA_VARIABLE = "GSBENCH_DATA"
+# the place of the data, as the YAML files of public scenes write it
 SCENE_PATH = re.compile(r"\$\{oc\.env:GSBENCH_DATA,data\}/(?P<folder>.+)")
 CATALOG_FILE = Path(__file__).with_name("catalog.yaml")
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsbench.densify.base import NEVER, Refinement, Rule, Statistic, revised_logits
 from gsbench.densify.budget import Budgeted, admit
+from gsbench.densify.scores import draw
 from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
@@ -118,10 +119,8 @@ class ADC(Budgeted):
             rules += [*self.governing(), self.grow_by_gradient, self.prune, self.reset_statistics]
         # As in 3DGS: with a white background, opacities are also reset once at the start of the
         # window.
-        periodic = step % self.opacity_reset_interval == 0
-        if step < self.stop and (
-            periodic or (self.context.white_background and step == self.start)
-        ):
+        first = self.context.white_background and step == self.start
+        if step < self.stop and (first or step % self.opacity_reset_interval == 0):
             rules.append(self.reset_opacity)
         return rules
 
@@ -222,12 +221,23 @@ class ADC(Budgeted):
             or not 0 < since_reset <= LOCKED_ROUNDS * self.interval
         )
 
-    def prune(self, refinement: Refinement) -> None:
-        """Remove faint Gaussians and, after the first opacity reset, huge ones."""
+    def to_prune(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
+        """Masks [N] of the faint and, after the first opacity reset, of the huge Gaussians."""
         values = refinement.gaussians.values
-        faint = self.faint(values.opacity_logits)
-        huge = self.huge(refinement.step, values.log_scales)
-        self.remove(refinement, faint, huge)
+        return self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
+
+    def prune(self, refinement: Refinement) -> None:
+        """Remove the Gaussians ``to_prune``."""
+        self.remove(refinement, *self.to_prune(refinement))
+
+    def prune_drawn(self, refinement: Refinement, known: Tensor, weights: Tensor) -> None:
+        """Remove those ``to_prune`` that are among half as many draws from the mask ``known`` [N].
+
+        The draws are in proportion to ``weights`` [N].
+        """
+        faint, huge = self.to_prune(refinement)
+        drawn = draw(known, weights, int((faint | huge).sum()) // 2, refinement.rng)
+        self.remove(refinement, faint & drawn, huge & drawn)
 
     def reset_opacity(self, refinement: Refinement) -> None:
         """Lower all opacities: those of needed Gaussians rise again, the others are pruned."""

@@ -80,17 +80,15 @@ class AbsGS(ADC):
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         over, large = super().candidates(refinement)
-        return torch.where(
-            large, self.reaches(self.mean_absolute_gradient(), self.split_threshold), over
-        ), large
+        split = self.reaches(self.mean_absolute_gradient(), self.split_threshold)
+        return torch.where(large, split, over), large
 
     def choose(self, refinement: Refinement, candidates: Tensor, gain: int) -> tuple[Tensor, int]:
         """Choose the candidates farthest above the threshold that applies to them."""
         _, large = self.candidates(refinement)
         signed = self.mean_gradient() / self.gradient_threshold
-        excess = torch.where(
-            large, self.mean_absolute_gradient() / self.split_threshold, signed
-        )  # [N]
+        absolute = self.mean_absolute_gradient() / self.split_threshold
+        excess = torch.where(large, absolute, signed)  # [N]
         return admit(candidates, excess, gain, self.allowance(refinement))
 
     def lower_opacity(self, refinement: Refinement) -> None:
@@ -169,13 +167,9 @@ class QuantileADC(ADC):
         # The opacity threshold is a quantile over all Gaussians after growth, so each child needs
         # its own entry.
         grown = self.grown(refinement)
-        index = torch.arange(len(grown.number), device=grown.number.device).repeat_interleave(
-            grown.number
-        )
-        pruned = (
-            self.faint(grown.opacity_logits[index])
-            | self.huge(refinement.step, grown.log_scales)[index]
-        )
+        index = torch.repeat_interleave(grown.number)  # [after growth] each child's parent
+        faint = self.faint(grown.opacity_logits[index])
+        pruned = faint | self.huge(refinement.step, grown.log_scales)[index]
         return len(index) - int(pruned.sum())
 
     def faint(self, opacity_logits: Tensor) -> Tensor:
@@ -281,21 +275,18 @@ class SteepGS(ADC):
         selected, blocked = admit(
             saddles.candidates, -saddles.values, 1, self.allowance(refinement)
         )
-        indices = selected.nonzero().squeeze(-1)  # [S]
-        parents = gaussians.values.detach().select(indices)
-        is_large = saddles.large[indices].unsqueeze(-1)
-        direction = saddles.directions[indices].to(parents.means)  # [S, 3]
+        parents = gaussians.values.detach().select(selected)
+        is_large = saddles.large[selected].unsqueeze(-1)  # [S, 1]
+        direction = saddles.directions[selected].to(parents.means)  # [S, 3]
         noise = standard_normal((2 * len(parents), 3), refinement.rng, parents.means)
         lengths = (noise * parents.scales.repeat(2, 1)).norm(dim=-1, keepdim=True)  # [2 S, 1]
         lengths = torch.where(is_large.repeat(2, 1), lengths, gaussians.position_rate)
         children = Gaussians.concatenate([parents, parents])
         children.means = children.means + lengths * torch.cat([direction, -direction])
-        children.log_scales = children.log_scales - math.log(self.split_shrink) * is_large.repeat(
-            2, 1
-        )
+        shrink = math.log(self.split_shrink) * is_large  # [S, 1]
+        children.log_scales = children.log_scales - shrink.repeat(2, 1)
         children.opacity_logits = faded(children.opacity_logits, self.opacity_factor)
-        self.edit(refinement, ~selected, children, indices.repeat(2), Cause.SPLIT_GRADIENT)
-        refinement.event.split_gradient += len(parents)
+        self.split_in_halves(refinement, selected, children)
         refinement.event.blocked_by_cap += blocked
 
 
@@ -355,9 +346,8 @@ class ResGS(ADC):
 
     def iteration_at(self, fraction: float) -> int:
         """The iteration of the round nearest to the given fraction of the window."""
-        return (
-            self.start + round(fraction * (self.stop - self.start) / self.interval) * self.interval
-        )
+        rounds = round(fraction * (self.stop - self.start) / self.interval)
+        return self.start + rounds * self.interval
 
     def warming_up(self, step: int) -> bool:
         """Return whether ``step`` is in the pause after the end of a phase."""
@@ -399,12 +389,10 @@ class ResGS(ADC):
         return self.reaches(mean, self.gradient_threshold), large
 
     def forecast(self, refinement: Refinement) -> int:
-        values = refinement.gaussians.values
+        logits = refinement.gaussians.values.opacity_logits
         over, _ = self.candidates(refinement)
-        parents = torch.where(
-            over, faded(values.opacity_logits, self.parent_opacity), values.opacity_logits
-        )
-        children = over & ~self.faint(values.opacity_logits)
+        parents = torch.where(over, faded(logits, self.parent_opacity), logits)
+        children = over & ~self.faint(logits)
         return int((~self.faint(parents)).sum()) + int(children.sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:

@@ -333,6 +333,17 @@ class Densifier:
         self.edit(refinement, keep=keep, append=new, parents=parents.repeat(children), cause=cause)
         return len(new) - (0 if keep_parent else len(parents))
 
+    def split_in_halves(
+        self, refinement: Refinement, selected: Tensor, children: Gaussians
+    ) -> None:
+        """Replace each Gaussian at the mask ``selected`` [N] by two ``children`` [2 S].
+
+        The first halves of all come first, then the second ones. They count as splits.
+        """
+        parents = selected.nonzero().squeeze(-1)  # [S]
+        self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
+        refinement.event.split_gradient += len(parents)
+
     def remove(self, refinement: Refinement, faint: Tensor, others: Tensor | None = None) -> None:
         """Remove the Gaussians at the masks ``faint`` [N] and ``others`` [N].
 
@@ -367,13 +378,11 @@ class Densifier:
         }
 
     def _zeros(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        kinds = {
-            n: Statistic(k) if isinstance(k, torch.dtype) else k for n, k in self.STATISTICS.items()
-        }
-        return {
-            name: torch.zeros(count, *kind.shape, dtype=kind.dtype, device=device)
-            for name, kind in kinds.items()
-        }
+        zeros = {}
+        for name, kind in self.STATISTICS.items():
+            dtype, shape = (kind, ()) if isinstance(kind, torch.dtype) else kind
+            zeros[name] = torch.zeros(count, *shape, dtype=dtype, device=device)
+        return zeros
 
 
 class NoDensifier(Densifier):

@@ -195,9 +195,8 @@ class Budgeted(Densifier):
         """The only rule of a frozen round: record how many Gaussians it would have added."""
         # With infinite strictness nothing grows: the difference is growth alone, without the effect
         # of pruning.
-        refinement.event.blocked_by_cap += self._forecast_at(refinement) - self._forecast_at(
-            refinement, math.inf
-        )
+        without_growth = self._forecast_at(refinement, math.inf)
+        refinement.event.blocked_by_cap += self._forecast_at(refinement) - without_growth
 
     def govern(self, refinement: Refinement) -> None:
         """The first rule of a governed round.

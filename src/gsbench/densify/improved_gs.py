@@ -18,7 +18,6 @@ from torch import Tensor
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
 from gsbench.densify.base import DensifyContext, Refinement, Rule, faded, quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
-from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction, Switch
@@ -60,13 +59,10 @@ class LongAxis(ADC):
         """Split the Gaussians whose mean gradient reaches the threshold."""
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)
-        parents = selected.nonzero().squeeze(-1)  # [S]
-        parent_values = refinement.gaussians.values.detach().select(parents)
-        children = halves(
-            parent_values, REACH * self.split_distance, *self._factors, self.opacity_factor
-        )
-        self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
-        refinement.event.split_gradient += len(parents)
+        parents = refinement.gaussians.values.detach().select(selected)
+        offset = REACH * self.split_distance
+        children = halves(parents, offset, *self._factors, self.opacity_factor)
+        self.split_in_halves(refinement, selected, children)
         refinement.event.blocked_by_cap += blocked
 
     @property
@@ -319,19 +315,14 @@ class GNS(EdgeAware):
         self.adjust_weight(step, gaussians.opacities.detach())
         logits = gaussians.opacity_logits + LOWEST_LOGIT
         if self.in_first_part(step):
-            return (
-                self.weight
-                * (logits / (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)).mean().square()
-            )
+            transparency = (1 - gaussians.opacities).clamp_min(MIN_TRANSPARENCY)
+            return self.weight * (logits / transparency).mean().square()
         return HARD_FACTOR * self.weight * logits.mean().square()
 
     def adjust_weight(self, step: int, opacities: Tensor) -> None:
         """Adjust the pressure by the opacity of the last Gaussian within the budget."""
-        last = (
-            opacities.sort(descending=True)
-            .values[min(self.max_gaussians, len(opacities)) - 1]
-            .item()
-        )
+        place = min(self.max_gaussians, len(opacities)) - 1
+        last = opacities.sort(descending=True).values[place].item()
         if self.aim is None:
             self.aim = FIRST_AIM * last
         elif (step - 1) % (2 * self.pressure_interval) == 0:
@@ -360,12 +351,8 @@ class GNS(EdgeAware):
     def meet_budget(self, refinement: Refinement) -> None:
         """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
         opacities = refinement.gaussians.values.opacities.detach()
-        kept = draw(
-            torch.ones_like(opacities, dtype=torch.bool),
-            opacities,
-            self.max_gaussians,
-            refinement.rng,
-        )
+        everybody = torch.ones_like(opacities, dtype=torch.bool)
+        kept = draw(everybody, opacities, self.max_gaussians, refinement.rng)
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
                 "the opacity pressure was too short: it ended with %d Gaussians, and %d of them "

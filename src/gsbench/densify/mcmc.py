@@ -56,10 +56,8 @@ class MCMC(Budgeted):
         return spread_out(gaussians, self.initial_opacity, self.initial_scale)
 
     def regularizer(self, gaussians: Gaussians) -> Tensor:
-        return (
-            self.opacity_weight * gaussians.opacities.mean()
-            + self.scale_weight * gaussians.scales.mean()
-        )
+        opacity, scale = gaussians.opacities.mean(), gaussians.scales.mean()
+        return self.opacity_weight * opacity + self.scale_weight * scale
 
     def rules(self, refinement: Refinement) -> list[Rule]:
         return [*self.governing(), self.relocate, self.add] if self.due(refinement.step) else []
@@ -78,9 +76,8 @@ class MCMC(Budgeted):
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
         values = gaussians.values
-        gate = torch.sigmoid(
-            -GATE_STEEPNESS * (values.opacities - self.min_opacity)
-        )  # [N], near 0 if opaque
+        # [N], near 0 if opaque
+        gate = torch.sigmoid(-GATE_STEEPNESS * (values.opacities - self.min_opacity))
         noise = standard_normal((len(gaussians), 3), rng, values.means)
         axes = values.rotations * values.scales.unsqueeze(-2)  # [N, 3, 3]
         covariance = axes @ axes.mT
@@ -160,21 +157,14 @@ def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
     """
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
-    return (
-        torch.searchsorted(cumulative, draws, right=True)
-        .clamp_max(len(weights) - 1)
-        .to(weights.device)
-    )
+    index = torch.searchsorted(cumulative, draws, right=True).clamp_max(len(weights) - 1)
+    return index.to(weights.device)
 
 
 def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
     """``gaussians`` with the same ``opacity`` for all, and their scales multiplied by ``scale``."""
-    changed = {
-        "opacity_logits": torch.full_like(
-            gaussians.opacity_logits, math.log(opacity / (1 - opacity))
-        ),
-        "log_scales": gaussians.log_scales + math.log(scale),
-    }
+    logits = torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity)))
+    changed = {"opacity_logits": logits, "log_scales": gaussians.log_scales + math.log(scale)}
     return Gaussians(**(gaussians.tensors() | changed))
 
 
@@ -186,8 +176,8 @@ MIN_SCALE = 1e-10  # world units; smaller Gaussians are pruned
 BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis that bound the scene
 NOISE_POWER = 150.0  # noise is proportional to (1 - opacity) to this power
 SPLIT_OFFSET = 0.5  # standard deviations
-# factors on the children's scales and opacity
-SPLIT_LONGEST, SPLIT_ACROSS, SPLIT_OPACITY = 0.5, 0.85, 0.6
+# factors on the children's longest scale, their other scales, and their opacity
+SPLIT_FACTORS = 0.5, 0.85, 0.6
 MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 
@@ -264,20 +254,13 @@ class MRNF(Budgeted):
         replacing = draw(seen & ~pruned, opacity_scores, num_pruned, rng)
         remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
         eligible = candidates & ~pruned & ~replacing
-        growing = draw(
-            eligible, weights * edge_factor, min(remaining, room - int(replacing.sum())), rng
-        )
+        allowed = min(remaining, room - int(replacing.sum()))
+        growing = draw(eligible, weights * edge_factor, allowed, rng)
         event.blocked_by_cap += max(0, min(remaining, int(eligible.sum())) - int(growing.sum()))
         event.pruned_opacity += num_pruned
         parents = (replacing | growing).nonzero().squeeze(-1)  # [S]
         event.split_gradient += len(parents)
-        children = halves(
-            values.detach().select(parents),
-            SPLIT_OFFSET,
-            SPLIT_LONGEST,
-            SPLIT_ACROSS,
-            SPLIT_OPACITY,
-        )
+        children = halves(values.detach().select(parents), SPLIT_OFFSET, *SPLIT_FACTORS)
         kept = ~(pruned | replacing | growing)
         self.edit(refinement, kept, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
 
@@ -285,13 +268,11 @@ class MRNF(Budgeted):
         """The refine weights [N] over the training views at the indices ``views``."""
         training, largest = self.context.training_views, torch.zeros_like(gaussians.opacity_logits)
         for index in views:
-            error = training.dissimilarity(
-                index, training.render(index, gaussians, step).image.detach()
-            )  # [H, W]
-            error = (error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)).unsqueeze(-1)
-            sums, _ = blended_sums(
-                training, index, gaussians, step, error.expand(-1, -1, 3).contiguous()
-            )
+            image = training.render(index, gaussians, step).image.detach()
+            error = training.dissimilarity(index, image)  # [H, W]
+            error = error / error.mean().clamp_min(torch.finfo(error.dtype).tiny)
+            weights = error.unsqueeze(-1).expand(-1, -1, 3).contiguous()
+            sums, _ = blended_sums(training, index, gaussians, step, weights)
             largest = torch.maximum(largest, sums[:, 0])
         return largest
 
@@ -312,13 +293,11 @@ class MRNF(Budgeted):
         values = refinement.gaussians.values
         remaining = max(0.0, 1 - refinement.step / self.decay_until)
         opacities = values.opacities - self.opacity_decay * remaining
-        margin = max(
-            MIN_DECAYED, torch.finfo(opacities.dtype).eps
-        )  # in float32, 1 - 1e-12 would be 1: an infinite logit
+        # in float32, 1 - 1e-12 would be 1: an infinite logit
+        margin = max(MIN_DECAYED, torch.finfo(opacities.dtype).eps)
         values.opacity_logits.copy_(torch.logit(opacities.clamp(MIN_DECAYED, 1 - margin)))
-        values.log_scales.add_(math.log(1 - self.scale_decay * remaining)).clamp_min_(
-            math.log(MIN_DECAYED)
-        )
+        shrink = math.log(1 - self.scale_decay * remaining)
+        values.log_scales.add_(shrink).clamp_min_(math.log(MIN_DECAYED))
 
     @torch.no_grad()
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
@@ -326,9 +305,8 @@ class MRNF(Budgeted):
             return
         values, seen = gaussians.values, self.statistics["seen"]
         _, _, size = bounds(values.means)
-        weight = (1 - values.opacities).pow(NOISE_POWER) * (
-            self.noise_rate * gaussians.position_rate
-        )  # [N]
+        rate = self.noise_rate * gaussians.position_rate
+        weight = (1 - values.opacities).pow(NOISE_POWER) * rate  # [N]
         noise = standard_normal((len(gaussians), 3), rng, values.means) * weight.unsqueeze(-1)
         values.means += torch.where(seen.unsqueeze(-1), noise.clamp(-size, size), 0.0)
 

@@ -79,9 +79,8 @@ class FastGS(AbsGS):
         for index in indices:
             render = views.render(index, values, refinement.step)
             bad = error_map(render.image, views.image(index)) > self.error_threshold
-            counts = render.require_footprint(
-                bad.to(render.image)
-            ).values  # [N] bad pixels that each is blended into
+            # [N] bad pixels that each is blended into
+            counts = render.require_footprint(bad.to(render.image)).values
             total += counts
             weighted += views.loss(index, render.image) * counts
         self.statistics["count"] = (total / len(indices)).floor().float()
@@ -93,19 +92,12 @@ class FastGS(AbsGS):
 
     def prune(self, refinement: Refinement) -> None:
         """Remove some of the faint and huge Gaussians, more likely those with high scores."""
-        values, score = refinement.gaussians.values, self.statistics["score"]
-        faint = self.faint(values.opacity_logits)
-        huge = self.huge(refinement.step, values.log_scales)
+        score, event = self.statistics["score"], refinement.event
         # Only Gaussians from before the round have a score. They come first, without the removed
         # split parents.
-        split_parents = refinement.event.split_gradient // (self.split_children - 1)
-        scored = (
-            torch.arange(len(score), device=score.device) < refinement.event.before - split_parents
-        )
-        drawn = draw(
-            scored, 1 / (MIN_DIVISOR + 1 - score), int((faint | huge).sum()) // 2, refinement.rng
-        )
-        self.remove(refinement, faint & drawn, huge & drawn)
+        known = event.before - event.split_gradient // (self.split_children - 1)
+        scored = torch.arange(len(score), device=score.device) < known
+        self.prune_drawn(refinement, scored, 1 / (MIN_DIVISOR + 1 - score))
 
     def prune_finally(self, refinement: Refinement) -> None:
         """Remove Gaussians below ``final_opacity`` or above ``final_score``."""
@@ -207,9 +199,5 @@ class Taming(ADC):
         """Remove some of the faint and huge Gaussians, more likely those with low scores."""
         if refinement.step // self.interval - self.start // self.interval > self.prune_rounds:
             return
-        values, score = refinement.gaussians.values, self.statistics["score"]
-        faint = self.faint(values.opacity_logits)
-        huge = self.huge(refinement.step, values.log_scales)
-        budget = int((faint | huge).sum()) // 2
-        drawn = draw(score > 0, 1 / score, budget, refinement.rng)
-        self.remove(refinement, faint & drawn, huge & drawn)
+        score = self.statistics["score"]
+        self.prune_drawn(refinement, score > 0, 1 / score)

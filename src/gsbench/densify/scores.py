@@ -1,6 +1,7 @@
 """Scores of Gaussians, sums over pixels of training views; and random draws by score."""
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Protocol
 
 import torch
@@ -73,13 +74,14 @@ def edge_map(image: Tensor) -> Tensor:
     Pillow's FIND_EDGES, except that the outermost pixels are 0 here.
     """
     rgb = image.to(torch.int32)
-    luma = (
-        rgb[..., 0] * LUMINANCE[0] + rgb[..., 1] * LUMINANCE[1] + rgb[..., 2] * LUMINANCE[2] + HALF
-    ) >> SHIFT
+    red, green, blue = LUMINANCE
+    sums = rgb[..., 0] * red + rgb[..., 1] * green + rgb[..., 2] * blue
+    luma = (sums + HALF) >> SHIFT
     edges = torch.zeros_like(luma)
     height, width = luma.shape
-    # 3 x 3 pixels
-    block = sum(luma[y : height - 2 + y, x : width - 2 + x] for y in range(3) for x in range(3))
+    block = torch.zeros_like(luma[1:-1, 1:-1])  # sums of 3 x 3 pixels
+    for y, x in product(range(3), repeat=2):
+        block += luma[y : height - 2 + y, x : width - 2 + x]
     edges[1:-1, 1:-1] = (9 * luma[1:-1, 1:-1] - block).clamp(0, 255)
     return to_unit_range(edges.float())
 
@@ -150,10 +152,8 @@ def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -
     device.
     """
     index = candidates.nonzero().squeeze(-1).cpu()  # [C]
-    keys = (
-        torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)
-        / scores.detach().cpu()[index]
-    )
+    times = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)
+    keys = times / scores.detach().cpu()[index]
     drawn = torch.zeros(len(candidates), dtype=torch.bool)
     drawn[index[torch.sort(keys, stable=True).indices[: max(count, 0)]]] = True
     return drawn.to(candidates.device)

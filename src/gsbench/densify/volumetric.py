@@ -186,9 +186,7 @@ class Volumetric(ADC):
         children = self.child_log_scales(log_scales)  # [N, 3]
         candidates = self.selected_by_volume(log_scales)
         selected, blocked = admit(candidates, volumes, self.volume_gain, self.allowance(refinement))
-        split_again = (
-            log_volume(children) > threshold
-        )  # [N] the next round would select the children, too
+        split_again = log_volume(children) > threshold  # [N] the next round would take them, too
         vanishing = children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent)  # [N]
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked
@@ -206,9 +204,8 @@ class Volumetric(ADC):
 
     def log_threshold(self, volumes: Tensor) -> float:
         """log V_th for Gaussians with log volumes [N], ``strictness`` of the governor included."""
-        return self._ungoverned_log_threshold(volumes) + self.governor_dimension * math.log(
-            self.strictness
-        )
+        governed = self.governor_dimension * math.log(self.strictness)
+        return self._ungoverned_log_threshold(volumes) + governed
 
     def _ungoverned_log_threshold(self, volumes: Tensor) -> float:
         if self.threshold_mode == "absolute":

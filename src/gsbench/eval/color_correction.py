@@ -25,15 +25,9 @@ def color_corrected(image: Tensor, truth: Tensor, mask: Tensor | None = None) ->
     clipped, and if the photograph's channel is not. This is done five times, each on the last
     result.
     """
-    corrected, goal = (
-        in_double_precision(image).reshape(-1, 3),
-        in_double_precision(truth).reshape(-1, 3),
-    )  # [P, 3]
-    counted = (
-        torch.ones(len(goal), dtype=torch.bool, device=goal.device)
-        if mask is None
-        else mask.reshape(-1)
-    )
+    corrected = in_double_precision(image).reshape(-1, 3)  # [P, 3]
+    goal = in_double_precision(truth).reshape(-1, 3)  # [P, 3]
+    counted = torch.ones_like(goal[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
     for _ in range(ROUNDS):
         inputs = torch.cat([corrected, torch.ones_like(corrected[:, :1])], dim=1)  # [P, 4]
         is_inside = counted & _unclipped(corrected).all(dim=1)

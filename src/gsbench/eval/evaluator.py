@@ -28,7 +28,7 @@ from gsbench.eval.facts import (
     further_keys,
     lpips_variants,
 )
-from gsbench.eval.images import as_unit_range, in_double_precision, replace_ignored
+from gsbench.eval.images import as_batch, as_unit_range, in_double_precision, replace_ignored
 from gsbench.eval.lpips import Lpips, load_lpips
 from gsbench.eval.metric import MaskedMetric, Metric, UnavailableError
 from gsbench.eval.metrics import flip, flip_map, psnr
@@ -45,9 +45,8 @@ class MetricContext:
     device: torch.device
     weights: Path | None = None
     download: bool = True
-    networks: dict[str, Lpips | MissingWeightsError] = field(
-        default_factory=dict, repr=False
-    )  # LPIPS, each loaded once
+    # LPIPS, each loaded once
+    networks: dict[str, Lpips | MissingWeightsError] = field(default_factory=dict, repr=False)
 
     def network(self, net: str) -> Lpips:
         """The LPIPS network ``net``; raises UnavailableError if its weights are missing."""
@@ -100,9 +99,7 @@ class LpipsMetric:
 
     def measure(self, image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
         _require_size(image, self._network.backbone.min_size)
-        first, second = (
-            x.permute(2, 0, 1).unsqueeze(0) for x in (image, truth)
-        )  # [1, 3, H, W] each
+        first, second = as_batch(image), as_batch(truth)  # [1, 3, H, W] each
         if not self._raw:
             first, second = 2 * first - 1, 2 * second - 1
         return float(self._network(first, second, mask))
@@ -219,11 +216,8 @@ class Evaluator:
         self.more = tuple(sorted(more))
         self.own = {name: facts_of(name, metric) for name, metric in extra.items()}
         wanted = {f"{LPIPS}{variant}" for variant in (variants if lpips is None else lpips)}
-        wanted |= (
-            {facts.key for facts in METRICS if not facts.setting}
-            | ({"flip"} if flip else set())
-            | set(more)
-        )
+        wanted |= {facts.key for facts in METRICS if not facts.setting}
+        wanted |= {*more, *(["flip"] if flip else [])}
         context = MetricContext(protocol, self.device, weights, download)
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
@@ -336,7 +330,6 @@ def summarize(
     if not per_view:
         return {}
     views = list(per_view.values())
-    shared = [
-        key for key in views[0] if key not in unavailable and all(key in view for view in views)
-    ]
+    everywhere = [key for key in views[0] if all(key in view for view in views)]
+    shared = [key for key in everywhere if key not in unavailable]
     return {key: float(np.mean([view[key] for view in views])) for key in shared}

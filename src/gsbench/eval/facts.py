@@ -44,6 +44,13 @@ def _lpips(variant: str, label: str, words: str) -> MetricFacts:
     return MetricFacts(f"{LPIPS}{variant}", label, -1, 3, "", 0.005, "eval.lpips", 0.0, words=words)
 
 
+def _bounded(
+    key: str, label: str, direction: Literal[-1, 1], lowest: float, setting: str, words: str
+) -> MetricFacts:
+    """A metric of at most 1 whose differences count from 0.005 on."""
+    return MetricFacts(key, label, direction, 3, "", 0.005, setting, lowest, 1.0, words)
+
+
 def _structural(
     key: str, label: str, direction: Literal[-1, 1], highest: float, words: str
 ) -> MetricFacts:
@@ -57,48 +64,21 @@ CORRECTED = "_cc"
 
 def _corrected(facts: MetricFacts) -> MetricFacts:
     """``facts`` of the same metric after the correction, computed if ``eval.more`` names it."""
+    words = f"{facts.label} after a correction of the colours"
     key, label = f"{facts.key}{CORRECTED}", f"{facts.label} cc"
-    return replace(
-        facts,
-        key=key,
-        label=label,
-        setting=MORE,
-        words=f"{facts.label} after a correction of the colours",
-    )
+    return replace(facts, key=key, label=label, setting=MORE, words=words)
 
 
 _PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
     MetricFacts(
         "psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"
     ),
-    MetricFacts(
-        "ssim",
-        "SSIM",
-        1,
-        3,
-        "",
-        0.005,
-        "",
-        -1.0,
-        1.0,
-        "means, contrast and structure in windows of 11 px",
-    ),
+    _bounded("ssim", "SSIM", 1, -1.0, "", "means, contrast and structure in windows of 11 px"),
     _lpips("vgg_raw", "LPIPS VGG raw", "distance of what vgg sees, fed [0, 1]"),
     _lpips("vgg", "LPIPS VGG", "distance of what vgg sees"),
     _lpips("alex", "LPIPS Alex", "distance of what alex sees"),
     _lpips("squeeze", "LPIPS Squeeze", "distance of what squeeze sees"),
-    MetricFacts(
-        "flip",
-        "FLIP",
-        -1,
-        3,
-        "",
-        0.005,
-        "eval.flip",
-        0.0,
-        1.0,
-        "difference one sees when two images alternate",
-    ),
+    _bounded("flip", "FLIP", -1, 0.0, "eval.flip", "difference one sees when two images alternate"),
     _structural("ms_ssim", "MS-SSIM", 1, 1.0, "SSIM's structure at five scales"),
     _structural(
         "iw_ssim", "IW-SSIM", 1, 1.0, "the same, weighted by the information that a place carries"
@@ -113,28 +93,12 @@ _CORRECTED = tuple(
     for facts in _PLAIN
     if facts.key in ("psnr", "ssim") or facts.key.startswith(LPIPS)
 )
-GAIN = MetricFacts(
-    "cc_gain",
-    "gain by cc",
-    0,
-    2,
-    "dB",
-    setting=MORE,
-    words="what the correction of the colours adds to PSNR",
-)
+_ADDED = "what the correction of the colours adds to PSNR"
+GAIN = MetricFacts("cc_gain", "gain by cc", 0, 2, "dB", setting=MORE, words=_ADDED)
 METRICS = (*_PLAIN, *_CORRECTED, GAIN)
 # A fact about the trained model instead of its pictures, measured separately in the evaluation.
-FPS = MetricFacts(
-    "fps",
-    "speed",
-    1,
-    2,
-    "frames/s",
-    None,
-    "eval.fps",
-    0.0,
-    words="renders of the test views at one size",
-)
+_RENDERS = "renders of the test views at one size"
+FPS = MetricFacts("fps", "speed", 1, 2, "frames/s", None, "eval.fps", 0.0, words=_RENDERS)
 ALL = (*METRICS, FPS)  # in the order of tables
 
 
@@ -145,9 +109,8 @@ def known_keys() -> tuple[str, ...]:
 
 def lpips_variants() -> tuple[str, ...]:
     """The values allowed in ``eval.lpips``."""
-    return tuple(
-        facts.key.removeprefix(LPIPS) for facts in METRICS if facts.setting == "eval.lpips"
-    )
+    own = [facts.key for facts in METRICS if facts.setting == "eval.lpips"]
+    return tuple(key.removeprefix(LPIPS) for key in own)
 
 
 def further_keys() -> tuple[str, ...]:

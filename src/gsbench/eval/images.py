@@ -87,9 +87,8 @@ def gradient_magnitude(images: Tensor, smoothing: tuple[float, float, float]) ->
 
     Gradients are central differences, smoothed in the other direction by three weights.
     """
-    horizontal = images.new_tensor(smoothing).unsqueeze(1) * images.new_tensor(
-        [-1.0, 0.0, 1.0]
-    )  # [3, 3]
+    difference = images.new_tensor([-1.0, 0.0, 1.0])
+    horizontal = images.new_tensor(smoothing).unsqueeze(1) * difference  # [3, 3]
     kernels = torch.stack([horizontal, horizontal.T]).unsqueeze(1)  # [2, 1, 3, 3]
     gradient = torch.nn.functional.conv2d(images, kernels, padding=1)  # [B, 2, H, W]
     return gradient.square().sum(dim=1, keepdim=True).sqrt()

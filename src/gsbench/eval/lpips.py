@@ -46,9 +46,8 @@ class Fire(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         squeezed = self.squeeze(x).relu_()
-        return torch.cat(
-            [self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1
-        ).relu_()  # [B, 2 * expanded, H, W]
+        both = torch.cat([self.expand1x1(squeezed), self.expand3x3(squeezed)], dim=1)
+        return both.relu_()  # [B, 2 * expanded, H, W]
 
 
 def _convolution(
@@ -181,9 +180,8 @@ class Lpips:
         load_features(stack, features, f"lpips {net}")
         last = max(self.backbone.taps)
         self._layers = stack[: last + 1].requires_grad_(False).eval().to(device)
-        self._heads = [
-            head.to(device) for head in _head_weights(self.backbone, heads, net)
-        ]  # [C] each
+        own = _head_weights(self.backbone, heads, net)
+        self._heads = [head.to(device) for head in own]  # [C] each
         self._shift = torch.tensor(SHIFT, device=device).view(1, 3, 1, 1)
         self._scale = torch.tensor(SCALE, device=device).view(1, 3, 1, 1)
         self.device = torch.device(device)
@@ -207,12 +205,10 @@ class Lpips:
             raise ValueError(
                 f"lpips {self.net} needs sides of at least {self.backbone.min_size} px"
             )
-        weights = (
-            None if mask is None else mask.to(self.device, torch.float32)[None, None]
-        )  # [1, 1, H, W]
-        return torch.stack(
-            [self._pair(a[None], b[None], weights) for a, b in zip(first, second, strict=True)]
-        )  # [B]
+        # [1, 1, H, W]
+        weights = None if mask is None else mask.to(self.device, torch.float32)[None, None]
+        pairs = zip(first.split(1), second.split(1), strict=True)
+        return torch.stack([self._pair(a, b, weights) for a, b in pairs])  # [B]
 
     def _pair(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
         """The distance [] of two images [1, 3, H, W]."""
@@ -228,10 +224,8 @@ class Lpips:
             first, second = layer(first), layer(second)  # [1, C, h, w] each
             if index in self.backbone.taps:
                 size = first.shape[2], first.shape[3]
-                layer_weights = (
-                    None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]
-                )  # [h, w]
-                total = total + _feature_distance(first, second, next(heads), layer_weights)
+                own = None if weights is None else F.adaptive_avg_pool2d(weights, size)[0, 0]
+                total = total + _feature_distance(first, second, next(heads), own)
         return total
 
 
@@ -276,14 +270,10 @@ def _feature_distance(
         )
         distances = ((first - second).square()[0] * head[:, None, None]).sum(dim=0)  # [h, w]
         return (distances * weights).sum().double() / weights.sum().double()
-    total = torch.zeros(
-        (),
-        dtype=torch.float64 if first.device.type == "cpu" else torch.float32,
-        device=first.device,
-    )
-    for a, b in zip(
-        first[0].split(ROWS_AT_A_TIME, dim=1), second[0].split(ROWS_AT_A_TIME, dim=1), strict=True
-    ):
+    on_cpu = first.device.type == "cpu"
+    total = first.new_zeros((), dtype=torch.float64 if on_cpu else torch.float32)
+    rows = (x[0].split(ROWS_AT_A_TIME, dim=1) for x in (first, second))
+    for a, b in zip(*rows, strict=True):
         a = a / (a.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
         b = b / (b.square().sum(dim=0).sqrt() + NORM_EPSILON)  # [C, rows, w]
         per_channel = (a - b).square().sum(dim=(1, 2))  # [C]

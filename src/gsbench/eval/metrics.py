@@ -42,18 +42,16 @@ def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     """
     check_pair(image, target)
     pairs = zip(*(as_batch(x).permute(0, 2, 3, 1) for x in (image, target)), strict=True)
-    values = torch.tensor(
-        [_mean_and_errors(x, y, ppd)[0] for x, y in pairs], device=image.device
-    )  # [B]
+    means = [_mean_and_errors(x, y, ppd)[0] for x, y in pairs]
+    values = torch.tensor(means, device=image.device)  # [B]
     return values[0] if image.ndim == 3 else values
 
 
 def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     """The FLIP error of every pixel, [H, W], of images [H, W, 3]; otherwise as `flip`."""
     check_pair(image, target)
-    return torch.as_tensor(_mean_and_errors(image, target, ppd)[1], device=image.device).reshape(
-        image.shape[:2]
-    )
+    _, errors = _mean_and_errors(image, target, ppd)
+    return torch.as_tensor(errors, device=image.device).reshape(image.shape[:2])
 
 
 def _mean_and_errors(image: Tensor, target: Tensor, ppd: float) -> tuple[float, Any]:

@@ -143,9 +143,8 @@ def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Te
     moments = F.avg_pool2d(
         torch.cat([band, target_band, band**2, target_band**2, band * target_band]), BLOCK, 1
     )
-    mean, target_mean, square, target_square, product = (
-        moments[:, 0].flatten(1).unsqueeze(-1)
-    )  # [P, 1] each
+    # [P, 1] each
+    mean, target_mean, square, target_square, product = moments[:, 0].flatten(1).unsqueeze(-1)
     variance = (square - mean**2).clamp_min(0)
     target_variance = (target_square - target_mean**2).clamp_min(0)
     covariance = product - mean * target_mean
@@ -153,9 +152,8 @@ def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Te
     gain = torch.where(flat | target_flat, 0.0, covariance / target_variance.clamp_min(FLAT))
     noise = torch.where(target_flat, variance, variance - gain * covariance)
     noise = torch.where(flat, 0.0, noise)
-    signal = (noise + (1 + gain**2) * EYE_NOISE) * factor * variances[
-        kept
-    ] + EYE_NOISE * noise  # [P, K']
+    # [P, K']
+    signal = (noise + (1 + gain**2) * EYE_NOISE) * factor * variances[kept] + EYE_NOISE * noise
     height, width = target_band.shape[-2] - BLOCK + 1, target_band.shape[-1] - BLOCK + 1
     return torch.log2(1 + signal / EYE_NOISE**2).sum(dim=1).view(height, width)
 
@@ -212,10 +210,7 @@ def fsim(image: Tensor, target: Tensor) -> Tensor:
     check_size(x, FSIM_MIN_SIZE, "FSIM")
     shrink = max(1, math.floor(min(x.shape[-2:]) / SIDE + 0.5))
     x, y = F.avg_pool2d(x, shrink), F.avg_pool2d(y, shrink)
-    light_x, light_y = (
-        mix_channels(x, LUMA),
-        mix_channels(y, LUMA),
-    )  # [B, 1, h, w], as all maps below
+    light_x, light_y = mix_channels(x, LUMA), mix_channels(y, LUMA)  # [B, 1, h, w], as all below
     phase_x, phase_y = phase_congruency(light_x), phase_congruency(light_y)
     contrast = similarity(
         gradient_magnitude(light_x, SCHARR), gradient_magnitude(light_y, SCHARR), T_GRADIENT
@@ -251,9 +246,8 @@ def phase_congruency(luminance: Tensor) -> Tensor:
 
 def _noise(finest: Tensor, filters: Tensor) -> Tensor:
     """The energy [B, O, 1, 1] of noise alone, from the finest responses [B, O, H, W]."""
-    median = (
-        finest.abs().square().flatten(2).median(dim=2).values
-    )  # [B, O]; chi-squared with 2 degrees of freedom
+    # [B, O]; chi-squared with 2 degrees of freedom
+    median = finest.abs().square().flatten(2).median(dim=2).values
     power = median / math.log(2) / filters[:, 0].square().sum(dim=(1, 2))
     even = torch.fft.ifft2(filters.sum(dim=1)).real  # [O, H, W], the filters in space
     area = even.shape[1] * even.shape[2]
@@ -277,10 +271,8 @@ def _log_gabor_filters(images: Tensor) -> Tensor:
     radial = []
     for scale in range(WAVES):
         frequency = 1 / (SHORTEST_WAVE * WAVE_STEP**scale)
-        passed = (
-            torch.exp(-((radius / frequency).log() ** 2) / (2 * math.log(BANDWIDTH) ** 2))
-            * low_pass
-        )
+        octaves = (radius / frequency).log() ** 2
+        passed = torch.exp(-octaves / (2 * math.log(BANDWIDTH) ** 2)) * low_pass
         passed[0, 0] = 0
         radial.append(passed)
     angular = []

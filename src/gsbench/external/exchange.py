@@ -85,6 +85,7 @@ def collect_model(
     Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
     files = _files(output, pattern)
+    # A program may leave a model for each checkpoint; a guess would measure the wrong one.
     if len(files) > 1:
         raise TrainingError(
             f"{counted(len(files), 'file')} fit densify.result ({_named(files, output)}): it must "

@@ -67,6 +67,8 @@ def watch(
     """
     started = time.monotonic()
     program = subprocess.Popen(command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL)
+    # The operating system tells a peak of single processes only, and programs have children: the
+    # sum is looked at again and again.
     pause, peak = FIRST_LOOK, 0.0
     while limit is None or time.monotonic() - started < limit:
         peak = max(peak, resident_memory_mb(program.pid))

@@ -153,6 +153,7 @@ class External:
                     f"densify.options.{name}: an option is one value with a name of its own, none "
                     f"of {', '.join(PLACEHOLDERS)}"
                 )
+        # An option's value may make a pattern lead out of the folder: it is checked as filled in.
         examples = dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/")
         pattern = fill_placeholders(self.result, examples | self.options, "densify.result")
         check_pattern(pattern)

@@ -97,28 +97,29 @@ def quaternion_to_matrix(quaternions: Tensor) -> Tensor:
     return torch.stack(rows, -2)
 
 
-C0 = math.sqrt(1 / (4 * math.pi))  # 0.28209479177387814
-C1 = math.sqrt(3 / (4 * math.pi))
-C2 = (  # xy, yz, 3z^2 - 1, xz, x^2 - y^2
-    math.sqrt(15 / (4 * math.pi)),
-    -math.sqrt(15 / (4 * math.pi)),
-    math.sqrt(5 / (16 * math.pi)),
-    -math.sqrt(15 / (4 * math.pi)),
-    math.sqrt(15 / (16 * math.pi)),
-)
+def _factor(numerator: int, denominator: int) -> float:
+    """A factor of the real spherical harmonics: the root of a fraction over pi."""
+    return math.sqrt(numerator / (denominator * math.pi))
+
+
+C0 = _factor(1, 4)  # 0.28209479177387814
+C1 = _factor(3, 4)
+# of xy, yz, 3z^2 - 1, xz, x^2 - y^2
+C2 = (_factor(15, 4), -_factor(15, 4), _factor(5, 16), -_factor(15, 4), _factor(15, 16))
 C3 = (
-    -math.sqrt(35 / (32 * math.pi)),
-    math.sqrt(105 / (4 * math.pi)),
-    -math.sqrt(21 / (32 * math.pi)),
-    math.sqrt(7 / (16 * math.pi)),
-    -math.sqrt(21 / (32 * math.pi)),
-    math.sqrt(105 / (16 * math.pi)),
-    -math.sqrt(35 / (32 * math.pi)),
+    -_factor(35, 32),
+    _factor(105, 4),
+    -_factor(21, 32),
+    _factor(7, 16),
+    -_factor(21, 32),
+    _factor(105, 16),
+    -_factor(35, 32),
 )
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics to ``degree`` at unit ``directions`` [N, 3]: [N, (degree + 1)^2]."""
+    # Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2, with the signs of 3DGS's code
     x, y, z = directions.unbind(-1)  # each [N]
     terms = [torch.full_like(x, C0)]
     if degree >= 1:

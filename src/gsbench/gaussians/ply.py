@@ -33,7 +33,7 @@ COLUMNS = (
     + [f"rot_{i}" for i in range(4)]
 )
 
-# what damage to a file makes plyfile and numpy raise; OverflowError is no ValueError
+# raised by plyfile and numpy for a damaged file; OverflowError is no ValueError
 DAMAGE = (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError)
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))

@@ -186,6 +186,8 @@ def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
     beta1, beta2 = ADAM_BETAS
     state.step += 1
     step, gradient = float(state.step), parameter.grad[index]
+    # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
+    # m' = m / (1 - b1^step), v' = v / (1 - b2^step); eps outside the root, as torch has it
     first = state.first[index].lerp_(gradient, 1 - beta1)
     second = state.second[index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     state.first[index], state.second[index] = first, second

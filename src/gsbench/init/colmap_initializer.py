@@ -135,6 +135,7 @@ def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
 
     from gsbench.init.colmap import database, mapping, reconstruct
 
+    # COLMAP writes a line for each image; the log is for what goes wrong
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     initializer, capture = job.initializer, job.capture
     timer = Timer(dict(job.preparation.seconds))
@@ -147,6 +148,7 @@ def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
             f"{initializer.name}: no pair of images shares enough matches: the photos need more "
             "overlap or texture"
         )
+    # not to be continued where an interrupted run left it
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     mapped = points = None

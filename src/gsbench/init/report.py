@@ -20,8 +20,9 @@ from gsbench.init.base import (
     InitReport,
 )
 from gsbench.init.colmap.alignment import measure_gauge, training_extent
-from gsbench.init.colmap.reconstruct import poses_by_name, save_reconstruction
+from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.init.picture import draw_cloud
+from gsbench.scene.colmap import save_model
 from gsbench.scene.types import Capture
 
 # correct models stay below 0.5; wrong ones that register every image reach 20 and more
@@ -67,7 +68,7 @@ def make_report(
 
 def write_result(model: pycolmap.Reconstruction, report: InitReport, output_dir: Path) -> None:
     """Write model, report and picture where `gsbench.init.base.Initializer` promises them."""
-    save_reconstruction(model, output_dir / MODEL_FOLDER)
+    save_model(model, output_dir / MODEL_FOLDER)
     title = (
         f"{report.init}, {report.poses} poses: {report.num_points:,} points, "
         f"{report.num_registered} cameras"

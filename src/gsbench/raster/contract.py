@@ -235,7 +235,8 @@ def _compare(
         row, column = divmod(index // pixel_size, case.width)
         place = f"pixel ({column}, {row})"
     else:
-        place = f"Gaussian {index // max(1, off[0].numel())}"
+        numbers = off.numel() // max(1, case.count) or 1  # of each Gaussian; 1 without a gradient
+        place = f"Gaussian {index // numbers}"
     scale = max(float(reference.abs().max()), 1e-30) if relative else 1.0
     return Error(str(case), quantity, float(off.max()) / scale, limit, place, unit)
 

@@ -58,6 +58,7 @@ from gsbench.system.resources import available_threads
 from gsbench.view.trials import find_trial
 from gsbench.words import counted, did_you_mean, some_of
 
+PerView = Mapping[str, Mapping[str, float]]  # values by metric, by view
 # groups of the configuration that apply to renders too
 KEPT_GROUPS = ("scene", "eval", "tracking", "launch")
 CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
@@ -178,7 +179,7 @@ def _lines(
     truth: ReferenceImages,
     evaluator: Evaluator,
     matching: Matching,
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     folder: Path | None,
 ) -> list[str]:
     metrics = summarize(per_view, evaluator.unavailable)
@@ -205,7 +206,7 @@ def _lines(
 def _as_dict(
     evaluator: Evaluator,
     matching: Matching,
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     folder: Path | None,
 ) -> dict[str, Any]:
     return {
@@ -318,6 +319,7 @@ def find_destination(
     scene_name = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
+    # on file systems without capitals, "Store" is "store"
     if experiment.casefold() in IN_RUNS:
         raise InputError(
             f"--as {word}: {experiment} is gsbench's own folder of {runs}: name an experiment"
@@ -337,7 +339,7 @@ def find_destination(
     if not dash:
         init, name = truth.init or "", arm
         trials = _trials(runs / experiment, scene_name)
-        # what gsbench trained comes before what came from renders
+        # the trials that gsbench trained come before those made of renders
         trained = [trial for trial in trials if not trial.from_renders]
         inits = sorted({trial.init for trial in trained or trials})
         if len(inits) > 1:
@@ -352,6 +354,7 @@ def find_destination(
 def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
     """Raise `InputError` if the experiment tests the scene on other photographs."""
     for trial in _trials(runs / destination.experiment, destination.scene):
+        # Numbers of other photographs, or of another size, are no answer to the same question.
         conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:
@@ -367,7 +370,7 @@ def import_trial(
     destination: Destination,
     truth: ReferenceImages,
     pairs: Sequence[PicturePair],
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     evaluator: Evaluator,
     source: Mapping[str, str],
     runs: Path,
@@ -383,6 +386,7 @@ def import_trial(
     name = f"{destination.init}-{destination.densify}"
     arm = runs / destination.experiment / destination.scene / name
     folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
+    # Two trainings with one seed would count as one pair in every comparison.
     if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
         raise InputError(
             f"seed {destination.seed} of {name} on {destination.scene} is taken ({taken[0]}): "
@@ -409,7 +413,7 @@ def _results(
     destination: Destination,
     truth: ReferenceImages,
     identity: str,
-    per_view: Mapping[str, Mapping[str, float]],
+    per_view: PerView,
     evaluator: Evaluator,
     source: Mapping[str, str],
 ) -> TrialRecord:

@@ -21,7 +21,7 @@ RENDERED, PHOTOGRAPHS = "color", "gt-color"
 # Archives may come from strangers: this stops one that unpacks to far more than test views need.
 MAX_TOTAL_BYTES = 20 << 30
 CHUNK = 1 << 20
-# what the two libraries raise for damaged, encrypted or foreign archives
+# raised by the two libraries for damaged, encrypted or foreign archives
 DAMAGE = (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError)
 
 
@@ -81,6 +81,7 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
             continue
         inside = PurePosixPath(name.removeprefix(home))
         if inside.parts[:1] in ((RENDERED,), (PHOTOGRAPHS,)) and inside.suffix == ".png":
+            # a name may lead out of the folder, by dots or, on Windows, by backslashes
             if ".." in inside.parts or "\\" in name:
                 raise InputError(f"{archive}: {name!r} leads out of the archive")
             wanted[name] = str(inside)
@@ -115,6 +116,7 @@ def _write(source: IO[bytes], target: Path, size: int) -> None:
     with target.open("wb") as file:
         while piece := source.read(CHUNK):
             written += len(piece)
+            # A small number in the directory of an archive may hide gigabytes.
             if written > size:
                 break
             file.write(piece)

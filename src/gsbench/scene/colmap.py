@@ -36,6 +36,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         for image in model.images.values():
             if image.has_pose and not np.isfinite(image.cam_from_world().matrix()).all():
                 raise ValueError(f"image {image.name} has no finite pose")
+    # raised by pycolmap for files that passed the check and yet are damaged
     except (ValueError, IndexError, RuntimeError, TypeError, MemoryError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(
@@ -95,11 +96,16 @@ def normalize_capture(capture: Capture, folder: Path) -> Capture:
         return capture
     model = read_model(capture.model)
     normalize_model(model, normalization)
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
+    save_model(model, folder)
     return replace(
         capture, model=folder, normalization=normalization, advised_normalization=IDENTITY
     )
+
+
+def save_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write ``model`` in COLMAP's binary format."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
 
 
 def normalize_model(
@@ -134,6 +140,8 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     model = read_model(capture.model)
     names = match_names(registered_names(model), capture.image_names)
     fitted = pycolmap.Reconstruction()
+    # The files of one camera may have several sizes, as where some were shrunk: then each
+    # size gets a camera, and the first one keeps the id.
     next_camera_id = max(model.cameras, default=0) + 1
     camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
     kept: set[int] = set()
@@ -275,8 +283,7 @@ def write_frames(
         model.add_image_with_trivial_frame(image, pose)
     for point, color in zip(*cloud, strict=True) if cloud is not None else ():
         model.add_point3D(point, pycolmap.Track(), color)
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
+    save_model(model, folder)
 
 
 def _copy_points(

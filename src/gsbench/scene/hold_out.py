@@ -88,13 +88,19 @@ def along_principal_axis(centers: Array) -> Array:
     return -coordinates if coordinates[np.argmax(off_center)] > 0.0 else coordinates
 
 
+def _forwards(cameras: Sequence[Camera]) -> Array:
+    return np.array([camera.rotation[2] for camera in cameras])
+
+
 def point_looked_at(cameras: Sequence[Camera], centers: Array) -> Array | None:
     """The point [3] nearest to all viewing axes in least squares; None if they are parallel."""
-    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
+    forwards = _forwards(cameras)  # [V, 3]
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V, 3, 3]
     normal = across.mean(axis=0)
     if float(np.linalg.eigvalsh(normal)[0]) < PARALLEL:
         return None
+    # The sum over cameras of |P (p - c)|^2, where P takes away what lies along a viewing axis, is
+    # least where (mean P) p = mean (P c).
     solution: Array = np.linalg.solve(normal, (across @ centers[:, :, None]).mean(axis=0)[:, 0])
     return solution
 
@@ -116,7 +122,7 @@ def _azimuths(cameras: Sequence[Camera], centers: Array) -> tuple[Array | None, 
     center = point_looked_at(cameras, centers)
     if center is None:
         return None, "the cameras look in one direction"
-    forwards = np.array([camera.rotation[2] for camera in cameras])  # [V, 3]
+    forwards = _forwards(cameras)  # [V, 3]
     facing = float((((center - centers) * forwards).sum(axis=1) > 0).mean())
     if facing < FACING:
         return None, f"the cameras do not look at one place; {facing:.0%} do"
@@ -153,19 +159,16 @@ def split_names(
 ) -> tuple[list[str], list[str]]:
     """Split sorted names into (training, test).
 
-    Every ``test_every``-th name from the first is a test view; ``test_every=0`` holds out none.
-    Explicit lists replace this rule. If only one list is given, the other side gets all other
-    names. If both are given, names in neither list are dropped.
+    Every ``test_every``-th name from the first is a test view. Explicit lists replace this rule. If
+    only one list is given, the other side gets all other names. If both are given, names in neither
+    list are dropped.
 
-    Raises `InputError` if there is no training view, or no test view although ``test_every`` is not
-    0.
+    Raises `InputError` if there is no training view or no test view.
     """
-    if test_every < 0:
-        raise InputError(
-            f"scene.test_every must be 0 (no test views) or positive, got {test_every}"
-        )
+    if test_every < 1:
+        raise InputError(f"scene.test_every must be positive, got {test_every}")
     if train is None and test is None:
-        held_out = set(names[::test_every]) if test_every else set()
+        held_out = set(names[::test_every])
     elif test is None:
         held_out = set(names) - set(train or ())
     else:
@@ -183,11 +186,8 @@ def split_names(
             f"the split leaves no training view of {len(names)}: raise scene.test_every or "
             "correct the lists"
         )
-    if not testing and test_every:
-        raise InputError(
-            f"the split leaves no test view of {len(names)}: correct the lists, or give "
-            "scene.test_every=0"
-        )
+    if not testing:
+        raise InputError(f"the split leaves no test view of {len(names)}: correct the lists")
     return training, testing
 
 
@@ -238,7 +238,7 @@ def _divide(
         description = "by lists"
     elif rule.split != "sector" and matched is None:
         train, test = split_names(names, rule.test_every)
-        description = f"every {rule.test_every}th image" if rule.test_every else "none"
+        description = f"every {rule.test_every}th image"
     else:
         if rule.split == "sector":
             chosen, description = _sector(names, rule, matched, cameras)

@@ -256,6 +256,7 @@ def _make_capture(
     if train is not None and test is not None:
         names = sorted({*train, *test})
     held_out = hold_out(select_images(names, max_images), split, (train, test), cameras)
+    # A test view that is trained on under another name would measure memory.
     copies = copies_of_test_views(folder, held_out.train, held_out.test)
     report_left_out(folder, copies, "with the content of a test view")
     kept = tuple(sorted({*held_out.train, *held_out.test} - set(copies)))

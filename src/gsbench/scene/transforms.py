@@ -40,6 +40,7 @@ from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 Row = Annotated[list[Number], Len(4, 4)]
+Optional = Number | None
 Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
 
 ONE_FILE = "transforms.json"
@@ -65,24 +66,24 @@ class Intrinsics(Record):
 
     camera_model: str | None = None
     is_fisheye: bool | None = None  # instant-ngp's key for OPENCV_FISHEYE
-    w: Number | None = None
-    h: Number | None = None
-    fl_x: Number | None = None
-    fl_y: Number | None = None
-    cx: Number | None = None
-    cy: Number | None = None
-    camera_angle_x: Number | None = None  # horizontal field of view, radians
-    camera_angle_y: Number | None = None  # vertical
-    x_fov: Number | None = None  # the same in degrees: instant-ngp's keys
-    y_fov: Number | None = None
-    k1: Number | None = None
-    k2: Number | None = None
-    k3: Number | None = None
-    k4: Number | None = None
-    k5: Number | None = None
-    k6: Number | None = None
-    p1: Number | None = None
-    p2: Number | None = None
+    w: Optional = None
+    h: Optional = None
+    fl_x: Optional = None
+    fl_y: Optional = None
+    cx: Optional = None
+    cy: Optional = None
+    camera_angle_x: Optional = None  # horizontal field of view, radians
+    camera_angle_y: Optional = None  # vertical
+    x_fov: Optional = None  # the same in degrees: instant-ngp's keys
+    y_fov: Optional = None
+    k1: Optional = None
+    k2: Optional = None
+    k3: Optional = None
+    k4: Optional = None
+    k5: Optional = None
+    k6: Optional = None
+    p1: Optional = None
+    p2: Optional = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,6 +292,7 @@ def _applied_transform(path: Path, record: TransformsRecord) -> AppliedTransform
 
 def nearest_rotation(matrix: Array, what: str) -> Array:
     """The rotation nearest to ``matrix`` [3, 3]; raises InputError if that is far from it."""
+    # U V^T of the singular value decomposition is the nearest orthogonal matrix (Schönemann 1966).
     left, _, right = np.linalg.svd(matrix)
     nearest: Array = left @ right
     if np.abs(nearest - matrix).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:

@@ -108,6 +108,7 @@ def without_copies(scene: Scene) -> Scene:
     for test in scene.test:
         for view in scene.train:
             value = likeness(small[test.name], small[view.name])
+            # Equal pixels are a costly question, asked of similar pictures only.
             if value < NEAR:  # NaN, where little is to be compared, goes on
                 continue
             if same_pixels(test, view):

@@ -55,6 +55,7 @@ class Camera:
             raise ValueError(f"camera: cx and cy must be finite, got cx={self.cx}, cy={self.cy}")
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
+        # 1e-4: quaternions are written with few digits, and pycolmap accepts any length
         if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
             raise ValueError("camera: rotation must be an orthonormal 3x3 matrix")
         if translation.shape != (3,) or not np.isfinite(translation).all():

@@ -130,11 +130,8 @@ def measure_similarity(
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
-    mean_x = _zeros(zero)
-    mean_y = _zeros(zero)
-    square_x = _zeros(zero)
-    square_y = _zeros(zero)
-    product = _zeros(zero)
+    mean_x, mean_y, product = _zeros(zero), _zeros(zero), _zeros(zero)
+    square_x, square_y = _zeros(zero), _zeros(zero)
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):

@@ -60,9 +60,8 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
     """
     sides = {side for image in images for side in image.shape[:2]}
     # From 0 to 1, the fractions at which a central window over a spectrum gains pixels.
-    fractions = np.unique(
-        [0.0, 1.0, *(2 * k / side for side in sides for k in range(side // 2 + 1))]
-    )  # [F]
+    gains = [2 * np.arange(side // 2 + 1) / side for side in sides]
+    fractions = np.unique(np.concatenate([[0.0, 1.0], *gains]))  # [F]
     curves = np.stack([_window_energies(image, fractions) for image in images])  # [V, F]
     if not (curves[:, -1] > 0).all():  # a black picture has no energy at any size
         return ScaleSchedule((0,), (1.0,))
@@ -78,10 +77,9 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
         *(1 / _first_reaching(fractions, mean, energy) for energy in energies[1:-1]),
         1.0,
     ]
-    begins = [
-        int(until * math.log(e / first) / math.log(whole / first)) if whole > first else 0
-        for e in energies
-    ]
+    begins = [0] * NUM_POINTS
+    if whole > first:
+        begins = [int(until * math.log(e / first) / math.log(whole / first)) for e in energies]
     begins[-1] = until
     # of several points at one iteration, the last
     points = dict(zip(begins, map(float, scales), strict=True))
@@ -95,20 +93,15 @@ def _window_energies(
 
     The last window is the whole spectrum.
     """
-    spectrum = np.fft.fftshift(np.abs(np.fft.fft2(image / 255.0, axes=(0, 1))), axes=(0, 1)).sum(
-        -1
-    )  # [H, W]
+    channels = np.abs(np.fft.fft2(image / 255.0, axes=(0, 1)))  # [H, W, 3]
+    spectrum = np.fft.fftshift(channels, axes=(0, 1)).sum(-1)  # [H, W]
     height, width = spectrum.shape
     sums = np.zeros((height + 1, width + 1))  # summed-area table
     sums[1:, 1:] = spectrum.cumsum(0).cumsum(1)
     row, column = height // 2, width // 2  # of frequency zero
-    half_height, half_width = (
-        (side * fractions / 2 + 1e-9).astype(int) for side in (height, width)
-    )  # [F] px
-    top = row - half_height
-    bottom = row + half_height
-    left = column - half_width
-    right = column + half_width
+    down = (height * fractions / 2 + 1e-9).astype(int)  # [F] px
+    across = (width * fractions / 2 + 1e-9).astype(int)
+    top, bottom, left, right = row - down, row + down, column - across, column + across
     energies = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
     energies[-1] = sums[-1, -1]
     return energies
@@ -211,8 +204,7 @@ def _reduced(view: View, scale: int) -> View:
     width, height = max(1, view.camera.width // scale), max(1, view.camera.height // scale)
     image = torch.from_numpy(view.image).permute(2, 0, 1).unsqueeze(0).float()  # [1, 3, H, W]
     small = torch.nn.functional.interpolate(image, (height, width), mode="bilinear", antialias=True)
-    pixels = (
-        small.round().to(torch.uint8).squeeze(0).permute(1, 2, 0).contiguous().numpy()
-    )  # [height, width, 3]
+    rounded = small.round().to(torch.uint8).squeeze(0)  # [3, height, width]
+    pixels = rounded.permute(1, 2, 0).contiguous().numpy()
     mask = None if view.mask is None else resize_mask(view.mask, width, height)
     return replace(view, camera=view.camera.resized(width, height), image=pixels, mask=mask)

@@ -81,11 +81,9 @@ class LossLog:
         loss, l1, ssim, total = readback.values().tolist()
         if not math.isfinite(total):
             raise FloatingPointError(f"the loss became {total} at iteration {step}")
-        self.smoothed = (
-            loss
-            if math.isnan(self.smoothed)
-            else SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
-        )
+        is_first = math.isnan(self.smoothed)
+        mean = SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
+        self.smoothed = loss if is_first else mean
         self._latest = {"step": step, "loss": loss, "l1": l1, "ssim": ssim}
 
 
@@ -126,9 +124,8 @@ class Trainer:
         self.snapshot_at = frozenset(snapshot_at)
         self.device = initial.means.device
         initial = densifier.prepare(initial)
-        self.background = torch.tensor(
-            list(options.background), dtype=torch.float32, device=self.device
-        )  # [3]
+        color = [*options.background]
+        self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
         self.gaussians = TrainableGaussians(initial, options, scene.extent)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = generators(seed)
@@ -284,9 +281,8 @@ class Trainer:
         """Render the training view ``index`` as in the present iteration, with gradients."""
         camera = self.scaled_views.at(self.scale)[0][index]
         # Passed only if needed: a user's rasterizer may not have this argument.
-        extra: dict[str, Any] = (
-            {"splitting_matrix": True} if self.densifier.needs_splitting_matrix else {}
-        )
+        wants = self.densifier.needs_splitting_matrix
+        extra: dict[str, Any] = {"splitting_matrix": True} if wants else {}
         return self.rasterizer.render(
             self.gaussians.values,
             camera,

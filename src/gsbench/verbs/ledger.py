@@ -27,7 +27,7 @@ from gsbench.runs.keys import config_hash
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
 from gsbench.settings import is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, add_question, names
+from gsbench.verbs.arguments import ArgumentParser, names
 from gsbench.words import did_you_mean, listed
 
 EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
@@ -45,8 +45,11 @@ def ledger(argv: Sequence[str], runs: Path) -> int:
     options = _parser().parse_args(argv)
     if not is_folder_name(options.name) or options.name in IN_RUNS:
         raise InputError(f"ledger: {options.name!r} cannot be the name of an experiment")
-    actions = {"new": new, "try": try_idea, "confirm": confirm, "show": show}
-    return actions[options.action](options, runs / options.name)
+    action, own = ACTIONS[options.action]
+    for option, flag in FLAGS.items():
+        if getattr(options, option) and option not in own:
+            raise InputError(f"ledger {options.action} takes no {flag}")
+    return action(options, runs / options.name)
 
 
 def _parser() -> ArgumentParser:
@@ -57,9 +60,13 @@ def _parser() -> ArgumentParser:
         "undecided, 2: bad input. `confirm` trains what was kept on other captures. `show` lists "
         "all (docs/night.md).",
     )
-    parser.add_argument("action", choices=["new", "try", "confirm", "show"])
+    parser.add_argument("action", choices=list(ACTIONS))
     parser.add_argument("name", help="the ledger, which is an experiment in the runs folder")
-    add_question(parser)
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="as of a sweep")
+    parser.add_argument("--metric", help="new: decides, such as lpips_squeeze (psnr)")
+    parser.add_argument(
+        "--least", help="new: the least difference that matters, as 0.1 or 10%% (the metric's)"
+    )
     parser.add_argument(
         "--ideas", type=_planned, help=f"new: the most ideas that will be tried ({IDEAS})"
     )
@@ -78,11 +85,12 @@ def new(options: argparse.Namespace, home: Path) -> int:
     trials = _compose(options.name, options.settings)
     keys, seeds = _keys(trials, options.name), _seeds(trials)
     values = next(iter(trials.values())).values
-    sign, least = asked_difference(options.metric, options.least, values)
-    EvalConfig(**values["eval"] | {"primary": options.metric})  # raises if it is not computed
+    metric = options.metric or "psnr"
+    sign, least = asked_difference(metric, options.least, values)
+    EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
     opened = records.Opened(
         time=_now(),
-        metric=options.metric,
+        metric=metric,
         sign=1 if sign > 0 else -1,
         least=least.size,
         relative=least.relative,
@@ -276,6 +284,25 @@ def show(options: argparse.Namespace, home: Path) -> int:
         return 0
     print("\n".join([*describe_ledger(book), "", *map(to_markdown, ledger_tables(book))]))
     return 0
+
+
+FLAGS = {
+    "settings": "settings",
+    "metric": "--metric",
+    "least": "--least",
+    "ideas": "--ideas",
+    "fdr": "--fdr",
+    "against": "--against",
+    "idea": "--as",
+    "only": "--only",
+    "json": "--json",
+}
+ACTIONS = {  # with the options that each of them takes
+    "new": (new, ("settings", "metric", "least", "ideas", "fdr")),
+    "try": (try_idea, ("settings", "against", "idea", "json")),
+    "confirm": (confirm, ("settings", "only")),
+    "show": (show, ("json",)),
+}
 
 
 # ---- trials of the ledger's words

@@ -39,6 +39,7 @@ def write_page(trial: TrialResult, out: Path) -> None:
     Raises GsbenchError with the command to type if npx is missing or fails; then model and settings
     lie beside ``out``.
     """
+    # first of all: whatever is wrong with the trial is said before anything is downloaded
     settings = page_settings(trial)
     npx = shutil.which("npx")
     if npx is None:

@@ -211,6 +211,7 @@ class Session:
             self._changed.wait()
             self._changed.clear()
             self._show(MOVING_HEIGHT)
+            # A change within this time starts again with a coarse picture, which keeps up with it.
             if not self._changed.wait(REST_SECONDS):
                 self._show(self.viewer.resting_height)
 
@@ -312,6 +313,7 @@ def is_own_page(hosts: list[str], origins: list[str]) -> bool:
     Any port is allowed, since connections may be forwarded, but both headers must have the same
     port.
     """
+    # A second header could be read by one program and passed over by another.
     if len(hosts) != 1 or len(origins) > 1:
         return False
     try:

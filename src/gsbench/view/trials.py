@@ -36,7 +36,7 @@ from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
 from gsbench.view import ADDRESS
 
-# what numpy raises for a file that is missing or damaged
+# raised by numpy for a file that is missing or damaged
 DAMAGE = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
 DIMMED = 0.35  # brightness of the render behind Gaussians coloured by their causes
 TEXT_COLOR, SHADOW = (255, 255, 255), (0, 0, 0)
@@ -94,6 +94,7 @@ def find_trial(address: str, runs: Path) -> TrialResult:
 
 
 def _trial_in(folder: Path) -> TrialResult:
+    # RUNS/EXPERIMENT/SCENE/ARM/TRIAL
     if len(folder.parents) < 4 or not (folder / RESULTS).is_file():
         raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
     experiment = load_experiment(folder.parents[3], folder.parents[2].name)
@@ -134,6 +135,7 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
             causes = lineage["causes"][lineage["ids"]]
     except DAMAGE as error:
         raise InputError(f"{path} cannot be read ({error}): run this trial again") from error
+    # a model and a record of two runs would give Gaussians the causes of others
     if len(causes) != num_gaussians:
         raise InputError(
             f"{path} is of {len(causes)} Gaussians, the model has {num_gaussians}: run this trial "

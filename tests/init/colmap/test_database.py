@@ -86,51 +86,36 @@ def test_the_strongest_features_are_those_of_the_largest_area(database: Path) ->
     rng = np.random.default_rng(0)
     keypoints = rng.normal(size=(12, 6)).astype(np.float32)
     descriptors = rng.integers(0, 256, (12, 128), dtype=np.uint8)
+    ids, sift = made.image_ids(database), pycolmap.FeatureExtractorType.SIFT
     with pycolmap.Database.open(database) as opened:
-        number = made.image_ids(database)["b.png"]
-        opened.write_keypoints(number, keypoints)
-        opened.write_descriptors(
-            number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors)
-        )
-        opened.write_keypoints(made.image_ids(database)["a.png"], keypoints[:1])
-        opened.write_descriptors(
-            made.image_ids(database)["a.png"],
-            pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors[:1]),
-        )
-        opened.write_keypoints(made.image_ids(database)["c.png"], keypoints[:0])
-        opened.write_descriptors(
-            made.image_ids(database)["c.png"],
-            pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors[:0]),
-        )
+        for name, count in (("b.png", 12), ("a.png", 1), ("c.png", 0)):
+            opened.write_keypoints(ids[name], keypoints[:count])
+            found = pycolmap.FeatureDescriptors(sift, descriptors[:count])
+            opened.write_descriptors(ids[name], found)
     areas = [abs(np.linalg.det(row[2:].reshape(2, 2))) for row in keypoints.astype(float)]
     order = sorted(range(12), key=lambda row: -areas[row])
-    np.testing.assert_array_equal(
-        made.strongest_descriptors(database, "b.png", 5), descriptors[order[:5]]
-    )
-    np.testing.assert_array_equal(made.strongest_descriptors(database, "a.png", 5), descriptors[:1])
-    assert made.strongest_descriptors(database, "c.png", 5).shape == (0, 128)
+    for name, rows in (("b.png", order[:5]), ("a.png", [0]), ("c.png", [])):
+        strongest = made.strongest_descriptors(database, name, 5)
+        np.testing.assert_array_equal(strongest, descriptors[rows].reshape(-1, 128))
+
+
+def write_geometries(database: Path, inliers: dict[tuple[str, str], np.ndarray]) -> None:
+    ids = made.image_ids(database)
+    with pycolmap.Database.open(database) as opened:
+        for pair, matches in inliers.items():
+            verified = pycolmap.TwoViewGeometry()
+            verified.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+            verified.inlier_matches = matches.astype(np.uint32)
+            opened.write_two_view_geometry(*(ids[name] for name in pair), verified)
 
 
 def test_counts_are_of_pairs_with_inliers(database: Path) -> None:
-    made.write_keypoints(
-        database, {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)}
-    )
-    matches = np.stack([np.arange(9), np.arange(9)], axis=1)
-    made.write_matches(
-        database,
-        {("a.png", "b.png"): matches, ("b.png", "c.png"): matches, ("a.png", "c.png"): matches},
-    )
-    ids = made.image_ids(database)
-    with pycolmap.Database.open(database) as opened:
-        for names, count in (
-            (("a.png", "b.png"), 1),
-            (("b.png", "c.png"), 7),
-            (("a.png", "c.png"), 0),
-        ):
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
-            geometry.inlier_matches = matches[:count].astype(np.uint32)
-            opened.write_two_view_geometry(*(ids[name] for name in names), geometry)
+    keypoints = {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)}
+    made.write_keypoints(database, keypoints)
+    matches, inliers = np.stack([np.arange(9)] * 2, axis=1), {"ab": 1, "bc": 7, "ac": 0}
+    pairs = {(f"{a}.png", f"{b}.png"): count for (a, b), count in inliers.items()}
+    made.write_matches(database, dict.fromkeys(pairs, matches))
+    write_geometries(database, {pair: matches[:count] for pair, count in pairs.items()})
     assert made.database_counts(database) == {
         "features": 10 + 11 + 12 + 13 + 14,
         "pairs_matched": 3,
@@ -142,17 +127,17 @@ def test_counts_are_of_pairs_with_inliers(database: Path) -> None:
 def test_guessed_focal_lengths_become_known_ones(database: Path) -> None:
     made.write_keypoints(database, dict.fromkeys(SIZES, np.ones((3, 2))))
     some, none = np.zeros((1, 2)), np.zeros((0, 2))
-    made.write_matches(
-        database, {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none}
-    )
+    matches = {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none}
+    made.write_matches(database, matches)
+    write_geometries(database, {("a.png", "b.png"): some})
     assert made.cameras_without_prior(database)
-    assert made.assume_focal_lengths(database, 0.9) == [("a.png", "b.png"), ("b.png", "c.png")]
-    assert not made.cameras_without_prior(database)
-    with pycolmap.Database.open(database) as opened:
-        assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
-    assert made.assume_focal_lengths(database, 5.0) == [("a.png", "b.png"), ("b.png", "c.png")]
-    with pycolmap.Database.open(database) as opened:
-        assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
+    for factor in (0.9, 5.0):  # the second finds nothing unknown
+        pairs = made.assume_focal_lengths(database, factor)
+        assert pairs == [("a.png", "b.png"), ("b.png", "c.png")]
+        assert not made.cameras_without_prior(database)
+        with pycolmap.Database.open(database) as opened:
+            assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
+            assert opened.num_verified_image_pairs() == 0  # under other focal lengths
 
 
 @pytest.mark.parametrize(("count", "each"), [(30, 50), (120, 50), (2100, 105)])
@@ -162,19 +147,15 @@ def test_verification_tells_its_progress_in_parts(
     """Of fifty pairs, or of a twentieth of them; each pair is listed once, by the ids of its
     images."""
     pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
-    monkeypatch.setattr(
-        pycolmap,
-        "verify_matches",
-        lambda path, file, options: listed.append(Path(file).read_text().splitlines()),
-    )
-    geometry.verify_pairs(
-        database, pairs, None, lambda phase, done, total: told.append((phase, done, total))
-    )
+
+    def verify(path: Path, file: Path, options: object) -> None:
+        listed.extend(file.read_text().splitlines())
+
+    monkeypatch.setattr(pycolmap, "verify_matches", verify)
+    geometry.verify_pairs(database, pairs, None, lambda *state: told.append(state))
     assert told == [("verify", done, count) for done in (*range(0, count, each), count)]
     ids = made.image_ids(database)
-    assert [line for part in listed for line in part] == [
-        f"{ids[first]} {ids[second]}" for first, second in pairs
-    ]
+    assert listed == [f"{ids[first]} {ids[second]}" for first, second in pairs]
     assert not list(database.parent.glob("*.txt"))
 
 
@@ -183,31 +164,18 @@ def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
     images: Path, monkeypatch: pytest.MonkeyPatch, threads: int, each: int
 ) -> None:
     calls, told, names = [], [], [f"{number}.png" for number in range(40)]
-    monkeypatch.setattr(
-        pycolmap, "extract_features", lambda *paths, **options: calls.append(options)
-    )
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **options: calls.append(options))
     masks = images if threads == 4 else None
-    settings = Sfm(
-        max_image_size=500,
-        max_num_features=70,
-        peak_threshold=0.01,
-        edge_threshold=9.0,
-        first_octave=1,
-    )
-    features.extract_sift(
-        Path("x.db"), images, names, settings, threads, lambda *state: told.append(state), masks
-    )
+    own = {"max_num_features": 70, "peak_threshold": 0.01, "edge_threshold": 9.0, "first_octave": 1}
+    settings, tell = Sfm(max_image_size=500, **own), lambda *state: told.append(state)
+    features.extract_sift(Path("x.db"), images, names, settings, threads, tell, masks)
     assert [name for call in calls for name in call["image_names"]] == names
     assert told == [("extract", done, 40) for done in (*range(0, 40, each), 40)]
     for call in calls:
         options = call["extraction_options"]
-        assert (options.num_threads, options.use_gpu, options.max_image_size) == (
-            threads,
-            False,
-            500,
-        )
-        assert (options.sift.max_num_features, options.sift.first_octave) == (70, 1)
-        assert (options.sift.peak_threshold, options.sift.edge_threshold) == (0.01, 9.0)
+        assert (options.num_threads, options.max_image_size) == (threads, 500)
+        assert not options.use_gpu
+        assert {name: getattr(options.sift, name) for name in own} == own
         assert Path(call["reader_options"].mask_path) == (masks or Path())
 
 
@@ -217,9 +185,7 @@ def test_what_colmap_cannot_read_gets_a_png_under_its_name(images: Path, tmp_pat
     names = ["a.png", "left/c.WEBP"]
     folder = made.readable_images(images, names, tmp_path / "work")
     assert folder != images
-    assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*")) == sorted(
-        names
-    )
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} == set(names)
     assert (folder / "a.png").resolve() == images / "a.png"
     with Image.open(folder / "left" / "c.WEBP") as copy:
         assert (copy.format, copy.getpixel((3, 4))) == ("PNG", (1, 2, 3))
@@ -280,9 +246,7 @@ def test_matching_is_divided_over_processes_and_tells_one_sum(
 
     monkeypatch.setattr(matches, "run_with_progress", match)
     pairs = list(itertools.combinations(SIZES, 2))
-    matches.match_sift(
-        database, pairs, Sfm(), 3, lambda phase, done, total: told.append((phase, done, total))
-    )
+    matches.match_sift(database, pairs, Sfm(), 3, lambda *state: told.append(state))
     assert (told[0], max(told)) == (("match", 0, 10), ("match", 10, 10))
     assert len({job.result for job in jobs}) == len(jobs) == 3
     divided = [pair for job in jobs for part in job.parts for pair in part]

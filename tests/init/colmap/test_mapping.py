@@ -3,6 +3,7 @@ known to the test."""
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,6 @@ from gsbench.init import Sfm
 from gsbench.init.colmap import mapping
 from gsbench.init.colmap.alignment import similarity_to
 from gsbench.init.colmap.database import (
-    assume_focal_lengths,
-    cameras_without_prior,
     create_database,
     unknown_camera_groups,
     write_keypoints,
@@ -26,9 +25,9 @@ from gsbench.init.colmap.database import (
 from gsbench.init.colmap.geometry import verification_options, verify_pairs
 from gsbench.init.colmap.mapping import MappingResult, map_images
 from gsbench.init.colmap.pairs import select_pairs
-from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
-from gsbench.init.colmap.similarity import align_poses
+from gsbench.init.colmap.reconstruct import common_poses
 from gsbench.logs import no_progress
+from tests.init.models import add_point, camera_at, model_with
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 520.0  # px; COLMAP's guess without EXIF is 1.2 x 640 = 768
 VERIFICATION = verification_options(Sfm())
@@ -52,31 +51,28 @@ def small_baseline(
         Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / name)
         center = np.array([(index % 3 - 1) * spread, (index // 3 - 1) * spread, 0.05 * (index % 2)])
         local = points - center
-        pixels = (
-            FOCAL * local[:, :2] / local[:, 2:]
-            + (WIDTH / 2, HEIGHT / 2)
-            + rng.normal(0, 0.3, (900, 2))
-        )
+        pixels = FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+        pixels = pixels + rng.normal(0, 0.3, (900, 2))
         inside = ((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1)
         names.append(name)
-        centers[name], seen[name], keypoints[name] = (
-            center,
-            np.flatnonzero(inside),
-            pixels[inside].astype(np.float32),
-        )
+        centers[name], seen[name] = center, np.flatnonzero(inside)
+        keypoints[name] = pixels[inside].astype(np.float32)
     database = folder / "database.db"
-    create_database(
-        database, unknown_camera_groups(folder / "images", names, "single", "SIMPLE_RADIAL", None)
-    )
+    images = folder / "images"
+    create_database(database, unknown_camera_groups(images, names, "single", "SIMPLE_RADIAL", None))
     write_keypoints(database, keypoints)
     matches = {}
-    for i, first in enumerate(names):
-        for second in names[i + 1 :]:
-            _, a, b = np.intersect1d(seen[first], seen[second], return_indices=True)
-            matches[first, second] = np.stack([a, b], axis=1).astype(np.uint32)
+    for first, second in itertools.combinations(names, 2):
+        _, a, b = np.intersect1d(seen[first], seen[second], return_indices=True)
+        matches[first, second] = np.stack([a, b], axis=1).astype(np.uint32)
     write_matches(database, matches)
     verify_pairs(database, sorted(matches), VERIFICATION, no_progress)
     return database, centers
+
+
+def mapper_of(folder: Path, options: Sfm, progress: Any = no_progress) -> mapping._Mapper:
+    """For three images, and a database that need not be there."""
+    return mapping._Mapper(folder / "a.db", folder, folder / "out", options, progress, 3)
 
 
 def mapped(database: Path, mapper: Any) -> MappingResult:
@@ -95,17 +91,11 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_pa
     assert result.strategy != "incremental"
     (warning,) = result.warnings
     assert result.strategy in warning
-    ours = poses_by_name(result.model)
-    names = sorted(truth)
-    similarity = align_poses(
-        np.array([ours[name][0] for name in names]),
-        np.array([ours[name][1] for name in names]),
-        np.array([truth[name] for name in names]),
-        np.stack([np.eye(3)] * 9),
-    )
-    placed = similarity(np.array([ours[name][0] for name in names]))
-    # of a rig 0.4 wide
-    assert np.abs(placed - np.array([truth[name] for name in names])).max() < 0.03
+    true = model_with({name: camera_at(center) for name, center in truth.items()})
+    similarity = similarity_to(result.model, true)
+    assert similarity is not None
+    centers, _, true_centers, _ = common_poses(result.model, true)
+    assert np.abs(similarity(centers) - true_centers).max() < 0.03  # of a rig 0.4 wide
     (camera,) = result.model.cameras.values()
     # which so small a baseline fixes weakly
     assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.2)
@@ -122,21 +112,6 @@ def test_where_the_defaults_do_nothing_else_is_tried(tmp_path: Path) -> None:
     result = mapped(database, "auto")
     assert result.tried == (("incremental", 9),)
     assert result.warnings == ()
-
-
-def test_an_assumed_focal_length_is_known_and_verified_anew(tmp_path: Path) -> None:
-    database, _ = small_baseline(tmp_path)
-    assert cameras_without_prior(database)
-    pairs = assume_focal_lengths(database, 0.8)
-    assert not cameras_without_prior(database)
-    assert len(pairs) == 36
-    with pycolmap.Database.open(database) as opened:
-        (camera,) = opened.read_all_cameras()
-        assert camera.mean_focal_length() == pytest.approx(0.8 * WIDTH)
-        assert opened.num_verified_image_pairs() == 0
-    verify_pairs(database, pairs, VERIFICATION, no_progress)
-    with pycolmap.Database.open(database) as opened:
-        assert opened.num_verified_image_pairs() == 36
 
 
 @pytest.mark.parametrize("mapper", [pytest.param("auto", marks=pytest.mark.slow), "global"])
@@ -178,19 +153,14 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
     best: tuple[int, int],
     tried: int,
 ) -> None:
-    (tmp_path / "images").mkdir()
-    names = [f"{k}.png" for k in range(10)]
-    for name in names:
-        Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
-    create_database(
-        tmp_path / "database.db",
-        unknown_camera_groups(tmp_path / "images", names, "single", "PINHOLE", 30.0),
-    )
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
+    create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
     monkeypatch.setattr(mapping, "_is_plausible", lambda model: True)
-    ways = [
-        (f"way {k}", lambda sizes=sizes: [Model(*size) for size in sizes])
-        for k, sizes in enumerate(found)
-    ]
+
+    def way(name: str, sizes: list[tuple[int, int]]) -> tuple[str, Any]:
+        return name, lambda: [Model(*size) for size in sizes]
+
+    ways = [way(f"way {k}", sizes) for k, sizes in enumerate(found)]
     monkeypatch.setattr(mapping._Mapper, "strategies", lambda mapper: iter(ways))
     result = mapped(tmp_path / "database.db", "auto")
     assert (result.model.num_reg_images(), result.model.num_points3D()) == best
@@ -201,7 +171,7 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
     )
     assert bool(result.warnings) == (tried > 1)
     for sizes, said in (([], "found no pair of images"), ([(2, 99)], "placed only 2 of 10 images")):
-        ways[:] = [("only", lambda sizes=sizes: [Model(*size) for size in sizes])]
+        ways[:] = [way("only", sizes)]
         with pytest.raises(InputError, match=said):
             mapped(tmp_path / "database.db", "auto")
 
@@ -213,38 +183,23 @@ def test_the_ways_of_a_mapper(
 ) -> None:
     """From the defaults to assumed focal lengths, these only where none is known."""
     calls: list[tuple[object, ...]] = []
-    monkeypatch.setattr(
-        mapping.colmap_database, "cameras_without_prior", lambda database: not prior
-    )
-    own = mapping._Mapper
-    monkeypatch.setattr(
-        own, "with_assumed_focal_lengths", lambda _, factor: calls.append(("assumed", factor)) or []
-    )
-    monkeypatch.setattr(
-        own,
-        "incremental",
-        lambda _, found, angle=None: calls.append(("incremental", found, angle)) or [],
-    )
-    monkeypatch.setattr(
-        own, "global_mapping", lambda made: calls.append(("global", made.database)) or []
-    )
-    database = tmp_path / "a.db"
-    ways = list(
-        own(database, tmp_path, tmp_path / "out", Sfm(mapper=mapper), no_progress, 9).strategies()
-    )
+
+    def note(name: str) -> Any:
+        return lambda _, *given: calls.append((name, *given)) or []
+
+    monkeypatch.setattr(mapping.colmap_database, "cameras_without_prior", lambda _: not prior)
+    for name in ("with_assumed_focal_lengths", "incremental", "global_mapping"):
+        monkeypatch.setattr(mapping._Mapper, name, note(name))
+    ways = list(mapper_of(tmp_path, Sfm(mapper=mapper)).strategies())
     for _, run in ways:
         run()
-    assumed = [] if prior else [("assumed", factor) for factor in mapping.FOCAL_FACTORS]
-    small = mapping.SMALL_ANGLE_DEG
+    small, factors = mapping.SMALL_ANGLE_DEG, () if prior else mapping.FOCAL_FACTORS
+    first, together = ("incremental", tmp_path / "a.db"), ("global_mapping",)
+    assumed = [("with_assumed_focal_lengths", factor) for factor in factors]
     expected = {
-        "incremental": [("incremental", database, None)],
-        "global": [("global", database)],
-        "auto": [
-            ("incremental", database, None),
-            ("incremental", database, small),
-            ("global", database),
-            *assumed,
-        ],
+        "incremental": [first],
+        "global": [together],
+        "auto": [first, (*first, small), together, *assumed],
     }
     assert calls == expected[mapper]
     assert len({name for name, _ in ways}) == len(ways)
@@ -264,9 +219,7 @@ def test_mapping_tells_its_progress_from_none_to_all(
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", place)
     monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: {0: Model(3)})
-    mapper = mapping._Mapper(
-        tmp_path / "a.db", tmp_path, tmp_path / "out", Sfm(), lambda *at: told.append(at), 3
-    )
+    mapper = mapper_of(tmp_path, Sfm(), lambda *at: told.append(at))
     assert [model.images for model in mapper.incremental(tmp_path / "a.db")] == [2, 2]
     assert told == [("map", done, 3) for done in (0, 1, 2, 3, 3, 3)]
     told.clear()
@@ -279,19 +232,11 @@ def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible:
     """Two cameras on either side of points at a distance of one; a third stands beside the
     first."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
+    model = model_with(
+        {f"{x} {k}": camera_at([x, 0, 0]) for k, x in enumerate((-half, half, -half))}, 3
     )
-    for number, x in enumerate((-half, half, -half), start=1):
-        pose = pycolmap.Rigid3d(np.column_stack([np.eye(3), [-x, 0, 0]]))
-        image = pycolmap.Image(
-            name=f"{number}", keypoints=np.zeros((3, 2)), camera_id=1, image_id=number
-        )
-        model.add_image_with_trivial_frame(image, pose)
     for index, images in enumerate([(1, 2, 3), (1, 2), (1, 3)]):
-        track = pycolmap.Track([pycolmap.TrackElement(number, index) for number in images])
-        model.add_point3D(np.array([0.0, 0.0, 1.0]), track, np.zeros(3, dtype=np.uint8))
+        add_point(model, [0, 0, 1], seen_by=dict.fromkeys(images, index))
     assert mapping._is_plausible(model) == plausible
     assert not mapping._is_plausible(pycolmap.Reconstruction())
 
@@ -301,42 +246,26 @@ def test_settings_reach_colmaps_mappers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, intrinsics: Any
 ) -> None:
     given: list[Any] = []
-    monkeypatch.setattr(
-        pycolmap,
-        "incremental_mapping",
-        lambda *_, next_image_callback, options: given.append(options) or {},
-    )
-    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_, options: given.append(options) or {})
-    tracks, refine = intrinsics == "estimate", intrinsics == "estimate"
+    for name in ("incremental_mapping", "global_mapping"):
+        monkeypatch.setattr(pycolmap, name, lambda *_, options, **__: given.append(options) or {})
+    tracks = refine = intrinsics == "estimate"
     settings = Sfm(
         seed=7, mapper_threads=3, min_model_size=5, two_view_tracks=tracks, intrinsics=intrinsics
     )
-    mapper = mapping._Mapper(
-        tmp_path / "a.db", tmp_path, tmp_path / "out", settings, no_progress, 3
-    )
+    mapper = mapper_of(tmp_path, settings)
     mapper.incremental(mapper.database)
     mapper.incremental(mapper.database, 2.5)
     mapper.global_mapping()
     *incremental, together = given
     assert [options.mapper.init_min_tri_angle for options in incremental] == [16.0, 2.5]
     for options in incremental:
-        assert (options.num_threads, options.mapper.num_threads, options.min_model_size) == (
-            3,
-            3,
-            5,
-        )
-        seeds = (options.random_seed, options.mapper.random_seed, options.triangulation.random_seed)
-        assert seeds == (7, 7, 7)
-        assert (options.multiple_models, options.triangulation.ignore_two_view_tracks) == (
-            True,
-            not tracks,
-        )
-        assert (options.ba_refine_focal_length, options.ba_refine_extra_params) == (refine, refine)
-        own = (
-            options.mapper.abs_pose_refine_focal_length,
-            options.mapper.abs_pose_refine_extra_params,
-        )
-        assert own == (refine, refine)
+        own, triangulation = options.mapper, options.triangulation
+        assert options.num_threads == own.num_threads == 3
+        assert (options.min_model_size, options.multiple_models) == (5, True)
+        assert options.random_seed == own.random_seed == triangulation.random_seed == 7
+        assert triangulation.ignore_two_view_tracks == (not tracks)
+        assert options.ba_refine_focal_length == options.ba_refine_extra_params == refine
+        assert own.abs_pose_refine_focal_length == own.abs_pose_refine_extra_params == refine
     assert (together.num_threads, together.random_seed, together.min_model_size) == (3, 7, 5)
     adjustment = together.mapper.bundle_adjustment
     assert (adjustment.refine_focal_length, adjustment.refine_extra_params) == (refine, refine)
@@ -348,64 +277,24 @@ def test_a_focal_length_is_assumed_in_a_copy_that_is_verified_anew(
     calls: list[tuple[Any, ...]] = []
     database = tmp_path / "a.db"
     database.write_text("cameras")
-    made = mapping.colmap_database
-    monkeypatch.setattr(
-        made, "assume_focal_lengths", lambda *given: calls.append(given) or [("a", "b")]
-    )
-    monkeypatch.setattr(mapping.geometry, "verify_pairs", lambda *given: calls.append(given))
-    monkeypatch.setattr(
-        mapping._Mapper, "incremental", lambda _, *given: calls.append(given) or ["model"]
-    )
-    mapper = mapping._Mapper(
-        database, tmp_path, tmp_path / "out", Sfm(seed=4, min_inliers=9), no_progress, 3
-    )
+
+    def note(owner: object, name: str, result: object) -> None:
+        monkeypatch.setattr(owner, name, lambda *given: calls.append(given) or result)
+
+    note(mapping.colmap_database, "assume_focal_lengths", [("a", "b")])
+    note(mapping.geometry, "verify_pairs", None)
+    note(mapping._Mapper, "incremental", ["model"])
+    mapper = mapper_of(tmp_path, Sfm(seed=4, min_inliers=9))
     assert mapper.with_assumed_focal_lengths(1.4) == ["model"]
-    assumed, (copy, pairs, options, progress), mapped_from = calls
+    assumed, (copy, pairs, options, progress), (_, *mapped_from) = calls
     assert assumed == (tmp_path / "assumed-1.4.db", 1.4)
     assert (copy.read_text(), database.read_text()) == ("cameras", "cameras")
     assert (pairs, progress) == ([("a", "b")], no_progress)
-    assert (options.ransac.random_seed, options.min_num_inliers, options.min_inlier_ratio) == (
-        4,
-        9,
-        0.0,
-    )
-    assert mapped_from == (copy, 2.0)
+    assert (options.ransac.random_seed, options.min_num_inliers) == (4, 9)
+    assert mapped_from == [copy, 2.0]
 
 
 def test_pairs_are_all_or_those_of_neighbours() -> None:
-    assert select_pairs("abcd", Sfm()) == [(a, b) for a in "abcd" for b in "abcd" if a < b]
-    assert select_pairs("abcd", Sfm(pairs="sequential", overlap=1)) == [
-        ("a", "b"),
-        ("b", "c"),
-        ("c", "d"),
-    ]
-
-
-def test_common_poses_are_in_the_order_of_names() -> None:
-    def model(centers: dict[str, list[float]], flip: float) -> pycolmap.Reconstruction:
-        made = pycolmap.Reconstruction()
-        made.add_camera_with_trivial_rig(
-            pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
-        )
-        for number, (name, center) in enumerate(centers.items(), start=1):
-            rotation = np.diag([flip, flip, 1.0])
-            pose = pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ center]))
-            made.add_image_with_trivial_frame(
-                pycolmap.Image(name=name, camera_id=1, image_id=number), pose
-            )
-        return made
-
-    one = model({"b": [1.0, 2, 3], "a": [4.0, 5, 6], "x": [0.0, 0, 0]}, 1.0)
-    other = model({"y": [9.0, 9, 9], "a": [7.0, 8, 9], "b": [3.0, 1, 2]}, -1.0)
-    centers, rotations, other_centers, other_rotations = common_poses(one, other)
-    assert (centers.tolist(), other_centers.tolist()) == (
-        [[4, 5, 6], [1, 2, 3]],
-        [[7, 8, 9], [3, 1, 2]],
-    )
-    np.testing.assert_array_equal(rotations, [np.eye(3)] * 2)
-    np.testing.assert_array_equal(other_rotations, [np.diag([-1.0, -1, 1])] * 2)
-    assert similarity_to(one, other) is None
-    assert [part.shape for part in common_poses(one, pycolmap.Reconstruction())] == [
-        (0, 3),
-        (0, 3, 3),
-    ] * 2
+    assert select_pairs("abcd", Sfm()) == list(itertools.combinations("abcd", 2))
+    neighbours = select_pairs("abcd", Sfm(pairs="sequential", overlap=1))
+    assert neighbours == [("a", "b"), ("b", "c"), ("c", "d")]

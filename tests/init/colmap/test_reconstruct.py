@@ -18,6 +18,7 @@ from gsbench.init.colmap import pairs as pairing
 from gsbench.init.colmap.database import create_database, write_keypoints, write_matches
 from gsbench.init.colmap.geometry import verify_pairs
 from gsbench.logs import no_progress
+from tests.init.models import camera_at, model_with
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0  # px
 NAMES = [f"{letter}.png" for letter in "abcd"]
@@ -25,35 +26,21 @@ POINTS = np.random.default_rng(0).uniform((-2, -1.5, 4), (2, 1.5, 7), (120, 3))
 
 
 def camera() -> pycolmap.Camera:
-    return pycolmap.Camera(
-        model="SIMPLE_PINHOLE",
-        width=WIDTH,
-        height=HEIGHT,
-        params=[FOCAL, WIDTH / 2, HEIGHT / 2],
-        camera_id=1,
-    )
+    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)
 
 
 def poses() -> dict[str, pycolmap.Rigid3d]:
     """Four cameras on an arc, each turned towards the points."""
     made = {}
     for index, name in enumerate(NAMES):
-        turn = Rotation.from_euler(
-            "yx", [8.0 * (index - 1.5), 3.0 * index], degrees=True
-        ).as_matrix()
-        center = np.array([0.8 * (index - 1.5), 0.2 * index, 0.1])
-        made[name] = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ center)
+        turn = Rotation.from_euler("yx", [8.0 * (index - 1.5), 3.0 * index], degrees=True)
+        made[name] = camera_at([0.8 * (index - 1.5), 0.2 * index, 0.1], turn.as_matrix())
     return made
 
 
-def model_of(poses: dict[str, pycolmap.Rigid3d], first_id: int = 40) -> pycolmap.Reconstruction:
+def model_of(poses: dict[str, pycolmap.Rigid3d]) -> pycolmap.Reconstruction:
     """A model of cameras alone, whose ids are not those of a database."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera())
-    for index, (name, pose) in enumerate(poses.items()):
-        image = pycolmap.Image(name=name, camera_id=1, image_id=first_id - index)
-        model.add_image_with_trivial_frame(image, pose)
-    return model
+    return model_with(dict(reversed(poses.items())), camera=camera())
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +52,8 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, pose in poses().items():
         Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / name)
         local = POINTS @ pose.rotation.matrix().T + pose.translation
-        keypoints[name] = (FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)).astype(
-            np.float32
-        )
+        pixels = FOCAL * local[:, :2] / local[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+        keypoints[name] = pixels.astype(np.float32)
     path = folder / "database.db"
     create_database(path, [(camera(), NAMES)])
     write_keypoints(path, keypoints)
@@ -82,20 +68,15 @@ def test_points_come_from_the_named_images_under_cameras_that_do_not_change(
     database: Path, tmp_path: Path
 ) -> None:
     said: list[tuple[str, int, int | None]] = []
+    images, reference = database.parent / "images", model_of(poses())
     model = mapping.triangulate(
-        database,
-        database.parent / "images",
-        tmp_path / "out",
-        model_of(poses()),
-        NAMES[:3],
-        Sfm(threads=1),
-        lambda phase, done, total, note="": said.append((phase, done, total)),
+        database, images, tmp_path, reference, NAMES[:3], Sfm(), lambda *at: said.append(at)
     )
     assert said == [("triangulate", 0, 1), ("triangulate", 1, 1)]
-    images = {image.name: image for image in model.images.values()}
-    assert sorted(images) == NAMES  # an image without points has its camera, too
+    placed = {image.name: image for image in model.images.values()}
+    assert sorted(placed) == NAMES  # an image without points has its camera, too
     for name, pose in poses().items():
-        assert images[name].cam_from_world().matrix().tobytes() == pose.matrix().tobytes()
+        assert placed[name].cam_from_world().matrix().tobytes() == pose.matrix().tobytes()
     assert model.num_points3D() > 100
     for point in model.points3D.values():
         seen = {model.images[element.image_id].name for element in point.track.elements}
@@ -108,86 +89,37 @@ def test_points_come_from_the_named_images_under_cameras_that_do_not_change(
 def test_matches_that_contradict_the_cameras_triangulate_nothing(
     database: Path, tmp_path: Path
 ) -> None:
-    reference, images = (
-        model_of(dict(zip(NAMES, reversed(poses().values()), strict=True))),
-        database.parent / "images",
-    )
-    with pytest.raises(
-        InputError, match="no point could be triangulated under the reference cameras"
-    ):
-        mapping.triangulate(
-            database,
-            images,
-            tmp_path / "out",
-            reference,
-            NAMES,
-            Sfm(threads=1),
-            lambda *args, **options: None,
-        )
+    images = database.parent / "images"
+    reference = model_of(dict(zip(NAMES, reversed(poses().values()), strict=True)))
+    said = "no point could be triangulated under the reference cameras"
+    with pytest.raises(InputError, match=said):
+        mapping.triangulate(database, images, tmp_path, reference, NAMES, Sfm(), no_progress)
 
 
 def test_the_poses_of_two_models_are_paired_by_name() -> None:
     scale, shift = 2.0, np.array([1.0, -2.0, 3.0])
-    moved = {  # in the opposite order, and without the first
-        name: pycolmap.Rigid3d(
-            pose.rotation, scale * pose.translation - pose.rotation.matrix() @ shift
-        )
-        for name, pose in reversed(list(poses().items())[1:])
-    }
+    moved = {}  # in the opposite order, and without the first
+    for name, pose in reversed(list(poses().items())[1:]):
+        turn = pose.rotation.matrix()
+        moved[name] = camera_at(scale * -turn.T @ pose.translation + shift, turn)
     first, second = model_of(poses()), model_of(moved)
     centers, rotations, other_centers, other_rotations = reconstruct.common_poses(first, second)
-    np.testing.assert_allclose(
-        centers, [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)], atol=1e-12
-    )
+    places = [[0.8 * (k - 1.5), 0.2 * k, 0.1] for k in (1, 2, 3)]
+    turns = [poses()[name].rotation.matrix() for name in NAMES[1:]]
+    np.testing.assert_allclose(centers, places, atol=1e-12)
     np.testing.assert_allclose(other_centers, scale * centers + shift, atol=1e-12)
-    np.testing.assert_allclose(
-        rotations, [poses()[name].rotation.matrix() for name in NAMES[1:]], atol=1e-12
-    )
+    np.testing.assert_allclose(rotations, turns, atol=1e-12)
     np.testing.assert_allclose(other_rotations, rotations, atol=1e-12)
     found = alignment.similarity_to(first, second)
     assert found is not None
     assert found.scale == pytest.approx(scale)
     lonely = model_of({NAMES[0]: poses()[NAMES[0]]})
     assert alignment.similarity_to(first, lonely) is None
+    nothing = reconstruct.common_poses(first, pycolmap.Reconstruction())
+    assert [part.shape for part in nothing] == [(0, 3), (0, 3, 3)] * 2
 
 
-def test_options_reach_colmap() -> None:
-    options = Sfm(
-        seed=7,
-        min_inliers=11,
-        min_inlier_ratio=0.31,
-        threads=2,
-        two_view_tracks=True,
-        min_model_size=5,
-    )
-    verification = geometry.verification_options(options)
-    assert verification.ransac.random_seed == 7
-    assert (verification.min_num_inliers, verification.min_inlier_ratio) == (11, 0.31)
-    pipeline = mapping.pipeline_options(options)
-    assert (
-        pipeline.random_seed
-        == pipeline.mapper.random_seed
-        == pipeline.triangulation.random_seed
-        == 7
-    )
-    assert pipeline.num_threads == pipeline.mapper.num_threads == options.mapper_threads
-    assert not pipeline.triangulation.ignore_two_view_tracks
-    assert mapping.pipeline_options(Sfm(two_view_tracks=False)).triangulation.ignore_two_view_tracks
-    assert pipeline.multiple_models
-    assert pipeline.min_model_size == 5
-    for intrinsics, refined in (("estimate", True), ("reference", False)):
-        pipeline = mapping.pipeline_options(Sfm(intrinsics=intrinsics))
-        assert pipeline.ba_refine_focal_length == pipeline.ba_refine_extra_params == refined
-        assert pipeline.mapper.abs_pose_refine_focal_length == refined
-        assert pipeline.mapper.abs_pose_refine_extra_params == refined
-
-
-def test_pairs_of_names() -> None:
-    assert pairing.select_pairs("abc", Sfm()) == [("a", "b"), ("a", "c"), ("b", "c")]
-    sequential = pairing.select_pairs("abcd", Sfm(pairs="sequential", overlap=1))
-    assert {frozenset(pair) for pair in sequential} >= {
-        frozenset("ab"),
-        frozenset("bc"),
-        frozenset("cd"),
-    }
-    assert len(sequential) < 6
+def test_settings_reach_colmaps_verification() -> None:
+    made = geometry.verification_options(Sfm(seed=7, min_inliers=11, min_inlier_ratio=0.31))
+    assert made.ransac.random_seed == 7
+    assert (made.min_num_inliers, made.min_inlier_ratio) == (11, 0.31)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model
@@ -32,7 +31,7 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("threads", [1, 5])
-def test_same_arguments_same_bytes(
+def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
     capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ):
     monkeypatch.setattr("gsbench.scene.courtyard.render.available_threads", lambda: threads)
@@ -41,15 +40,10 @@ def test_same_arguments_same_bytes(
         tmp_path, views=4, width=160, height=120, progress=lambda *state: told.append(state)
     )
     assert told == [("courtyard", done, 4) for done in range(1, 5)]
-    names = sorted(
-        path.relative_to(capture_dir).as_posix()
-        for path in capture_dir.rglob("*")
-        if path.is_file()
-    )
-    same, different, failed = filecmp.cmpfiles(capture_dir, tmp_path, names, shallow=False)
+    files = [path for path in capture_dir.rglob("*") if path.is_file()]
+    names = [path.relative_to(capture_dir).as_posix() for path in files]
+    same, _, _ = filecmp.cmpfiles(capture_dir, tmp_path, names, shallow=False)
     assert len(same) == len(names) >= 7
-    assert not different
-    assert not failed
 
 
 def test_the_model_holds_the_exact_cameras(capture_dir: Path, tmp_path: Path):
@@ -67,12 +61,8 @@ def test_neighbouring_views_are_close(views: int):
     centers = np.array([camera.center for camera in courtyard_cameras(views, 40, 30).values()])
     azimuth = np.degrees(np.unwrap(np.arctan2(centers[:, 1], centers[:, 0])))
     assert np.abs(np.diff(azimuth)).max() <= 7.5 + 1e-9
-    assert (
-        4.0
-        < np.linalg.norm(centers[:, :2], axis=1).min()
-        < np.linalg.norm(centers[:, :2], axis=1).max()
-        < 5.0
-    )
+    radii = np.linalg.norm(centers[:, :2], axis=1)
+    assert 4.0 < radii.min() < radii.max() < 5.0
     assert surface_distance(centers).min() > 0.5  # no camera in or at a thing
 
 
@@ -102,16 +92,6 @@ def test_a_surface_point_looks_alike_from_two_views():
     assert np.median(np.abs(first - second)) < 8
     shuffled = np.median(np.abs(first - second[rng.permutation(len(second))]))
     assert np.median(np.abs(first - second)) < 0.6 * shuffled
-
-
-def test_pictures_have_detail_and_a_quiet_lawn(capture_dir: Path):
-    for path in sorted((capture_dir / "images").iterdir()):
-        image = np.asarray(Image.open(path)).astype(float)
-        assert image.shape == (120, 160, 3)
-        assert 70 < image.mean() < 180
-        assert image.std() > 30
-        lawn = (image[..., 1] > image[..., 0]) & (image[..., 1] > 1.3 * image[..., 2])
-        assert lawn.mean() > 0.1
 
 
 SOLIDS = {  # by seed: `fingerprint` of each array
@@ -166,12 +146,6 @@ def test_the_pictures_are_those_of_this_version():
     np.testing.assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
 
 
-def test_seeds_differ():
-    camera = courtyard_cameras(3, 64, 48)["0001.png"]
-    pictures = [render_view(build_layout(seed), camera, seed).astype(float) for seed in (0, 1)]
-    assert np.abs(pictures[0] - pictures[1]).mean() > 2
-
-
 def test_surface_distance_against_dense_samples_of_the_surfaces():
     layout = build_layout(0)
     rng = np.random.default_rng(1)
@@ -200,7 +174,7 @@ def test_surface_distance_against_dense_samples_of_the_surfaces():
     assert surface_distance(np.array([[0.0, 0.0, 8.0]]), limit=0.5)[0] == 0.5
 
 
-def test_bad_settings():
+def test_too_few_views_and_too_small_ones_are_refused():
     with pytest.raises(InputError, match=r"scene\.views"):
         courtyard_cameras(2, 40, 30)
     with pytest.raises(InputError, match=r"scene\.width"):

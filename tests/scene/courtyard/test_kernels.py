@@ -125,13 +125,9 @@ def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
         ]
         ground = -origin[2] / direction[2] if direction[2] < 0 else inf
         expected = min(ground, *local)
-        index = (
-            PLAIN.SKY
-            if expected == inf
-            else PLAIN.GROUND
-            if expected == ground
-            else int(np.argmin(local))
-        )
+        index = PLAIN.GROUND if expected == ground else int(np.argmin(local))
+        if expected == inf:
+            index = PLAIN.SKY
         t, hit = PLAIN.cast(LAYOUT, *origin, *direction, False)
         assert (hit, t) == (index, pytest.approx(expected))
         _, anything = PLAIN.cast(LAYOUT, *origin, *direction, True)
@@ -186,18 +182,12 @@ def test_textures_are_those_of_this_version(name: str) -> None:
             elif name == "SKY":
                 values.append(PLAIN.sky(px, py, pz, 3))
             else:
-                values.append(
-                    PLAIN.shade_factors(getattr(layout, name), px, py, pz, u, v, footprint, 3)
-                )
-                values.append(
-                    PLAIN.shade_factors(
-                        getattr(layout, name), u / 8, v / 8, 0.45, u / 8, v / 8, footprint, 3
-                    )
-                )
+                material = getattr(layout, name)
+                for place in ((px, py, pz, u, v), (u / 8, v / 8, 0.45, u / 8, v / 8)):
+                    values.append(PLAIN.shade_factors(material, *place, footprint, 3))
     assert np.isfinite(values).all()
-    assert fingerprint(np.array(values)) == pytest.approx(PINNED[name], rel=1e-9), fingerprint(
-        np.array(values)
-    )
+    found = fingerprint(np.array(values))
+    assert found == pytest.approx(PINNED[name], rel=1e-9), found
 
 
 def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
@@ -207,14 +197,7 @@ def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
         assert PLAIN.noise3(i, 4 - i, 0, 7) == pytest.approx(corner)
         for x, y in ((i + 1e-4, 4 - i), (i - 1e-4, 4 - i), (i, 4 - i + 1e-4), (i, 4 - i - 1e-4)):
             assert PLAIN.noise2(x, y, 7) == pytest.approx(corner, abs=1e-9)  # no slope at a corner
-    cells = np.array(
-        [
-            PLAIN.random_cell(i, j, k, 0)
-            for i in range(-8, 8)
-            for j in range(-8, 8)
-            for k in range(4)
-        ]
-    )
+    cells = np.array([PLAIN.random_cell(i - 8, j - 8, k, 0) for i, j, k in np.ndindex(16, 16, 4)])
     assert 0 <= cells.min() < 0.01 < 0.99 < cells.max() < 1
     counts, _ = np.histogram(cells, bins=8, range=(0, 1))
     assert np.abs(counts - 128).max() < 5 * 128**0.5

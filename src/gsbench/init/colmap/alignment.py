@@ -11,13 +11,14 @@ import pycolmap
 
 from gsbench.gaussians.paper_values import VOLUME_THRESHOLD
 from gsbench.init.base import Gauge, PoseErrors
-from gsbench.init.colmap.reconstruct import common_poses, poses_by_name, save_reconstruction
+from gsbench.init.colmap.reconstruct import common_poses, poses_by_name
 from gsbench.init.colmap.similarity import (
     Similarity,
     align_poses,
     rotation_angles,
     transformed_rotations,
 )
+from gsbench.scene.colmap import save_model
 from gsbench.scene.types import Array, Capture, extent_of_centers
 
 
@@ -54,7 +55,7 @@ def align(
     if own_gauge is None:
         return Alignment(similarity.scale, pose_errors=errors)
     gauge = measure_gauge(training_extent(model, capture), similarity.scale)
-    save_reconstruction(model, own_gauge)
+    save_model(model, own_gauge)
     rotation = pycolmap.Rotation3d(similarity.rotation)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
     return Alignment(1.0, gauge, errors)

@@ -156,6 +156,7 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     The ids follow the sorted names. Because they are fixed here, extraction and matching give the
     same database on any number of threads. Each camera gets its own rig.
     """
+    # An interrupted run may have left one; its ids may be of other images.
     path.unlink(missing_ok=True)
     ids_of: dict[str, tuple[int, int]] = {}  # of camera and rig
     image_ids: dict[str, int] = {}

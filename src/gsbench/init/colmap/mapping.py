@@ -227,6 +227,7 @@ def triangulate(
                 posed.add_image_with_trivial_frame(image, pose)
             else:
                 unused.append((image, pose))
+    # COLMAP has a generator for the whole process beside the seeds in its options
     pycolmap.set_random_seed(options.seed)
     output.mkdir(parents=True, exist_ok=True)
     model = pycolmap.triangulate_points(

@@ -43,12 +43,6 @@ def common_poses(
     return centers[0], rotations[0], centers[1], rotations[1]
 
 
-def save_reconstruction(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write ``model`` in COLMAP's binary format."""
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
-
-
 def keep_training_points(
     model: pycolmap.Reconstruction, names: Collection[str], images: Path
 ) -> TrainingPoints:

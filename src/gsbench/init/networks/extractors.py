@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.init.networks.features import Features, FeatureSettings
@@ -22,7 +23,8 @@ LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."
 
 # Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of
 # the first pixel at (0, 0), descriptors [K, D] and scores [K].
-Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
+Found = tuple[Tensor, Tensor, Tensor]
+Extractor = Callable[[Tensor], Found]
 
 
 def extract_features(
@@ -51,7 +53,7 @@ def extract_features(
 
 
 def load_into(
-    network: torch.nn.Module, state: Mapping[str, torch.Tensor], path: Path, device: torch.device
+    network: torch.nn.Module, state: Mapping[str, Tensor], path: Path, device: torch.device
 ) -> None:
     """Load ``state``, with all parameters, into ``network`` on ``device``; buffers may lack."""
     try:
@@ -60,6 +62,7 @@ def load_into(
         raise MissingWeightsError(
             f"weights file {path} has tensors of other shapes than the network: replace it"
         ) from error
+    # Buffers are constants that a network makes itself, and checkpoints of others often lack them.
     learned = {name for name, _ in network.named_parameters()}
     missing = sorted(learned.intersection(missing))
     if missing or unexpected:
@@ -96,7 +99,7 @@ def _superpoint(settings: FeatureSettings, weights: Path | None, device: torch.d
         state = {name.removeprefix(prefix): state[name] for name in detector}
     load_into(network, state, weights, device)
 
-    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def extract(image: Tensor) -> Found:
         height, width = image.shape[-2:]
         output = network(_gray(image))  # reads the first channel only
         size = torch.tensor([width, height], device=image.device)
@@ -126,7 +129,7 @@ def _aliked(settings: FeatureSettings, weights: Path | None, device: torch.devic
     )
     load_into(network, load_state(weights), weights, device)
 
-    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def extract(image: Tensor) -> Found:
         features = network(image)[0]
         return features.keypoints, features.descriptors, features.keypoint_scores
 
@@ -140,7 +143,7 @@ def _disk(settings: FeatureSettings, weights: Path | None, device: torch.device)
     network = DISK()
     load_into(network, load_state(weights, entry="extractor"), weights, device)
 
-    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def extract(image: Tensor) -> Found:
         features = network(
             image,
             n=settings.max_keypoints,
@@ -162,7 +165,7 @@ def _sift_kornia(
         settings.max_keypoints, device=device, descriptor_backend="pyramid"
     ).eval()
 
-    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def extract(image: Tensor) -> Found:
         frames, responses, descriptors = network(_gray(image)[:, :1])
         filled = laf_is_filled(frames)[0]  # [K]: slots stay empty in an image with few extrema
         return frames[0, filled, :, 2], descriptors[0, filled], responses[0, filled]
@@ -170,7 +173,7 @@ def _sift_kornia(
     return extract
 
 
-def _gray(image: torch.Tensor) -> torch.Tensor:
+def _gray(image: Tensor) -> Tensor:
     """The luma of ITU-R BT.601 in three equal channels [1, 3, H, W]."""
     weights = image.new_tensor([0.299, 0.587, 0.114])[None, :, None, None]
     return (image * weights).sum(dim=1, keepdim=True).expand(-1, 3, -1, -1)

@@ -15,15 +15,15 @@ from gsbench.init.networks.extractors import GPU_MEMORY_HINT, load_into
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.weights import load_state
 
-# Matches two images: indices [M, 2] of keypoints in the first and the second.
-Matcher = Callable[[Features, Features], NDArray[np.uint32]]
+Matches = NDArray[np.uint32]  # indices [M, 2] of keypoints in the first and the second image
+Matcher = Callable[[Features, Features], Matches]
 
 
 def mutual_nearest_matcher(max_ratio: float, device: torch.device) -> Matcher:
     """Match descriptors that are each other's nearest and pass the ratio test both ways."""
     from kornia.feature import match_smnn
 
-    def match_features(first: Features, second: Features) -> NDArray[np.uint32]:
+    def match_features(first: Features, second: Features) -> Matches:
         ours, theirs = (
             torch.from_numpy(features.descriptors).to(device) for features in (first, second)
         )  # [K, D]
@@ -66,7 +66,7 @@ def lightglue_matcher(
             ),  # [1, 2]
         }
 
-    def match_features(first: Features, second: Features) -> NDArray[np.uint32]:
+    def match_features(first: Features, second: Features) -> Matches:
         with torch.inference_mode():
             result = network({"image0": inputs(first), "image1": inputs(second)})
         return result["matches"][0].cpu().numpy().astype(np.uint32).reshape(-1, 2)
@@ -85,7 +85,7 @@ def build_matcher(settings: FeatureSettings, weights: Path | None, device: torch
     return lightglue_matcher(settings.extractor, settings.filter_threshold, weights, device)
 
 
-def match(matcher: Matcher, first: Features, second: Features) -> NDArray[np.uint32]:
+def match(matcher: Matcher, first: Features, second: Features) -> Matches:
     """The matches [M, 2] of two images; raises ``InputError`` if the device runs out of memory."""
     if len(first.keypoints) == 0 or len(second.keypoints) == 0:
         return np.empty((0, 2), dtype=np.uint32)

@@ -40,6 +40,7 @@ def inverse(value):
 def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
     """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit if
     it misses."""
+    # Kay and Kajiya 1986: the ray is in the box where it is between all three pairs of planes.
     ax, bx = (lx - ox) * ix, (hx - ox) * ix
     ay, by = (ly - oy) * iy, (hy - oy) * iy
     az, bz = (lz - oz) * iz, (hz - oz) * iz
@@ -50,6 +51,7 @@ def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
 def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
     """The first distance > 0 of a ray to a capped cylinder, solid or bored; inf for a miss."""
     best = inf
+    # The mantles x^2 + y^2 = r^2: the roots of a t^2 + 2 b t + c. A ray along the axis has a = 0.
     a = dx * dx + dy * dy
     for radius in (outer, inner):
         if radius > 0.0 and a > 1e-12:
@@ -60,6 +62,7 @@ def hit_tube(outer, half, inner, ox, oy, oz, dx, dy, dz):
                 for t in ((-b - root) / a, (-b + root) / a):
                     if 0.0 < t < best and abs(oz + t * dz) <= half:
                         best = t
+    # The caps z = -half and z = half are rings between the bore and the mantle.
     if abs(dz) > 1e-12:
         for cap in (-half, half):
             t = (cap - oz) / dz
@@ -90,6 +93,7 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
         )
         return entry if 0.0 < entry <= exit_ else inf
     if kind == SPHERE:
+        # |o + t d| = r with |d| = 1: t^2 + 2 b t + c = 0
         b, c = ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz - size[0] * size[0]
         root = b * b - c
         if root <= 0.0:
@@ -143,6 +147,8 @@ def signed_distance(kind, size, x, y, z):
     else:
         middle = 0.5 * (size[0] + size[2]) if size[2] > 0.0 else 0.0
         qx, qy, qz = abs(sqrt(x * x + y * y) - middle) - (size[0] - middle), -inf, abs(z) - size[1]
+    # Of a box, and of a ring's section, which is a box in (radius, z): the distance to its nearest
+    # corner or edge outside, and to its nearest face, negative, inside.
     outside = sqrt(max(qx, 0.0) ** 2 + max(qy, 0.0) ** 2 + max(qz, 0.0) ** 2)
     return outside + min(max(qx, qy, qz), 0.0)
 
@@ -158,6 +164,7 @@ def nearest_surface(layout, x, y, z, limit):
             max(low[1] - y, 0.0, y - high[1]),
             max(low[2] - z, 0.0, z - high[2]),
         )
+        # nothing in the group's box can be nearer than the box itself
         if qx * qx + qy * qy + qz * qz >= best * best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
@@ -248,12 +255,14 @@ def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
         red = tint[0] * light * (1.0 + 0.30 * warmth)
         green = tint[1] * light
         blue = tint[2] * light * (1.0 - 0.30 * warmth)
+    # Ambient occlusion: less free space along the normal than the step means something is near.
     occlusion = 1.0
     for step in OCCLUSION_STEPS:
         free = nearest_surface(layout, x + step * nx, y + step * ny, z + step * nz, step)
         occlusion -= 0.38 * (1.0 - free / step)
     sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
     if sun > 0.0:
+        # from a little above the surface, which would otherwise shade itself
         sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
         _, blocker = cast(layout, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
         sun = sun if blocker == SKY else 0.0
@@ -272,6 +281,7 @@ def encode(value):
     value = EXPOSURE * value
     if value > 0.6:
         value = 0.6 + 0.4 * (1.0 - exp(-(value - 0.6) / 0.4))
+    # IEC 61966-2-1
     srgb = 12.92 * value if value <= 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
     return floor(255.0 * clamp(srgb, 0.0, 1.0) + 0.5)
 

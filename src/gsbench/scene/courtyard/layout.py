@@ -48,6 +48,7 @@ class Layout(NamedTuple):
 class _Builder:
     """Collects primitives in groups; positions are relative to the group's position and yaw."""
 
+    rng: np.random.Generator
     rows: list[tuple[int, NDArray, NDArray, tuple, int, tuple]] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
     place: NDArray = field(default_factory=lambda: np.zeros(3))
@@ -96,17 +97,16 @@ class _Builder:
 
 def build_layout(seed: int) -> Layout:
     """The courtyard. The plan is fixed; the seed varies small objects and shrubs."""
-    rng = np.random.default_rng(seed)
-    build = _Builder()
+    build = _Builder(np.random.default_rng(seed))
     # Objects near the cameras come first: a ray that hits one skips the groups behind it.
     _well(build)
-    _crates(build, rng)
-    _bench(build, rng)
-    _pots(build, rng)
-    _logs(build, rng)
-    _sundial(build, rng)
-    _shrubs(build, rng)
-    _pergola(build, rng)
+    _crates(build)
+    _bench(build)
+    _pots(build)
+    _logs(build)
+    _sundial(build)
+    _shrubs(build)
+    _pergola(build)
     _walls(build)
     _house(build)
     return build.layout()
@@ -160,13 +160,13 @@ def _walls(build: _Builder) -> None:
             build.box((x, 0.16, z), (0.86, 0.03, 0.1), METAL, _IRON)
 
 
-def _pergola(build: _Builder, rng: np.random.Generator) -> None:
+def _pergola(build: _Builder) -> None:
     for y in (-4.2, -1.4, 1.4, 4.2):
         build.group(-5.9, y)
         build.box((0, 0, 0.14), (0.56, 0.56, 0.28), STONE, _GREY_STONE)
         build.tube((0, 0, 1.27), 0.19, 1.98, STONE, _WHITEWASH)
         build.box((0, 0, 2.32), (0.5, 0.5, 0.14), STONE, _GREY_STONE)
-        angle = rng.uniform(0, 2 * pi)
+        angle = build.rng.uniform(0, 2 * pi)
         build.sphere((0.24 * cos(angle), 0.24 * sin(angle), 0.32), 0.25, LEAVES, _DEEP_LEAF)
     build.group(-6.3, 0.0)
     build.box((0.4, 0, 2.48), (0.2, 9.6, 0.2), WOOD, _DARK_OAK)
@@ -174,18 +174,18 @@ def _pergola(build: _Builder, rng: np.random.Generator) -> None:
         build.box((0.1, float(y), 2.64), (2.3, 0.11, 0.14), WOOD, _OAK)
 
 
-def _shrubs(build: _Builder, rng: np.random.Generator) -> None:
+def _shrubs(build: _Builder) -> None:
     places = [(6.5, y) for y in (-5.8, -3.9, -1.6, 0.8, 3.2, 5.4)] + [
         (x, -6.5) for x in (-5.6, -3.6, -1.8, 3.0, 5.0)
     ]
     for x, y in places:
-        build.group(x + rng.uniform(-0.15, 0.1), y + rng.uniform(-0.3, 0.3))
-        tint = (_LEAF, _DEEP_LEAF, _PALE_LEAF)[rng.integers(3)]
-        radius = rng.uniform(0.36, 0.58)
+        build.group(x + build.rng.uniform(-0.15, 0.1), y + build.rng.uniform(-0.3, 0.3))
+        tint = (_LEAF, _DEEP_LEAF, _PALE_LEAF)[build.rng.integers(3)]
+        radius = build.rng.uniform(0.36, 0.58)
         build.sphere((0, 0, 0.7 * radius), radius, LEAVES, tint)
         for _ in range(4):
-            angle, small = rng.uniform(0, 2 * pi), radius * rng.uniform(0.5, 0.72)
-            height = radius * rng.uniform(0.5, 1.5)
+            angle, small = build.rng.uniform(0, 2 * pi), radius * build.rng.uniform(0.5, 0.72)
+            height = radius * build.rng.uniform(0.5, 1.5)
             at = (0.62 * radius * cos(angle), 0.62 * radius * sin(angle), height)
             build.sphere(at, small, LEAVES, tint)
 
@@ -205,11 +205,11 @@ def _well(build: _Builder) -> None:
     build.tube((0.15, -0.68, 0.87), 0.135, 0.03, METAL, _IRON, inner=0.11)
 
 
-def _crates(build: _Builder, rng: np.random.Generator) -> None:
-    build.group(2.0, -1.25, 18.0 + rng.uniform(-6, 6))
+def _crates(build: _Builder) -> None:
+    build.group(2.0, -1.25, 18.0 + build.rng.uniform(-6, 6))
     _crate(build, (0, 0, 0), 0.72, 0.0, _PALE_WOOD)
     _crate(build, (0.86, 0.12, 0), 0.56, 24.0, _OAK)
-    _crate(build, (0.04, -0.02, 0.72), 0.46, 31.0 + rng.uniform(-5, 5), _OAK)
+    _crate(build, (0.04, -0.02, 0.72), 0.46, 31.0 + build.rng.uniform(-5, 5), _OAK)
     build.group(1.35, -2.15)
     build.tube((0, 0, 0.42), 0.31, 0.84, WOOD, _OAK)
     for z in (0.12, 0.3, 0.55, 0.74):
@@ -231,8 +231,8 @@ def _crate(
             build.box(post, (slat, slat, side), WOOD, _DARK_OAK, yaw=yaw)
 
 
-def _bench(build: _Builder, rng: np.random.Generator) -> None:
-    build.group(-1.95, 1.45, 55.0 + rng.uniform(-6, 6))
+def _bench(build: _Builder) -> None:
+    build.group(-1.95, 1.45, 55.0 + build.rng.uniform(-6, 6))
     for y in (-0.16, 0.0, 0.16):
         build.box((0, y, 0.46), (1.6, 0.16, 0.045), WOOD, _PALE_WOOD)
     for z in (0.66, 0.84):
@@ -243,29 +243,29 @@ def _bench(build: _Builder, rng: np.random.Generator) -> None:
         build.box((x, 0.03, 0.40), (0.06, 0.46, 0.06), WOOD, _DARK_OAK)
 
 
-def _pots(build: _Builder, rng: np.random.Generator) -> None:
+def _pots(build: _Builder) -> None:
     for x, y, scale in ((-1.55, -1.75, 1.0), (-2.25, -1.15, 0.75), (-2.2, -2.15, 0.6)):
         build.group(x, y)
         build.tube((0, 0, 0.2 * scale), 0.24 * scale, 0.4 * scale, CLAY, _TERRACOTTA)
         build.tube((0, 0, 0.4 * scale), 0.28 * scale, 0.07 * scale, CLAY, _TERRACOTTA)
-        tint = (_LEAF, _PALE_LEAF, _DEEP_LEAF)[rng.integers(3)]
+        tint = (_LEAF, _PALE_LEAF, _DEEP_LEAF)[build.rng.integers(3)]
         build.sphere((0, 0, 0.66 * scale), 0.3 * scale, LEAVES, tint)
         for _ in range(3):
-            angle, out = rng.uniform(0, 2 * pi), 0.18 * scale
-            at = (out * cos(angle), out * sin(angle), scale * rng.uniform(0.65, 0.95))
+            angle, out = build.rng.uniform(0, 2 * pi), 0.18 * scale
+            at = (out * cos(angle), out * sin(angle), scale * build.rng.uniform(0.65, 0.95))
             build.sphere(at, 0.19 * scale, LEAVES, tint)
 
 
-def _logs(build: _Builder, rng: np.random.Generator) -> None:
-    build.group(-0.15, -2.55, -12.0 + rng.uniform(-5, 5))
+def _logs(build: _Builder) -> None:
+    build.group(-0.15, -2.55, -12.0 + build.rng.uniform(-5, 5))
     for row, count in enumerate((4, 3, 2)):
         for k in range(count):
-            at = (rng.uniform(-0.04, 0.04), (k - (count - 1) / 2) * 0.25, 0.125 + row * 0.215)
-            build.tube(at, rng.uniform(0.112, 0.124), 0.9, LOG, _OAK, tilt=90)
+            at = (build.rng.uniform(-0.04, 0.04), (k - (count - 1) / 2) * 0.25, 0.125 + row * 0.215)
+            build.tube(at, build.rng.uniform(0.112, 0.124), 0.9, LOG, _OAK, tilt=90)
 
 
-def _sundial(build: _Builder, rng: np.random.Generator) -> None:
-    build.group(2.45, 1.0, rng.uniform(0, 45))
+def _sundial(build: _Builder) -> None:
+    build.group(2.45, 1.0, build.rng.uniform(0, 45))
     build.box((0, 0, 0.09), (0.66, 0.66, 0.18), STONE, _GREY_STONE)
     build.tube((0, 0, 0.58), 0.17, 0.8, STONE, _SANDSTONE)
     build.box((0, 0, 1.02), (0.44, 0.44, 0.09), STONE, _GREY_STONE)

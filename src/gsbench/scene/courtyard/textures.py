@@ -38,6 +38,7 @@ def noise2(x, y, seed):
     fx, fy = floor(x), floor(y)
     ix, iy = int(fx), int(fy)
     u, v = x - fx, y - fy
+    # Perlin 2002: 6 t^5 - 15 t^4 + 10 t^3 has no slope and no curvature at the lattice
     u, v = u * u * u * (u * (6 * u - 15) + 10), v * v * v * (v * (6 * v - 15) + 10)
     low = random_cell(ix, iy, 0, seed) * (1 - u) + random_cell(ix + 1, iy, 0, seed) * u
     high = random_cell(ix, iy + 1, 0, seed) * (1 - u) + random_cell(ix + 1, iy + 1, 0, seed) * u
@@ -91,6 +92,7 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
 @inlined
 def pebbles(x, y, cell, seed):
     """Cellular noise: distances to the nearest feature point and the border, shade of the cell."""
+    # Worley 1996: one feature point in each cell, so the nearest lies in the cell or beside it
     gx, gy = floor(x / cell), floor(y / cell)
     first, second, shade = 9.0, 9.0, 0.0
     for i in range(gx - 1, gx + 2):

@@ -1,0 +1,53 @@
+"""COLMAP models of a few cameras, and what identifies a written model."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+
+def camera_at(center: np.ndarray, rotation: np.ndarray | None = None) -> pycolmap.Rigid3d:
+    """The pose of a camera; without a rotation it looks along +z, with y downwards."""
+    turn = np.eye(3) if rotation is None else rotation
+    return pycolmap.Rigid3d(np.column_stack([turn, -turn @ np.asarray(center)]))
+
+
+def model_with(
+    poses: Mapping[str, pycolmap.Rigid3d],
+    keypoints: Mapping[str, np.ndarray] | int = 0,
+    camera: pycolmap.Camera | None = None,
+) -> pycolmap.Reconstruction:
+    """A model of images with ids from 1 and one camera, by default of 100 x 80 px, f = 100 px.
+
+    ``keypoints`` [K, 2] are those of each image, or their number.
+    """
+    model = pycolmap.Reconstruction()
+    plain = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
+    model.add_camera_with_trivial_rig(camera or plain)
+    for number, (name, pose) in enumerate(poses.items(), start=1):
+        seen = np.zeros((keypoints, 2)) if isinstance(keypoints, int) else keypoints[name]
+        image = pycolmap.Image(name=name, keypoints=seen, camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
+    return model
+
+
+def add_point(
+    model: pycolmap.Reconstruction,
+    position: object,
+    color: tuple[int, int, int] = (10, 20, 30),
+    seen_by: Mapping[int, int] | None = None,
+) -> None:
+    """Add a point; ``seen_by`` maps the ids of images to the indices of their keypoints."""
+    elements = [pycolmap.TrackElement(*item) for item in (seen_by or {}).items()]
+    place = np.asarray(position, dtype=float)
+    model.add_point3D(place, pycolmap.Track(elements), np.array(color, dtype=np.uint8))
+
+
+def digest(model: Path) -> str:
+    """One value for the bytes of all files of a model."""
+    files = sorted(model.glob("*.bin"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

@@ -1,0 +1,117 @@
+"""Short trainings of a tiny scene, as most tests of this room run them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, SteepGS
+from gsbench.gaussians.initial import gaussians_from_cloud
+from gsbench.gaussians.model import Gaussians
+from gsbench.raster.base import Rasterizer
+from gsbench.scene.types import Scene
+from gsbench.train.options import TrainConfig
+from gsbench.train.trainer import Status, Trainer
+
+CPU = torch.device("cpu")
+EVENTS, METRICS = "events.jsonl", "metrics.jsonl"
+
+
+def cloud(truth: Gaussians) -> Gaussians:
+    colors = torch.full((len(truth), 3), 127, dtype=torch.uint8)
+    return gaussians_from_cloud(truth.means.double().numpy(), colors.numpy())
+
+
+def options(**changes: Any) -> TrainConfig:
+    values = {
+        "name": "test",
+        "iterations": 120,
+        "sh_interval": 40,
+        "position_steps": 120,
+        "checkpoint_every": 50,
+        "volume_histogram": [60],
+    }
+    return TrainConfig(**(values | changes))
+
+
+def small(kind: type[ADC] = ADC, **changes: Any) -> ADC:
+    window = {"start": 20, "stop": 110, "interval": 20, "opacity_reset_interval": 60}
+    return kind(**(window | changes))
+
+
+# Densifiers with a state of their own that a training must go on from.
+STATEFUL: dict[str, Callable[[], Densifier]] = {
+    "adc": small,
+    "mcmc": lambda: MCMC(start=20, stop=110, interval=20),
+    "mrnf": lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
+    "gns": lambda: GNS(
+        start=20, stop=60, interval=20, max_gaussians=90, pressure_length=1.0, overgrowth=2.0
+    ),
+    "fastgs": lambda: small(FastGS, error_threshold=0.05, least_count=0.0, max_gaussians=200),
+    "steepgs": lambda: small(SteepGS),
+}
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    pairs = zip(a.tensors().values(), b.tensors().values(), strict=True)
+    return len(a) == len(b) and all(torch.equal(x, y) for x, y in pairs)
+
+
+class StopError(Exception):
+    """Stands for a kill: nothing is saved on the way out."""
+
+
+def stop_at(step: int) -> Callable[[Status], None]:
+    def stop(status: Status) -> None:
+        if status.step == step:
+            raise StopError
+
+    return stop
+
+
+@dataclass
+class Lab:
+    """A scene with its Gaussians, a rasterizer, and a folder for trainings."""
+
+    scene: Scene
+    truth: Gaussians
+    rasterizer: Rasterizer
+    folder: Path
+
+    def new(
+        self, densifier: Densifier, seed: int = 0, snapshot_at: Sequence[int] = (), **changes: Any
+    ) -> Trainer:
+        parts = (self.scene, cloud(self.truth), densifier, self.rasterizer)
+        return Trainer(*parts, options(**changes), seed, snapshot_at)
+
+    def train(
+        self,
+        densifier: Densifier,
+        name: str = "",
+        on_status: Callable[[Status], None] = lambda status: None,
+        **changes: Any,
+    ) -> Gaussians:
+        (self.folder / name).mkdir(exist_ok=True)
+        return self.new(densifier, **changes).run(self.folder / name, on_status)
+
+    def text(self, file: str, name: str = "") -> str:
+        return (self.folder / name / file).read_text()
+
+    def records(self, file: str, name: str = "") -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.text(file, name).splitlines()]
+
+    def steps(self, file: str, name: str = "") -> list[int]:
+        return [record["step"] for record in self.records(file, name)]
+
+    def checkpoints(self, name: str = "") -> list[int]:
+        """The iterations of the checkpoints."""
+        found = (self.folder / name).glob("checkpoint-*.pt")
+        return sorted(int(path.stem.removeprefix("checkpoint-")) for path in found)
+
+    def with_views(self, **changes: Any) -> Lab:
+        return replace(self, scene=replace(self.scene, **changes))
