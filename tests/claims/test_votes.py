@@ -1,8 +1,6 @@
 """Votes: a page that tells nothing, a whole round in a browser by keyboard, and a verdict by exact
 tests."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random

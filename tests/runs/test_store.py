@@ -1,7 +1,5 @@
 """The store: done once, whole or absent, damage named and mended, kills and rivals survived."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
