@@ -1,8 +1,6 @@
 """A metric of one's own that is added to an experiment with trials: what these lack counts as
 unset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

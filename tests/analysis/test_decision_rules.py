@@ -1,7 +1,5 @@
 """The fast simulator of ``scripts/decision_rules.py`` decides as the judge does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

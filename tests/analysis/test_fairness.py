@@ -1,8 +1,6 @@
 """The fairness sheet: generated from records and files, and nothing that was recorded is missing
 from it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The data frame of an experiment: one row a trial, as the result files have it."""
 
-from __future__ import annotations
-
 import io
 import json
 import statistics

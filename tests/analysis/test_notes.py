@@ -1,8 +1,6 @@
 """Notes on what trials have in common, word for word, for made-up trials whose numbers are
 known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

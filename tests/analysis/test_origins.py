@@ -1,7 +1,5 @@
 """Machines and initial clouds: averaged over, compared across, and always said."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The paper as data: its numbers against its own text, and the classing of cells."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Arms ranked over scenes: the published critical values, Friedman's test, groups, and what is left
 out."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,8 +1,6 @@
 """The report: it stands alone, says the verdict first, needs neither mouse nor eyes, and shows the
 right places."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Reading result files: what is sound is read, everything else is named and left out."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tables: the numbers in the cells, what is refused, what is marked, and the formats."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """The error in textured parts, against its definition pixel by pixel."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hydra's own settings: what of them is read, and the advice of errors."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsbench import cli

@@ -1,8 +1,6 @@
 """Several grids in one experiment: what trials they make, and that plan, dry run and retry see one
 experiment."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,8 +1,6 @@
 """A sweep in planned looks: which trials each look launches, when it stops, and that a stopped one
 goes on."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Tuning parity with trials that take no time: what is declared, searched and chosen, and that
 nobody is favoured."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

@@ -1,8 +1,6 @@
 """Switches of densifiers: which are on, which runs they make, and verdicts from result files with
 known gains."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path

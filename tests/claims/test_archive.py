@@ -1,8 +1,6 @@
 """Archives of results: what comes back, what is never in them, and damage of every kind named in
 one line."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable

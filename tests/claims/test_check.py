@@ -1,8 +1,6 @@
 """A check from its file to its page: what is asked, what is run at each look, and that again
 nothing is."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """Files of claims: those that ship, and every kind of bad input as one line that names the place
 and the mend."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import re

@@ -1,8 +1,6 @@
 """The page of a check: what it says of scenes like these, of machines and clouds, and of
 initialisers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 """The mean of many studies: Student's t over them, refused where protocols are unlike; archives as
 studies."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

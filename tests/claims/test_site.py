@@ -1,8 +1,6 @@
 """The site from archives: what its pages say, that strangers' words stay words, and that its tables
 sort."""
 
-from __future__ import annotations
-
 import json
 import re
 from html.parser import HTMLParser

@@ -1,8 +1,6 @@
 """Looks: which trials each needs, in which order, and that a question whose trials failed gets no
 more."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

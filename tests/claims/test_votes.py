@@ -1,8 +1,6 @@
 """Votes: a page that tells nothing, a whole round in a browser by keyboard, and a verdict by exact
 tests."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random
@@ -53,12 +51,20 @@ def runs(pictures, monkeypatch) -> Path:
     return pictures
 
 
-def made(runs: Path, out: Path, *words: str) -> RoundKey:
-    """The key of a new round of the experiment ``exp``, whose page is in ``out``."""
-    before = set((runs / "exp" / "votes").glob("*"))
-    assert run(["vote", "make", "exp", "--out", str(out), *words]) == 0
-    (folder,) = set((runs / "exp" / "votes").glob("*")) - before
-    return read_key(folder)
+@pytest.fixture
+def made(runs, tmp_path) -> Callable[..., RoundKey]:
+    """A function that makes a round of ``exp`` with its page in ``page``, and returns its key."""
+
+    def make(*words, pairs="12", out="page"):
+        before = set((runs / "exp" / "votes").glob("*"))
+        assert (
+            run(["vote", "make", "exp", "--out", str(tmp_path / out), "--pairs", pairs, *words])
+            == 0
+        )
+        (folder,) = set((runs / "exp" / "votes").glob("*")) - before
+        return read_key(folder)
+
+    return make
 
 
 def prefers(arm: str) -> Chooser:
@@ -122,8 +128,8 @@ def made_up(
 # ---- the page
 
 
-def test_the_page_tells_nothing_of_arms(runs, tmp_path):
-    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
+def test_the_page_tells_nothing_of_arms(made, tmp_path):
+    key = made("--people", "2")
     text = (tmp_path / "page" / "index.html").read_text()
     for word in ("sfm", "volumetric", "courtyard", "garden", "view0", key.salt, "blurred"):
         assert word not in text
@@ -135,13 +141,13 @@ def test_the_page_tells_nothing_of_arms(runs, tmp_path):
         assert not set(file.stem) - set("0123456789abcdef")
         with Image.open(file) as image:
             assert not image.info
-    again = made(runs, tmp_path / "again", "--pairs", "12", "--people", "2")
+    again = made("--people", "2", out="again")
     assert not set(map(key.commitment, key.showings)) & set(map(again.commitment, again.showings))
 
 
-def test_each_showing_has_the_pictures_that_its_key_says(runs, tmp_path):
+def test_each_showing_has_the_pictures_that_its_key_says(made, runs, tmp_path):
     page = tmp_path / "page"
-    key = made(runs, page, "--pairs", "12")
+    key = made()
     text = (page / "index.html").read_text()
     entries = json.loads(text.partition('id="data">')[2].partition("</script>")[0])["showings"]
     trials = {(t.scene, str(t.arm), t.seed): t.path for t in load_experiment(runs, "exp").trials}
@@ -164,8 +170,8 @@ def test_each_showing_has_the_pictures_that_its_key_says(runs, tmp_path):
                 np.testing.assert_array_equal(shown, np.asarray(Image.open(render)))
 
 
-def test_views_sides_repeats_and_traps_follow_the_rules(runs, tmp_path):
-    key = made(runs, tmp_path / "page", "--pairs", "12")
+def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
+    key = made()
     kinds = [one.kind for one in key.showings]
     assert [kinds.count(kind) for kind in ("pair", "again", "trap")] == [12, 1, 4]
     assert [one.left for one in key.pairs].count(ADC) == 6
@@ -198,19 +204,19 @@ def test_views_sides_repeats_and_traps_follow_the_rules(runs, tmp_path):
             assert key.showings.index(showing) > key.showings.index(first)
 
 
-def test_more_pairs_than_views_are_said(runs, tmp_path, capsys):
-    key = made(runs, tmp_path / "page", "--pairs", "40", "--people", "9")
+def test_more_pairs_than_views_are_said(made, capsys):
+    key = made("--people", "9", pairs="40")
     out = capsys.readouterr().out
     assert len(key.pairs) == 14
     assert "no more than 14 views" in out
     assert "judged at 126 votes of 9 people" in out
     assert "decide nothing" not in out
-    made(runs, tmp_path / "two", "--people", "5")
+    made("--people", "5", pairs="40", out="two")
     assert "decide nothing: that needs 6 people" in capsys.readouterr().out
 
 
-def test_it_is_declared_and_leaves_other_declarations_alone(runs, tmp_path):
-    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "7")
+def test_it_is_declared_and_leaves_other_declarations_alone(made, runs, tmp_path):
+    key = made("--people", "7")
     declared = [one for one in read_declarations(runs / "exp") if one.vote_round == key.round]
     assert [(one.kind, one.votes, len(one.questions)) for one in declared] == [("votes", 84, 1)]
     page = build_report(load_experiment(runs, "exp"))
@@ -256,8 +262,8 @@ def test_without_pictures_there_is_no_page(tmp_path):
 # ---- files of votes
 
 
-def test_files_that_do_not_fit_are_refused(runs, tmp_path, refused):
-    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
+def test_files_that_do_not_fit_are_refused(made, tmp_path, refused):
+    key = made("--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
     twice = replace(sound, person=f"{3:016x}", votes=(*sound.votes, sound.votes[0]))
@@ -280,8 +286,8 @@ def test_files_that_do_not_fit_are_refused(runs, tmp_path, refused):
     )
 
 
-def test_a_changed_key_judges_nothing(runs, tmp_path, refused):
-    key = made(runs, tmp_path / "page", "--pairs", "12")
+def test_a_changed_key_judges_nothing(made, runs, tmp_path, refused):
+    key = made()
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
     first = key.showings[0]
@@ -293,8 +299,8 @@ def test_a_changed_key_judges_nothing(runs, tmp_path, refused):
     file.write_text(text)
 
 
-def test_names_of_strangers_stay_words(runs, tmp_path):
-    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
+def test_names_of_strangers_stay_words(made, runs, tmp_path):
+    key = made("--people", "1")
     careless = ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>")
     assert run(["vote", "judge", "exp", saved(tmp_path, careless)]) == 0
     page = build_report(load_experiment(runs, "exp"))
@@ -302,8 +308,8 @@ def test_names_of_strangers_stay_words(runs, tmp_path):
     assert "<img src=x" not in page
 
 
-def test_the_report_shows_where_people_and_lpips_disagree(runs, tmp_path):
-    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "1")
+def test_the_report_shows_where_people_and_lpips_disagree(made, runs, tmp_path):
+    key = made("--people", "1")
     assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 0
     page = build_report(load_experiment(runs, "exp"))
     part = page.partition(f"Round {key.round}")[2].partition("</section>")[0].partition("Round ")[0]
@@ -451,8 +457,8 @@ class Voter:
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_two_people_vote_by_keyboard_and_are_judged(runs, tmp_path, capsys, said):
-    key = made(runs, tmp_path / "page", "--pairs", "12", "--people", "2")
+def test_two_people_vote_by_keyboard_and_are_judged(made, runs, tmp_path, capsys, said):
+    key = made("--people", "2")
     address, files, last = (tmp_path / "page" / "index.html").as_uri(), [], len(key.showings)
     for width, chooser in ((1200, prefers(VOLUMETRIC)), (400, prefers(ADC))):
         with Browser(address, tmp_path / f"profile{width}", (width, 800)) as browser:

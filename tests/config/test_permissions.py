@@ -1,8 +1,6 @@
 """Other people's runs folders and trainers: what they may run is what the one who types allows,
 every time."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

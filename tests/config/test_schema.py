@@ -1,8 +1,6 @@
 """Every file in ``conf`` composes, its classes can be built, and what is written there is what the
 code defaults to."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

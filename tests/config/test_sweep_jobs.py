@@ -1,8 +1,6 @@
 """A job of a sweep has the configuration that its words give alone, whatever it shares with the
 others."""
 
-from __future__ import annotations
-
 import pickle
 
 import pytest

@@ -5,8 +5,6 @@ Every case tries to leave a mark: a module that writes a file when it is importe
 makes a folder.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from typing import Any

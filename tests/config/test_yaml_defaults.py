@@ -1,8 +1,6 @@
 """A value that YAML and a class both state is the same, unless it is said here that it shall
 differ."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 from collections.abc import Iterator

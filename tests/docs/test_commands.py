@@ -4,8 +4,6 @@ choices and keys.
 Read from the text, not run; values other than choices are checked where commands run.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import importlib

@@ -1,8 +1,6 @@
 """The examples in docstrings are true, what users extend has one, and docstrings begin with a verb
 or a noun."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib

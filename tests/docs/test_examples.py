@@ -1,7 +1,5 @@
 """The Python blocks of the documents run, in order, as a reader would run them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """docs/fidelity.md says what the restatements of the arms measure."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

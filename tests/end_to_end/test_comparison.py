@@ -1,8 +1,6 @@
 """What a comparison says of its arms, from real trials: gsbench's own, and one from a file
 outside."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsbench.cli import run

@@ -1,7 +1,5 @@
 """gsbench itself is edited: no command returns the numbers that it gave before."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from typing import Any

@@ -1,7 +1,5 @@
 """Renders and models of other programs, measured by our protocol and entered beside our arms."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

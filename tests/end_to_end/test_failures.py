@@ -1,8 +1,6 @@
 """The program where something fails: a full disk, a folder that cannot be written to, a trial that
 raises."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

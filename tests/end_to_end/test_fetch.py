@@ -1,8 +1,6 @@
 """A fresh machine: one command brings the data, and nothing of the paper's sweep is missing any
 more."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,8 +1,6 @@
 """Versions of a densifier, trained for real: the gate's exit codes, and the commit that bisect
 finds."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

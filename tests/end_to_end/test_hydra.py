@@ -1,7 +1,5 @@
 """gsbench as a Hydra app, through the real program: launchers of others, and callbacks."""
 
-from __future__ import annotations
-
 import json
 from importlib.util import find_spec
 from pathlib import Path

@@ -5,8 +5,6 @@ Two of them need older packages than gsbench's own search and tracker, so ``make
 test-hydra-plugins`` installs them into a folder of their own. Without it these tests are skipped.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections import defaultdict

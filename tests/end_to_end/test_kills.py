@@ -1,8 +1,6 @@
 """The program killed by signals, or run twice at once: it goes on, and ends as if nothing had
 happened."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

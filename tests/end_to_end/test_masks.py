@@ -1,8 +1,6 @@
 """Masks in whole trials: not one bit of an ignored pixel enters one, an edited mask makes a new
 one."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

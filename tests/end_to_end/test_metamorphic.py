@@ -5,8 +5,6 @@ A similarity may change a result as another seed does. Other names, or another f
 values, may not change one bit.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,8 +1,6 @@
 """OpenSplat as an arm, where it is installed: its model lies where the photographs were taken, and
 it grows."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

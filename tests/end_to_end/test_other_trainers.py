@@ -1,8 +1,6 @@
 """Another program as an arm: it trains on what it is given, and what it leaves stands in the
 tables."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

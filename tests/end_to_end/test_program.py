@@ -1,8 +1,6 @@
 """The program from outside: a sweep, its files and its table; bad input; and the installed
 wheel."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import venv

@@ -1,8 +1,6 @@
 """The program as a user runs it, one short test for each thing that it is used for: part of ``make
 test``."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

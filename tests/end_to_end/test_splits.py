@@ -1,8 +1,6 @@
 """Splits in whole trials: not one bit of a held-out photograph enters a training, and a search
 never sees one."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

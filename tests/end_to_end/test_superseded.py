@@ -1,8 +1,6 @@
 """What a densifier needs is edited and a seed is run: no table averages both versions, one command
 forgets the old."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

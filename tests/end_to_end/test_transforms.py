@@ -1,8 +1,6 @@
 """A COLMAP scene written as transforms.json by other code, and read back: the same cameras, the
 same training."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

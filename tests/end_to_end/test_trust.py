@@ -1,8 +1,6 @@
 """Whole trials in a folder that holds a module for every name that anything imports; none of them
 may be imported."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import subprocess

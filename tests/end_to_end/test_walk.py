@@ -6,8 +6,6 @@ from one to the next, up to the frame that they share and down again. A crossing
 folder of gsbench to another.
 """
 
-from __future__ import annotations
-
 import inspect
 import itertools
 from collections import Counter

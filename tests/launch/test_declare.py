@@ -1,8 +1,6 @@
 """Declaring the metric of a verdict: recorded before trials run, visible when changed, and nothing
 is computed anew."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

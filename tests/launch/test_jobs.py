@@ -1,7 +1,5 @@
 """How a job ended is told by the files of its trial; what it returned is not read."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

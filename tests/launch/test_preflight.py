@@ -1,7 +1,5 @@
 """Checks of trials before any of them runs."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsbench.config.compose import compose_one

@@ -1,7 +1,5 @@
 """How far a sweep is, as ``gsbench status --watch`` and `progress_frame` show it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Composition, plan, states and finished trials: what needs no training."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

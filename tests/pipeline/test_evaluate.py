@@ -1,7 +1,5 @@
 """What an evaluation depends on: its key must not change for a setting that changes nothing."""
 
-from __future__ import annotations
-
 import csv
 import json
 from contextlib import nullcontext

@@ -1,8 +1,6 @@
 """Under which keys the results of one known trial lie in the store: a key that moves throws stored
 results away."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from gsbench.config.compose import compose_one

@@ -1,8 +1,6 @@
 """Keys of trials with classes of the user's: whatever makes them compute something else, moves
 them."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

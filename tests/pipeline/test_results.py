@@ -1,8 +1,6 @@
 """What results.json says of a training by gsbench, of another program's and of none, and of what it
 was made."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

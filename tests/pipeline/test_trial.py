@@ -1,7 +1,5 @@
 """A trial's end, whatever its code does."""
 
-from __future__ import annotations
-
 import json
 import sys
 from typing import Any

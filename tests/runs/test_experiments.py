@@ -1,8 +1,6 @@
 """The records of an experiment: which experiments there are, the search for an arm's settings,
 declared questions."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Which code made a result: the rooms of gsbench behind a stage, and the modules of a user's."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import importlib.util

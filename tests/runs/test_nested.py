@@ -1,7 +1,5 @@
 """Flattening: one function for configurations, stage inputs and MLflow's parameters."""
 
-from __future__ import annotations
-
 import doctest
 
 from gsbench.runs import keys as nested

@@ -1,7 +1,5 @@
 """The store: done once, whole or absent, damage named and mended, kills and rivals survived."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -33,14 +31,18 @@ def refuse(folder: Path) -> None:
     raise AssertionError("built again")
 
 
+BUILD = Step(LETTERS, {"x": 1}, write_letters)
+FOUND = Step(LETTERS, {"x": 1}, refuse)  # the same step, which has its result already
+
+
 @pytest.fixture
 def store(tmp_path) -> Store:
     return Store(tmp_path / "store")
 
 
 def test_second_request_is_not_built(store):
-    first = store.get(Step(LETTERS, {"x": 1}, write_letters))
-    second = store.get(Step(LETTERS, {"x": 1}, refuse))
+    first = store.get(BUILD)
+    second = store.get(FOUND)
     assert not first.cached
     assert second.cached
     assert second.path == first.path
@@ -54,8 +56,8 @@ def test_what_other_code_may_have_built_is_not_kept(store):
 
     with pytest.raises(InputError, match="edited meanwhile"):
         store.get(Step(LETTERS, {"x": 1}, write_letters, check=changed))
-    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
-    assert not store.get(Step(LETTERS, {"x": 1}, write_letters)).cached
+    assert store.find(FOUND) is None
+    assert not store.get(BUILD).cached
     assert store.get(Step(LETTERS, {"x": 1}, refuse, check=changed)).cached  # nothing was built now
 
 
@@ -75,36 +77,36 @@ def test_every_input_and_the_version_make_another_key(store):
 @pytest.mark.parametrize("name", ["a.txt", "sub/b.bin", MANIFEST])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
 def test_damage_is_named_and_mended(store, name, damage, caplog):
-    path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path / name
+    path = store.get(BUILD).path / name
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 4
     if damage == "delete":
         path.unlink()
     else:
         path.write_bytes(content if damage == "flip" else content[: len(content) // 2])
-    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
-    mended = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    assert store.find(FOUND) is None
+    mended = store.get(BUILD)
     assert not mended.cached
     assert (mended.path / "sub" / "b.bin").read_bytes() == bytes(range(256))
     message = " ".join(record.getMessage() for record in caplog.records)
     assert "damaged" in message
     assert name in message
-    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+    assert store.get(FOUND).cached
     assert not list(store.root.glob("*/.*.removed"))
 
 
 def test_damage_is_removed_over_what_a_killed_removal_left(store):
-    path = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    path = store.get(BUILD).path
     left = path.with_name(f".{path.name}.removed")
     left.mkdir()
     (left / "file").touch()
     (path / "a.txt").unlink()
-    assert not store.get(Step(LETTERS, {"x": 1}, write_letters)).cached
+    assert not store.get(BUILD).cached
     assert not left.exists()
 
 
 def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store):
-    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    folder = store.get(BUILD).path
     path = folder / "a.txt"
     state = path.stat()
     path.write_text("alpha beta")
@@ -119,7 +121,7 @@ def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store):
 
 
 def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store):
-    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    folder = store.get(BUILD).path
     sound = (folder / MANIFEST).read_bytes()
     rng = random.Random(0)
     for _ in range(300):
@@ -147,7 +149,7 @@ def flip_a_bit(path: Path) -> None:
 
 
 def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store):
-    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    folder = store.get(BUILD).path
     flip_a_bit(folder / "a.txt")
     read_manifest(folder)
     with pytest.raises(ValueError, match=r"a\.txt"):
@@ -155,7 +157,7 @@ def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store):
 
 
 def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(store, monkeypatch, caplog):
-    step = Step(LETTERS, {"x": 1}, write_letters)
+    step = BUILD
     path = store.get(step).path / "sub" / "b.bin"
     flip_a_bit(path)
     later = Store(store.root)  # as a later process
@@ -175,9 +177,9 @@ def compare_no_checksums(folder: Path, thorough: bool = False) -> Manifest:
 
 
 def test_a_copy_of_the_store_is_believed_by_content(store, tmp_path):
-    folder = store.get(Step(LETTERS, {"x": 1}, write_letters)).path
+    folder = store.get(BUILD).path
     os.utime(folder / "a.txt", ns=(1, 1))  # what copying does
-    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+    assert store.get(FOUND).cached
 
 
 def test_failed_build_is_not_published_and_starts_afresh(store):
@@ -187,8 +189,8 @@ def test_failed_build_is_not_published_and_starts_afresh(store):
 
     with pytest.raises(RuntimeError, match="no"):
         store.get(Step(LETTERS, {"x": 1}, fail))
-    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is None
-    assert not (store.get(Step(LETTERS, {"x": 1}, write_letters)).path / "half.txt").exists()
+    assert store.find(FOUND) is None
+    assert not (store.get(BUILD).path / "half.txt").exists()
 
 
 def test_resumable_build_finds_what_was_left_without_temporaries(store):
@@ -234,16 +236,16 @@ def test_files_are_on_the_disk_before_their_manifest_and_the_folder_after_it_is_
     synced: list[tuple[str, bool]] = []
     note = lambda path: synced.append((path.name, (path.parent / MANIFEST).exists()))  # noqa: E731
     monkeypatch.setattr("gsbench.runs.store.sync_to_disk", note)
-    store.get(Step(LETTERS, {"x": 1}, write_letters))
+    store.get(BUILD)
     assert synced == [("a.txt", False), ("b.bin", False), ("letters", False)]
 
 
 def test_killed_between_manifest_and_rename_is_only_published(store):
-    entry = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    entry = store.get(BUILD)
     os.replace(entry.path, store.partial(LETTERS, entry.key))
-    again = store.get(Step(LETTERS, {"x": 1}, refuse))
+    again = store.get(FOUND)
     assert again.seconds == entry.seconds
-    assert store.find(Step(LETTERS, {"x": 1}, refuse)) is not None
+    assert store.find(FOUND) is not None
 
 
 def test_sweep_removes_leftovers_and_leaves_what_serves(store):
@@ -356,7 +358,7 @@ def small_disk(tmp_path):
 
 def test_full_disk_is_one_line_and_corrupts_nothing(small_disk):
     store = Store(small_disk / "store")
-    sound = store.get(Step(LETTERS, {"x": 1}, write_letters))
+    sound = store.get(BUILD)
 
     def big(folder):
         (folder / "big.bin").write_bytes(bytes(2 << 20))
@@ -365,15 +367,15 @@ def test_full_disk_is_one_line_and_corrupts_nothing(small_disk):
         store.get(Step(LETTERS, {"x": 2}, big))
     assert "\n" not in str(caught.value)
     assert store.find(Step(LETTERS, {"x": 2}, refuse)) is None
-    assert store.get(Step(LETTERS, {"x": 1}, refuse)).path == sound.path
+    assert store.get(FOUND).path == sound.path
     store.sweep([LETTERS])
     assert not store.get(Step(LETTERS, {"x": 2}, write_letters)).cached
 
 
 def test_read_only_store_serves_what_it_has_and_says_so(small_disk):
     store = Store(small_disk / "store")
-    store.get(Step(LETTERS, {"x": 1}, write_letters))
+    store.get(BUILD)
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    assert store.get(Step(LETTERS, {"x": 1}, refuse)).cached
+    assert store.get(FOUND).cached
     with pytest.raises(InputError, match="cannot be written to"):
         store.get(Step(LETTERS, {"x": 2}, write_letters))

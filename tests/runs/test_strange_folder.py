@@ -1,7 +1,5 @@
 """A runs folder of a stranger's: no link of it is followed, and nothing of it holds anybody up."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from contextlib import suppress

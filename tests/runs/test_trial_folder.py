@@ -1,8 +1,6 @@
 """A finished trial's files are held against what was written down of them, and what was changed is
 named."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The types of a trial's files: what is left out has its default, and what cannot be is damaged."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A tracker that a file of somebody else names gets nothing unless its address is typed."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

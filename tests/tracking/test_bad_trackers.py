@@ -1,8 +1,6 @@
 """Whatever a tracker does, and whenever: a trial that is complete ends with exit code 0, and one
 line says the rest."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The page of an experiment in MLflow answers which arm is better, also in a browser."""
 
-from __future__ import annotations
-
 import base64
 import json
 import threading

@@ -1,8 +1,6 @@
 """What people who know MLflow look for: address, user, reasons of failures, files that are
 found."""
 
-from __future__ import annotations
-
 import getpass
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Many processes, one tracker: nothing is lost, doubled or mixed."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 from typing import Any

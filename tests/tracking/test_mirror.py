@@ -1,8 +1,6 @@
 """The MLflow mirror: every metric arrives once and in the right experiment, and a bad tracker harms
 no trial."""
 
-from __future__ import annotations
-
 import json
 import logging
 import subprocess

@@ -1,7 +1,5 @@
 """What each tracker shows of the same files; the packages of some are optional."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -158,9 +158,8 @@ def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     """
     first, second, truth = read_compared(*pair, view)
     errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
-    gain = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)[
-        ..., None
-    ]  # [H, W, 1], 1 where the second is nearer
+    nearer = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)  # [H, W], 1: the second is
+    gain = nearer[..., None]  # [H, W, 1]
     white, blue, red = (
         np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43))
     )
@@ -206,9 +205,8 @@ def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixel
         raise InputError(f"{one.label} and {other.label}: {view} has different sizes")
     counted = read_counted(one, view, truth.shape[:2])
     rows, columns = np.indices(counted.shape)
-    stripes = np.where((rows + columns) % (2 * STRIPE) < STRIPE, *STRIPES).astype(
-        np.uint8
-    )  # [H, W]
+    is_first = (rows + columns) % (2 * STRIPE) < STRIPE  # [H, W]
+    stripes = np.where(is_first, *STRIPES).astype(np.uint8)  # [H, W]
     return [
         np.where(counted[..., None], image, stripes[..., None]) for image in (first, second, truth)
     ]

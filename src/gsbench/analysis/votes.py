@@ -154,13 +154,9 @@ def judge_votes(
 
     ``votes`` [K, V] of K people on V views are 1, 0 or -1; ``scenes`` has the scene of each view.
     """
-    of_scene = [
-        [place for place, one in enumerate(scenes) if one == scene]
-        for scene in dict.fromkeys(scenes)
-    ]
-    cells = np.stack(
-        [votes[:, places].mean(axis=1) for places in of_scene]
-    )  # [S, K]: scenes have the same weight
+    places = np.array(scenes)  # [V]
+    own = [votes[:, places == scene] for scene in dict.fromkeys(scenes)]
+    cells = np.stack([one.mean(axis=1) for one in own])  # [S, K]: scenes have the same weight
     people, views = cells.mean(axis=0), cells.mean(axis=1)
     return judge_like_these(people, 1, LEAST_PREFERENCE, level), judge_like_these(
         views, 1, LEAST_PREFERENCE, level
@@ -171,9 +167,8 @@ def rank_arms(key: RoundKey, counted: Sequence[Ballot]) -> tuple[tuple[Arm, floa
     """The arms by their chance to win against the average arm, the best first."""
     names = [str(arm) for arm in key.arms]
     scenes = list(dict.fromkeys(one.scene for one in key.pairs))
-    wins = np.zeros(
-        (len(counted), len(scenes), len(names), len(names))
-    )  # [K, S, A, A], of row against column
+    people, arms = len(counted), len(names)
+    wins = np.zeros((people, len(scenes), arms, arms))  # [K, S, A, A], of row against column
     for person, ballot in enumerate(counted):
         for one in key.pairs:
             left, right = names.index(one.left), names.index(one.right)

@@ -339,7 +339,8 @@ def _plan(
 def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1, 1], list[int]]:
     """The metric of all searches, its better direction, and the seeds of a point's trials.
 
-    Raises InputError for an unknown metric, and for one without a better direction."""
+    Raises InputError for an unknown metric, and for one without a better direction.
+    """
     values = trials[0].values
     declared = {str(trial.values["eval"].get("primary") or "") for trial in trials}
     primary = metric_and_question(declared.pop())[0] if len(declared) == 1 else ""

@@ -124,18 +124,17 @@ def check_files(folders: Sequence[Path]) -> None:
     A few lines of nested aliases can stand for billions of values ("billion laughs"), and Hydra
     would expand them.
     """
-    for file in (
-        file
-        for folder in folders
-        for depth in ("", "*/", "*/*/")
-        for file in folder.glob(f"{depth}*.yaml")
-    ):
+    files: list[Path] = []
+    for folder in folders:
+        for pattern in ("*.yaml", "*/*.yaml", "*/*/*.yaml"):
+            files += folder.glob(pattern)
+    for file in files:
         try:
             text = file.read_text(encoding="utf-8") if file.is_file() else ""
+            if "*" not in text:
+                continue
             # The loader in Python raises RecursionError for deep nesting; that in C would crash.
-            count = (
-                _expanded_size(yaml.compose(text, Loader=yaml.SafeLoader), {}) if "*" in text else 0
-            )
+            count = _expanded_size(yaml.compose(text, Loader=yaml.SafeLoader), {})
         # Hydra reports it if it reads the file
         except (OSError, ValueError, RecursionError, yaml.YAMLError):
             continue
@@ -150,10 +149,9 @@ def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
     """
     if id(node) not in sizes:
         sizes[id(node)] = 1  # counts where an alias stands for a mapping or list that contains it
-        children = node.value if isinstance(node, yaml.CollectionNode) else []
-        parts = chain.from_iterable(
-            child if isinstance(child, tuple) else [child] for child in children
-        )
+        parts = node.value if isinstance(node, yaml.CollectionNode) else []
+        if isinstance(node, yaml.MappingNode):
+            parts = chain(*parts)  # keys and values
         sizes[id(node)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
     return sizes[id(node)]
 
@@ -195,12 +193,11 @@ def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
             if len(words) < 2:
                 return installed_nodes(())
             # One by one: a choice that no package has must not take the others along.
-            return {
-                name: node
-                for word in words
-                for name, node in installed_nodes((word,)).items()
-                if name in word
-            }
+            nodes: dict[str, Any] = {}
+            for word in words:
+                own = installed_nodes((word,))
+                nodes |= {name: own[name] for name in own if name in word}
+            return nodes
         return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 

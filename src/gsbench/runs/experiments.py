@@ -104,9 +104,9 @@ class TuningRecord(Record):
     def __post_init__(self) -> None:
         if len({frozenset(point.settings) for point in self.points if point.value is not None}) > 1:
             raise ValueError("the points have different settings")
-        on_scale = (point.settings.get(key) for point in self.points for key in self.log)
-        if any(value is not None and value <= 0 for value in on_scale):
-            raise ValueError("a setting of a log scale is not above 0")
+        for point in self.points:
+            if any(point.settings.get(key, 1) <= 0 for key in self.log):
+                raise ValueError("a setting of a log scale is not above 0")
 
     @property
     def best(self) -> SearchPoint | None:

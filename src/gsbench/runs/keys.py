@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
+from gsbench.files import file_sha256
 from gsbench.parsing import DamagedError, read_json
 from gsbench.settings import option_fields
 
@@ -50,10 +51,9 @@ def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
     for key, group in kept.items():
         if isinstance(group, dict):
-            without_effect = (
-                WITHOUT_EFFECT if str(group.get("_target_") or OWN).startswith(OWN) else ()
-            )
-            dropped = (*without_effect, *DECLARED.get(key, ()))
+            dropped = set(DECLARED.get(key, ()))
+            if str(group.get("_target_") or OWN).startswith(OWN):
+                dropped |= set(WITHOUT_EFFECT)
             kept[key] = {name: value for name, value in group.items() if name not in dropped}
     return kept
 
@@ -449,27 +449,20 @@ def _digest_on_disk(spec: ModuleSpec) -> str | None:
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
     if not folders:
         file = Path(spec.origin or "")
-        return (
-            hashlib.sha256(file.read_bytes()).hexdigest()
-            if spec.has_location and file.is_file()
-            else None
-        )
-    parts = [
-        f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder).as_posix()}\n"
-        for folder in folders
-        for file in sorted(folder.rglob("*"))
-        if file.suffix in CODE_SUFFIXES and file.is_file()
-    ]
+        return file_sha256(file) if spec.has_location and file.is_file() else None
+    parts = []
+    for folder in folders:
+        for file in sorted(folder.rglob("*")):
+            if file.suffix in CODE_SUFFIXES and file.is_file():
+                parts.append(f"{file_sha256(file)}  {file.relative_to(folder).as_posix()}\n")
     return hashlib.sha256("".join(parts).encode()).hexdigest() if parts else None
 
 
 def _is_installed(spec: ModuleSpec) -> bool:
     """Return whether a module is Python's or an installed package's, whose version counts."""
-    paths = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
+    places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
     library = [sysconfig.get_path(key) for key in ("stdlib", "platstdlib")]
-    return all(
-        path is None
-        or INSTALLED & set(Path(path).parts)
-        or any(Path(path).is_relative_to(one) for one in library)
-        for path in paths
-    )
+    for path in [Path(place) for place in places if place is not None]:
+        if not INSTALLED & set(path.parts) and not any(map(path.is_relative_to, library)):
+            return False
+    return True

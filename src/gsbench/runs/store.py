@@ -196,7 +196,7 @@ class Store:
 
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:
     """Write the manifest of ``folder``: checksums of all files, once these are safe on the disk."""
-    scratch = {path for pattern in step.stage.scratch for path in folder.rglob(pattern)}
+    scratch = set().union(*map(folder.rglob, step.stage.scratch))
     outputs = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path not in scratch:

@@ -245,10 +245,7 @@ class TrialFolder:
             pycolmap=version_of("pycolmap"),
             sources={str(source): source_stamp_of(source) for source in sources},
             # Adding or removing a file changes its folder's time.
-            folders={
-                str(folder): _changed_at(folder)
-                for folder in sorted({source.parent for source in sources})
-            },
+            folders={str(source.parent): _changed_at(source.parent) for source in sources},
             entries={name: str(entry) for name, entry in (entries or {}).items()},
             published={name: stamp_of(file) for name, file in names.items()},
             digests={
@@ -314,15 +311,11 @@ class TrialFolder:
         """
         path, content = self.path / layout.PER_VIEW, self._unchanged(layout.PER_VIEW)
         try:
-            text = content.decode("utf-8")
-            return {
-                row["view"]: {
-                    key: _number(value)
-                    for key, value in row.items()
-                    if key != "view" and value != ""
-                }
-                for row in csv.DictReader(io.StringIO(text, newline=""))
-            }
+            views = {}
+            for row in csv.DictReader(io.StringIO(content.decode("utf-8"), newline="")):
+                name = row.pop("view")
+                views[name] = {key: _number(value) for key, value in row.items() if value != ""}
+            return views
         except (UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:
             raise DamagedError(path, f"is damaged ({one_line(repr(error))})") from None
 

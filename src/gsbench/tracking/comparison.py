@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
+from gsbench.analysis.quantities import metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.eval.facts import known_keys
 from gsbench.tracking.mlflow_sink import NOTE, connect, ensure_experiment
 from gsbench.tracking.sinks import EVAL, arm_name, eval_name
 
@@ -107,12 +107,7 @@ def packed(state: dict[str, Any]) -> str:
 
 def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
     """The state of MLflow's page: ``trials`` in groups by arm, with a chart for each result."""
-    measured = {key for trial in trials for key in trial.metrics}
-    keys = [
-        *(key for key in known_keys() if key in measured),
-        *sorted(measured - set(known_keys())),
-    ]
-    results = [*map(eval_name, keys), f"{EVAL}/gaussians", f"{EVAL}/minutes"]
+    results = [*map(eval_name, metric_keys(trials)), f"{EVAL}/gaussians", f"{EVAL}/minutes"]
     curves = ["train/gaussians", "train/loss"]
     if any(trial.record.metrics_at for trial in trials):  # eval.at
         curves.insert(0, results[0])
@@ -129,9 +124,8 @@ def view_state(trials: Sequence[TrialResult]) -> dict[str, Any]:
 
 def _group_of(trial: TrialResult, swept: Sequence[str]) -> str:
     """The id of the trial's group on MLflow's page."""
-    values = {ARM: arm_name(trial.densify, trial.init)} | {
-        key: str(trial.config.get(key, "")) for key in swept
-    }
+    values = {ARM: arm_name(trial.densify, trial.init)}
+    values |= {key: str(trial.config.get(key, "")) for key in swept}
     return ",".join(f"param.{key}.{value or 'null'}" for key, value in values.items())
 
 
@@ -167,19 +161,18 @@ def _state(
         "groupsExpanded": expanded,
         "autoRefreshEnabled": True,
         "compareRunCharts": list(_placed(sections)),
-        "compareRunSections": [
-            {
-                "uuid": name,
-                "name": name,
-                "display": True,
-                "isReordered": True,
-                "deleted": False,
-                "isGenerated": False,
-            }
-            | {"columns": 3, "cardHeight": CHART_HEIGHT}
-            for name in sections
-        ],
+        "compareRunSections": [SECTION | {"uuid": name, "name": name} for name in sections],
     }
+
+
+SECTION: dict[str, Any] = {
+    "display": True,
+    "isReordered": True,
+    "deleted": False,
+    "isGenerated": False,
+    "columns": 3,
+    "cardHeight": CHART_HEIGHT,
+}
 
 
 def _chart(kind: str, name: str, **options: Any) -> dict[str, Any]:

@@ -218,26 +218,16 @@ class TrackedTrial:
         building = self.folder.building()
         sources = [Path(building.folder)] if building.stage == TRAIN.name else []
         for name, names in CURVES.items():
-            source = next(
-                (
-                    folder / name
-                    for folder in (*sources, self.folder.path)
-                    if (folder / name).exists()
-                ),
-                None,
-            )
-            records = (
-                []
-                if source is None
-                else [r for r in read_rows(source) if r["step"] > logged.get(name, 0)]
-            )
+            files = (folder / name for folder in (*sources, self.folder.path))
+            source = next((file for file in files if file.exists()), None)
+            rows = [] if source is None else read_rows(source)
+            records = [row for row in rows if row["step"] > logged.get(name, 0)]
+            scalars: list[Scalar] = []
+            for record in records:
+                step, seconds = int(record["step"]), _seconds(record)
+                known = [key for key in record if key in names]
+                scalars += [Scalar(names[key], float(record[key]), step, seconds) for key in known]
             if records:
-                scalars = [
-                    Scalar(names[key], float(value), int(record["step"]), _seconds(record))
-                    for record in records
-                    for key, value in record.items()
-                    if key in names
-                ]
                 yield name, int(records[-1]["step"]), scalars
 
     def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
@@ -253,28 +243,28 @@ class TrackedTrial:
         numbers |= {f"{EVAL}/{key}": value for key, value in counts.items() if value is not None}
         if "train" in results.seconds:
             numbers[f"{EVAL}/minutes"] = results.seconds["train"] / 60
-        scalars = [
-            Scalar(eval_name(key), float(value), int(at), seconds * int(at) / max(1, step))
-            for at, measured in results.metrics_at.items()
-            for key, value in measured.metrics.items()
-        ]
+        scalars = []
+        for at, measured in results.metrics_at.items():
+            then = seconds * int(at) / max(1, step)
+            for key, value in measured.metrics.items():
+                scalars.append(Scalar(eval_name(key), float(value), int(at), then))
+        scalars += [Scalar(key, float(value), step, seconds) for key, value in numbers.items()]
         tags = {
             "protocol": results.protocol,
             "raster": results.raster,
             "commit": results.code.commit or "unknown",
         }
-        names = (*FILES, *([layout.POINT_CLOUD] if with_model else []))
-        files = [
-            ("", self.folder.path / name) for name in names if (self.folder.path / name).exists()
-        ]
+        tags |= {f"hash_{key}": value for key, value in results.hashes.items()}
+        names = (*FILES, layout.POINT_CLOUD) if with_model else FILES
+        paths = [self.folder.path / name for name in names]
+        files = [("", path) for path in paths if path.exists()]
+        figures = self.folder.pictures(layout.FIGURES)[:images]
         return Summary(
             note=self._note(results),
-            scalars=scalars
-            + [Scalar(key, float(value), step, seconds) for key, value in numbers.items()],
-            tags=tags | {f"hash_{key}": value for key, value in results.hashes.items()},
+            scalars=scalars,
+            tags=tags,
             pictures=self._pictures(images),
-            files=files
-            + [(layout.FIGURES, path) for path in self.folder.pictures(layout.FIGURES)[:images]],
+            files=files + [(layout.FIGURES, path) for path in figures],
             step=step,
             seconds=seconds,
         )
@@ -290,12 +280,8 @@ class TrackedTrial:
             f"Folder: `{self.path}`",
         ]
         plan = read_if_sound(self.folder.home / layout.PLAN, _Plan)
-        planned = (
-            plan.trials.get(self.folder.path.relative_to(self.folder.home).as_posix())
-            if plan
-            else None
-        )
-        if planned:
+        place = self.folder.path.relative_to(self.folder.home).as_posix()
+        if plan and (planned := plan.trials.get(place)):
             lines.append(f"Again: `{shlex.join(['gsbench', *planned.overrides])}`")
         return "\n\n".join(lines)
 
@@ -457,10 +443,8 @@ class WandbSink:
         pictures = {name: wandb.Image(picture) for name, picture in summary.pictures.items()}
         if pictures:
             self._run.log({STEP: summary.step, **pictures})
-        final = {
-            scalar.key: scalar.value for scalar in summary.scalars if scalar.step == summary.step
-        }
-        self._run.summary.update(final)
+        final = [scalar for scalar in summary.scalars if scalar.step == summary.step]
+        self._run.summary.update({scalar.key: scalar.value for scalar in final})
         self._run.config.update(summary.tags, allow_val_change=True)
         self._run.notes = summary.note
         for _, path in summary.files:

@@ -1,8 +1,6 @@
 """The overlay draws what it says: one outline, of the right Gaussian, in its place, in the colour
 of its cause."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,8 +1,6 @@
 """What steps hand on: another program gets the training views and the settings, an initialiser its
 cameras."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys

@@ -1,8 +1,6 @@
 """The photographs of a trial before anything looks at them: who makes them, what replaces pixels,
 what is kept."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path

@@ -63,9 +63,10 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     judged = verdicts.judge_pairs(trials, pairs, declared)
     quantity = next((one.declared for one in judged if one.declared is not None), None)
     paper_table = layout_of(experiment.name)
-    tables = (
-        [build_table(experiment)] if paper_table is None else paper_tables(experiment, paper_table)
-    )
+    if paper_table is None:
+        tables = [build_table(experiment)]
+    else:
+        tables = paper_tables(experiment, paper_table)
     volumes, volume_notes = volume_charts(trials, arms)
     return fill(
         "report.html.j2",
@@ -79,14 +80,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=declared.sentences(quantity.name) if declared and quantity else [],
         families=verdicts.families(judged),
-        # The top of the page has the notes on verdicts.
-        tables=[
-            replace(
-                one,
-                notes=tuple(note for note in one.notes if not note.startswith(verdicts.VERDICT)),
-            )
-            for one in with_agreement(tables)
-        ],
+        tables=[_without_verdicts(one) for one in with_agreement(tables)],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
@@ -103,6 +97,12 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         provenance=provenance(trials),
         warnings=experiment.warnings,
     )
+
+
+def _without_verdicts(table: Table) -> Table:
+    """The table without the notes on verdicts, which the top of the page has."""
+    notes = [note for note in table.notes if not note.startswith(verdicts.VERDICT)]
+    return replace(table, notes=tuple(notes))
 
 
 def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
@@ -203,54 +203,40 @@ def training_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[
     """Curves by arm, averaged over scenes and seeds at the steps that all trials have."""
     keys = [key for key, _, _ in CURVES]
     means = {arm: _mean_curves(_trials_of(trials, arm), layout.CURVES, keys) for arm in arms}
-    charts = [
-        line_chart(
-            title, [(str(arm), curves[key]) for arm, curves in means.items()], "iteration", y_label
-        )
-        for key, title, y_label in CURVES
-    ]
-    return [chart for chart in charts if chart]
+    charts = []
+    for key, title, y_label in CURVES:
+        lines = [(str(arm), curves[key]) for arm, curves in means.items()]
+        charts.append(line_chart(title, lines, "iteration", y_label))
+    return list(filter(None, charts))
 
 
 def event_table(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> Table | None:
     """A row per cause with the mean number of Gaussians per arm; None if nothing was logged."""
     rows = []
+    events_by_arm = [[trial.record.events for trial in _trials_of(trials, arm)] for arm in arms]
     for cause in EVENT_CAUSES:
-        means = [
-            fmean(float(trial.record.events.get(cause, 0)) for trial in _trials_of(trials, arm))
-            for arm in arms
-        ]
+        means = [fmean(float(own.get(cause, 0)) for own in events) for events in events_by_arm]
         if any(means):
-            rows.append(
-                Row((cause.replace("_", " "),), tuple(TableEntry(f"{mean:,.0f}") for mean in means))
-            )
+            entries = tuple(TableEntry(f"{mean:,.0f}") for mean in means)
+            rows.append(Row((cause.replace("_", " "),), entries))
+    if not rows:
+        return None
     columns = tuple(Column("", str(arm), ("events", str(arm))) for arm in arms)
-    return (
-        Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows))
-        if rows
-        else None
-    )
+    return Table("Gaussians by cause, mean of a trial", ("cause",), columns, tuple(rows))
 
 
 def event_charts(trials: Sequence[TrialResult], arms: Sequence[Arm]) -> list[str]:
     """Events by cause over the iterations of each arm."""
-    means = {
-        arm: _mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms
-    }
-    causes = [
-        cause
-        for cause in EVENT_CAUSES
-        if any(count for own in means.values() for _, count in own[cause])
-    ]
-    series = {
-        arm: [(cause.replace("_", " "), own[cause]) for cause in causes]
-        for arm, own in means.items()
-    }
-    charts = [
-        line_chart(f"Refinement over time: {arm}", own, "iteration", "Gaussians")
-        for arm, own in series.items()
-    ]
-    return [chart for chart in charts if chart]
+    means = [_mean_curves(_trials_of(trials, arm), layout.EVENTS, EVENT_CAUSES) for arm in arms]
+    counts = {cause: [dict(own[cause]).values() for own in means] for cause in EVENT_CAUSES}
+    # All arms show the same causes, so that a cause has the same colour in every chart.
+    causes = [cause for cause, by_arm in counts.items() if any(map(any, by_arm))]
+    charts = []
+    for arm, own in zip(arms, means, strict=True):
+        lines = [(cause.replace("_", " "), own[cause]) for cause in causes]
+        title = f"Refinement over time: {arm}"
+        charts.append(line_chart(title, lines, "iteration", "Gaussians"))
+    return list(filter(None, charts))
 
 
 def _trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
@@ -285,9 +271,7 @@ def volume_charts(
     notes = []
     for arm in arms:
         try:
-            volumes = np.concatenate(
-                [_volumes_in_training(trial) for trial in _trials_of(trials, arm)]
-            )
+            volumes = np.concatenate([*map(_volumes_in_training, _trials_of(trials, arm))])
         except InputError as error:
             notes.append(f"{arm}: no histogram, {error}")
             continue
@@ -297,17 +281,16 @@ def volume_charts(
                 f"{arm}: {np.mean(volumes > math.log10(threshold)):.2%} of volumes exceed "
                 f"{threshold:g}."
             )
-    charts = [
-        line_chart(
-            "Volumes of the trained Gaussians", final, *VOLUME_AXES, log=True, marker=threshold
-        )
-    ]
+    lines = {"Volumes of the trained Gaussians": final}
     for arm in arms:
         histograms = _logged_histograms(_trials_of(trials, arm))
         logged = [(f"iteration {step}", curve) for step, curve in histograms.items()]
-        title = f"Volumes during training: {arm}"
-        charts.append(line_chart(title, logged, *VOLUME_AXES, log=True, marker=threshold))
-    return [chart for chart in charts if chart], notes
+        lines[f"Volumes during training: {arm}"] = logged
+    charts = [
+        line_chart(title, own, *VOLUME_AXES, log=True, marker=threshold)
+        for title, own in lines.items()
+    ]
+    return list(filter(None, charts)), notes
 
 
 def _volumes_in_training(trial: TrialResult) -> NDArray[np.float64]:
@@ -338,13 +321,8 @@ def histogram(volumes: NDArray[np.float64]) -> Curve:
     """(volume, share) of each filled quarter decade of the finite log10 ``volumes`` [N]."""
     finite = volumes[np.isfinite(volumes)]
     bins, counts = np.unique(np.floor(finite / BIN_WIDTH), return_counts=True)
-    return list(
-        zip(
-            (10 ** ((bins + 0.5) * BIN_WIDTH)).tolist(),
-            (counts / len(finite)).tolist(),
-            strict=True,
-        )
-    )
+    centres, shares = 10 ** ((bins + 0.5) * BIN_WIDTH), counts / len(finite)
+    return list(zip(centres.tolist(), shares.tolist(), strict=True))
 
 
 def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
@@ -352,15 +330,15 @@ def _logged_histograms(trials: Sequence[TrialResult]) -> dict[int, Curve]:
     pooled: dict[int, dict[float, float]] = defaultdict(lambda: defaultdict(float))
     for trial in trials:
         for row in trial.folder.curves(layout.HISTOGRAMS, Histogram):
-            for (low, high), count in zip(
-                itertools.pairwise(row.log10_edges), row.counts, strict=True
-            ):
-                pooled[row.step][10 ** ((low + high) / 2)] += count
-    return {
-        step: [(volume, count / total) for volume, count in sorted(bins.items()) if count]
-        for step, bins in sorted(pooled.items())
-        if (total := sum(bins.values()))
-    }
+            bins = itertools.pairwise(row.log10_edges)
+            for (low, high), count in zip(bins, row.counts, strict=True):
+                if count:
+                    pooled[row.step][10 ** ((low + high) / 2)] += count
+    shares = {}
+    for step, filled in sorted(pooled.items()):
+        total = sum(filled.values())
+        shares[step] = [(volume, count / total) for volume, count in sorted(filled.items())]
+    return shares
 
 
 def _threshold(trials: Sequence[TrialResult]) -> float | None:
@@ -379,27 +357,28 @@ def _threshold(trials: Sequence[TrialResult]) -> float | None:
 
 def provenance(trials: Sequence[TrialResult]) -> Table:
     """One row per trial: its folder, conditions, hashes, code, machine and versions."""
-    facts_by_trial = {
-        trial.label: {
-            "raster": trial.record.raster,
-            "protocol": trial.record.protocol,
-            "iterations": str(trial.record.iterations),
-            **{f"{key} hash": str(value)[:12] for key, value in trial.record.hashes.items()},
-            "code": ", ".join(
-                f"{part} {short_version(version)}" for part, version in trial.code.items()
-            ),
-            "machine": trial.machine or "",
-            "versions": ", ".join(f"{key} {value}" for key, value in trial.record.versions.items()),
-        }
-        for trial in trials
-    }
-    names = dict.fromkeys(name for facts in facts_by_trial.values() for name in facts)
+    facts_by_trial = {trial.label: _facts_of(trial) for trial in trials}
+    names = dict.fromkeys(itertools.chain(*facts_by_trial.values()))
     columns = tuple(Column("", name, ("provenance", name)) for name in names)
-    rows = tuple(
-        Row((label,), tuple(TableEntry(facts.get(name, "")) for name in names))
-        for label, facts in facts_by_trial.items()
-    )
-    return Table("Trials", ("trial",), columns, rows, wrapped=True)
+    rows = []
+    for label, facts in facts_by_trial.items():
+        entries = tuple(TableEntry(facts.get(name, "")) for name in names)
+        rows.append(Row((label,), entries))
+    return Table("Trials", ("trial",), columns, tuple(rows), wrapped=True)
+
+
+def _facts_of(trial: TrialResult) -> dict[str, str]:
+    record = trial.record
+    code = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
+    return {
+        "raster": record.raster,
+        "protocol": record.protocol,
+        "iterations": str(record.iterations),
+        **{f"{key} hash": value[:12] for key, value in record.hashes.items()},
+        "code": ", ".join(code),
+        "machine": trial.machine or "",
+        "versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
+    }
 
 
 def search_summary(home: Path) -> tuple[str, str] | None:
