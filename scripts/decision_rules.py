@@ -148,7 +148,7 @@ def calibration(scenes: int, seeds: int) -> list[Draws]:
 
 @cache
 def look_levels(rule: Rule, scenes: int, looks: tuple[int, ...], rate: float) -> tuple[float, ...]:
-    """As `gsbench.analysis.statistics.look_levels`, for any rule."""
+    """The levels of the looks for any rule, made as in `gsbench.analysis.statistics`."""
     simulated = calibration(scenes, looks[-1])[: 1 if rule.equal_noise else 3]
     free, levels = np.ones((len(simulated), CALIBRATION), dtype=bool), list[float]()
     for seeds in looks:
