@@ -141,6 +141,7 @@ def day(tmp_path: Path) -> Day:
     return made
 
 
+@pytest.mark.slow
 def test_parts_that_fail_hang_or_are_killed_cost_no_other_part(day: Day) -> None:
     faults = {
         "proof-triton": ("doctor --json --prove --raster triton", "hang"),

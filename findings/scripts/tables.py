@@ -22,9 +22,13 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
+from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.verdicts import p_text
+from gsbench.claims.archive import unpack_archive
 from gsbench.claims.check import ClaimVerdict, recheck
 from gsbench.claims.file import read_claims
+from gsbench.runs.ledger import read_ledger
 from gsbench.words import counted, signed
 
 FINDINGS = Path(__file__).parents[1]
@@ -82,6 +86,15 @@ ASKED = [
     ("full_count", "once_at_as_many", "the same, against adc with as many Gaussians"),
     ("paper", "lower_lpips", "160 px, 2,000 iterations, each growing up to 30,000"),
 ]
+
+
+def ideas_table(name: str) -> str:
+    """A ledger of ideas, as `gsbench ledger show` prints it, and its confirmations."""
+    with tempfile.TemporaryDirectory() as folder:
+        home = unpack_archive(ARCHIVES / f"{name}.zip", Path(folder)).folder
+        ledger = read_ledger(home)
+    tables = [re.sub("^### (.*)$", r"*\1.*", to_markdown(one)) for one in ledger_tables(ledger)]
+    return "\n".join([*describe_ledger(ledger), "", *tables])
 
 
 def read_trials(name: str) -> pd.DataFrame:
@@ -612,6 +625,7 @@ def sections() -> list[tuple[str, list[Callable[[], str] | str]]]:
                 made(metrics_table, "matched", (*both, "longaxis")),
             ],
         ),
+        ("A night of ideas", [made(ideas_table, "night")]),
         (
             "The first four scenes, 160 px",
             [
