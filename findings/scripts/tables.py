@@ -93,8 +93,7 @@ def ideas_table(name: str) -> str:
     with tempfile.TemporaryDirectory() as folder:
         home = unpack_archive(ARCHIVES / f"{name}.zip", Path(folder)).folder
         ledger = read_ledger(home)
-    tables = [re.sub("^### (.*)$", r"*\1.*", to_markdown(one)) for one in ledger_tables(ledger)]
-    return "\n".join([*describe_ledger(ledger), "", *tables])
+    return "\n".join([*describe_ledger(ledger), "", *map(to_markdown, ledger_tables(ledger))])
 
 
 def read_trials(name: str) -> pd.DataFrame:
