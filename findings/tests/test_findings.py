@@ -25,6 +25,7 @@ FIGURE = re.compile(
 # written otherwise).
 SETTINGS = {
     "1,000",
+    "1,500",
     "2,000",
     "3,000",
     "5,000",

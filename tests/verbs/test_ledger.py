@@ -14,6 +14,7 @@ import pytest
 
 from gsbench.analysis.results import read_experiment
 from gsbench.app.command import compose_trials
+from gsbench.claims.archive import _shared_ledger, without_private_words
 from gsbench.cli import run
 from gsbench.config.compose import Trial
 from gsbench.runs import ledger as records
@@ -375,6 +376,20 @@ def test_report_and_archive_have_the_ledger(home: Path, trainings: Trainings) ->
     assert 'id="ledger"' in page
     assert "1 larger splits" in page
     assert "1 of 40 planned ideas were tried, and 1 kept" in page
+
+
+def test_an_archived_ledger_names_no_folder_and_no_server(
+    home: Path, trainings: Trainings, tmp_path: Path
+) -> None:
+    words = ["scene.path='/home/me/a b',/home/me/c", "+x.y=[/home/me/d]", "tracking.uri=http://u@h"]
+    assert without_private_words(words) == ["scene.path='a b',c", "+x.y=[d]"]
+    attempt(f"{SPLIT}=0.02")
+    own = Path("ledger.jsonl")
+    own.write_bytes(_shared_ledger(home))
+    shared, kept = read_ledger(tmp_path), read_ledger(home)  # its chain is whole
+    assert len(shared.entries) == len(kept.entries)
+    assert "tracking=none" in kept.opened.words
+    assert "tracking=none" not in shared.opened.words
 
 
 def test_show_prints_all_for_programs(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,6 +53,7 @@ from gsbench.runs.layout import (
     RENDERS,
     RESULTS,
 )
+from gsbench.runs.ledger import as_json, chained, read_ledger
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders
 
@@ -71,6 +72,7 @@ FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
 FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
+ITEM = re.compile(r"[^=,\[\]{}'\"]+")  # of a word with a list of values
 SEED_KEY = "seed"
 NO_CONFIGURATION = f"it has no {CONFIG}"
 NAMED_GROUPS = ("scene", "init", "densify")  # groups of settings whose names results.json repeats
@@ -150,7 +152,11 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
 
     The pictures themselves are mostly not in the archive.
     """
-    contents = {name: read_bytes(home / name) for name in RECORDS if (home / name).is_file()}
+    contents = {}
+    if (home / DECLARED).is_file():
+        contents[DECLARED] = read_bytes(home / DECLARED)
+    if (home / LEDGER).is_file():
+        contents[LEDGER] = _shared_ledger(home)
     asked = itertools.chain(*(one.questions for one in read_declarations(home)))
     if TEXTURED.key in {question.metric for question in asked}:
         measured = []
@@ -160,6 +166,26 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
                 measured.append({"folder": _folder(trial), "measures": measures})
         contents[PIXELS] = _json_lines(measured)
     return contents
+
+
+def _shared_ledger(home: Path) -> bytes:
+    """The ledger for others, without folders and servers of this machine, and so chained anew."""
+    entries = []
+    for entry in map(as_json, read_ledger(home).entries):
+        if "words" in entry:
+            entry["words"] = without_private_words(entry["words"])
+        entries.append(without_paths(entry))
+    return chained(entries).encode()
+
+
+def without_private_words(words: Sequence[str]) -> list[str]:
+    """Settings as words, without those of the user's folders and servers; paths have no folders."""
+    shared = []
+    for word in words:
+        group = re.split(r"[./=]", word.lstrip("+~"), maxsplit=1)[0]
+        if group not in PRIVATE:
+            shared.append(ITEM.sub(lambda item: str(without_paths(item[0])), word))
+    return shared
 
 
 def _page(content: Mapping[str, Any]) -> bytes:

@@ -6,11 +6,11 @@ edited, moved or dropped is found when the file is read (`read_ledger`).
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -266,5 +266,22 @@ def append(home: Path, make: Callable[[Ledger], Entry | None]) -> Ledger:
 
 def _write(home: Path, text: str, head: str, entry: Entry) -> None:
     """Replace the file as a whole, so that a kill leaves the old file or the new one."""
-    values = {"before": head, "entry": {"kind": entry.kind} | entry.to_json()}
-    write_text(home / LEDGER, f"{text}{json.dumps(values, ensure_ascii=False)}\n")
+    write_text(home / LEDGER, text + _line(head, as_json(entry)))
+
+
+def as_json(entry: Entry) -> dict[str, Any]:
+    """The JSON object of an entry."""
+    return {"kind": entry.kind} | entry.to_json()
+
+
+def chained(entries: Iterable[Mapping[str, Any]]) -> str:
+    """The content of a ledger with these entries (`as_json`)."""
+    text = head = ""
+    for entry in entries:
+        line = _line(head, entry)
+        text, head = text + line, hashlib.sha256(line.encode()).hexdigest()
+    return text
+
+
+def _line(before: str, entry: Mapping[str, Any]) -> str:
+    return json.dumps({"before": before, "entry": entry}, ensure_ascii=False) + "\n"
