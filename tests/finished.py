@@ -37,3 +37,20 @@ def write_results(folder: Path, values: dict[str, Any], **changes: Any) -> Trial
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(record.to_json()))
     return record
+
+
+def search_record(points: list[dict[str, Any]]) -> dict[str, Any]:
+    """``tuning.json`` of a search with these points, for the settings of ``volumetric``."""
+    return {
+        "sweep": "vth",
+        "arm": "sfm-volumetric",
+        "metric": "psnr",
+        "direction": 1,
+        "wanted": 2,
+        "seeds": [100],
+        "scenes": ["courtyard"],
+        "ranges": {},
+        "log": [],
+        "as_it_is": False,
+        "points": points,
+    }

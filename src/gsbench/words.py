@@ -37,6 +37,11 @@ def readable_time(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days"
 
 
+def least_text(least: float, relative: bool) -> str:
+    """A least difference that matters: ``0.005``, or ``10 %`` if it is ``relative``."""
+    return f"{100 * least:g} %" if relative else f"{least:g}"
+
+
 def signed(value: float, spec: str) -> str:
     """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign.
 

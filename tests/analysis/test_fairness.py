@@ -20,6 +20,7 @@ from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import tables
 from tests.analysis.synthetic import write_arms
 from tests.analysis.test_attribution import densifier
+from tests.finished import search_record
 
 LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
@@ -176,19 +177,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
         {"value": value, "settings": {"densify.volume_threshold": threshold}}
         for value, threshold in ((27.6, 0.1), (27.5, 0.06841))
     ]
-    record = {
-        "sweep": "vth",
-        "arm": "sfm-volumetric",
-        "metric": "psnr",
-        "direction": 1,
-        "wanted": 2,
-        "seeds": [100],
-        "scenes": ["courtyard"],
-        "ranges": {},
-        "log": [],
-        "as_it_is": False,
-        "points": points,
-    }
+    record = search_record(points)
     (tmp_path / "vth").mkdir()
     (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record))
     for name, content in (("other", '{"points": [3, {"settings": []}]}'), ("broken", "{")):

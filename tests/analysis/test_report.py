@@ -36,6 +36,7 @@ from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import Histogram
 from gsbench.verbs.results import report
 from tests.analysis.synthetic import Plan, write_arms, write_runs
+from tests.finished import search_record
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
@@ -565,19 +566,7 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path):
     write_runs(tmp_path, Plan())
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
     points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
-    record = {
-        "sweep": "vth",
-        "arm": "sfm-volumetric",
-        "metric": "psnr",
-        "direction": 1,
-        "wanted": 2,
-        "seeds": [100],
-        "scenes": ["courtyard"],
-        "ranges": {},
-        "log": [],
-        "as_it_is": False,
-        "points": points,
-    }
+    record = search_record(points)
     (tmp_path / "exp" / "tuning.json").write_text(json.dumps(record))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "Verdicts, " not in page

@@ -212,7 +212,7 @@ def test_what_an_idea_cannot_be_is_refused_and_leaves_no_line(
         (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
         (["seed=0,1", "--metric", "psmr"], "there is no such metric"),
         (["seed=0,1", "--fdr", "1"], "must be above 0 and below 1"),
-        (["seed=0,1", "--ideas", "0"], "must be from 1 to"),
+        (["seed=0,1", "--ideas", "0"], "must be a whole number from 1 to 10000"),
         (["seed=0,1", "eval.primary=psnr"], "eval.primary follows from the ledger"),
         (["seed=0,1", "launch.wait=false"], "launch.wait=false"),
     ],

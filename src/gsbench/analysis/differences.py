@@ -18,6 +18,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, seeds_words
+from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
 from gsbench.runs.keys import SHOWN
 from gsbench.system.install import conf_dir
@@ -67,18 +68,7 @@ INGREDIENT_NAMES = {
         for key in ("prune_opacity", "prune_size", "prune_screen_radius")
     },
     **{f"init.{key}": "cameras" for key in ("poses", "align")},
-    **{
-        f"train.{key}": "learning rates"
-        for key in (
-            "position_initial",
-            "position_final",
-            "sh_dc",
-            "sh_rest",
-            "opacity",
-            "scale",
-            "rotation",
-        )
-    },
+    **{f"train.{key}": "learning rates" for key in RATES},
 }
 # Settings that do not change the trained model.
 WITHOUT_EFFECT = (

@@ -5,6 +5,7 @@ import math
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.runs.experiments import display_time
 from gsbench.runs.ledger import Confirmed, Confirming, Difference, Ledger, Opened
+from gsbench.words import least_text, signed
 
 HEADS = ("against", "level", "seeds", "difference", "Gaussians", "time", "result", "why")
 
@@ -12,7 +13,7 @@ HEADS = ("against", "level", "seeds", "difference", "Gaussians", "time", "result
 def describe_ledger(ledger: Ledger) -> list[str]:
     """Sentences on what decides, and on what is left of the planned ideas."""
     opened = ledger.opened
-    least = f"{100 * opened.least:g} %" if opened.relative else f"{opened.least:g}"
+    least = least_text(opened.least, opened.relative)
     better = "more" if opened.sign > 0 else "less"
     return [
         f"{opened.metric} decides: {better} is better, and {least} is the least that matters. "
@@ -65,8 +66,10 @@ def difference_text(opened: Opened, difference: Difference | None) -> str:
     if difference is None:
         return ""
     values = (difference.mean, difference.low, difference.high)
-    texts = [f"{100 * math.expm1(v):+.1f} %" if opened.relative else f"{v:+.4g}" for v in values]
-    mean, low, high = (text.replace("-", "−") for text in texts)
+    if opened.relative:
+        mean, low, high = (f"{signed(100 * math.expm1(value), '.1f')} %" for value in values)
+    else:
+        mean, low, high = (signed(value, ".4g") for value in values)
     return f"{mean} ({low} to {high})"
 
 

@@ -17,6 +17,7 @@ from torch.profiler import ProfilerActivity, profile
 from gsbench.bench.scenes import SEED, make_scene
 from gsbench.densify import ADC
 from gsbench.errors import InputError
+from gsbench.gaussians.paper_values import RATES
 from gsbench.logs import Progress, progress
 from gsbench.pipeline.parts import build_own_rasterizer
 from gsbench.raster import Rasterizer, create_rasterizer
@@ -201,16 +202,7 @@ def make_rasterizer(raster: str, device: torch.device, threads: int) -> Rasteriz
 
 def constant_scene_options() -> TrainConfig:
     """Options of a training that does not end and does not change the Gaussians."""
-    rates = (
-        "position_initial",
-        "position_final",
-        "sh_dc",
-        "sh_rest",
-        "opacity",
-        "scale",
-        "rotation",
-    )
-    zero: dict[str, Any] = dict.fromkeys(rates, ZERO_RATE)
+    zero: dict[str, Any] = dict.fromkeys(RATES, ZERO_RATE)
     return TrainConfig(name="bench", iterations=NEVER, sh_interval=1, **zero)
 
 

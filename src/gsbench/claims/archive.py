@@ -57,7 +57,7 @@ from gsbench.runs.ledger import as_json, chained, read_ledger
 from gsbench.settings import is_folder_name
 from gsbench.words import readable_bytes, without_folders
 
-RECORDS = (DECLARED, LEDGER)  # files of the experiment, kept as they are
+RECORDS = (DECLARED, LEDGER)  # files of the experiment itself
 FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"

@@ -40,7 +40,7 @@ from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved
 from gsbench.runs.experiments import Arm, Question
 from gsbench.settings import check_values
-from gsbench.words import did_you_mean
+from gsbench.words import did_you_mean, least_text
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
@@ -66,7 +66,7 @@ class LeastEffect:
     relative: bool
 
     def __str__(self) -> str:
-        return f"{100 * self.size:g} %" if self.relative else f"{self.size:g}"
+        return least_text(self.size, self.relative)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from gsbench.claims.stopping import facts_for
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
 from gsbench.runs.experiments import ERROR_RATE, Declaration, Question, declared_now, trial_key
-from gsbench.words import counted, did_you_mean, listed
+from gsbench.words import counted, did_you_mean, least_text, listed
 
 # replace the configuration hash in trials' keys, since versions may share settings
 BASELINE, NEW = "baseline", "new"
@@ -138,7 +138,7 @@ def describe(verdict: Verdict) -> str:
         return f"{PASSED}: {same}" if verdict.equal else f"not testable: {verdict.untestable}"
     if answer is None or answer.interval is None:
         return f"{NOT_DECIDED}: {'; '.join(('trials are missing', *verdict.notes))}"
-    least = f"{100 * question.least:g} %" if question.relative else f"{question.least:g}"  # type: ignore[operator]
+    least = least_text(question.least or 0.0, question.relative)
     words = {
         SUPPORTED: f"{PASSED}, better",
         TOO_SMALL: f"{PASSED}, any difference is below {least}",

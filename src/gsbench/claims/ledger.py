@@ -30,7 +30,7 @@ from gsbench.runs.ledger import (
     Opened,
     Result,
 )
-from gsbench.words import counted, listed
+from gsbench.words import counted, least_text, listed
 
 # The chance, at each look, that an idea as good as the least difference that matters is given up.
 # It costs power and cannot make a false discovery.
@@ -56,11 +56,14 @@ def declaration_of(ledger: Ledger, idea: str) -> Declaration:
     """
     started = ledger.started[idea]
     question = _question(
-        ledger.opened, ledger.keys_of(started.against), started.keys, ledger.opened.seeds, idea
+        ledger.opened,
+        (started.against, ledger.keys_of(started.against)),
+        (idea, started.keys),
+        ledger.opened.seeds,
     )
     return Declaration(
         time=started.time,
-        questions=(replace(question, baseline=Arm("", started.against)),),
+        questions=(question,),
         looks=plan_looks(len(question.seeds)),
         error_rate=min(1.0, 2 * started.level),
     )
@@ -69,7 +72,7 @@ def declaration_of(ledger: Ledger, idea: str) -> Declaration:
 def confirmation_of(opened: Opened, confirming: Confirming) -> Declaration:
     """The questions of a confirmation. All seeds are judged at once; the ideas share 5 %."""
     questions = tuple(
-        _question(opened, confirming.keys[BASELINE], keys, confirming.seeds, idea)
+        _question(opened, (BASELINE, confirming.keys[BASELINE]), (idea, keys), confirming.seeds)
         for idea, keys in confirming.keys.items()
         if idea != BASELINE
     )
@@ -78,20 +81,21 @@ def confirmation_of(opened: Opened, confirming: Confirming) -> Declaration:
 
 def _question(
     opened: Opened,
-    baseline: Mapping[str, str],
-    idea: Mapping[str, str],
+    baseline: tuple[str, Mapping[str, str]],
+    idea: tuple[str, Mapping[str, str]],
     seeds: tuple[int, ...],
-    name: str,
 ) -> Question:
+    """The question of an idea against a baseline, each a name with its trials by scene."""
+    (against, old), (name, new) = baseline, idea
     # The baseline's trials are older than the question, as those of a gate are.
     return Question(
         metric=opened.metric,
         sign=opened.sign,
         least=opened.least,
         relative=opened.relative,
-        baseline=Arm("", BASELINE),
+        baseline=Arm("", against),
         arm=Arm("", name),
-        scenes={scene: (baseline[scene], idea[scene]) for scene in idea},
+        scenes={scene: (old[scene], new[scene]) for scene in new},
         seeds=seeds,
         versions=True,
         name=name,
@@ -161,8 +165,7 @@ def difference_of(verdict: Verdict) -> Difference | None:
 
 def reason_of(verdict: Verdict) -> str:
     """The result in a few words."""
-    least = verdict.question.least or 0.0
-    size = f"{100 * least:g} %" if verdict.question.relative else f"{least:g}"
+    size = least_text(verdict.question.least or 0.0, verdict.question.relative)
     if verdict.equal:
         words = "equal to the last bit: the idea had no effect"
     elif verdict.untestable or verdict.answer is None:

@@ -5,7 +5,7 @@ In such a sweep, each compared pair of arms is a question about ``eval.primary``
 
 import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -160,7 +160,7 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     return SweepInLooks(declaration, home, by_key)
 
 
-def finished_trials(home: Path, trials: Sequence[Trial]) -> list[TrialResult]:
+def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
     """The results of those ``trials`` that are done. Results of earlier code do not count as
     done."""
     by_folder = {trial.folder: trial for trial in trials}

@@ -9,7 +9,6 @@ import hashlib
 import itertools
 import random
 import secrets
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
@@ -23,7 +22,7 @@ from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.analysis.table_formats import fill
 from gsbench.errors import InputError
-from gsbench.runs.experiments import STAMP, Arm
+from gsbench.runs.experiments import Arm, stamp_now
 from gsbench.runs.votes import BLURRED, PHOTOGRAPH, Chosen, Kind, RoundKey, Showing
 
 PAGE, PICTURES = "index.html", "pictures"
@@ -138,7 +137,7 @@ def make_round(
         )
     key = RoundKey(
         salt=secrets.token_hex(32),
-        time=time.strftime(STAMP, time.gmtime()),
+        time=stamp_now(),
         arms=tuple(arms),
         people=people,
         traps_allowed=traps // TRAPS_PER_MISTAKE,

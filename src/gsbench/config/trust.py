@@ -242,7 +242,7 @@ def check_composed(
 
 
 def _differing(given: Any, installed: Any) -> Any:
-    """What differs in ``given`` from ``installed``: entries of mappings, else ``given`` itself."""
+    """The part of ``given`` that differs from ``installed``: entries of mappings, else all."""
     if not isinstance(given, dict) or not isinstance(installed, dict):
         return given
     differing = {

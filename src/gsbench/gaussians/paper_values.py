@@ -1,7 +1,7 @@
 """Values from papers and their code that several packages share. Does not import torch."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from pydantic import PositiveFloat, PositiveInt
 
@@ -28,3 +28,7 @@ class LearningRates:
         return math.exp(
             (1 - t) * math.log(self.position_initial) + t * math.log(self.position_final)
         )
+
+
+# the settings of `LearningRates` that are rates
+RATES = tuple(one.name for one in fields(LearningRates) if one.name != "position_steps")

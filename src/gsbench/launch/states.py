@@ -297,7 +297,7 @@ class FinishedTrials:
 
 
 def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
-    """What trials of similar times share: scene, rasterizer and densifier, or the first two."""
+    """The facts that trials of similar times share: scene, rasterizer and densifier, or two."""
     shared = [settings["scene"], settings["raster"]["name"]]
     return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
 

@@ -392,7 +392,7 @@ def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
 
 
 def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
-    """What the sweep of this trial had declared about its metric when the trial ended."""
+    """The declaration of this trial's sweep about its metric, as it was when the trial ended."""
     primary = values["eval"].get("primary")
     declared = [
         one

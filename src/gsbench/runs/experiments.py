@@ -274,7 +274,7 @@ class Declaration(Record):
 
 def declared_now(**values: Any) -> Declaration:
     """A declaration with the present time."""
-    return Declaration(time=time.strftime(STAMP, time.gmtime()), **values)
+    return Declaration(time=stamp_now(), **values)
 
 
 def metric_and_question(primary: str) -> tuple[str, str]:
@@ -332,6 +332,11 @@ def record_text(declarations: Iterable[Declaration]) -> str:
     """The content of ``declared.jsonl``, in the order of time."""
     ordered = sorted(declarations, key=lambda declaration: declaration.moment)
     return "".join(json.dumps(declaration.to_json()) + "\n" for declaration in ordered)
+
+
+def stamp_now() -> str:
+    """The present time as a time stamp (`STAMP`)."""
+    return time.strftime(STAMP, time.gmtime())
 
 
 def display_time(stamp: str) -> str:

@@ -1,6 +1,7 @@
 """Parsing of a verb's words by argparse, with gsbench's errors of one line."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -51,6 +52,19 @@ def port(text: str) -> int:
     if not text.isascii() or not text.isdigit() or int(text) > MAX_PORT:
         raise argparse.ArgumentTypeError(f"must be a number from 0 to {MAX_PORT}, got {text!r}")
     return int(text)
+
+
+def whole_number(most: int) -> Callable[[str], int]:
+    """The reader of a whole number from 1 to ``most``; an argument's ``type``."""
+
+    def read(text: str) -> int:
+        if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(
+                f"must be a whole number from 1 to {most}, got {text!r}"
+            )
+        return int(text)
+
+    return read
 
 
 def path(text: str) -> Path:

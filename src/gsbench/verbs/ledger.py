@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,12 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.runs import ledger as records
-from gsbench.runs.experiments import STAMP, make_home
+from gsbench.runs.experiments import make_home, stamp_now
 from gsbench.runs.keys import config_hash
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
 from gsbench.settings import is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, names
+from gsbench.verbs.arguments import ArgumentParser, names, whole_number
 from gsbench.words import did_you_mean, listed
 
 EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
@@ -68,7 +67,9 @@ def _parser() -> ArgumentParser:
         "--least", help="new: the least difference that matters, as 0.1 or 10%% (the metric's)"
     )
     parser.add_argument(
-        "--ideas", type=_planned, help=f"new: the most ideas that will be tried ({IDEAS})"
+        "--ideas",
+        type=whole_number(MOST_IDEAS),
+        help=f"new: the most ideas that will be tried ({IDEAS})",
     )
     parser.add_argument(
         "--fdr", type=_rate, help=f"new: the false discovery rate, from 0 to 1 ({RATE})"
@@ -89,7 +90,7 @@ def new(options: argparse.Namespace, home: Path) -> int:
     sign, least = asked_difference(metric, options.least, values)
     EvalConfig(**values["eval"] | {"primary": metric})  # raises if it is not computed
     opened = records.Opened(
-        time=_now(),
+        time=stamp_now(),
         metric=metric,
         sign=1 if sign > 0 else -1,
         least=least.size,
@@ -167,7 +168,7 @@ def _start(
             name = f"{name}-{len(book.started) + 1}"
         chosen.append(name)
         return records.Started(
-            time=_now(),
+            time=stamp_now(),
             idea=name,
             against=against,
             level=level,
@@ -195,18 +196,18 @@ def _run(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
             fails = "its trials fail" if code else ""
 
     def judged() -> list[Any]:
-        return [rules.judge_idea(finished_trials(home, list(trials.values())), declaration)]
+        return [rules.judge_idea(finished_trials(home, trials.values()), declaration)]
 
     (verdict,) = run_looks(declaration, judged, run)
-    ended = rules.end_of(idea, verdict, _now())
+    ended = rules.end_of(idea, verdict, stamp_now())
     if fails and not verdict.final:
         own = set(book.keys_of(idea).values())
         failed = {key for key, trial in trials.items() if trial.files.has_failed()}
-        done = {one.key for one in finished_trials(home, list(trials.values()))}
+        done = {one.key for one in finished_trials(home, trials.values())}
         if own & done or not {key for key, _ in failed} <= own:
             raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
         reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
-        ended = records.Ended(time=_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
+        ended = records.Ended(time=stamp_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
 
     def make(now: Ledger) -> records.Ended | None:
         before = now.ended.get(idea)  # by a process that ran the same command
@@ -233,7 +234,7 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
         for idea in (BASELINE, *ideas)
     }
     keys = {idea: _keys(trials, home.name) for idea, trials in by_idea.items()}
-    asked = records.Confirming(time=_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
+    asked = records.Confirming(time=stamp_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
 
     def make(now: Ledger) -> records.Confirming | None:
         if now.number_of(asked) is not None:
@@ -262,12 +263,12 @@ def _run_confirmation(
     trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
-    verdicts = judge(finished_trials(home, list(trials.values())), declaration)
+    verdicts = judge(finished_trials(home, trials.values()), declaration)
 
     def make(now: Ledger) -> records.Confirmed | None:
         if now.confirmations[number][1] is not None:  # by a process that ran the same command
             return None
-        return rules.confirmed(number, verdicts, _now())
+        return rules.confirmed(number, verdicts, stamp_now())
 
     return records.append(home, make)
 
@@ -391,7 +392,7 @@ def _print_idea(book: Ledger, idea: str, as_json: bool) -> None:
 
 
 def _facts(book: Ledger, idea: str) -> dict[str, Any]:
-    """What is known of an idea, for programs."""
+    """The known facts of an idea, for programs."""
     started, ended = book.started[idea], book.ended.get(idea)
     facts = {"idea": idea, "against": started.against, "level": started.level}
     if ended is None:
@@ -403,16 +404,6 @@ def _facts(book: Ledger, idea: str) -> dict[str, Any]:
 
 def _left(book: Ledger) -> dict[str, Any]:
     return {"tried": book.tried, "planned": book.opened.ideas, "kept": book.kept}
-
-
-def _now() -> str:
-    return time.strftime(STAMP, time.gmtime())
-
-
-def _planned(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= MOST_IDEAS:
-        raise argparse.ArgumentTypeError(f"must be from 1 to {MOST_IDEAS}, got {text!r}")
-    return int(text)
 
 
 def _rate(text: str) -> float:

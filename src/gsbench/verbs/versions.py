@@ -73,7 +73,7 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         gate = gates.Gate(
             declare_questions(home, declaration),
             lambda: old,
-            lambda: finished_trials(home, list(trials.values())),
+            lambda: finished_trials(home, trials.values()),
         )
 
         def run(planned: Sequence[KeyAndSeed]) -> None:

@@ -23,10 +23,11 @@ from gsbench.parsing import read_typed, resolved
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.layout import VOTE_KEY, VOTES
 from gsbench.runs.votes import Ballot, check_ballot, read_key
-from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
 from gsbench.words import counted, some_of
 
 PAIRS, PEOPLE = 40, 9  # nine: the sign test then lets one person disagree
+MOST = 1000  # pairs, and people
 
 
 def vote(argv: Sequence[str], runs: Path) -> int:
@@ -70,13 +71,13 @@ def _parser() -> ArgumentParser:
     )
     parser.add_argument(
         "--pairs",
-        type=_whole,
+        type=whole_number(MOST),
         default=PAIRS,
         help=f"of renders that each person compares ({PAIRS}), before repeats",
     )
     parser.add_argument(
         "--people",
-        type=_whole,
+        type=whole_number(MOST),
         default=PEOPLE,
         help=f"whose votes are declared to count ({PEOPLE}), no more or fewer",
     )
@@ -191,9 +192,3 @@ def choose_arms(arms: Sequence[Arm], wanted: Sequence[str]) -> list[Arm]:
     if len(unique) < 2:
         raise InputError(f"votes compare two arms or more, and here is {unique[0]} alone")
     return unique
-
-
-def _whole(text: str) -> int:
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 1000:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1000, got {text!r}")
-    return int(text)
