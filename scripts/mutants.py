@@ -2,7 +2,7 @@
 notice them.
 
     python scripts/mutants.py # 160 faults over all rooms, two at a time
-    python scripts/mutants.py --rooms densify eval --count 40 --seed 3
+    python scripts/mutants.py --rooms densify eval --count 40 --seed 3 --coverage lines.db
 
 A fault is one of these:
 
@@ -16,8 +16,12 @@ A fault is one of these:
 
 Texts, messages and annotations get no faults. A fault is caught if a test of ``make test`` fails or
 hangs. A table and the survivors are printed as Markdown. A survivor either shows a gap in the tests
-or changes nothing. The tests that run for a fault are those of its room, then others that import
-its module. Triton's kernels are left out: their tests belong to ``make test-all``.
+or changes nothing. Triton's kernels are left out: their tests belong to ``make test-all``.
+
+First all quick tests run once, and coverage.py records which of them run each line (``--coverage``
+names a file that keeps this for further seeds of the same code). The tests of a fault are those
+that run its line. Some lines have no such record: what runs at the import of a module, or in a
+compiled kernel. Their tests are those of the room, then others that import the module.
 """
 
 from __future__ import annotations
@@ -34,10 +38,12 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
+
+import coverage
 
 ROOT = Path(__file__).parents[1]
 SOURCE = "src/gsbench"
@@ -60,6 +66,7 @@ LEFT_OUT = "triton"  # files with this in their path
 # Swapped arguments change nothing in calls of these.
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add", "ssim_map", "similarity", "fma", "dot"}
 SPEED_ONLY = {"prefetch"}  # calls that change no result
+PYTEST = [sys.executable, "-m", "pytest", "-m", "not slow", "-p", "no:cacheprovider"]
 SECONDS = 1800  # time limit for the tests of one fault
 Replacements = dict[type[ast.AST], type[ast.AST]]
 OPPOSITE: Replacements = {
@@ -259,23 +266,61 @@ def copy_checkout(folder: Path) -> Path:
     return place
 
 
-def tests_of(fault: Fault, place: Path) -> list[str]:
-    """The test files for a fault: the module's own, then those of its room, then others that import
-    the module."""
+class Reached:
+    """The quick tests that run each line of the source, by the record of coverage.py."""
+
+    def __init__(self, record: Path) -> None:
+        self._data = coverage.CoverageData(str(record))
+        self._data.read()
+        self._files = {
+            name[name.index(SOURCE + "/") :]: name for name in self._data.measured_files()
+        }
+
+    def tests(self, fault: Fault) -> list[str]:
+        """The tests that run the first line of a fault. Where a fixture runs it, all tests of the
+        fixture's file: the test that happened to be the first is not the one that looks."""
+        if fault.file not in self._files:
+            return []
+        contexts = self._data.contexts_by_lineno(self._files[fault.file]).get(fault.line, [])
+        found = set()
+        for context in filter(None, contexts):  # "tests/test_x.py::test_a[b]|run"
+            test, _, phase = context.rpartition("|")
+            found.add(test if phase == "run" else test.partition("::")[0])
+        return sorted(test for test in found if test.partition("::")[0] not in found - {test})
+
+
+def record_coverage(place: Path, record: Path) -> None:
+    """Run all quick tests of a copy, and write which of them runs each line."""
+    words = [*PYTEST, "-n", "2", "--cov", "gsbench", "--cov-context", "test", "--cov-report", ""]
+    environment = os.environ | {"PYTHONPATH": str(place / "src"), "COVERAGE_FILE": str(record)}
+    if subprocess.run(words, cwd=place, env=environment, check=False).returncode:
+        raise SystemExit("the quick tests fail without a fault: mend them first")
+
+
+def tests_of(fault: Fault, place: Path, reached: Reached) -> list[str]:
+    """The tests for a fault: those that run its line, or all that may. The module's own are the
+    first, then those of its room."""
+    own_folders = tests_of_room(fault.room, place)
+
+    def distance(test: str) -> int:
+        file = Path(test.partition("::")[0])
+        if file.stem == f"test_{Path(fault.file).stem}":
+            return 0
+        return 1 if any(file.is_relative_to(folder) for folder in own_folders) else 2
+
+    tests = reached.tests(fault) or [*own_folders, *importing_tests(fault, place)]
+    return [*sorted(tests, key=distance), *FURTHER_TESTS.get(fault.room, [])]
+
+
+def importing_tests(fault: Fault, place: Path) -> list[str]:
+    """The files of tests that import the module of a fault."""
     module = Path(fault.file).relative_to("src").with_suffix("").as_posix().replace("/", ".")
     parent, _, name = module.rpartition(".")
     imports = re.compile(rf"{re.escape(module)}\b|from {re.escape(parent)} import .*\b{name}\b")
-    own = [place / name for name in tests_of_room(fault.room, place)]
     every = sorted((place / "tests").rglob("test_*.py"))
-    named = [path for path in every if path.stem == f"test_{Path(fault.file).stem}"]
-    elsewhere = [
-        path
-        for path in every
-        if not any(path.is_relative_to(folder) for folder in own)
-        and imports.search(path.read_text())
+    return [
+        path.relative_to(place).as_posix() for path in every if imports.search(path.read_text())
     ]
-    chosen = dict.fromkeys([*named, *own, *elsewhere])
-    return [path.relative_to(place).as_posix() for path in chosen]
 
 
 def tests_of_room(room: str, place: Path) -> list[str]:
@@ -285,37 +330,14 @@ def tests_of_room(room: str, place: Path) -> list[str]:
     return [f"tests/{TESTS.get(room, room)}"]
 
 
-def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
-    """Plant the fault in the copy, run its tests, and remove it again. Without a fault, run the
-    room's tests."""
-    tests = tests_of_room(room, place)
-    original = b""
-    if fault is not None:
-        tests = tests_of(fault, place)
-        original = (place / fault.file).read_bytes()
-        (place / fault.file).write_bytes(
-            original[: fault.start] + fault.after.encode() + original[fault.end :]
-        )
-    tests += FURTHER_TESTS.get(room, [])
-    words = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-m",
-        "not slow",
-        "-p",
-        "no:cacheprovider",
-        "-n",
-        "0",
-        *tests,
-    ]
+def is_caught(fault: Fault, place: Path, reached: Reached) -> bool:
+    """Plant the fault in the copy, run its tests, and remove it again."""
+    words = [*PYTEST, "-x", "-q", "-n", "0", *tests_of(fault, place, reached)]
     # No byte code of faulty files is kept: Python takes files of one size and second for the same.
-    environment = os.environ | {
-        "PYTHONPATH": str(place / "src"),
-        "PYTHONDONTWRITEBYTECODE": "1" if fault else "",
-    }
+    environment = os.environ | {"PYTHONPATH": str(place / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    original = (place / fault.file).read_bytes()
+    faulty = original[: fault.start] + fault.after.encode() + original[fault.end :]
+    (place / fault.file).write_bytes(faulty)
     try:
         done = subprocess.run(
             words, cwd=place, env=environment, capture_output=True, timeout=SECONDS, check=False
@@ -324,10 +346,30 @@ def is_caught(fault: Fault | None, place: Path, room: str) -> bool:
     except subprocess.TimeoutExpired:
         return True
     finally:
-        if fault is not None:
-            (place / fault.file).write_bytes(original)
-            # makes its kept byte code valid again
-            shutil.copystat(ROOT / fault.file, place / fault.file)
+        (place / fault.file).write_bytes(original)
+        # makes its kept byte code valid again
+        shutil.copystat(ROOT / fault.file, place / fault.file)
+
+
+def plant(faults: list[Fault], workers: int, record: Path) -> Iterator[tuple[Fault, bool]]:
+    """Plant the faults, each in a copy of its worker; yields each with whether a test noticed."""
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(workers) as pool:
+        places: Queue[Path] = Queue()
+        for worker in range(workers):
+            places.put(copy_checkout(Path(folder) / str(worker)))
+        if not record.exists():
+            record_coverage(Path(folder) / "0/checkout", record.absolute())
+        reached = Reached(record)
+
+        def tried(fault: Fault) -> tuple[Fault, bool]:
+            place = places.get()
+            try:
+                return fault, is_caught(fault, place, reached)
+            finally:
+                places.put(place)
+
+        for done in as_completed([pool.submit(tried, fault) for fault in faults]):
+            yield done.result()
 
 
 def main() -> int:
@@ -336,43 +378,18 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=160)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--coverage", type=Path, help="file of the lines that each test runs")
     arguments = parser.parse_args()
     faults = choose_faults(arguments.rooms, arguments.count, arguments.seed)
     random.Random(arguments.seed).shuffle(faults)
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.workers) as pool:
-        places: Queue[Path] = Queue()
-        for worker in range(arguments.workers):
-            places.put(copy_checkout(Path(folder) / str(worker)))
-
-        def caught(fault: Fault | None, room: str) -> bool:
-            place = places.get()
-            try:
-                found = is_caught(fault, place, room)
-            finally:
-                places.put(place)
-            if fault is not None:
-                print("caught  " if found else "SURVIVED", describe(fault), flush=True)
-            return found
-
-        broken = [
-            room
-            for room, fails in zip(
-                arguments.rooms,
-                pool.map(caught, [None] * len(arguments.rooms), arguments.rooms),
-                strict=True,
-            )
-            if fails
-        ]
-        if broken:
-            print(f"the tests of {', '.join(broken)} fail without a fault: mend them first")
-            return 1
-        results = dict(
-            zip(faults, pool.map(caught, faults, [fault.room for fault in faults]), strict=True)
-        )
-    planted, seen = (
-        Counter(fault.room for fault in results),
-        Counter(fault.room for fault in results if results[fault]),
-    )
+    results = {}
+    with tempfile.TemporaryDirectory() as folder:
+        record = arguments.coverage or Path(folder) / "lines.db"
+        for fault, caught in plant(faults, arguments.workers, record):
+            results[fault] = caught
+            print("caught  " if caught else "SURVIVED", describe(fault), flush=True)
+    planted = Counter(fault.room for fault in results)
+    seen = Counter(fault.room for fault in results if results[fault])
     print("\n| room | planted | caught |\n|---|---|---|")
     for room in sorted(planted):
         print(f"| {room} | {planted[room]} | {seen[room]} |")
