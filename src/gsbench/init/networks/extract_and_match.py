@@ -134,7 +134,7 @@ def _extract_all(
     for done, name in enumerate(names, start=1):
         features = store.read_features(name)
         if features is None:
-            # only where an image needs it: a run that is continued may need no network
+            # loaded when an image needs it, since a run that is continued may need no network
             extractor = extractor or EXTRACTORS[settings.extractor](
                 settings, job.extractor_weights, device
             )
