@@ -246,9 +246,8 @@ def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path: Path) ->
         assert (pixels[row : row + 3, column : column + 3] == [10, 20, 30]).all()
     assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
     bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
-    np.testing.assert_allclose(
-        [bar.min(), bar.max()], [60, 60 + scale], atol=1.0
-    )  # the bar is one unit long
+    # the bar is one unit long
+    np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
 
 
 def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path: Path) -> None:

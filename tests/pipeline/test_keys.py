@@ -31,10 +31,8 @@ BARE = Capture(
 )
 KEYS = [
     ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
-    (
-        "init",
-        "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae",
-    ),  # of the reference cameras
+    # of the reference cameras
+    ("init", "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae"),
     ("init", "cad201af4f604b328caa8c2ed8aca73b64062872f7f0a7b2461e97dbd362a442"),
     ("train", "7a176da93dc7e68fd25ee10044cf3183c8cb124d04f8db5675e00a55f16c0f6c"),
     ("ground_truth", "25bd2fff6458d0bf7b5f3c85e52eea1f097cf4fa10c2f93e6be1429d23b17af4"),

@@ -111,7 +111,7 @@ def test_distorted_cameras_are_not_pinholes(make_scene):
         cameras_of(read_model(root / "sparse/0"))
 
 
-def test_written_cameras_project_alike(tmp_path: Path):
+def test_written_cameras_project_points_to_the_same_pixels(tmp_path: Path):
     rng = np.random.default_rng(5)
     cameras = {}
     for k in range(4):

@@ -265,7 +265,7 @@ def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path
         load_scene(only_test, small / "sparse/0", tmp_path / "cache2")
 
 
-def test_truncated_photo_is_named_and_leaves_nothing(make_scene, tmp_path: Path):
+def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path: Path):
     root = make_scene(size=(80, 60))
     path = root / "images/03.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -276,7 +276,9 @@ def test_truncated_photo_is_named_and_leaves_nothing(make_scene, tmp_path: Path)
 
 
 @pytest.mark.shared
-def test_real_photos_of_a_distorted_camera(shared: Path, tmp_path: Path):
+def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(
+    shared: Path, tmp_path: Path
+):
     capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
     scene = load_scene(capture, capture.model, tmp_path, max_size=300)
     assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}

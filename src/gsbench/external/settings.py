@@ -41,7 +41,7 @@ Command = str | Sequence[str]  # one text is split as a shell would, but no shel
 
 
 def split_command(command: Command, key: str) -> list[str]:
-    """Split a command into words; raises InputError naming ``key`` if empty or if a quote is open."""
+    """Split a command into words; raises InputError naming ``key`` if it is empty or malformed."""
     try:
         words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
     except ValueError as error:

@@ -14,9 +14,8 @@ from gsbench.scene.types import Array
 
 SIDE, MARGIN = 960, 60  # px
 MAX_POINTS = 200_000  # drawn; more would only cover each other
-VISIBLE_SHARE = (
-    0.98  # share of the points in view; distant outliers must not shrink the rest to a dot
-)
+# share of the points in view; distant outliers must not shrink the rest to a dot
+VISIBLE_SHARE = 0.98
 # third over second singular value of the camera centres: below it they lie in a plane
 PLANE_RATIO = 0.5
 LINE_RATIO = 0.05  # second over first: below it they lie on a line

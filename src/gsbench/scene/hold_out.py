@@ -1,6 +1,6 @@
 """Dividing photographs into training and test views, and the rest again for validation.
 
-Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround
+Sectors need an order of cameras in which neighbours are next to each other. Cameras that surround
 the scene are ordered by azimuth around its centre and up direction. Other cameras are ordered along
 the principal axis of their centres, so that planes across the axis separate the sectors.
 """
@@ -15,7 +15,7 @@ from gsbench.scene.options import MIN_IMAGES, TEST_EVERY, SplitRule
 from gsbench.scene.types import Array, Camera
 from gsbench.words import counted, some_of
 
-# degrees: cameras with a wider gap between azimuths stand on one side of the scene
+# degrees: cameras with a wider gap between azimuths are on one side of the scene
 SURROUNDED = 180.0
 OPEN_RING = 30.0  # degrees: the order begins after a gap wider than this, else at the first camera
 FACING = 0.9  # share of the cameras that must look towards the centre

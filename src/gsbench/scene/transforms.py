@@ -97,7 +97,7 @@ class FrameRecord(Intrinsics):
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsRecord(Intrinsics):
-    """The content of ``transforms.json`` as it is written."""
+    """The content of ``transforms.json`` before its conversion."""
 
     frames: list[FrameRecord]
     applied_transform: Matrix | None = None
@@ -160,7 +160,8 @@ def find_files(folder: Path) -> dict[str, Path]:
             "that holds it, or take scene=colmap or scene=photos"
         )
     if "test" in files:
-        files.pop("val", None)  # reports on Blender's scenes use the training and test views alone
+        # published results on Blender's scenes use only the training and test views
+        files.pop("val", None)
     return files
 
 

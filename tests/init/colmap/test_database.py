@@ -138,9 +138,8 @@ def test_assumed_focal_lengths_count_as_known(database: Path) -> None:
         assert not made.cameras_without_prior(database)
         with pycolmap.Database.open(database) as opened:
             assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
-            assert (
-                opened.num_verified_image_pairs() == 0
-            )  # they were verified with other focal lengths
+            # they were verified with other focal lengths
+            assert opened.num_verified_image_pairs() == 0
 
 
 @pytest.mark.parametrize(("count", "each"), [(30, 50), (120, 50), (2100, 105)])

@@ -35,7 +35,7 @@ LOWRES_MATCHES = 20  # pairs with more matches are matched at full size
 
 @dataclass(frozen=True)
 class NetworkJob:
-    """Inputs of the isolated process. Weights are checked files, or None where none is needed."""
+    """Inputs of the isolated process. Weights are checked files, or None if not needed."""
 
     options: FeatureOptions
     settings: FeatureSettings

@@ -220,9 +220,9 @@ class Views:
 
     @cached_property
     def scene(self) -> Scene:
-        """The undistorted, shrunk views without training copies of test views; needs ``init`` built.
+        """The undistorted, shrunk views, without training views that are copies of test views.
 
-        Prepared images are cached in the store.
+        ``init`` must be built. Prepared images are cached in the store.
         """
         with progress("scene") as report:
             scene = load_scene(
@@ -238,7 +238,7 @@ class Views:
 
 @cache
 def view_versions() -> dict[str, str | None]:
-    """The versions of code that makes the views' pixels: edited parts of gsbench, and packages.
+    """The versions of what makes the views' pixels: edited parts of gsbench, and packages.
 
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
