@@ -15,7 +15,7 @@ from tests.datasets.server import Server, serve
 
 
 def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[str, bytes]:
-    """Files of a scene as the archives have them: four sizes, a model, and what nobody wants."""
+    """The files of a scene in an archive: four sizes, a model, and files that are not wanted."""
     rng = np.random.default_rng([seed, *scene_folder.encode()])
     files = {}
     sizes = {"images": 40_000, "images_2": 20_000, "images_4": 9_000, "images_8": 3_000}
@@ -23,7 +23,7 @@ def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[s
         for index in range(photos):
             files[f"{scene_folder}/{images}/IMG_{index:04d}.JPG"] = rng.bytes(size + index)
     for name in ("cameras", "images", "points3D"):
-        # half of it packs well
+        # the zeros compress well
         files[f"{scene_folder}/sparse/0/{name}.bin"] = rng.bytes(5_000) + bytes(20_000)
     files[f"{scene_folder}/images_4/.DS_Store"] = b"nobody wants this"
     files[f"{scene_folder}/poses_bounds.npy"] = rng.bytes(600)
@@ -53,7 +53,7 @@ def made_archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def archives(made_archives: Path, tmp_path: Path) -> Path:
-    """A copy that the test may change."""
+    """A copy of `made_archives` that the test may change."""
     return Path(shutil.copytree(made_archives, tmp_path / "archives"))
 
 

@@ -1,4 +1,4 @@
-"""A file server on loopback whose manners can be chosen: a real one on a bad day."""
+"""A file server on loopback that can imitate faults of real servers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 @dataclass
 class Manners:
-    """How the server behaves; ``…_every``: after so many bytes of a body, again and again."""
+    """How the server behaves. ``cut_every`` and ``stall_every`` count the bytes of a body."""
 
     ranges: bool = True
     cut_every: int | None = None
-    cuts: int = 1_000_000  # how many times
+    cuts: int = 1_000_000  # how many bodies are cut or stalled
     stall_every: int | None = None
-    claimed_size: int | None = None  # a lie about the length
+    claimed_size: int | None = None  # a wrong length of the file, sent in headers
     damage: Callable[[str, int, bytes], bytes] | None = None  # (path, offset, body) -> body
-    status: dict[str, int] = field(default_factory=dict)  # path -> status instead of an answer
-    fail_first: int = 0  # so many requests get 503
+    status: dict[str, int] = field(default_factory=dict)  # path -> error status instead of the file
+    fail_first: int = 0  # number of requests that get 503 first
     redirect: bool = False
-    shift: int = 0  # a range that begins elsewhere than asked
+    shift: int = 0  # bytes by which the start of a range is wrong
 
 
 @dataclass
@@ -111,7 +111,7 @@ def serve(folder: Path) -> Iterator[Server]:
                         data = data[: max(0, limit - (position - first))]
                     try:
                         self.wfile.write(data)
-                    except OSError:  # the client has what it wanted
+                    except OSError:  # the client has closed the connection
                         return
                     state.sent += len(data)
                     position += len(data)

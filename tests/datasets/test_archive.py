@@ -1,4 +1,4 @@
-"""Archives of scenes: on servers on a bad day, damaged, or packed to do damage."""
+"""Archives of scenes: on faulty servers, damaged, or malicious."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ def extract_only(archive: zipfile.ZipFile, target: Path, which: int = 0) -> None
 
 
 @pytest.mark.parametrize("value", [5, 10**9, 2**32 - 2])
-def test_a_wrong_offset_is_damage(value: int, tmp_path: Path) -> None:
+def test_a_wrong_offset_counts_as_damage(value: int, tmp_path: Path) -> None:
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 42, "<I", value)
     with open_archive(io.BytesIO(data), "x.zip") as archive, pytest.raises(DamagedMemberError):
         extract_only(archive, tmp_path / "a.jpg")
     assert not (tmp_path / "a.jpg").exists()
 
 
-def test_a_member_without_a_name_is_passed_over() -> None:
+def test_a_member_without_a_name_is_skipped() -> None:
     data = packed("s/images/a.jpg", "x")
-    # zipfile takes a name up to the first NUL
+    # zipfile cuts a name at the first NUL
     data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)
     with open_archive(io.BytesIO(data), "x.zip") as archive:
         assert "" in archive.namelist()
@@ -81,7 +81,7 @@ def test_a_member_without_a_name_is_passed_over() -> None:
         (("s/images/a\nb.jpg",), "a name that no file can have"),
     ],
 )
-def test_names_that_cannot_lie_side_by_side_are_refused(names: tuple[str, ...], said: str) -> None:
+def test_names_that_cannot_be_files_together_are_refused(names: tuple[str, ...], said: str) -> None:
     with (
         open_archive(io.BytesIO(packed(*names)), "x.zip") as archive,
         pytest.raises(InputError, match=said),
@@ -90,7 +90,7 @@ def test_names_that_cannot_lie_side_by_side_are_refused(names: tuple[str, ...], 
 
 
 @pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) -> None:
+def test_damaged_bytes_of_a_member_are_detected(compression: int, tmp_path: Path) -> None:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as archive:
         archive.writestr("s/images/a.jpg", content := np.random.default_rng(0).bytes(300))
@@ -101,7 +101,7 @@ def test_damaged_bytes_of_a_member_are_damage(compression: int, tmp_path: Path) 
         damage = contextlib.suppress(DamagedMemberError, InputError)
         with open_archive(io.BytesIO(damaged), "x.zip") as archive, damage:
             extract_only(archive, tmp_path / "a.jpg")
-            # the byte was one that no reader looks at
+            # no reader uses this byte
             assert (tmp_path / "a.jpg").read_bytes() == content
             (tmp_path / "a.jpg").unlink()
     assert not (tmp_path / "a.jpg").exists()
@@ -135,11 +135,13 @@ def fetched(server: Server, target: Path) -> bytes:
         Manners(redirect=True),
     ],
 )
-def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners: Manners) -> None:
+def test_a_member_is_fetched_whole_and_alone(
+    served: Server, tmp_path: Path, manners: Manners
+) -> None:
     served.manners = manners
     assert fetched(served, tmp_path / "out") == np.random.default_rng(6).bytes(300_000)
     if not manners.cut_every and not manners.stall_every:
-        assert served.sent < 400_000  # the other member stays there
+        assert served.sent < 400_000  # the other member is not sent
 
 
 @pytest.mark.parametrize(
@@ -154,7 +156,7 @@ def test_a_member_comes_whole_and_alone(served: Server, tmp_path: Path, manners:
         (Manners(shift=7), DamagedMemberError, None),
     ],
 )
-def test_what_the_server_did_is_said(
+def test_faults_of_the_server_are_reported(
     served: Server, tmp_path: Path, manners: Manners, kind: type[Exception], said: str | None
 ) -> None:
     served.manners = manners
@@ -163,7 +165,7 @@ def test_what_the_server_did_is_said(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_server_that_is_not_there_is_said() -> None:
+def test_a_missing_server_is_reported() -> None:
     with (
         pytest.raises(FetchError, match="Connection refused"),
         open_archive_at("http://127.0.0.1:9/file.zip", PATIENT),
@@ -171,7 +173,7 @@ def test_a_server_that_is_not_there_is_said() -> None:
         pass
 
 
-def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path) -> None:
+def test_a_file_that_changes_between_requests_is_detected(served: Server, tmp_path: Path) -> None:
     url = f"{served.url}/file.zip"
     with open_archive_at(url, PATIENT) as archive:
         content = bytearray((served.folder / "file.zip").read_bytes())
@@ -184,7 +186,7 @@ def test_a_file_that_changes_in_between_is_damage(served: Server, tmp_path: Path
             with_retries(lambda: extract_only(archive, tmp_path / "out", 1), url, PATIENT)
 
 
-def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) -> None:
+def test_a_download_is_complete_or_fails(served: Server, tmp_path: Path) -> None:
     served.manners = Manners(ranges=False, cut_every=300_000, cuts=2)
     seen: list[tuple[int, int | None]] = []
     url, target = f"{served.url}/file.zip", tmp_path / "copy"
@@ -197,8 +199,8 @@ def test_a_whole_file_comes_whole_or_not_at_all(served: Server, tmp_path: Path) 
         download(url, target, PATIENT, lambda *_: None)
 
 
-def test_offsets_beyond_four_gigabytes(tmp_path: Path) -> None:
-    """The real archive has 12.5 GB and needs zip64. A sparse file of its kind takes no space."""
+def test_offsets_beyond_four_gigabytes_are_read(tmp_path: Path) -> None:
+    """The real archive has 12.5 GB and needs zip64; a sparse file takes no space."""
     file = tmp_path / "large.zip"
     with file.open("wb") as stream:
         stream.truncate(5 << 30)

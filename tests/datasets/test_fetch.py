@@ -1,4 +1,4 @@
-"""`gsbench fetch`: what the archive has, only what is wanted, whole or not at all."""
+"""`gsbench fetch` brings the wanted files of an archive, complete or not at all."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BAD_INPUT, FAILED = 2, 1
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     monkeypatch.delenv("GSBENCH_MIRROR", raising=False)
-    # those of other tests write to closed files
+    # handlers of other tests write to closed files
     monkeypatch.setattr(logging.getLogger("gsbench"), "handlers", [])
     return tmp_path / "data"
 
@@ -55,7 +55,7 @@ def wanted(place: str, images: str) -> dict[str, bytes]:
     }
 
 
-def test_every_scene_of_the_catalogue_is_a_scene_file_at_the_same_place() -> None:
+def test_every_scene_of_the_catalogue_has_a_scene_file_with_the_same_folder() -> None:
     known = {}
     for dataset in read_catalog().values():
         for archive in dataset.archives:
@@ -66,7 +66,7 @@ def test_every_scene_of_the_catalogue_is_a_scene_file_at_the_same_place() -> Non
         assert wanted_files(scene).folder == folder
 
 
-def test_brings_what_the_scene_file_wants_and_nothing_else(
+def test_fetch_brings_the_files_that_the_scene_file_needs_and_no_others(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert fetch("mipnerf360", "garden", "room", "flowers") == 0
@@ -79,14 +79,14 @@ def test_brings_what_the_scene_file_wants_and_nothing_else(
     assert "please cite: Barron" in text
     archives = ("360_v2.zip", "360_extra_scenes.zip")
     whole = sum((server.folder / name).stat().st_size for name in archives)
-    assert server.sent < 0.6 * whole  # the tails of small archives count much
+    assert server.sent < 0.6 * whole  # the directory is a large share of a small archive
 
     assert fetch("tandt_db", "truck", "playroom") == 0
     assert files_below(data / "tandt" / "truck") == wanted("tandt/truck", "images")
     assert files_below(data / "db" / "playroom") == wanted("db/playroom", "images")
 
 
-def test_a_second_fetch_asks_nothing_of_the_network(
+def test_a_second_fetch_makes_no_request(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fetch("mipnerf360", "garden")
@@ -99,7 +99,7 @@ def test_a_second_fetch_asks_nothing_of_the_network(
     assert files_below(data / "garden") == wanted("garden", "images_4")
 
 
-def test_goes_on_where_it_was_stopped(fetch: Fetch, server: Server, data: Path) -> None:
+def test_an_interrupted_fetch_continues(fetch: Fetch, server: Server, data: Path) -> None:
     def die_after(path: str, _: int, body: bytes) -> bytes:
         if server.sent > 90_000:  # the directory is 64 kB
             server.manners.status = {path: 500}
@@ -116,15 +116,17 @@ def test_goes_on_where_it_was_stopped(fetch: Fetch, server: Server, data: Path) 
     assert not (data / ".fetch" / "garden").exists()
 
 
-def test_bad_manners_leave_the_same_files(fetch: Fetch, server: Server, data: Path) -> None:
-    """Each kind of them alone: test_archive.py."""
+def test_faults_of_the_server_do_not_change_the_files(
+    fetch: Fetch, server: Server, data: Path
+) -> None:
+    """test_archive.py tests each fault alone."""
     server.manners = Manners(cut_every=6_000, cuts=1, fail_first=1, redirect=True)
     assert fetch("mipnerf360", "garden", "stump") == 0
     assert files_below(data / "garden") == wanted("garden", "images_4")
     assert files_below(data / "stump") == wanted("stump", "images_4")
 
 
-def test_damaged_bytes_are_found_and_not_kept(
+def test_damaged_bytes_are_detected_and_not_kept(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with zipfile.ZipFile(server.folder / "360_v2.zip") as archive:
@@ -145,7 +147,7 @@ def test_damaged_bytes_are_found_and_not_kept(
     assert files_below(data / "garden") == wanted("garden", "images_4")
 
 
-def test_a_folder_may_be_the_mirror(
+def test_a_folder_can_be_the_mirror(
     archives: Path, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == 0
@@ -155,7 +157,7 @@ def test_a_folder_may_be_the_mirror(
     assert "360_v2.zip cannot be read" in capsys.readouterr().err
 
 
-def test_another_image_folder_comes_beside_the_first(fetch: Fetch, data: Path) -> None:
+def test_another_image_folder_is_added_to_the_first(fetch: Fetch, data: Path) -> None:
     assert fetch("mipnerf360", "garden", "--images", "images_8") == 0
     assert files_below(data / "garden") == wanted("garden", "images_8")
     assert fetch("mipnerf360", "garden") == 0
@@ -163,7 +165,7 @@ def test_another_image_folder_comes_beside_the_first(fetch: Fetch, data: Path) -
     assert files_below(data / "garden") == both
 
 
-def test_the_list_says_what_is_here(
+def test_the_list_tells_which_scenes_are_here(
     fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fetch("mipnerf360", "garden")
@@ -191,7 +193,7 @@ def test_the_list_says_what_is_here(
         ),
     ],
 )
-def test_a_request_for_what_is_not_there_is_refused(
+def test_unknown_names_and_addresses_are_refused(
     archives: Path, data: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
 ) -> None:
     mirror = [] if "--mirror" in words else ["--mirror", str(archives)]
@@ -202,7 +204,7 @@ def test_a_request_for_what_is_not_there_is_refused(
 
 
 @pytest.mark.parametrize("place", ["a-file", "a-file/below", "/proc/nosuch"])
-def test_a_data_folder_that_cannot_be_made(
+def test_a_data_folder_that_cannot_be_made_is_refused(
     archives: Path,
     data: Path,
     capsys: pytest.CaptureFixture[str],
@@ -218,7 +220,7 @@ def test_a_data_folder_that_cannot_be_made(
 
 
 @pytest.mark.parametrize("name", ["garden/images_4/up\\x.JPG", "garden/images_4//etc/x.JPG"])
-def test_names_that_lead_elsewhere_are_refused(
+def test_names_that_lead_out_of_the_folder_are_refused(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     content = archive_content("garden") | {name: b"x", "garden/images_4/../../../escaped.JPG": b"x"}
@@ -228,7 +230,7 @@ def test_names_that_lead_elsewhere_are_refused(
     assert not [path for path in data.parent.rglob("*.JPG") if not path.name.startswith("IMG_")]
 
 
-def test_what_is_no_zip_is_refused(
+def test_a_file_that_is_no_zip_archive_is_refused(
     fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (server.folder / "360_v2.zip").write_text("<html>this file has moved</html>")

@@ -22,7 +22,7 @@ def corrected(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = No
 
 
 def by_numpy(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The definition with numpy's solver, one pixel set a channel."""
+    """The definition with numpy's solver, with a set of pixels for each channel."""
     found, goal = image.reshape(-1, 3), truth.reshape(-1, 3)
     low, high = 0.5 / 255, 1 - 0.5 / 255
     for _ in range(5):
@@ -42,7 +42,7 @@ def test_an_affine_change_of_colours_is_undone() -> None:
     np.testing.assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
 
 
-def test_it_is_numpys_least_squares_where_pixels_are_clipped() -> None:
+def test_the_correction_equals_least_squares_of_numpy_with_clipped_pixels() -> None:
     truth = RANDOM.uniform(0, 1, (24, 30, 3))
     truth[:3] = 1.0
     noisy = np.clip(1.6 * truth @ MATRIX.T + RANDOM.normal(0, 0.05, truth.shape), 0, 1)
@@ -60,19 +60,19 @@ def test_pixels_that_a_mask_ignores_do_not_count() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_a_render_of_one_colour_is_finite(value: float) -> None:
+def test_the_correction_of_a_render_of_one_colour_is_finite(value: float) -> None:
     result = corrected(np.full_like(TRUTH, value), TRUTH)
     assert np.isfinite(result).all()
-    if value == 0.5:  # the best of one colour is the mean
+    if value == 0.5:  # the best single colour is the mean
         np.testing.assert_allclose(
             result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9
         )
-    else:  # all pixels are clipped: nothing is known
+    else:  # all pixels are clipped, so the map is unknown
         np.testing.assert_array_equal(result, value)
 
 
 @pytest.mark.parametrize("protocol", [PAPER, STANDARD])
-def test_the_metrics_are_those_of_the_corrected_render(protocol) -> None:
+def test_corrected_metrics_are_those_of_the_corrected_render(protocol) -> None:
     more = ["psnr_cc", "ssim_cc", "cc_gain"]
     evaluator = Evaluator(protocol, lpips=[], flip=False, more=more)
     darker = (TRUTH * 0.6 * 255 + 0.5).astype(np.uint8)

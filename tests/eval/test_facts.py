@@ -1,7 +1,4 @@
-"""The table of metrics.
-
-One place that everything asks, and what a user's metric may say of itself.
-"""
+"""The table of metrics, and the attributes that a user's metric may have."""
 
 from __future__ import annotations
 
@@ -35,14 +32,14 @@ from gsbench.eval.protocol import PAPER, PROTOCOLS
 IMAGE = np.random.default_rng(0).integers(0, 256, (24, 30, 3), dtype=np.uint8)
 
 
-def test_the_table_and_the_protocols_load_no_torch() -> None:
+def test_facts_and_protocols_load_no_torch() -> None:
     code = "import sys, gsbench.eval.facts, gsbench.eval.protocol; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("facts", METRICS, ids=lambda facts: facts.key)
 def test_every_metric_is_described(facts: MetricFacts) -> None:
-    if facts is GAIN:  # it says something about the capture, not which arm is better
+    if facts is GAIN:  # it describes the capture and does not say which arm is better
         assert (facts.direction, facts.worthwhile, facts.lowest) == (0, None, None)
         return
     assert facts.direction in (-1, 1)
@@ -52,7 +49,7 @@ def test_every_metric_is_described(facts: MetricFacts) -> None:
     assert find_metric(facts.key) is facts
 
 
-def test_the_evaluator_knows_exactly_the_metrics_of_the_table() -> None:
+def test_the_evaluator_has_exactly_the_metrics_of_the_table() -> None:
     evaluator = Evaluator(PAPER, lpips=["vgg"], more=further_keys(), download=False)
     values = evaluator.evaluate_view(IMAGE, IMAGE)
     of_images = {facts.key for facts in METRICS}
@@ -71,7 +68,7 @@ class Brightness:
         return float((image.mean() - truth.mean()).abs() * 255)
 
 
-def test_a_metric_of_ones_own_is_measured_beside_the_others() -> None:
+def test_a_users_metric_is_measured_with_the_others() -> None:
     evaluator = Evaluator(PAPER, lpips=[], flip=False, extra={"brightness": Brightness()})
     values = evaluator.evaluate_view(np.minimum(IMAGE, 245) + 10, IMAGE)
     expected = abs((np.minimum(IMAGE, 245) + 10).astype(float).mean() - IMAGE.mean())
@@ -81,7 +78,7 @@ def test_a_metric_of_ones_own_is_measured_beside_the_others() -> None:
     assert from_record("brightness", to_record(facts)) == facts
 
 
-def test_a_metric_of_ones_own_may_be_unavailable() -> None:
+def test_a_users_metric_may_be_unavailable() -> None:
     class Never:
         def measure(self, image: torch.Tensor, truth: torch.Tensor) -> float:
             raise UnavailableError("not on\na Sunday", awaited=True)
@@ -95,10 +92,10 @@ def test_a_metric_of_ones_own_may_be_unavailable() -> None:
         assert evaluator.evaluate_view(IMAGE, IMAGE).keys() == {"psnr", "ssim"}
     assert evaluator.unavailable["never"] == "not on a Sunday"
     assert evaluator.unavailable["broken"] == "the value of a view is nan"
-    assert not evaluator.awaited  # only gsbench's own can say when what they lack has come
+    assert not evaluator.awaited  # only gsbench's own metrics can be awaited
 
 
-def test_missing_weights_are_awaited_and_what_was_not_asked_for_is_not(
+def test_metrics_with_missing_weights_are_awaited_and_unrequested_ones_are_not(
     tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
@@ -127,7 +124,7 @@ def test_missing_weights_are_awaited_and_what_was_not_asked_for_is_not(
         ("worthwhile", True),
     ],
 )
-def test_what_a_metric_says_of_itself_is_checked(name: str, value: object) -> None:
+def test_wrong_attributes_of_a_users_metric_are_refused(name: str, value: object) -> None:
     metric = type("Mine", (Brightness,), {name: value})()
     with pytest.raises(InputError, match=rf"Mine\.{name} must be "):
         facts_of("mine", metric)
@@ -137,11 +134,11 @@ def test_what_a_metric_says_of_itself_is_checked(name: str, value: object) -> No
     ("name", "value"),
     [("direction", 0), ("decimals", 0), ("decimals", 12), ("unit", ""), ("worthwhile", 1e-9)],
 )
-def test_a_metric_may_say_what_the_rules_allow(name: str, value: object) -> None:
+def test_allowed_attributes_of_a_users_metric_are_accepted(name: str, value: object) -> None:
     assert getattr(facts_of("mine", type("Mine", (Brightness,), {name: value})()), name) == value
 
 
-def test_a_metric_that_says_nothing_has_no_direction() -> None:
+def test_a_metric_without_attributes_has_no_direction() -> None:
     facts = facts_of("plain", object())
     assert (facts.label, facts.direction, facts.decimals, facts.worthwhile) == ("plain", 0, 3, None)
     assert from_record("plain", None) == facts

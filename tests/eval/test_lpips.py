@@ -1,4 +1,4 @@
-"""LPIPS against the published value, and its networks against another statement of them."""
+"""LPIPS against the published value, and its networks against an independent version."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ State = dict[str, Tensor]
 
 
 def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
-    """Weights of the right shapes from a fixed seed.
-
-    A backbone's, keyed with ``prefix``, and the heads'.
-    """
+    """Random weights of the right shapes: the backbone's, keyed with ``prefix``, and the heads'."""
     generator = torch.Generator().manual_seed(0)
     shapes = {key: value.shape for key, value in BACKBONES[net].build().state_dict().items()}
     features = {}
@@ -37,7 +34,7 @@ def random_weights(net: str, prefix: str = "features.") -> tuple[State, State]:
 
 
 def vgg_taps(x: Tensor, w: State) -> list[Tensor]:
-    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, by torchvision's numbers."""
+    """VGG16 after relu1_2, relu2_2, relu3_3, relu4_3 and relu5_3, by torchvision's indices."""
     taps = []
     for block in ([0, 2], [5, 7], [10, 12, 14], [17, 19, 21], [24, 26, 28]):
         if block[0] > 0:
@@ -51,7 +48,7 @@ def vgg_taps(x: Tensor, w: State) -> list[Tensor]:
 
 
 def alex_taps(x: Tensor, w: State) -> list[Tensor]:
-    """AlexNet (torchvision) after each of its five rectified convolutions."""
+    """torchvision's AlexNet after each of its five convolutions with ReLU."""
     taps = []
     for index, stride, padding, pool in (
         (0, 4, 2, False),
@@ -70,7 +67,7 @@ def alex_taps(x: Tensor, w: State) -> list[Tensor]:
 
 
 def textbook_lpips(first: Tensor, second: Tensor, taps, features: State, heads: State) -> Tensor:
-    """LPIPS v0.1 by its definition, for [B, 3, H, W] in [-1, 1], 1x1 convolutions as heads."""
+    """LPIPS v0.1 by its definition, for [B, 3, H, W] in [-1, 1], with 1x1 convolutions as heads."""
     shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
     total = torch.zeros(len(first))
@@ -104,7 +101,7 @@ def test_the_published_heads_fit_the_taps(shared: Path, net: str) -> None:
 
 
 @pytest.mark.parametrize(("net", "taps"), [("vgg", vgg_taps), ("alex", alex_taps)])
-def test_networks_match_an_independent_statement(net: str, taps) -> None:
+def test_networks_match_an_independent_version(net: str, taps) -> None:
     features, heads = random_weights(net)
     generator = torch.Generator().manual_seed(1)
     first, second = (torch.rand(2, 3, 70, 66, generator=generator) * 2 - 1 for _ in range(2))
@@ -140,7 +137,7 @@ def test_identical_images_have_distance_zero_and_order_does_not_matter() -> None
     assert float(network(first, second)) == pytest.approx(float(network(second, first)), rel=1e-6)
 
 
-def test_keys_without_the_features_prefix_and_with_a_classifier_load_alike() -> None:
+def test_keys_may_lack_the_features_prefix_or_include_a_classifier() -> None:
     plain, heads = random_weights("squeeze", prefix="")
     prefixed, _ = random_weights("squeeze")
     first, second = torch.rand(1, 3, 32, 32), torch.rand(1, 3, 32, 32)
@@ -159,7 +156,9 @@ def test_weights_of_another_network_are_refused() -> None:
         Lpips("vgg", vgg, alex_heads)
 
 
-def test_missing_weights_name_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_weights_are_reported_with_the_file_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(MissingWeightsError, match=r"vgg16-397923af\.pth"):
@@ -167,7 +166,7 @@ def test_missing_weights_name_the_file(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("net", ["vgg", "alex", "squeeze"])
-def test_the_smallest_size_is_the_smallest_that_works(net: str) -> None:
+def test_the_minimum_size_works_and_a_smaller_one_is_refused(net: str) -> None:
     network = Lpips(net, *random_weights(net))
     size = BACKBONES[net].min_size
     assert torch.isfinite(network(torch.rand(1, 3, size, size), torch.rand(1, 3, size, size))).all()

@@ -1,4 +1,4 @@
-"""Metrics over the pixels that count, against other programs and against what must not matter."""
+"""Metrics over the pixels that count, against other programs and under irrelevant changes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def evaluator(protocol=STANDARD, shared=None, **options) -> Evaluator:
     )
 
 
-def test_psnr_is_of_the_pixels_that_count(pair) -> None:
+def test_masked_psnr_is_over_the_pixels_that_count(pair) -> None:
     render, truth, mask = pair
     found = evaluator().evaluate_view(render, truth, mask)["psnr"]
     squared = ((render.astype(float) - truth) / 255)[mask] ** 2
@@ -39,7 +39,9 @@ def test_psnr_is_of_the_pixels_that_count(pair) -> None:
 
 
 @pytest.mark.parametrize(("protocol", "inside"), [(STANDARD, True), (PAPER, False)])
-def test_ssim_is_scikit_images_map_where_pixels_count(pair, protocol, inside) -> None:
+def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(
+    pair, protocol, inside
+) -> None:
     render, truth, mask = pair
     shown = np.where(mask[..., None], render, truth) / 255
     border = 0 if inside else 5
@@ -59,7 +61,7 @@ def test_ssim_is_scikit_images_map_where_pixels_count(pair, protocol, inside) ->
     assert found == pytest.approx(full[counts].mean(), abs=1e-9)
 
 
-def test_not_one_metric_sees_what_is_under_the_mask(pair, shared) -> None:
+def test_pixels_under_the_mask_change_no_metric(pair, shared) -> None:
     render, truth, mask = pair
     noisy = np.where(mask[..., None], render, 255 - render)
     more = ["gmsd", "fsim"]
@@ -78,7 +80,7 @@ def test_a_mask_of_ones_changes_nothing(pair, shared) -> None:
     assert full == pytest.approx(plain, rel=1e-6)
 
 
-def test_ignoring_what_is_perfect_makes_a_view_worse_and_what_is_bad_better(pair, shared) -> None:
+def test_masking_perfect_pixels_makes_a_view_worse(pair, shared) -> None:
     render, truth, mask = pair
     half_right = np.where(mask[..., None], render, truth)
     plain = evaluator(shared=shared).evaluate_view(half_right, truth)
@@ -89,11 +91,8 @@ def test_ignoring_what_is_perfect_makes_a_view_worse_and_what_is_bad_better(pair
     assert masked["flip"] > plain["flip"]
 
 
-def test_lpips_of_a_mask_is_the_mean_of_its_maps_where_pixels_count(shared) -> None:
-    """Two pictures side by side, far enough apart for the network.
-
-    The mask chooses the distance of one of them.
-    """
+def test_masked_lpips_is_the_distance_of_the_part_that_counts(shared) -> None:
+    """The mask chooses one of two pictures side by side."""
     rng = np.random.default_rng(3)
     network = load_lpips("squeeze", shared / "weights", download=False)
     left, right = torch.rand(2, 1, 3, 256, 256, generator=torch.Generator().manual_seed(1)) * 2 - 1
@@ -109,10 +108,10 @@ def test_lpips_of_a_mask_is_the_mean_of_its_maps_where_pixels_count(shared) -> N
         assert float(network(first, second, mask)) == pytest.approx(wanted, abs=0.03 * alone)
 
 
-def test_a_view_without_a_window_that_counts_says_so(pair) -> None:
+def test_ssim_of_a_view_without_a_counted_window_is_unavailable(pair) -> None:
     render, truth, mask = pair
     mask = np.zeros_like(mask)
-    mask[:3] = True  # no window lies in the picture there
+    mask[:3] = True  # no window fits into the image there
     judge = evaluator(STANDARD)
     values = judge.evaluate_view(render, truth, mask)
     assert "ssim" not in values
@@ -120,7 +119,7 @@ def test_a_view_without_a_window_that_counts_says_so(pair) -> None:
     assert "ssim" in judge.unavailable
 
 
-def test_an_own_metric_gets_the_mask_if_it_asks(pair) -> None:
+def test_a_users_metric_gets_the_mask_if_it_has_measure_masked(pair) -> None:
     render, truth, mask = pair
 
     class Plain:

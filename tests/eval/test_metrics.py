@@ -1,4 +1,4 @@
-"""PSNR, SSIM and FLIP against scikit-image, brute force and values worked out by hand."""
+"""PSNR, SSIM and FLIP against scikit-image, brute force and values calculated by hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def distorted_pair(
 
 
 def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> float:
-    """Zero-padded SSIM of [H, W, 3], pixel by pixel from the definition of a weighted window."""
+    """Zero-padded SSIM of [H, W, 3], pixel by pixel, by its definition in a weighted window."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
     window /= window.sum()

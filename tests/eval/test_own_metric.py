@@ -1,4 +1,4 @@
-"""What a user's metric may return, and what becomes of one that does something else."""
+"""What a user's metric may return, and the errors for one that does something else."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def measured(value: Any) -> dict[str, float]:
         torch.tensor([2]),
     ],
 )
-def test_any_number_will_do(value: Any) -> None:
+def test_a_users_metric_may_return_a_number_of_any_type(value: Any) -> None:
     assert measured(value)["own"] == 2.0
 
 
@@ -54,14 +54,14 @@ def test_any_number_will_do(value: Any) -> None:
     "value",
     ["2.0", "good", b"2", True, None, 2j, [2.0], {}, np.zeros(2), torch.zeros(2), np.array("2")],
 )
-def test_what_is_no_number_is_named(value: Any) -> None:
+def test_a_users_metric_that_returns_no_number_is_refused(value: Any) -> None:
     with pytest.raises(
         InputError, match=r"eval\.extra\.own must return a number for each view, got "
     ):
         measured(value)
 
 
-def test_a_metric_that_ends_the_process_is_an_error() -> None:
+def test_a_users_metric_that_ends_the_process_is_refused() -> None:
     with pytest.raises(InputError, match=r"eval\.extra\.own ended the process \(exit code 0\)"):
         measured(SystemExit)
 
@@ -100,7 +100,7 @@ def failing() -> Any:
         ),
     ],
 )
-def test_a_metric_that_falls_is_named_in_one_line(fall: Callable[[], Any], said: str) -> None:
+def test_a_users_metric_that_fails_is_named_in_one_line(fall: Callable[[], Any], said: str) -> None:
     evaluator = Evaluator(get_protocol("paper"), lpips=(), flip=False, extra={"own": Falls(fall)})
     with pytest.raises(InputError, match=said) as caught:
         evaluator.evaluate_view(IMAGE, IMAGE)

@@ -1,4 +1,4 @@
-"""Pictures are measured as they are, in the order that is asked for, or refused."""
+"""Pictures are measured without changes, in the given order, or refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def pairs(tmp_path: Path) -> list[PicturePair]:
     return made
 
 
-def test_the_metrics_are_of_the_files_pixels(pairs: list[PicturePair]) -> None:
+def test_metrics_are_computed_from_the_pixels_of_the_files(pairs: list[PicturePair]) -> None:
     per_view = measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
     assert list(per_view) == ["b", "a"]
     for pair in pairs:
@@ -34,11 +34,11 @@ def test_the_metrics_are_of_the_files_pixels(pairs: list[PicturePair]) -> None:
             np.asarray(Image.open(path), dtype=float) for path in (pair.picture, pair.photograph)
         )
         expected = 10 * np.log10(255**2 / ((render - truth) ** 2).mean())
-        # the pixels are single precision before they are squared
+        # pixels are in single precision before they are squared
         assert per_view[pair.view]["psnr"] == pytest.approx(expected, abs=1e-6)
 
 
-def test_sizes_are_never_changed(pairs: list[PicturePair]) -> None:
+def test_a_picture_of_another_size_is_refused(pairs: list[PicturePair]) -> None:
     Image.open(pairs[1].picture).resize((25, 20)).save(pairs[1].picture)
     with pytest.raises(
         InputError, match=r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"
@@ -46,7 +46,7 @@ def test_sizes_are_never_changed(pairs: list[PicturePair]) -> None:
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 
-def test_a_torn_picture_is_named(pairs: list[PicturePair]) -> None:
+def test_a_truncated_picture_is_named(pairs: list[PicturePair]) -> None:
     pairs[0].picture.write_bytes(pairs[0].picture.read_bytes()[:500])
     with pytest.raises(InputError, match=r"b_render\.png: the image is damaged"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))

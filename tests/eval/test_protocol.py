@@ -1,4 +1,4 @@
-"""The conventions of the protocols, each pinned by a case small enough to work out by hand."""
+"""The conventions of the protocols, each in a case that can be calculated by hand."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_identical_images_get_the_documented_cap() -> None:
     assert values == {"psnr": 100.0, "ssim": pytest.approx(1.0), "flip": 0.0}
 
 
-def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
+def test_missing_weights_are_named_and_not_replaced_by_another_network() -> None:
     evaluator = Evaluator(PAPER, lpips=["vgg_raw", "vgg"], download=False)
     image = np.zeros((32, 32, 3), dtype=np.uint8)
     assert set(evaluator.evaluate_view(image, image)) == {"psnr", "ssim", "flip"}
@@ -82,7 +82,7 @@ def test_missing_weights_are_named_and_nothing_stands_in_for_them() -> None:
 
 
 @pytest.mark.shared
-def test_lpips_variants_see_the_range_that_their_name_says(
+def test_raw_lpips_variants_get_values_from_0_to_1_and_others_from_minus_1_to_1(
     shared: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     squeeze = find_metric("lpips_squeeze")
@@ -106,7 +106,7 @@ def test_lpips_variants_see_the_range_that_their_name_says(
 
 
 @pytest.mark.shared
-def test_a_view_too_small_for_a_network_is_said(shared: Path) -> None:
+def test_lpips_of_too_small_a_view_is_unavailable(shared: Path) -> None:
     evaluator = Evaluator(
         PAPER, lpips=["squeeze"], flip=False, weights=shared / "weights", download=False
     )
@@ -125,18 +125,18 @@ def test_without_the_flip_package_the_metric_is_unavailable(
     assert "pip install" in evaluator.unavailable["flip"]
 
 
-def test_a_broken_render_is_an_error_not_a_number() -> None:
+def test_a_render_with_nan_is_refused() -> None:
     render = torch.full((16, 16, 3), float("nan"))
     with pytest.raises(TrainingError, match="not finite"):
         Evaluator(PAPER, lpips=[]).evaluate_view(render, np.zeros((16, 16, 3), dtype=np.uint8))
 
 
-def test_an_unknown_variant_is_refused() -> None:
+def test_an_unknown_lpips_variant_is_refused() -> None:
     with pytest.raises(InputError, match="vgg_raw, vgg, alex, squeeze"):
         Evaluator(PAPER, lpips=["vgg16"])
 
 
-def test_means_leave_out_what_some_view_lacks() -> None:
+def test_means_leave_out_metrics_that_a_view_lacks() -> None:
     per_view = {"a": {"psnr": 20.0, "flip": 0.1}, "b": {"psnr": 30.0}}
     assert summarize(per_view, {}) == {"psnr": 25.0}
     assert summarize(per_view, {"psnr": "broken"}) == {}

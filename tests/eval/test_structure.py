@@ -1,4 +1,4 @@
-"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, restatements, and values by hand."""
+"""MS-SSIM, IW-SSIM, FSIM and GMSD against piq, independent versions and values by hand."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ PEERS = {
     "gmsd": "gmsd.gmsd",
 }
 ODD = (201, 180)  # px, height and width
-# piq 0.8.0 of the pairs below, in the order of PEERS. It is no dependency of the tests, since it
-# asks for torchvision; where it is installed (pip install --no-deps piq), the values are computed
-# again.
+# The values of piq 0.8.0 for the pairs below, in the order of PEERS. The tests do not depend on piq,
+# because it requires torchvision. If it is installed (pip install --no-deps piq), they check these
+# values.
 PIQ = {
     ((176, 208), "noise"): (0.855058, 0.918725, 0.795243, 0.094648),
     ((176, 208), "blur"): (0.975246, 0.947219, 0.892405, 0.071217),
@@ -53,9 +53,9 @@ PIQ = {
 
 @pytest.fixture(scope="module")
 def peer() -> Iterator[Callable[[str], Callable[..., torch.Tensor]]]:
-    """piq's function for a metric.
+    """Finds piq's function for a metric.
 
-    Its modules are loaded one by one: the package as a whole wants torchvision.
+    Modules are loaded one by one, because the whole package requires torchvision.
     """
     spec = importlib.util.find_spec("piq")
     if spec is None:
@@ -86,17 +86,17 @@ def pair(height: int, width: int, distortion: str = "noise") -> tuple[torch.Tens
 
 
 @pytest.mark.parametrize("case", PIQ, ids=str)
-def test_agrees_with_piq(case: tuple[tuple[int, int], str]) -> None:
+def test_structural_metrics_agree_with_piq(case: tuple[tuple[int, int], str]) -> None:
     image, truth = pair(*case[0], case[1])
     for key, expected in zip(PEERS, PIQ[case], strict=True):
         if key == "ms_ssim" and case[0] == ODD:
-            # piq lengthens odd sides at their beginning; a test below restates what the authors do
+            # piq pads odd sides at their start; a test below follows the authors
             continue
         assert float(FUNCTIONS[key](image, truth)) == pytest.approx(expected, abs=1e-4), key
 
 
 @pytest.mark.parametrize("case", PIQ, ids=str)
-def test_the_values_noted_here_are_those_of_piq(
+def test_the_stored_values_are_those_of_piq(
     case: tuple[tuple[int, int], str], peer: Callable
 ) -> None:
     images = (x.permute(2, 0, 1).unsqueeze(0) for x in pair(*case[0], case[1]))
@@ -107,11 +107,10 @@ def test_the_values_noted_here_are_those_of_piq(
 
 
 @pytest.mark.parametrize("size", [(161, 170), (187, 161), (192, 192)], ids=str)
-def test_ms_ssim_halves_as_its_authors_do(size: tuple[int, int]) -> None:
-    """Their ``imfilter(image, ones(2) / 4, 'symmetric')``, restated with scipy.
+def test_ms_ssim_halves_images_as_its_authors_do(size: tuple[int, int]) -> None:
+    """Their ``imfilter(image, ones(2) / 4, 'symmetric')`` and every other pixel, with scipy.
 
-    Then every other pixel. SSIM itself is scikit-image's; contrast and structure are its quotient
-    by luminance.
+    SSIM is scikit-image's; contrast times structure is SSIM divided by luminance.
     """
     image, truth = (x.numpy() for x in pair(*size))
     products = []
@@ -141,15 +140,14 @@ def test_ms_ssim_halves_as_its_authors_do(size: tuple[int, int]) -> None:
     )
 
 
-def test_gmsd_by_hand() -> None:
-    """A vertical edge of height 1 against none, as [2, 4] after halving.
+def test_gmsd_of_a_square_equals_the_value_by_hand() -> None:
+    """A grey square against black; the similarity at a gradient m is c / (m² + c).
 
-    Its similarity is c / (m² + c) where m is not 0. Zeros outside make an edge all round the black
-    picture's partner too, so both have black borders.
+    Zeros pad the images, so both have black borders, which make no edge.
     """
     truth = torch.zeros(12, 12, 3, dtype=torch.float64)
     image = truth.clone()
-    image[4:8, 4:8] = 0.5  # 2x2 px of 0.5 in 6x6
+    image[4:8, 4:8] = 0.5  # 2x2 px of 0.5 in 6x6 px after halving
     plane = np.zeros((6, 6))
     plane[2:4, 2:4] = 0.5
     across = ndimage.correlate(plane, np.array([[-1, 0, 1]] * 3) / 3, mode="constant")
@@ -160,7 +158,7 @@ def test_gmsd_by_hand() -> None:
 
 
 def test_phase_congruency_does_not_depend_on_contrast() -> None:
-    """What it is for (Kovesi 1999): an edge is one whatever its height, and noise is none."""
+    """An edge of any height has the same value, and noise has a low one (Kovesi 1999)."""
     rows = torch.zeros(128, 128, dtype=torch.float64)
     rows[64:] = 1.0
     rows += 0.02 * torch.randn(
@@ -172,7 +170,7 @@ def test_phase_congruency_does_not_depend_on_contrast() -> None:
 
 
 @pytest.mark.parametrize("key", FUNCTIONS)
-def test_identical_images_are_best_and_worse_ones_worse(key: str) -> None:
+def test_identical_images_have_the_best_value_and_more_distortion_is_worse(key: str) -> None:
     facts = next(facts for facts in METRICS if facts.key == key)
     image, truth = pair(176, 180)
     best = float(FUNCTIONS[key](truth, truth))
@@ -195,7 +193,7 @@ def test_a_batch_gives_the_values_of_its_images(key: str) -> None:
 @pytest.mark.parametrize(
     ("key", "smallest"), [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)]
 )
-def test_what_is_too_small_is_refused_and_reported(key: str, smallest: int) -> None:
+def test_too_small_images_are_refused_and_reported_as_unavailable(key: str, smallest: int) -> None:
     assert MULTISCALE_MIN_SIZE == 161
     with pytest.raises(ValueError, match=f"at least {smallest} px"):
         FUNCTIONS[key](torch.rand(smallest - 1, 300, 3), torch.rand(smallest - 1, 300, 3))
@@ -212,15 +210,15 @@ def test_what_is_too_small_is_refused_and_reported(key: str, smallest: int) -> N
 
 
 @pytest.mark.parametrize("key", ["iw_ssim", "fsim"])
-def test_flat_views_have_a_reason_and_no_number(key: str) -> None:
+def test_metrics_of_flat_views_are_unavailable_with_a_reason(key: str) -> None:
     evaluator = Evaluator(PAPER, lpips=[], flip=False, more=[key])
     flat = np.full((170, 170, 3), 90, dtype=np.uint8)
     assert key not in evaluator.evaluate_view(flat, flat)
     assert evaluator.unavailable[key] == "a view is flat: it has no structure to compare"
 
 
-def test_views_that_are_flat_in_part_are_measured() -> None:
-    """Black borders of undistorted photographs, and renders of one colour."""
+def test_partly_flat_views_are_measured() -> None:
+    """For example, black borders of undistorted photographs and renders of one colour."""
     image, truth = pair(176, 180)
     image[:90], truth[:90] = 0, 0
     for function in FUNCTIONS.values():
@@ -228,7 +226,7 @@ def test_views_that_are_flat_in_part_are_measured() -> None:
         assert np.isfinite(float(function(torch.full_like(truth, 0.5), truth)))
 
 
-def test_metrics_that_are_not_asked_for_leave_no_trace() -> None:
+def test_further_metrics_that_are_not_requested_leave_no_trace() -> None:
     evaluator, image = Evaluator(PAPER, lpips=[], flip=False), np.zeros((9, 9, 3), np.uint8)
     assert set(FUNCTIONS) < set(further_keys())
     assert not {*evaluator.unavailable, *evaluator.evaluate_view(image, image)} & {*further_keys()}
@@ -240,6 +238,6 @@ def test_an_unknown_metric_is_refused() -> None:
 
 
 @pytest.mark.parametrize("key", FUNCTIONS)
-def test_pictures_of_unlike_sizes_are_refused(key: str) -> None:
+def test_images_of_different_sizes_are_refused(key: str) -> None:
     with pytest.raises(ValueError, match=r"different shapes: \(192, 192, 3\) and \(192, 193, 3\)"):
         FUNCTIONS[key](torch.zeros(192, 192, 3), torch.zeros(192, 193, 3))

@@ -1,4 +1,4 @@
-"""Another program as a trainer: its command, what it is given, how it is run."""
+"""Another program as a trainer: its command, its input folders, and its process."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from gsbench.system.isolate import error_tail
 from tests.config.test_schema import composed
 from tests.processes import is_running
 
-PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
+PATIENCE = 60.0  # seconds to wait for a process to end on a slow machine
 
 
 @pytest.fixture
 def views() -> list[View]:
-    """Three views of different cameras and sizes, one in a folder of its own."""
+    """Three views with different cameras and sizes, one of them in a sub-folder."""
     rng = np.random.default_rng(0)
     found = []
     for index, name in enumerate(("a.JPG", "left/b.png", "c.jpeg")):
@@ -47,7 +47,7 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
-def test_the_training_folder_as_pycolmap_reads_it(views: list[View], tmp_path: Path) -> None:
+def test_pycolmap_reads_the_training_folder(views: list[View], tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     cloud = PointCloud(rng.normal(size=(50, 3)), rng.integers(0, 256, (50, 3), dtype=np.uint8))
     write_training_views(tmp_path, views, cloud)
@@ -68,7 +68,9 @@ def test_the_training_folder_as_pycolmap_reads_it(views: list[View], tmp_path: P
         np.testing.assert_allclose(image.project_point(ahead), wanted, atol=1e-6)
 
 
-def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_path: Path) -> None:
+def test_the_folder_of_test_cameras_has_no_images_and_the_same_projections(
+    views: list[View], tmp_path: Path
+) -> None:
     write_test_cameras(tmp_path, views)
     files = {path.name for path in tmp_path.rglob("*") if path.is_file()}
     stems = ("cameras", "images", "points3D", "rigs", "frames")
@@ -78,7 +80,7 @@ def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_pat
         points = view.camera.center + np.random.default_rng(2).normal(size=(20, 3))
         # OpenGL's axes
         local = np.linalg.inv(frame["transform_matrix"]) @ np.column_stack([points, np.ones(20)]).T
-        seen = local[2] < 0  # it looks along -z, y is up
+        seen = local[2] < 0  # the camera looks along -z, and y is up
         columns = frame["cx"] - frame["fl_x"] * local[0] / local[2]
         rows = frame["cy"] + frame["fl_y"] * local[1] / local[2]
         pixels = np.column_stack([columns, rows])
@@ -89,7 +91,7 @@ def test_test_cameras_have_no_pixel_and_project_alike(views: list[View], tmp_pat
 
 def test_a_command_is_split_and_its_placeholders_are_filled_once() -> None:
     assert split_command("a 'b c' {d}", "x") == ["a", "b c", "{d}"]
-    # each is replaced once
+    # a replaced value is not replaced again
     assert fill_placeholders("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"
     for command, said in (("", "x is empty"), ("'a", "cannot be split")):
         with pytest.raises(InputError, match=said):
@@ -98,7 +100,7 @@ def test_a_command_is_split_and_its_placeholders_are_filled_once() -> None:
         fill_placeholders("{tset}", {"test": 1}, "x")
 
 
-def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
+def test_the_yaml_of_the_original_code_passes_our_schedule_on() -> None:
     words = [
         "densify=external/3dgs",
         "densify.options.code=/code",
@@ -110,7 +112,7 @@ def test_yaml_of_the_original_code_hands_our_schedule_on() -> None:
     assert str(command[command.index("--opacity_lr") + 1]) == "0.05"
 
 
-def test_a_limit_of_time_makes_no_other_trial_but_an_option_does() -> None:
+def test_an_option_changes_the_hash_of_a_trial_and_a_time_limit_does_not() -> None:
     words = ["densify=external/opensplat", "densify.version='1'", "allow_targets=[opensplat]"]
     base = config_hash(composed(*words))
     assert config_hash(composed(*words, "densify.time_limit_minutes=5")) == base
@@ -118,7 +120,7 @@ def test_a_limit_of_time_makes_no_other_trial_but_an_option_does() -> None:
     assert config_hash(composed(*words, "densify.version='2'")) != base
 
 
-def test_a_command_must_take_the_data_and_its_result_says_what_it_leaves() -> None:
+def test_a_command_must_contain_data_and_its_result_tells_model_from_renders() -> None:
     with pytest.raises(InputError, match=r"has no \{data\}"):
         External(command=["a"], result="*.ply", version="1")
     assert External(command=["a", "{data}"], result="x/*.PLY", version="1").leaves_model
@@ -137,13 +139,13 @@ def test_a_program_runs_in_its_folder_with_its_environment(tmp_path: Path) -> No
     assert "said" in (tmp_path / "log").read_text()
 
 
-def test_memory_of_its_children_counts(tmp_path: Path) -> None:
+def test_memory_of_child_processes_counts(tmp_path: Path) -> None:
     child = "x = bytearray(300 << 20); import time; time.sleep(2)"
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
     assert run(tmp_path, code) > 290
 
 
-def test_nothing_is_left_running(tmp_path: Path) -> None:
+def test_no_child_process_is_left_running(tmp_path: Path) -> None:
     code = (
         "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; "
         "time.sleep(600)']).pid)"
@@ -168,7 +170,7 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.slow
-def test_bad_ends_are_one_line_with_the_log(
+def test_failures_are_reported_in_one_line_with_the_log(
     tmp_path: Path, code: str, limit: float | None, said: str
 ) -> None:
     with pytest.raises(TrainingError, match=said) as caught:
@@ -177,7 +179,7 @@ def test_bad_ends_are_one_line_with_the_log(
     assert "\n" not in str(caught.value)
 
 
-def test_the_last_words_of_gigabytes_of_output_cost_little(tmp_path: Path) -> None:
+def test_the_last_lines_of_gigabytes_of_output_need_little_memory(tmp_path: Path) -> None:
     log = tmp_path / "trainer.log"
     with log.open("wb") as stream:
         stream.truncate(3 << 30)  # sparse: it takes no space

@@ -1,4 +1,4 @@
-"""What is refused of another program's settings before it is run."""
+"""Settings of another program that are refused before it runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def external(result: str, **options: Any) -> External:
         "[ab].ply",
     ],
 )
-def test_patterns_below_the_output_folder_pass(result: str) -> None:
+def test_patterns_below_the_output_folder_are_accepted(result: str) -> None:
     assert external(result, options={"kind": "deep"}).result == result
 
 
@@ -37,7 +37,7 @@ def test_patterns_below_the_output_folder_pass(result: str) -> None:
         ("a**/b.ply", "not a pattern of files"),
         ("/home/me/a.ply", "below the program's output folder"),
         ("{output}/a.ply", "below the program's output folder"),
-        ("{kind}/a.ply", "below the program's output folder"),  # an option can say as much
+        ("{kind}/a.ply", "below the program's output folder"),  # the option is an absolute path
         ("../a.ply", "below the program's output folder"),
         ("a/../../b.ply", "below the program's output folder"),
         ("C:/a.ply", "below the program's output folder"),
@@ -46,7 +46,7 @@ def test_patterns_below_the_output_folder_pass(result: str) -> None:
         ("x" * 300, "not a pattern of files"),
     ],
 )
-def test_patterns_that_fit_no_file_are_refused_before_any_training(result: str, words: str) -> None:
+def test_patterns_that_fit_no_file_below_the_folder_are_refused(result: str, words: str) -> None:
     with pytest.raises(InputError, match=words) as refused:
         external(result, options={"kind": "/abs"})
     assert "densify.result" in str(refused.value)

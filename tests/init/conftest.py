@@ -1,4 +1,4 @@
-"""A small capture with exact poses, and networks without training that still match features."""
+"""A small capture with exact poses, and untrained networks that still match features."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A weights folder with a random SuperPoint, and a LightGlue whose layers add nothing.
 
     Random convolutions move with the picture, so their maxima and descriptors can be matched. With
-    layers that add nothing and an identity before the assignment, LightGlue picks descriptors that
-    are each other's nearest.
+    layers that add nothing and an identity before the assignment, LightGlue picks mutual
+    nearest neighbours.
     """
     transformers = pytest.importorskip("transformers", reason="needs the extra dim")
     from kornia.feature import LightGlue

@@ -1,4 +1,4 @@
-"""COLMAP models of a few cameras, and what identifies a written model."""
+"""COLMAP models of a few cameras, and a digest of written models."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def model_with(
 ) -> pycolmap.Reconstruction:
     """A model of images with ids from 1 and one camera, by default of 100 x 80 px, f = 100 px.
 
-    ``keypoints`` [K, 2] are those of each image, or their number.
+    ``keypoints`` are the keypoints [K, 2] of each image, or their number.
     """
     model = pycolmap.Reconstruction()
     plain = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 100, 80)
@@ -48,6 +48,6 @@ def add_point(
 
 
 def digest(model: Path) -> str:
-    """One value for the bytes of all files of a model."""
+    """The sha256 of all files of a model together."""
     files = sorted(model.glob("*.bin"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

@@ -1,4 +1,4 @@
-"""The YAML of every initialiser, composed: all options of its class with its defaults."""
+"""The YAML files of initialisers have all options and defaults of the classes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DELIBERATE: dict[str, dict[str, Any]] = {
 
 
 def composed(name: str) -> dict[str, Any]:
-    """The group as a trial gets it."""
+    """The settings of the initialiser as a trial gets them."""
     return compose_one([f"init={name}", "scene=courtyard", *REQUIRED.get(name, [])]).values["init"]
 
 

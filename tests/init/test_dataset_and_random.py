@@ -1,4 +1,4 @@
-"""The clouds that need no matching."""
+"""Initialisers that need no matching."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
     return points
 
 
-def test_dataset_takes_over_the_cloud(courtyard: Capture, tmp_path: Path):
+def test_dataset_keeps_the_cloud_of_the_model(courtyard: Capture, tmp_path: Path):
     points = add_points(courtyard.model, tmp_path / "model", 20)
     report = Dataset().run(replace(courtyard, model=tmp_path / "model"), tmp_path / "out")
     cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
@@ -60,7 +60,7 @@ def test_dataset_needs_points_and_a_model(courtyard: Capture, bare_photos: Captu
 
 
 @pytest.mark.slow
-def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tmp_path: Path):
+def test_random_fills_the_cube_around_the_training_cameras(courtyard: Capture, tmp_path: Path):
     report = Random(count=5000, size=2.0, seed=3).run(courtyard, tmp_path / "a")
     cloud = read_cloud(tmp_path / "a" / MODEL_FOLDER)
     images = pycolmap.Reconstruction(courtyard.model).images.values()
@@ -68,7 +68,7 @@ def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tm
     center = np.mean([image.projection_center() for image in training], axis=0)
     offset = np.abs(cloud.points - center) / report.gauge.scene_extent
     assert 1.99 < offset.max() <= 2.0
-    assert offset.mean() == pytest.approx(1.0, abs=0.03)  # of uniform values in [0, 2]
+    assert offset.mean() == pytest.approx(1.0, abs=0.03)  # the mean of uniform values in [0, 2]
     assert cloud.colors.mean() == pytest.approx(127.5, abs=2)
     assert report.mean_reprojection_error is None
     assert "NaN" not in (tmp_path / "a" / "report.json").read_text()
@@ -79,10 +79,10 @@ def test_random_fills_the_box_around_the_training_cameras(courtyard: Capture, tm
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])
-def test_carved_keeps_what_training_cameras_have_in_view(
+def test_carved_keeps_points_in_view_of_enough_training_cameras(
     courtyard: Capture, tmp_path: Path, seen_by: int
 ) -> None:
-    """COLMAP's own projection, one point and one image at a time."""
+    """Checked with COLMAP's projection, one point and one image at a time."""
     options = {"count": 300, "size": 2.0, "seed": 3}
     Random(**options).run(courtyard, tmp_path / "random")
     report = Carved(**options, seen_by=seen_by).run(courtyard, tmp_path / "carved")
@@ -102,13 +102,13 @@ def test_carved_keeps_what_training_cameras_have_in_view(
     assert 0 < len(expected) == report.num_points < 300
 
 
-def test_carved_says_when_nobody_sees_anything(courtyard: Capture, tmp_path: Path) -> None:
+def test_carved_refuses_a_cloud_without_points_in_view(courtyard: Capture, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none is in view of 9999 training cameras"):
         Carved(count=10, seen_by=9999).run(courtyard, tmp_path)
 
 
-def test_copies_lie_about_their_points(tmp_path: Path) -> None:
-    """A grid of two spacings: shifts are normal and in proportion to the neighbour's distance."""
+def test_shifts_of_copies_are_proportional_to_the_neighbours_distance(tmp_path: Path) -> None:
+    """Shifts are normal and proportional to the distance of the nearest neighbour."""
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
     points = np.concatenate([grid, 100 + 10 * grid])
     copies = shifted_copies(points, 3, 0.5, seed=1)
@@ -128,12 +128,12 @@ def test_random_needs_cameras(bare_photos: Capture, courtyard: Capture, tmp_path
     assert Random(count=10).run(bare_photos, tmp_path, reference=courtyard.model).num_points == 10
 
 
-def test_a_folder_without_a_model_has_no_cloud(tmp_path: Path):
+def test_reading_a_cloud_without_a_model_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="no COLMAP model here"):
         read_cloud(tmp_path)
 
 
-def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(
+def test_a_trained_model_becomes_points_and_is_copied_unchanged(
     courtyard: Capture, tmp_path: Path
 ) -> None:
     gaussians = random_gaussians(20, dtype=torch.float32)
@@ -151,4 +151,4 @@ def test_a_trained_model_becomes_points_under_the_cameras_and_is_kept_whole(
     (tmp_path / "words.ply").write_text("no model")
     said = r"words\.ply: not a readable PLY of Gaussians \(it has no header\)"
     with pytest.raises(InputError, match=said):
-        Ply(path=str(tmp_path / "words.ply"))  # before any photograph is looked at
+        Ply(path=str(tmp_path / "words.ply"))  # refused before any photograph is read

@@ -1,4 +1,4 @@
-"""Deep image matching without training, and the contracts of its libraries."""
+"""Deep image matching with untrained networks, and the behaviour that it needs of libraries."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def superpoint(weights: Path, **options: object) -> Dim:
 
 
 def features_of(descriptors: np.ndarray) -> Features:
-    """Features at one place of a picture of nine pixels a side."""
+    """Features that are all at one place of a 9 x 9 image."""
     count, own = len(descriptors), descriptors.astype(np.float32)
     return Features(
         np.zeros((count, 2), np.float32), own, np.ones(count, np.float32), (9, 9), (9, 9)
@@ -63,7 +63,7 @@ def no_gpu(*_: object) -> Any:
 
 
 class TestUntrained:
-    """The whole path with networks that were never trained."""
+    """The whole path, with untrained networks."""
 
     @pytest.fixture(scope="class")
     def run(
@@ -85,7 +85,7 @@ class TestUntrained:
         assert np.median(surface_distance(read_cloud(output / "out" / MODEL_FOLDER).points)) < 0.15
 
     @pytest.mark.slow
-    def test_lightglue_on_the_same_path(
+    def test_lightglue_matches_enough_points(
         self, few: Capture, untrained_weights: Path, tmp_path: Path, caplog
     ):
         own = {"max_keypoints": 256, "filter_threshold": 0.0, "pairs": "sequential", "overlap": 1}
@@ -96,7 +96,7 @@ class TestUntrained:
         assert sum("noncommercial" in message for message in caplog.messages) == 1
 
 
-def test_pairs_of_few_matches_at_low_resolution_are_left_out(
+def test_pairs_with_few_matches_at_low_resolution_are_left_out(
     few: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     init = SiftKornia(max_keypoints=300, max_ratio=0.9, threads=1, pairs="lowres")
@@ -120,7 +120,7 @@ def test_pairs_of_few_matches_at_low_resolution_are_left_out(
 
 
 class TestStore:
-    """A killed run goes on, and nothing is read that belongs to other settings."""
+    """An interrupted run continues, and entries of other settings are not read."""
 
     @pytest.fixture(scope="class")
     def run(self, few: Capture, tmp_path_factory: pytest.TempPathFactory):
@@ -130,7 +130,7 @@ class TestStore:
         return init, output
 
     @pytest.mark.slow
-    def test_only_what_is_missing_or_damaged_is_computed(self, run, few: Capture):
+    def test_only_missing_or_damaged_files_are_computed_again(self, run, few: Capture):
         init, output = run
         features = sorted((output / "work" / "features").iterdir())
         matches = sorted((output / "work" / "matches").iterdir())
@@ -149,7 +149,9 @@ class TestStore:
         init.run(few, tmp_path)
         assert digest(tmp_path / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
 
-    def test_other_settings_or_pictures_have_other_names(self, courtyard: Capture, tmp_path: Path):
+    def test_other_settings_or_images_have_other_file_names(
+        self, courtyard: Capture, tmp_path: Path
+    ):
         def paths(
             extraction: dict[str, object], matching: dict[str, object], images: Path
         ) -> tuple[Path, Path]:
@@ -171,7 +173,7 @@ class TestStore:
 
 
 class TestContracts:
-    """What the code relies on in transformers and kornia beyond their documented calls."""
+    """Undocumented behaviour of transformers and kornia on which the code relies."""
 
     @pytest.mark.parametrize(("width", "height"), [(128, 96), (1237, 40), (131, 101)])
     def test_superpoint_keypoints_are_the_maxima_of_its_score_map(
@@ -223,7 +225,7 @@ class TestContracts:
     def test_lightglue_reads_the_published_names(
         self, untrained_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ):
-        """cvg/LightGlue's files say self_attn.0.…, the network transformers.0.self_attn.…"""
+        """Tensors are self_attn.0.… in published files, transformers.0.self_attn.… in the network."""
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
         published = {}
         for name, value in state.items():
@@ -258,7 +260,7 @@ class TestContracts:
         build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
         EXTRACTORS[settings.extractor](settings, untrained_weights / "superpoint.safetensors", CPU)
 
-    def test_disk_through_its_checkpoint_layout(self, tmp_path: Path):
+    def test_disk_is_loaded_from_its_published_layout(self, tmp_path: Path):
         from kornia.feature import DISK
 
         torch.manual_seed(0)
@@ -282,7 +284,7 @@ class TestContracts:
 def test_detection_settings_are_the_extractors_own_unless_given(
     extractor: str, threshold: float, radius: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As deep-image-matching and the authors have them; the files are of the networks in use."""
+    """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)  # type: ignore[arg-type]
     found = own.feature_settings()
     assert (found.keypoint_threshold, found.nms_radius) == (threshold, radius)
@@ -303,7 +305,7 @@ def test_detection_settings_are_the_extractors_own_unless_given(
         f"{extractor}_lightglue_v0-1_arxiv-pth",
     )
     assert ("transformers" in own.packages()) == (extractor == "superpoint")
-    for one in (found, given):  # what features depend on, and no more, makes other features
+    for one in (found, given):  # features depend on exactly these settings
         expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
         expected |= {"keypoint_threshold": one.keypoint_threshold, "nms_radius": one.nms_radius}
         expected |= {"aliked_model": "n16"} if extractor == "aliked" else {}
@@ -322,7 +324,7 @@ class TestErrors:
             Dim(download=False).run(courtyard, tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
-    def test_wrong_checksum(self, courtyard: Capture, tmp_path: Path):
+    def test_weights_with_a_wrong_checksum_are_refused(self, courtyard: Capture, tmp_path: Path):
         (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
         with pytest.raises(
             MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"
@@ -331,7 +333,7 @@ class TestErrors:
                 courtyard, tmp_path / "out"
             )
 
-    def test_weights_of_another_network(self, tmp_path: Path):
+    def test_weights_of_another_network_are_refused(self, tmp_path: Path):
         torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "foreign.pth")
         settings = superpoint(tmp_path).feature_settings()
         with pytest.raises(MissingWeightsError, match="is for another network"):
@@ -341,7 +343,7 @@ class TestErrors:
                 Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU
             )
 
-    def test_weights_of_another_shape(self, untrained_weights: Path, tmp_path: Path):
+    def test_weights_of_another_shape_are_refused(self, untrained_weights: Path, tmp_path: Path):
         state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
         state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
         torch.save(state, tmp_path / "bad.pth")
@@ -349,8 +351,10 @@ class TestErrors:
             build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
 
     @pytest.mark.slow
-    def test_images_without_keypoints(self, few: Capture, tmp_path: Path):
-        """A blank photograph is named and left out; only blank ones are an error."""
+    def test_images_without_keypoints_are_left_out_with_a_warning(
+        self, few: Capture, tmp_path: Path
+    ):
+        """A blank photograph is named in a warning; if all are blank, it is an error."""
         images = tmp_path / "images"
         images.mkdir()
         for name in few.image_names:
@@ -366,13 +370,13 @@ class TestErrors:
         with pytest.raises(InputError, match="no keypoint in any image"):
             SiftKornia().run(capture, tmp_path / "blank")
 
-    def test_out_of_gpu_memory_in_matching_says_so(self):
+    def test_too_little_gpu_memory_for_matching_is_reported(self):
         features = features_of(np.zeros((1000, 8)))
         said = r"1000 keypoints ran out of memory: lower init.max_image_size"
         with pytest.raises(InputError, match=said):
             match(no_gpu, features, features)
 
-    def test_out_of_gpu_memory_in_extraction_says_so(self, courtyard: Capture):
+    def test_too_little_gpu_memory_for_extraction_is_reported(self, courtyard: Capture):
         settings = SiftKornia().feature_settings()
         with pytest.raises(InputError, match=r"0000.png: cpu ran out of memory at 320x240 px"):
             extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
@@ -404,12 +408,12 @@ class TestErrors:
         with pytest.raises(InputError, match=message):
             Dim(**options)
 
-    def test_unknown_device(self, courtyard: Capture, tmp_path: Path):
+    def test_an_unknown_device_is_refused(self, courtyard: Capture, tmp_path: Path):
         with pytest.raises(InputError, match=r"init\.device=tpu is not known to torch"):
             SiftKornia(device="tpu").run(courtyard, tmp_path)
 
 
-def test_mutual_nearest_by_brute_force():
+def test_mutual_nearest_matches_equal_those_of_brute_force():
     rng = np.random.default_rng(2)
     sides = [features_of(rng.normal(size=(60, 6))) for _ in range(2)]
     distance = np.linalg.norm(sides[0].descriptors[:, None] - sides[1].descriptors[None], axis=2)
@@ -426,7 +430,9 @@ def test_mutual_nearest_by_brute_force():
 
 @pytest.mark.shared
 @pytest.mark.slow
-def test_aliked_with_real_weights(courtyard: Capture, shared_weights: Path, tmp_path: Path):
+def test_aliked_with_real_weights_finds_points_on_the_surfaces(
+    courtyard: Capture, shared_weights: Path, tmp_path: Path
+):
     init = Dim(extractor="aliked", matcher="mutual_nearest", weights=shared_weights, download=False)
     report = init.run(courtyard, tmp_path)
     assert report.num_points > 200

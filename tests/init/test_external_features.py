@@ -1,4 +1,4 @@
-"""Features from outside COLMAP: the same model as COLMAP's own, and right coordinates."""
+"""Features from outside COLMAP give the same model as its own, in the right coordinates."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def rewritten(own: Path, path: Path, capture: Capture, options: Sfm) -> dict[Pai
 
 @pytest.fixture(scope="module")
 def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database that COLMAP filled by itself."""
+    """A database with COLMAP's own features and matches."""
     path = tmp_path_factory.mktemp("own") / "database.db"
     names = new_database(path, bare_photos)
     extract_sift(path, bare_photos.images, names, Sfm(), 1, no_progress)
@@ -96,10 +96,10 @@ def extract(path: Path, max_image_size: int) -> Features:
 
 
 @pytest.mark.parametrize("max_image_size", [320, 213])
-def test_kornia_keypoints_coincide_with_colmaps(
+def test_keypoints_of_kornia_coincide_with_those_of_colmap(
     own_path: Path, bare_photos: Capture, max_image_size: int
 ):
-    """Two implementations of SIFT find the same points; an error would shift all of them."""
+    """Two implementations of SIFT find the same points; a wrong convention would shift all of them."""
     name = bare_photos.image_names[0]
     with pycolmap.Database.open(own_path) as database:
         colmap = database.read_keypoints(database.read_image_with_name(name).image_id)[:, :2]
@@ -115,7 +115,7 @@ def test_kornia_keypoints_coincide_with_colmaps(
 
 @pytest.mark.parametrize("center", [(50.0, 40.0), (50.3, 39.8)])
 def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, float]):
-    """Coordinates in which the first pixel covers 0 to 1: the blob is drawn, and found, in them."""
+    """The first pixel covers 0 to 1, both in the drawing and in the found keypoint."""
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
@@ -123,7 +123,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, floa
     np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
 
 
-def test_keypoints_scale_with_each_side():
+def test_keypoints_are_scaled_separately_in_x_and_y():
     features = Features(
         np.array([[0, 0], [99, 49]], dtype=np.float32),
         np.zeros((2, 8), dtype=np.float32),
@@ -137,11 +137,11 @@ def test_keypoints_scale_with_each_side():
 def test_a_pair_must_keep_a_share_of_its_matches(
     own_path: Path, bare_photos: Capture, tmp_path: Path
 ):
-    """Pairs below the ratio are dropped, those above stay.
+    """Pairs below the ratio are dropped, and others are kept.
 
-    COLMAP asks the ratio of each geometry that it tries (essential, fundamental, homography), so a
-    pair may be kept by another one than without the ratio, with other inliers; by the same one, it
-    is what it was.
+    COLMAP applies the ratio to each geometry that it tries (essential, fundamental, homography).
+    So a kept pair may have another geometry than without the ratio, and other inliers. If the
+    geometry is the same, so are the inliers.
     """
     geometries: dict[float, dict[Pair, pycolmap.TwoViewGeometry]] = {}
     for ratio in (0.0, 0.8):

@@ -1,4 +1,4 @@
-"""Clouds of points from files of every kind, against written arrays and pycolmap."""
+"""Clouds of points from files of all formats, against the written arrays and pycolmap."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write(
         (("red", "green", "blue"), "u2", 257),
     ],
 )
-def test_ply_of_any_order_and_type(
+def test_ply_properties_may_have_any_order_and_type(
     tmp_path: Path, text: bool, order: str, names, kind: str, scale: float
 ):
     red, green, blue = ((name, kind) for name in names)
@@ -62,7 +62,9 @@ def test_ply_of_any_order_and_type(
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
 @pytest.mark.parametrize("colored", [False, True])
-def test_a_table_has_coordinates_and_maybe_colours(tmp_path: Path, suffix: str, colored: bool):
+def test_a_table_has_coordinates_with_or_without_colours(
+    tmp_path: Path, suffix: str, colored: bool
+):
     table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
@@ -72,7 +74,7 @@ def test_a_table_has_coordinates_and_maybe_colours(tmp_path: Path, suffix: str, 
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
-def test_a_table_may_have_a_mark_and_line_ends_of_windows(tmp_path: Path, suffix: str):
+def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path: Path, suffix: str):
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, XYZ, fmt="%.17g", delimiter="," if suffix == ".csv" else " ", newline="\r\n")
     path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
@@ -82,7 +84,7 @@ def test_a_table_may_have_a_mark_and_line_ends_of_windows(tmp_path: Path, suffix
         read_points(path)
 
 
-def test_colours_of_gaussians_are_those_of_their_constant_harmonic(tmp_path: Path):
+def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path: Path):
     """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: 3DGS's colour without view dependence."""
     properties = [(name, "f4") for name in (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2")]
     dc = (RGB / 255 - 0.5) * 2 * np.sqrt(np.pi)
@@ -93,7 +95,7 @@ def test_colours_of_gaussians_are_those_of_their_constant_harmonic(tmp_path: Pat
     np.testing.assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
 
 
-def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):
+def test_colours_come_from_the_nearest_photograph(courtyard: Capture):
     model = pycolmap.Reconstruction(courtyard.model)
     points = RNG.uniform(-6, 6, (60, 3))
     found = seen_colors(points, courtyard, model)
@@ -111,7 +113,7 @@ def test_colours_are_those_of_the_nearest_photograph(courtyard: Capture):
     assert 5 < (found[:, 0] >= 0).sum() < 60
 
 
-def test_black_is_a_colour_and_what_no_camera_sees_is_grey(
+def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
     courtyard: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     save(tmp_path / "scan.xyz", XYZ[:3])
@@ -121,7 +123,7 @@ def test_black_is_a_colour_and_what_no_camera_sees_is_grey(
     np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
 
 
-def test_of_the_references_own_points_none_is_left(courtyard: Capture, tmp_path: Path):
+def test_the_points_of_the_reference_are_all_replaced(courtyard: Capture, tmp_path: Path):
     save(tmp_path / "scan.xyz", np.tile([0.0, 0.0, 5.0], (4, 1)) + np.arange(4)[:, None] / 10)
     model = model_of(CENTERS)
     own = {tuple(point.xyz) for point in model.points3D.values()}
@@ -136,7 +138,9 @@ def test_of_the_references_own_points_none_is_left(courtyard: Capture, tmp_path:
     assert not any(len(image.points2D) for image in model.images.values())
 
 
-def test_a_cloud_is_thinned_and_placed(courtyard: Capture, tmp_path: Path):
+def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(
+    courtyard: Capture, tmp_path: Path
+):
     save(tmp_path / "scan.xyz", XYZ)
     options = Points(path=tmp_path / "scan.xyz", max_points=30, seed=1)
     report = options.run(courtyard, tmp_path / "out")
@@ -180,14 +184,18 @@ def empty_ply(path: Path) -> None:
         ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],
 )
-def test_bad_files_in_one_line(courtyard: Capture, tmp_path: Path, name: str, make, message: str):
+def test_bad_files_are_refused_in_one_line(
+    courtyard: Capture, tmp_path: Path, name: str, make, message: str
+):
     make(tmp_path / name)
     with pytest.raises(InputError, match=message) as caught:
         Points(path=tmp_path / name).cloud(courtyard, pycolmap.Reconstruction(courtyard.model))
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Capture, tmp_path: Path):
+def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
+    bare_photos: Capture, tmp_path: Path
+):
     with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is not a file"):
         Points(path="nowhere.ply")
     save(tmp_path / "a.xyz", XYZ)
@@ -197,12 +205,12 @@ def test_a_file_that_is_not_there_and_photos_without_cameras(bare_photos: Captur
 @pytest.mark.parametrize(
     ("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
 )
-def test_a_cloud_takes_rows_of_three_coordinates_alone(shape: tuple[int, ...], kind: str) -> None:
+def test_a_cloud_refuses_points_of_another_shape_or_type(shape: tuple[int, ...], kind: str) -> None:
     with pytest.raises(ValueError, match="points must be"):
         PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))
 
 
-def test_a_picture_has_its_upper_and_left_border_and_nothing_behind_the_camera() -> None:
+def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_behind() -> None:
     wide = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 100, 80)
     model = model_with({"a": camera_at([0, 0, 0])}, camera=wide)
     points = np.array(

@@ -1,4 +1,4 @@
-"""The gauge report on models whose numbers are known beforehand."""
+"""The report on models whose numbers are known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CENTERS = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 5.0, 0]])  # d i
 def model_of(
     centers: np.ndarray, turn: Rotation | None = None, shift_px: float = 0.0
 ) -> pycolmap.Reconstruction:
-    """Cameras that look along +z, and two points that the first two observe.
+    """Cameras that look along +z, and two points that the first two cameras see.
 
     ``shift_px`` is the error of the observations in x.
     """
@@ -59,11 +59,11 @@ def capture(tmp_path: Path) -> Capture:
 
 
 def test_extent_is_that_of_the_training_cameras(capture: Capture):
-    # their mean is (0, 1/3, 0): a and b are sqrt(1 + 1/9) away
+    # the mean of a, b and c is (0, 1/3, 0); a and b are sqrt(1 + 1/9) away
     assert training_extent(model_of(CENTERS), capture) == pytest.approx(1.1 * math.sqrt(1 + 1 / 9))
 
 
-def test_gauge_of_the_papers_threshold():
+def test_the_gauge_expresses_the_threshold_of_the_paper():
     gauge = measure_gauge(2.0, 0.5)
     assert 4 / 3 * math.pi * gauge.threshold_radius**3 == pytest.approx(0.03)
     assert gauge.threshold_over_extent_cubed == pytest.approx(0.03 / 8)
@@ -79,7 +79,7 @@ def reported(
     return make_report("x", "own", capture, model, None, packages, settings={}, seconds={}, **more)
 
 
-def test_a_report_has_the_figures_of_its_model(capture: Capture):
+def test_a_report_has_the_numbers_of_its_model(capture: Capture):
     model, capture = model_of(CENTERS, shift_px=0.75), replace(capture, image_names=(*NAMES, "e"))
     report = reported(capture, model, ("pycolmap",), counts={"features": 7})
     assert report.counts == {"features": 7}
@@ -122,7 +122,7 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
         ),
     ],
 )
-def test_a_model_is_doubted_beyond_each_limit(
+def test_each_limit_has_its_own_warning(
     capture: Capture, sound: dict[str, object], doubtful: dict[str, object], said: str
 ) -> None:
     model = model_of(CENTERS)
@@ -137,10 +137,10 @@ def test_a_model_is_doubted_beyond_each_limit(
 @pytest.mark.parametrize(
     ("focal", "view"), [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
 )
-def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(
+def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(
     capture: Capture, focal: float, view: float
 ) -> None:
-    """Of the longest side, 100 px: twice the arc tangent of 50 px over the focal length."""
+    """Along the longest side, 100 px, it is 2 atan(50 / focal)."""
     assert math.degrees(2 * math.atan(50 / focal)) == pytest.approx(view, abs=0.05)
     model = model_of(CENTERS)
     model.cameras[1].params = [focal, focal, 50.0, 40.0]
@@ -149,7 +149,7 @@ def test_a_field_of_view_beyond_5_to_150_degrees_is_doubted(
 
 
 def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
-    """A model moved by a similarity has no error; one that is tilted has an angle alone."""
+    """A model moved by a similarity has no error; tilted cameras have an angle only."""
     turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
     reference = model_of(CENTERS)
     model = model_of(CENTERS)
@@ -168,10 +168,10 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     assert errors.center_max < 1e-9
 
 
-def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(
+def test_two_common_cameras_are_not_compared_and_give_a_warning(
     capture: Capture, tmp_path: Path
 ) -> None:
-    """Three at least fix a similarity."""
+    """A similarity needs at least three."""
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
         reference.deregister_frame(reference.images[image_id].frame_id)
@@ -187,7 +187,7 @@ def test_where_two_cameras_are_common_nothing_is_compared_and_that_is_said(
     )
 
 
-def test_center_errors_are_in_reference_units_and_relative():
+def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
     moved = CENTERS.copy()
     moved[3, 2] += 0.3
     model, reference = model_of(moved), model_of(CENTERS)
@@ -199,7 +199,7 @@ def test_center_errors_are_in_reference_units_and_relative():
     assert errors.center_rmse_relative == pytest.approx(0.3 / 4)
 
 
-def test_above_is_along_the_normal_of_a_ring_of_cameras():
+def test_up_is_the_normal_of_a_ring_of_cameras():
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     ring = np.stack([np.cos(angles), np.sin(angles), 0.3 + 0 * angles], axis=1) * 4
     up = np.array([0.0, 0.0, 1.0])
@@ -216,8 +216,8 @@ def test_above_is_along_the_normal_of_a_ring_of_cameras():
 
 @pytest.mark.parametrize("points", [1, 5])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_above_for_cameras_that_look_down(points: int, side: float):
-    """What is above is the side of the points on which the cameras stand."""
+def test_up_points_from_the_points_to_cameras_that_look_down(points: int, side: float):
+    """The cameras are above the points."""
     centers = np.array([[x, y, 10.0 * side] for x in range(4) for y in range(4)])
     # world to camera: looks along -z or z, the image's top is +y
     down = np.diag([side, -1.0, -side])
@@ -225,10 +225,12 @@ def test_above_for_cameras_that_look_down(points: int, side: float):
     np.testing.assert_allclose(axes[2], [0, 0, side], atol=1e-9)
 
 
-def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None:
-    """All cameras look along +z from the plane z = 0: x is right, y is down. Five units and a
-    twentieth more at either side fill 840 of 960 px, so a unit takes 840 / 5.5 px about the middle,
-    (0, 2.5)."""
+def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path: Path) -> None:
+    """All cameras are in the plane z = 0 and look along +z: x is right, y is down.
+
+    Five units, and a twentieth of that on each side, fill 840 of 960 px. So a unit takes
+    840 / 5.5 px, and (0, 2.5) is in the middle.
+    """
     draw_cloud(model_of(CENTERS), tmp_path / "cloud.png", "hand-made")
     pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
     assert pixels.shape == (960, 960, 3)
@@ -244,11 +246,12 @@ def test_the_picture_is_a_map_seen_from_the_cameras_side(tmp_path: Path) -> None
         assert (pixels[row : row + 3, column : column + 3] == [10, 20, 30]).all()
     assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
     bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
-    np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)  # one unit
+    # the bar is one unit long
+    np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
 
 
-def test_a_line_shows_where_a_camera_looks(tmp_path: Path) -> None:
-    """All stand in the plane z = 0 and look along +x, which is upwards in the picture."""
+def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path: Path) -> None:
+    """All cameras are in the plane z = 0 and look along +x, which is up in the picture."""
     sideways = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     places = [(0, 0, 0), (4, 0, 0), (0, 4, 0), (4, 4, 0), (2, 2, 0)]
     draw_cloud(
@@ -258,12 +261,12 @@ def test_a_line_shows_where_a_camera_looks(tmp_path: Path) -> None:
     )
     pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
     red = np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8
-    assert red[480 - 40, 478:483].any()  # of the camera in the middle
+    assert red[480 - 40, 478:483].any()  # the line of the camera in the middle
     assert not red[480 + 40, 478:483].any()
 
 
-def test_points_are_drawn_smaller_the_more_there_are(tmp_path: Path) -> None:
-    """Most of them stand in one place; the other is drawn alone."""
+def test_more_points_are_drawn_smaller(tmp_path: Path) -> None:
+    """All points but one are at one place; the other one is measured."""
     inked = []
     for others in (1, 6_000, 60_000):
         model = model_with({"a": camera_at([0, 0, 0]), "b": camera_at([8, 5, 0])})

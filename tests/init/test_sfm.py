@@ -45,7 +45,7 @@ def own(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[I
 
 @pytest.fixture(scope="module")
 def told() -> list[tuple[str, int, int | None]]:
-    """What the run of the fixture ``shared`` said of its progress."""
+    """The progress that the run of the fixture ``shared`` reported."""
     return []
 
 
@@ -66,7 +66,7 @@ def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
     assert report.pose_errors is not None
     assert report.pose_errors.exact
     assert report.pose_errors.center_max < 0.02  # m, on a ring of 4.5 m radius
-    # an arc of 52 degrees fixes the turn about itself weakly
+    # cameras on an arc of 52 degrees determine the rotation about the arc weakly
     assert report.pose_errors.rotation_max_deg < 1.5
     assert report.focal_lengths[0] == pytest.approx(300.9, rel=0.01)  # 320 / (2 tan 28 degrees)
     assert report.mean_reprojection_error < 0.5
@@ -77,7 +77,7 @@ def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
 def test_jittered_is_sfm_with_copies_nearby(
     shared: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
 ) -> None:
-    """The points themselves first, to the bit, then twice as many of their colours."""
+    """First the same points, bit for bit, then two shifted copies in the same colours."""
     plain, folder = shared
     report = Jittered(copies=2, shift=0.1).run(courtyard, tmp_path)
     before, after = read_cloud(folder / MODEL_FOLDER), read_cloud(tmp_path / MODEL_FOLDER)
@@ -124,14 +124,14 @@ def test_known_poses_give_points_on_the_true_surfaces(
     assert np.median(surface_distance(read_cloud(output / MODEL_FOLDER).points)) < 0.02
     model = pycolmap.Reconstruction(output / MODEL_FOLDER)
     exact = pycolmap.Reconstruction(courtyard.model)
-    for image in exact.images.values():  # the cameras are the reference's, to the bit
+    for image in exact.images.values():  # the cameras equal the reference's, bit for bit
         np.testing.assert_array_equal(
             model.find_image_with_name(image.name).cam_from_world().matrix(),
             image.cam_from_world().matrix(),
         )
 
 
-def test_colours_are_the_photographs(shared: tuple[InitReport, Path], courtyard: Capture):
+def test_colours_are_those_of_the_photographs(shared: tuple[InitReport, Path], courtyard: Capture):
     _, output = shared
     model = pycolmap.Reconstruction(output / MODEL_FOLDER)
     pixels = {
@@ -157,7 +157,7 @@ def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport
     assert not (output / WORK_FOLDER).exists()
 
 
-def test_every_phase_is_told_from_its_start_to_its_end(
+def test_the_progress_of_each_phase_is_reported_from_start_to_end(
     shared: tuple[InitReport, Path], told: list
 ) -> None:
     phases = {phase: [state for state in told if state[0] == phase] for phase, _, _ in told}
@@ -177,10 +177,10 @@ def test_every_phase_is_told_from_its_start_to_its_end(
         ("own", "estimate", "train", "abcd", False),
     ],
 )
-def test_whose_cameras_are_taken_and_which_photographs_are_used(
+def test_poses_and_points_from_choose_the_photographs_and_the_need_for_a_reference(
     poses: str, intrinsics: str, points_from: str, names: str, needed: bool
 ) -> None:
-    """Of four photographs, b is a test view and a is not in the reference."""
+    """There are four photographs; b is a test view, and a is not in the reference."""
     options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)  # type: ignore[arg-type]
     capture = Capture("x", Path("x"), ("a", "b", "c", "d"), ("b",), None, False, "0")
     reference = model_with({name: camera_at([0, 0, 0]) for name in "dcb"})
@@ -191,7 +191,7 @@ def test_whose_cameras_are_taken_and_which_photographs_are_used(
 
 
 @pytest.mark.slow
-def test_two_runs_are_equal_to_the_bit_on_any_number_of_threads(
+def test_two_runs_are_equal_bit_for_bit_on_any_number_of_threads(
     own: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
 ):
     _, first = own
@@ -220,7 +220,7 @@ def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(
 
 
 @pytest.mark.slow
-def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path: Path):
+def test_names_with_spaces_and_photos_of_two_sizes_are_accepted(courtyard: Capture, tmp_path: Path):
     images = tmp_path / "my photos"
     images.mkdir()
     for index, name in enumerate(courtyard.image_names):
@@ -230,7 +230,7 @@ def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path:
     report = Sfm().run(capture_of(images), tmp_path / "out")
     assert report.num_registered >= 7
     model = pycolmap.Reconstruction(tmp_path / "out" / MODEL_FOLDER)
-    for image in model.images.values():  # one camera for each size, the size of the file
+    for image in model.images.values():  # one camera for each size of files
         camera = model.cameras[image.camera_id]
         with Image.open(images / image.name) as file:
             assert (camera.width, camera.height) == file.size
@@ -238,7 +238,7 @@ def test_names_with_spaces_and_photos_of_two_sizes(courtyard: Capture, tmp_path:
 
 
 @pytest.mark.slow
-def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path):
+def test_webp_photos_give_the_same_points_as_png_photos(courtyard: Capture, tmp_path: Path):
     """COLMAP cannot read WebP; lossless copies must lead to the same points."""
     images = tmp_path / "images"
     images.mkdir()
@@ -252,7 +252,7 @@ def test_webp_photos_give_what_png_ones_give(courtyard: Capture, tmp_path: Path)
     np.testing.assert_array_equal(first.colors, second.colors)
 
 
-def test_detection_at_a_smaller_size_comes_back_at_the_files_size(
+def test_keypoints_found_at_a_smaller_size_are_scaled_back_to_the_file(
     courtyard: Capture, tmp_path: Path
 ):
     Sfm(max_image_size=200).run(courtyard, tmp_path)
@@ -260,8 +260,8 @@ def test_detection_at_a_smaller_size_comes_back_at_the_files_size(
 
 
 @pytest.mark.slow
-def test_wrong_reference_is_noticed(courtyard: Capture, tmp_path: Path):
-    """Poses that are placed but wrong must not pass silently."""
+def test_a_wrong_reference_gives_a_warning(courtyard: Capture, tmp_path: Path):
+    """All images get a pose, but a warning says that poses are wrong."""
     model = pycolmap.Reconstruction(courtyard.model)
     names = sorted(image.name for image in model.images.values())
     poses = {name: model.find_image_with_name(name).cam_from_world() for name in names}
@@ -293,14 +293,14 @@ def test_photos_without_overlap_are_refused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_photos_from_one_place_are_refused(courtyard: Capture, tmp_path: Path):
-    """Copies of one photograph match perfectly and have no depth."""
+    """Copies of one photograph match perfectly, but without depth."""
     for index in range(4):
         shutil.copy(courtyard.images / "0000.png", tmp_path / f"{index}.png")
     with pytest.raises(InputError, match=r"structure from motion found no pair|no pair of images"):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-def test_two_photos_are_too_few(courtyard: Capture, tmp_path: Path):
+def test_two_photos_are_refused(courtyard: Capture, tmp_path: Path):
     with pytest.raises(InputError, match="has 2 images: sfm needs at least 3"):
         Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
 

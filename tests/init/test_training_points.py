@@ -1,4 +1,4 @@
-"""Points that owe nothing to test photographs."""
+"""Points that do not depend on test photographs (init.points_from=train)."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tests.init.models import add_point
 
 
 def quick_sfm(**options: Any) -> Sfm:
-    """SIFT on the pictures as they are, with few features: this is not about good points."""
+    """SIFT without enlarged images and with few features, to be fast."""
     return Sfm(**({"threads": 1, "first_octave": 0, "max_num_features": 1500} | options))
 
 
 @pytest.fixture(scope="module")
 def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """The courtyard with points that all views made, its images numbered against their names."""
+    """The courtyard with points of all views, and image ids in the reverse order of names."""
     folder = tmp_path_factory.mktemp("points")
     quick_sfm().run(courtyard, folder)
     model, turned = read_model(folder / MODEL_FOLDER), pycolmap.Reconstruction()
@@ -65,10 +65,12 @@ def poses(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_dataset_keeps_what_two_training_views_see(with_points: Capture, tmp_path: Path) -> None:
+def test_dataset_keeps_the_points_that_two_training_views_see(
+    with_points: Capture, tmp_path: Path
+) -> None:
     before = read_model(with_points.model)  # type: ignore[arg-type]
     train, test = set(with_points.train_names), set(with_points.test_names)
-    wanted = sorted(  # two features at one place, of unlike orientation, may be two points there
+    wanted = sorted(  # as a list: features of two orientations may make two points at one place
         point.xyz.tobytes()
         for point, names in zip(before.points3D.values(), seen_by(before), strict=True)
         if len(names & train) >= 2
@@ -91,7 +93,7 @@ def test_dataset_keeps_what_two_training_views_see(with_points: Capture, tmp_pat
 
 
 def test_colours_come_from_training_photographs(with_points: Capture, tmp_path: Path) -> None:
-    """Each is the mean of the photographs at its observations, here interpolated anew."""
+    """Each colour is the mean of the photographs at the observations, interpolated here again."""
     Dataset(points_from="train").run(with_points, tmp_path)
     model = read_model(tmp_path / MODEL_FOLDER)
     pictures = {
@@ -125,8 +127,8 @@ def with_noise(capture: Capture, folder: Path) -> Capture:
 
 MAKERS: dict[str, Initializer] = {
     "sfm": quick_sfm(points_from="train"),
-    "sfm on all": quick_sfm(points_from="all"),  # noise would be seen
-    # the path of dim, without weights
+    "sfm on all": quick_sfm(points_from="all"),  # this one must see the noise
+    # takes the path of dim without weights
     "sift_kornia": SiftKornia(points_from="train", max_keypoints=1024, threads=1),
     "dataset": Dataset(points_from="train"),
 }
@@ -134,7 +136,7 @@ MAKERS: dict[str, Initializer] = {
 
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.slow
-def test_not_one_bit_of_a_test_photograph_is_in_the_cloud(
+def test_the_cloud_does_not_depend_on_test_photographs(
     with_points: Capture, tmp_path: Path, name: str
 ) -> None:
     clouds = []
@@ -161,13 +163,15 @@ def test_estimated_cameras_keep_all_views_and_points_of_training_views(
     assert points.kept == model.num_points3D() < points.total
 
 
-def test_without_two_training_views_nothing_is_left(with_points: Capture, tmp_path: Path) -> None:
+def test_points_from_train_is_refused_with_one_training_view(
+    with_points: Capture, tmp_path: Path
+) -> None:
     lonely = replace(with_points, test_names=with_points.image_names[1:])
     with pytest.raises(InputError, match=r"init\.points_from=train: no point is left"):
         Dataset(points_from="train").run(lonely, tmp_path)
 
 
-def test_the_choice_of_before_has_no_part_in_a_key() -> None:
+def test_the_key_of_an_initialiser_contains_points_from() -> None:
     for made in (Sfm, SiftKornia, Dataset):
         assert options_of("init", made())["points_from"] == "all"
         assert options_of("init", made(points_from="train"))["points_from"] == "train"

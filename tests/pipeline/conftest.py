@@ -1,4 +1,4 @@
-"""The small scene that trainings are tested on, here for what is done with a trained model."""
+"""The small scene of the tests of training, for the steps around it."""
 
 from tests.train.conftest import tiny_scene, truth
 

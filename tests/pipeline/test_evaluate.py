@@ -1,4 +1,4 @@
-"""What an evaluation depends on: its key must not change for a setting that changes nothing."""
+"""What an evaluation depends on, and what it measures."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
 
 
 def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
-    """The inputs of an evaluation without LPIPS, whose views are not needed for a key."""
+    """The inputs of an evaluation without LPIPS; a key needs no views."""
     evaluator = Evaluator(PAPER, lpips=[], **options)
     cpu = torch.device("cpu")
     parts: Any = SimpleNamespace(
@@ -54,7 +54,7 @@ def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
     return dict(step.inputs)
 
 
-def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeypatch):
+def test_an_evaluation_without_newer_settings_keeps_its_key(monkeypatch):
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     old = {"train": TRAINED.key, "protocol": "paper-1", "unavailable": FOUR_LPIPS, "maps": False}
     assert inputs() == old
@@ -66,7 +66,7 @@ def test_an_evaluation_that_asks_for_nothing_new_has_the_key_that_it_had(monkeyp
     )
 
 
-def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch):
+def test_speed_is_measured_at_the_given_size(monkeypatch):
     case, sizes = CASES[-1], []
 
     class Watched(ReferenceRasterizer):
@@ -82,7 +82,7 @@ def test_speed_is_measured_at_the_size_that_is_asked_for(monkeypatch):
     found = measure_speed(
         Watched(), case.gaussians(), scene, torch.zeros(3, dtype=torch.float64), [64, 20]
     )
-    assert sizes == [(64, 20)] * 6  # the first is not timed
+    assert sizes == [(64, 20)] * 6  # the first render is not timed
     assert found == {"a": 2.5}
 
 
@@ -96,9 +96,8 @@ def told(monkeypatch) -> list[tuple[Any, ...]]:
     return told
 
 
-def test_an_evaluation_measures_what_its_pictures_hold(tmp_path, truth, tiny_scene, told):
-    """Metrics by the formula from the PNG files; the nearest training view by trying all; an
-    earlier model's means."""
+def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tiny_scene, told):
+    """Metrics, nearest training views and means of an earlier model are computed here again."""
     store, init = Store(tmp_path), Step(INIT, {}, lambda folder: None)
     masked = replace(tiny_scene.test[1], mask=np.arange(32 * 40).reshape(32, 40) % 4 > 0)
     scene = replace(tiny_scene, test=(tiny_scene.test[0], masked))
@@ -116,7 +115,7 @@ def test_an_evaluation_measures_what_its_pictures_hold(tmp_path, truth, tiny_sce
         device=torch.device("cpu"),
         train=SimpleNamespace(background=(0.1, 0.2, 0.3)),
         eval=SimpleNamespace(maps=True, fps=[20, 16]),
-        measured_earlier=[7, 9],  # a limit of time came before the ninth
+        measured_earlier=[7, 9],  # a time limit ended the training before iteration 9
         user_code=UserCode(),
         program=None,
     )
@@ -168,11 +167,11 @@ def test_an_evaluation_measures_what_its_pictures_hold(tmp_path, truth, tiny_sce
         for view in scene.test
     ]
     assert figure.shape == (32, 40, 3)
-    assert unlike[0] < unlike[1]  # it is of the first view
+    assert unlike[0] < unlike[1]  # the figure is of the first view
     assert told == [("views", 1, 2), ("views", 2, 2), ("iteration 7", 1, 2), ("iteration 7", 2, 2)]
 
 
-def test_another_programs_renders_are_measured_as_they_are(tmp_path, tiny_scene, told):
+def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_scene, told):
     store = Store(tmp_path)
     renders = store.path(TRAINED) / "renders"
     renders.mkdir(parents=True)

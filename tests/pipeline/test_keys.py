@@ -1,5 +1,4 @@
-"""Under which keys the results of one known trial lie in the store: a key that moves throws stored
-results away."""
+"""The keys of one known trial in the store. If a key changes, stored results are not found."""
 
 from pathlib import Path
 
@@ -32,7 +31,8 @@ BARE = Capture(
 )
 KEYS = [
     ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
-    ("init", "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae"),  # of the cameras
+    # of the reference cameras
+    ("init", "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae"),
     ("init", "cad201af4f604b328caa8c2ed8aca73b64062872f7f0a7b2461e97dbd362a442"),
     ("train", "7a176da93dc7e68fd25ee10044cf3183c8cb124d04f8db5675e00a55f16c0f6c"),
     ("ground_truth", "25bd2fff6458d0bf7b5f3c85e52eea1f097cf4fa10c2f93e6be1429d23b17af4"),
@@ -45,9 +45,8 @@ class BareSource(CaptureSource):
         return BARE
 
 
-def test_the_keys_of_a_known_trial_stay(tmp_path, monkeypatch):
-    """A photographs' trial without cameras: so the keys of the cameras that stand in for them are
-    seen as well."""
+def test_the_keys_of_a_known_trial_do_not_change(tmp_path, monkeypatch):
+    """The photographs come without cameras, so the step of the reference cameras has a key too."""
     monkeypatch.setattr(scene_module, "version_of", lambda package: "4.0.0")
     monkeypatch.setattr(keys, "edited", lambda files: {})  # as in a release
     values = compose_one(WORDS).values

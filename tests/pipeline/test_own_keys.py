@@ -1,5 +1,4 @@
-"""Keys of trials with classes of the user's: whatever makes them compute something else, moves
-them."""
+"""Keys of trials with the user's classes: they change with everything that changes results."""
 
 import sys
 from collections.abc import Iterator
@@ -36,7 +35,7 @@ WRAPPED = (
 
 @pytest.fixture(autouse=True)
 def home(tmp_path, monkeypatch) -> Iterator[Path]:
-    """The folder in which somebody types."""
+    """The user's current folder."""
     monkeypatch.chdir(tmp_path)
     yield tmp_path
     _forget()
@@ -45,7 +44,7 @@ def home(tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def _forget() -> None:
-    """As in another process."""
+    """Forget the user's modules, as a new process would."""
     for name in MODULES:
         sys.modules.pop(name, None)
 
@@ -56,8 +55,7 @@ def bare_capture(monkeypatch) -> None:
 
 
 def keys_of(home: Path, *words: str) -> dict[str, str]:
-    """The keys of a trial as a new process would find them, by stage, and the hash of its
-    configuration."""
+    """The keys of a trial by stage in a new process, and the hash of its configuration."""
     _forget()
     values = compose_one([*WORDS, f"allow_targets=[{','.join(MODULES)}]", *words]).values
     steps = list(TrialSteps(Parts(values), Store(home / "store")).steps())
@@ -73,7 +71,7 @@ def moved(one: dict[str, str], other: dict[str, str]) -> set[str]:
     [METRIC, FROM_A_FUNCTION, WITHIN, WRAPPED],
     ids=["plain", "made by a function", "in a class", "wrapped"],
 )
-def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home, text):
+def test_an_edit_of_a_metric_changes_its_key_however_its_class_is_made(home, text):
     words = ["+eval.extra.m._target_=mine.M"]
     found = []
     for value in ("1.0", "2.0", "1.0"):
@@ -83,7 +81,7 @@ def test_an_edited_metric_is_computed_anew_however_its_class_is_made(home, text)
     assert found[0] == found[2]
 
 
-def test_what_passes_a_class_on_counts_as_well(home):
+def test_a_module_that_passes_a_class_on_is_in_the_key(home):
     (home / "mine.py").write_text(METRIC.format("1.0"))
     found = []
     for value in ("3.0", "4.0"):
@@ -102,7 +100,7 @@ def test_what_passes_a_class_on_counts_as_well(home):
     assert moved(*found) == {"config", "train", "evaluate"}
 
 
-def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home):
+def test_options_of_a_users_class_are_in_the_key_whatever_their_names(home):
     text = (
         "from dataclasses import dataclass\nfrom gsbench.densify import Volumetric\n"
         "@dataclass(kw_only=True)\nclass Mine(Volumetric):\n    weights: float = 1.0\n    "
@@ -126,7 +124,7 @@ def test_options_of_ones_own_class_have_an_effect_whatever_they_are_called(home)
     }
 
 
-def test_the_cache_of_prepared_photographs_knows_the_code_that_prepared_them(monkeypatch):
+def test_the_cache_of_prepared_photographs_depends_on_the_code(monkeypatch):
     monkeypatch.setattr(
         "gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited")
     )

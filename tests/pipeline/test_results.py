@@ -1,5 +1,4 @@
-"""What results.json says of a training by gsbench, of another program's and of none, and of what it
-was made."""
+"""The content of results.json after a training by gsbench, by another program and without one."""
 
 import json
 from dataclasses import replace
@@ -46,7 +45,7 @@ def write(files: dict[str, Any], folder: Path) -> None:
 
 @pytest.fixture
 def made(tmp_path, tiny_scene) -> Any:
-    """A function that makes the results of a trial whose training is ``TRAINING`` with changes."""
+    """A function that makes the results of a trial with the training ``TRAINING`` and changes."""
     values = compose_one(
         ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]
     ).values
@@ -90,7 +89,7 @@ def made(tmp_path, tiny_scene) -> Any:
     return make
 
 
-def test_results_are_put_together_from_the_steps(made):
+def test_results_combine_the_results_of_the_steps(made):
     found = made()
     expected = {
         "experiment": "x",
@@ -145,7 +144,7 @@ def test_results_are_put_together_from_the_steps(made):
         ),
     ],
 )
-def test_what_nobody_knows_is_unavailable(made, changes, evaluated_from, raster, unknown, timed):
+def test_unknown_costs_are_unavailable(made, changes, evaluated_from, raster, unknown, timed):
     found = made(**changes)
     assert (found.evaluated_from, found.raster) == (evaluated_from, raster)
     assert found.unavailable.keys() == {"flip"} | unknown
@@ -153,7 +152,7 @@ def test_what_nobody_knows_is_unavailable(made, changes, evaluated_from, raster,
     assert (found.trained_by is None) == ("trained_by" not in changes)
 
 
-def test_the_newest_declaration_of_the_metric_is_repeated(made):
+def test_results_repeat_the_newest_declaration_of_the_metric(made):
     home = TrialFolder.of(made.values).home
     home.mkdir(parents=True)
     times = [f"2026-01-01T0{hour}:00:00Z" for hour in range(4)]
@@ -166,7 +165,7 @@ def test_the_newest_declaration_of_the_metric_is_repeated(made):
     assert made().declared == declared[1].summary()
 
 
-def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path):
+def test_the_hash_of_a_cloud_covers_its_model_and_its_gaussians(tmp_path):
     store = Store(tmp_path)
 
     def hash_of(number, **changes):
@@ -189,14 +188,14 @@ def test_the_hash_of_a_cloud_is_of_its_model_and_its_gaussians(tmp_path):
     )
 
 
-def test_versions_are_those_of_installed_packages():
+def test_versions_cover_python_and_the_installed_packages():
     found = versions()
     assert found["python"].startswith("3.")
     assert {"gsbench", "torch", "numpy", "pycolmap"} <= found.keys()
     assert None not in found.values()
 
 
-def test_the_users_files_are_what_a_capture_was_read_from(tmp_path):
+def test_source_files_are_the_users_files_of_a_capture(tmp_path):
     store = Store(tmp_path / "store")
     (tmp_path / "model").mkdir()
     for name in ("cameras.bin", "images.bin", "points3D.bin"):

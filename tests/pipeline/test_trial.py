@@ -1,4 +1,4 @@
-"""A trial's end, whatever its code does."""
+"""A trial's parts, their checks before any work, and failures of its code."""
 
 import json
 import sys
@@ -15,7 +15,7 @@ from gsbench.runs.trial_folder import TrialFolder
 
 
 @pytest.mark.parametrize("code", [0, None, 3, "text"])
-def test_code_that_ends_the_process_is_a_failure(code, tmp_path):
+def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
     folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d" / "x")
     folder.path.mkdir(parents=True)
     with (
@@ -31,7 +31,7 @@ def test_code_that_ends_the_process_is_a_failure(code, tmp_path):
     [
         (["raster=auto"], True, None),
         (["raster=cpu"], True, None),
-        (["raster=gsplat"], False, None),  # where it will run there may be a GPU
+        (["raster=gsplat"], False, None),  # the machine on which it will run may have a GPU
         (["raster=gsplat"], True, "raster=gsplat runs on device=cuda"),
         (
             ["raster=gsplat", "densify=taming"],
@@ -42,7 +42,7 @@ def test_code_that_ends_the_process_is_a_failure(code, tmp_path):
         (["raster=cpu", "densify=taming"], True, None),
     ],
 )
-def test_a_rasterizer_that_cannot_run_or_offer_what_is_asked_is_refused_before_any_work(
+def test_a_rasterizer_that_cannot_run_or_lacks_a_needed_feature_is_refused_before_any_work(
     words, here, refusal
 ):
     parts = Parts(compose_one(["scene=courtyard", "device=cpu", *words]).values)
@@ -53,13 +53,13 @@ def test_a_rasterizer_that_cannot_run_or_offer_what_is_asked_is_refused_before_a
             parts.check(here)
 
 
-def test_threads_are_those_that_are_set_or_what_parallel_trials_leave(monkeypatch):
+def test_auto_threads_are_those_that_parallel_trials_leave(monkeypatch):
     monkeypatch.setattr("gsbench.pipeline.parts.available_threads", lambda parallel: 100 + parallel)
     for words, threads in ((["threads=3"], 3), (["threads=auto", "launch.parallel=2"], 102)):
         assert Parts(compose_one(["scene=courtyard", *words]).values).threads == threads
 
 
-def test_only_the_threads_that_are_left_open_are_those_of_the_trial():
+def test_auto_threads_of_the_initialiser_are_those_of_the_trial():
     for word, threads in (("init.threads=auto", 3), ("init.threads=2", 2)):
         initializer: Any = Parts(
             compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values
@@ -67,19 +67,19 @@ def test_only_the_threads_that_are_left_open_are_those_of_the_trial():
         assert initializer.threads == threads
 
 
-def test_test_views_are_measured_earlier_where_the_training_comes_by():
+def test_iterations_measured_earlier_are_sorted_and_before_the_last():
     words = ["scene=courtyard", "train.iterations=9", "eval.at=[7,3,9]"]
     assert Parts(compose_one(words).values).measured_earlier == [3, 7]
 
 
-def test_a_configuration_that_nobody_has_composed_may_run_no_more_than_one_that_was():
+def test_a_configuration_that_was_not_composed_is_checked_for_permissions_too():
     values = compose_one(["scene=courtyard"]).values
     Parts(values)
     with pytest.raises(InputError, match="allow_targets"):
         Parts(values | {"densify": values["densify"] | {"_target_": "mine.Mine"}})
 
 
-def test_a_program_must_be_there_only_where_it_runs():
+def test_a_program_must_exist_only_on_the_machine_where_it_runs():
     command = "densify.command='/nowhere/program {data} {output}'"
     words = [
         "scene=courtyard",
@@ -170,7 +170,9 @@ def own_module(tmp_path, monkeypatch) -> None:
         ("init", {"_target_": "gsbench.init.Random", "count": 0}, "init"),
     ],
 )
-def test_a_part_that_cannot_be_made_is_refused_with_its_setting(own_module, group, values, said):
+def test_a_part_that_cannot_be_made_is_refused_with_the_name_of_its_setting(
+    own_module, group, values, said
+):
     if said is None:
         made = build(group, values, ["own_classes"])
         assert type(made).__name__ == str(values["_target_"]).rpartition(".")[2]
@@ -183,7 +185,7 @@ def test_a_part_that_cannot_be_made_is_refused_with_its_setting(own_module, grou
 @pytest.mark.parametrize(
     ("name", "sound"), [("Named", True), ("Nameless", False), ("Taken", False)]
 )
-def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module, name, sound):
+def test_a_users_rasterizer_needs_a_name_of_its_own(own_module, name, sound):
     values = {"name": "own", "_target_": f"own_classes.{name}"}
     if sound:
         assert build_own_rasterizer(values, ["own_classes"]).name == "named"
@@ -210,7 +212,7 @@ def test_a_rasterizer_of_ones_own_goes_by_a_name_of_its_own(own_module, name, so
 
 @pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])
 def test_nothing_is_written_through_a_link_in_the_runs_folder(tmp_path, place):
-    """Whoever sent the folder would choose the file that is written to."""
+    """A runs folder from somebody else could have links to any file."""
     trial = compose_one(["scene=courtyard", f"runs={tmp_path / 'runs'}"])
     outside = tmp_path / "outside"
     outside.mkdir()

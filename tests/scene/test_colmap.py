@@ -21,7 +21,7 @@ from .conftest import smooth_image
 
 
 def reprojection_errors(model: pycolmap.Reconstruction) -> list[float]:
-    """|projected 3D point - stored 2D point| in px, by pycolmap's own camera model, of all."""
+    """All distances in px between projected 3D and stored 2D points, by pycolmap's own cameras."""
     errors = []
     for point in model.points3D.values():
         for element in point.track.elements:
@@ -68,7 +68,7 @@ def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
     np.testing.assert_array_equal(model_points(again)[0], model_points(fitted)[0])
 
 
-def test_points_of_fewer_than_two_kept_images_go(make_scene):
+def test_points_that_fewer_than_two_kept_images_see_are_dropped(make_scene):
     root = make_scene()
     model = read_model(root / "sparse/0")
     # point 1, the first 2D point of every image, stays in 00.png and 01.png only
@@ -79,7 +79,7 @@ def test_points_of_fewer_than_two_kept_images_go(make_scene):
     assert sorted(fitted.points3D) == list(range(2, 10))
 
 
-def test_each_size_of_the_files_of_one_camera_has_a_camera(make_scene):
+def test_files_of_one_camera_get_a_camera_for_each_size(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(80, 60)).save(root / "images/02.png")
     cameras = cameras_of(read_reference(read_colmap("toy", root)))
@@ -100,7 +100,7 @@ def test_an_image_of_another_shape_than_its_camera_is_refused(make_scene):
         read_reference(read_colmap("toy", root))
 
 
-def test_bare_photos_have_no_reference(make_scene):
+def test_bare_photos_have_no_reference_model(make_scene):
     with pytest.raises(InputError, match="no COLMAP model came with"):
         read_reference(read_photos("toy", make_scene()))
 
@@ -111,7 +111,7 @@ def test_distorted_cameras_are_not_pinholes(make_scene):
         cameras_of(read_model(root / "sparse/0"))
 
 
-def test_written_cameras_project_alike(tmp_path: Path):
+def test_written_cameras_project_points_to_the_same_pixels(tmp_path: Path):
     rng = np.random.default_rng(5)
     cameras = {}
     for k in range(4):
@@ -131,15 +131,15 @@ def test_written_cameras_project_alike(tmp_path: Path):
         np.testing.assert_allclose(back.center, image.projection_center(), atol=1e-12)
 
 
-def test_models_of_cameras_are_those_of_colmap() -> None:
-    """Their numbers, how many parameters they have, and that focal lengths come first."""
+def test_camera_models_are_those_of_colmap() -> None:
+    """Model numbers and parameter counts are COLMAP's, and focal lengths come first."""
     known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
     known.pop("INVALID")
     assert {name: number for number, (name, _) in _MODELS.items()} == known
     for name, length in _MODELS.values():
         camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
         assert len(camera.params) == length
-        focal = list(camera.focal_length_idxs()) or [0, 1]  # EQUIRECTANGULAR has its two sides
+        focal = list(camera.focal_length_idxs()) or [0, 1]  # EQUIRECTANGULAR has its size
         ModelChecks().camera(1, name, 40, 30, [float(place in focal) for place in range(length)])
         for place in focal:
             with pytest.raises(InputError, match="is damaged"):
@@ -147,12 +147,12 @@ def test_models_of_cameras_are_those_of_colmap() -> None:
 
 
 POSE = (1.0, 0, 0, 0, 0, 0, 5)
-# COLMAP's numbers for "none" are one above
+# one less than COLMAP's numbers for "none"
 LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}
 
 
 def sound_model() -> list[tuple[str, tuple]]:
-    """The calls of `ModelChecks` for a model with numbers at both ends."""
+    """Calls of `ModelChecks` for a sound model with the smallest and largest ids."""
     return [
         ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
         ("camera", (LARGEST["camera"], "OPENCV", 40, 30, (50.0, 50, -20, 15, 0, -0.1, 0, 0))),
@@ -190,7 +190,7 @@ def sound_model() -> list[tuple[str, tuple]]:
         (4, 2, [(0, 0)], "2D point 0 of image 0"),
     ],
 )
-def test_what_no_model_may_hold_is_refused(
+def test_impossible_values_in_a_model_are_refused(
     call: int | None, argument: int, value: object, said: str
 ) -> None:
     checks = ModelChecks()
@@ -217,7 +217,7 @@ def rigs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_each_file_of_a_model_with_rigs_is_walked_to_its_end(rigs: Path, stem: str) -> None:
+def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs: Path, stem: str) -> None:
     check_model(rigs)
     (file,) = rigs.glob(f"{stem}.*")
     whole = file.read_bytes()
@@ -227,7 +227,7 @@ def test_each_file_of_a_model_with_rigs_is_walked_to_its_end(rigs: Path, stem: s
             check_model(rigs)
 
 
-def test_a_rig_without_a_sensor_has_no_reference(rigs: Path) -> None:
+def test_a_rig_without_sensors_is_accepted(rigs: Path) -> None:
     if (rigs / "rigs.bin").is_file():
         (rigs / "rigs.bin").write_bytes(struct.pack("<QIIII", 2, 1, 0, 2, 0))
     else:
@@ -243,10 +243,10 @@ def test_a_rig_without_a_sensor_has_no_reference(rigs: Path) -> None:
         ("frames", 16, 2, "frame 1"),
     ],
 )
-def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
+def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(
     rigs: Path, stem: str, start: int, at: int, said: str
 ) -> None:
-    """``start`` of a pose: behind the count, ids and, in a rig, the reference and the sensor."""
+    """The quaternion at byte ``start``, or at word ``at`` of a text line, becomes zero."""
     (file,) = rigs.glob(f"{stem}.*")
     if file.suffix == ".bin":
         data = file.read_bytes()
@@ -285,7 +285,7 @@ def test_a_pose_of_a_rig_or_a_frame_without_a_direction_is_refused(
         ("points3D", "1 0 0 5 0 255 0 0.1 1", "point 1 lacks numbers"),
     ],
 )
-def test_a_line_of_a_text_model_that_lacks_something_is_named(
+def test_a_bad_line_of_a_text_model_is_named(
     tmp_path: Path, stem: str, line: str, said: str
 ) -> None:
     lines = {

@@ -1,4 +1,4 @@
-"""Which views are held out, by each way of `scene.split`."""
+"""Which views each `scene.split` holds out."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_every_eighth_name_is_held_out_by_default() -> None:
     assert found.description == "every 8th image"
 
 
-def test_a_sector_is_contiguous_and_walks_around() -> None:
+def test_sectors_are_contiguous_and_follow_each_other_around_the_scene() -> None:
     rule = SplitRule(split="sector", sectors=4)
     parts = [hold_out(NAMES, replace(rule, sector=part), cameras=cameras).test for part in range(4)]
     assert parts[0] == tuple(NAMES[:6])
@@ -76,7 +76,7 @@ def test_no_split_is_empty_or_trains_on_a_test_view(data: st.DataObject) -> None
 
 
 @pytest.mark.parametrize("split", ["every_nth", "sector"])
-def test_validation_puts_the_test_views_away_and_asks_the_same_of_the_rest(split: str) -> None:
+def test_validation_drops_the_test_views_and_divides_the_rest_by_the_same_rule(split: str) -> None:
     rule = SplitRule(split=split, sectors=4, test_every=4)  # type: ignore[arg-type]
     test = hold_out(NAMES, rule, cameras=cameras).test
     found = hold_out(NAMES, replace(rule, validation=True), cameras=cameras)
@@ -84,7 +84,7 @@ def test_validation_puts_the_test_views_away_and_asks_the_same_of_the_rest(split
     assert found.description.endswith("put away unseen")
     assert not set(test) & {*found.train, *found.test}
     assert sorted([*found.train, *found.test, *test]) == NAMES
-    if split == "sector":  # the part beside the one put away
+    if split == "sector":  # the sector next to the one that was put away
         assert found.test == tuple(NAMES[6:10])
 
 
@@ -96,7 +96,9 @@ def test_validation_of_lists_takes_every_nth_of_the_training_list() -> None:
     assert "the 4 test views (by lists) put away unseen" in found.description
 
 
-def test_a_put_away_view_is_no_part_of_the_capture(make_scene: Callable[..., Path]) -> None:
+def test_a_view_dropped_by_validation_is_not_in_the_capture(
+    make_scene: Callable[..., Path],
+) -> None:
     root = make_scene(names=NAMES[:9])
     rules = [SplitRule(test_every=3, validation=judged) for judged in (False, True)]
     plain, judged = (read_colmap("toy", root, split=rule) for rule in rules)
@@ -191,7 +193,7 @@ def test_a_setting_has_limits(name: str, least: int, most: int) -> None:
             config(value)
 
 
-def test_settings_without_a_value_are_those_of_the_paper() -> None:
+def test_default_settings_are_those_of_the_paper() -> None:
     config = SceneConfig(name="a", kind="courtyard")
     assert (config.max_images, config.test_every, config.sectors, config.sector) == (200, 8, 8, 0)
     assert (config.views, config.width, config.height, config.seed) == (48, 400, 300, 0)

@@ -24,10 +24,10 @@ def test_lossless_formats_come_back_exactly(tmp_path: Path, suffix: str):
     assert image_size(path) == (20, 14)
 
 
-def test_modes_become_rgb(tmp_path: Path):
+def test_all_pixel_modes_become_rgb(tmp_path: Path):
     path = tmp_path / "a.png"
     Image.fromarray(np.array([[[200, 100, 50, 255], [200, 100, 50, 0]]], dtype=np.uint8)).save(path)
-    # transparency lies over black
+    # transparent pixels are blended over black
     assert read_image(path).tolist() == [[[200, 100, 50], [0, 0, 0]]]
     Image.fromarray(np.array([[7, 250]], dtype=np.uint8)).save(path)
     assert read_image(path).tolist() == [[[7, 7, 7], [250, 250, 250]]]
@@ -69,7 +69,7 @@ def test_damaged_files_are_named(tmp_path: Path, suffix: str):
         ((3118, 2078), 2, (1559, 1039)),
     ],
 )
-def test_sizes_of_the_benchmark(native, factor, expected):
+def test_downscaled_sizes_are_those_of_mipnerf360(native, factor, expected):
     assert downscaled_size(*native, downscale=factor) == expected
     assert same_up_to_rounding(expected, native)
 
@@ -94,7 +94,7 @@ def test_sides_may_be_rounded_by_one_pixel(size: tuple[int, int], same: bool):
     assert same_up_to_rounding(size, (40, 30)) == same
 
 
-def test_a_side_in_training_has_sixteen_pixels():
+def test_a_final_side_below_sixteen_pixels_is_refused():
     check_final_size((16, 40), 1, None, "a.png")
     check_final_size((40, 32), 2, None, "a.png")
     for size, downscale, max_size in (((15, 40), 1, None), ((40, 31), 3, None), ((40, 20), 1, 30)):

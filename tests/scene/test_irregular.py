@@ -1,4 +1,4 @@
-"""Captures that hold what is no photograph: pipes, devices, circles of links, other formats."""
+"""Captures with files that are not photographs: pipes, devices, circles of links, other formats."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SECONDS = 20
 
 @pytest.fixture(autouse=True)
 def limit() -> Iterator[None]:
-    """A hang is an error."""
+    """A test that hangs fails."""
 
     def stop(signum: int, frame: object) -> None:
         raise AssertionError("it hangs")
@@ -59,7 +59,7 @@ def photos(tmp_path: Path) -> Path:
 
 
 def odd_files(folder: Path, suffix: str) -> list[Path]:
-    """A pipe, a device that never ends, and a link to each."""
+    """A pipe, a link to the endless device /dev/zero, and a link to the pipe."""
     os.mkfifo(folder / f"pipe{suffix}")
     (folder / f"zero{suffix}").symlink_to("/dev/zero")
     (folder / f"link{suffix}").symlink_to(folder / f"pipe{suffix}")
@@ -94,7 +94,7 @@ def test_a_pipe_among_photographs_is_named(photos: Path, tmp_path: Path) -> None
         read_photos("x", tmp_path)
 
 
-def test_a_pipe_is_no_file_of_a_model(tmp_path: Path) -> None:
+def test_a_pipe_is_not_read_as_a_model_file(tmp_path: Path) -> None:
     for stem in ("cameras", "images", "points3D"):
         os.mkfifo(tmp_path / f"{stem}.bin")
     with pytest.raises(InputError, match="no COLMAP model here"):
@@ -109,7 +109,7 @@ def test_links_in_a_circle_are_followed_once(photos: Path) -> None:
     assert list_images(photos) == ["a.png", "b.png", "c.png"]
 
 
-def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(
+def test_images_are_listed_by_real_folders_and_outside_ones_by_their_link(
     photos: Path, tmp_path: Path
 ) -> None:
     (photos / "z").mkdir()
@@ -123,7 +123,7 @@ def test_a_folder_goes_by_its_own_name_and_a_linked_one_by_the_link(
     assert list_images(photos) == ["c.png", "far/b.png", "z/a.png"]
 
 
-def test_photographs_that_cannot_be_read_are_counted(
+def test_heic_photographs_are_counted_in_a_warning(
     photos: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (photos / "d.HEIC").touch()
@@ -159,15 +159,13 @@ def test_the_formats_of_photographs_are_read_whatever_their_name(form: str, tmp_
     "exif",
     [b"Exif\0\0" + bytes(range(200)), b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + bytes(20), b"Exif"],
 )
-def test_a_damaged_exif_is_as_none(exif: bytes, tmp_path: Path) -> None:
+def test_damaged_exif_data_count_as_none(exif: bytes, tmp_path: Path) -> None:
     Image.new("RGB", (16, 12)).save(tmp_path / "a.jpg", exif=exif)
     assert exif_orientation(tmp_path / "a.jpg") == 1
     assert read_image(tmp_path / "a.jpg").shape == (12, 16, 3)
 
 
-def test_names_that_make_no_file_name_are_refused_before_any_work(
-    photos: Path, tmp_path: Path
-) -> None:
+def test_names_too_long_or_equal_as_pictures_are_refused(photos: Path, tmp_path: Path) -> None:
     long = "ä" * 120 + ".png"  # 244 bytes
     (photos / "a.png").rename(photos / long)
     with pytest.raises(InputError, match="a name of more than 220 bytes"):
@@ -179,7 +177,7 @@ def test_names_that_make_no_file_name_are_refused_before_any_work(
 
 
 def synthetic(cameras: int) -> pycolmap.Reconstruction:
-    """A model of rigs of ``cameras``."""
+    """A synthetic model; each of its rigs has ``cameras`` cameras."""
     options = pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3, num_points3D=12)
     options.num_cameras_per_rig, options.sensor_from_rig_rotation_stddev = cameras, 5.0
     return pycolmap.synthesize_dataset(options)
@@ -188,7 +186,7 @@ def synthetic(cameras: int) -> pycolmap.Reconstruction:
 @pytest.mark.parametrize("kind", ["binary", "text"])
 @pytest.mark.parametrize("file", ["frames", "rigs", "images"])
 @pytest.mark.parametrize("length", [1.001, 2.0, 0.01])
-def test_quaternions_of_any_length_are_rotations(
+def test_quaternions_of_any_length_are_normalised(
     kind: str, file: str, length: float, tmp_path: Path
 ) -> None:
     model = synthetic(2)

@@ -57,7 +57,7 @@ def test_every_model_of_this_pycolmap_is_tested():
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_spots_land_where_a_pinhole_sees_them(name: str):
+def test_undistorted_spots_land_where_a_pinhole_sees_them(name: str):
     source = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=MODELS[name])
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = np.zeros((HEIGHT, WIDTH))
@@ -86,7 +86,7 @@ PERSPECTIVE = [name for name in MODELS if "FISHEYE" not in name]
 def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
     make_scene, tmp_path: Path, name: str, amount
 ):
-    """Zero and tiny coefficients leave pixels alone in perspective models, and in no fisheye."""
+    """With zero or tiny coefficients, perspective models keep their pixels; fisheyes do not."""
     plain = pycolmap.Camera.create_from_model_name(1, name, 150.0, WIDTH, HEIGHT)
     params = np.array(MODELS[name], dtype=float)
     neutral = {"EUCM": [0.0, 1.0], "FOV": [0.0]}.get(name, np.zeros(len(plain.extra_params_idxs())))
@@ -114,7 +114,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
 
 
 def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not():
-    # px from the centre; f = 1 in these units, so k moves it by k r^3
+    # px from the centre; in units of the focal length, k moves a point at r by k r^3
     corner = np.hypot(WIDTH, HEIGHT) / 2
     for moved, ignored in ((0.049, True), (-0.049, True), (0.051, False), (-0.051, False)):
         params = [150.0, WIDTH / 2, HEIGHT / 2, moved / 150.0 / (corner / 150.0) ** 3]
@@ -132,7 +132,7 @@ def test_panoramas_are_refused(tmp_path: Path):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
     image = ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # and so from the isolated process
+    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # raised in the isolated process, too
         prepare_all([image], no_progress)
 
 
@@ -152,7 +152,7 @@ def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
         assert camera.cx == pytest.approx(camera.width / 2)
 
 
-def test_untouched_views_are_the_files(make_scene, tmp_path: Path):
+def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path: Path):
     root = make_scene()
     capture = read_colmap("toy", root)
     scene = load_scene(capture, capture.model, tmp_path / "cache")
@@ -162,7 +162,7 @@ def test_untouched_views_are_the_files(make_scene, tmp_path: Path):
         np.testing.assert_array_equal(view.image, Image.open(root / "images" / view.name))
         assert (view.camera.fx, view.camera.cx, view.camera.cy) == (50.0, 20.0, 15.0)
     assert not list((tmp_path / "cache").rglob("*.png"))
-    # camera k stands at x = -0.1 k; training views 1..5: mean -0.3, farthest 0.2 away
+    # camera k is at x = -0.1 k; training views 1..5: mean -0.3, farthest 0.2 away
     assert scene.extent == pytest.approx(1.1 * 0.2)
 
 
@@ -193,7 +193,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     load(downscale=4, progress=no_progress)
     assert len(list(cache.iterdir())) == 2
     load(made_by={"scene/images.py": "edited"})
-    assert done == [("views", 6, 6)] * 3  # what other code has prepared is not taken
+    assert done == [("views", 6, 6)] * 3  # images that other code prepared are not used
     assert len(list(cache.iterdir())) == 3
     model = read_model(capture.model)
     model.points3D[1].xyz += 1.0
@@ -203,7 +203,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     model.cameras[1].params = [71.0, 40, 30, 0.05]
     model.write_binary(capture.model)
     load()
-    assert len(done) == 4  # but on the cameras
+    assert len(done) == 4  # pixels depend on the cameras
 
 
 def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path: Path):
@@ -223,7 +223,7 @@ def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path
         load_scene(capture, capture.model, tmp_path / "cache")
 
 
-def test_a_set_without_its_cameras_is_prepared_again(make_scene, tmp_path: Path):
+def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path: Path):
     capture = read_colmap("toy", make_scene())
     options = {"downscale": 2, "resample": "area"}
     first = load_scene(capture, capture.model, tmp_path / "cache", **options)
@@ -265,7 +265,7 @@ def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path
         load_scene(only_test, small / "sparse/0", tmp_path / "cache2")
 
 
-def test_truncated_photo_is_named_and_leaves_nothing(make_scene, tmp_path: Path):
+def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path: Path):
     root = make_scene(size=(80, 60))
     path = root / "images/03.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -276,7 +276,9 @@ def test_truncated_photo_is_named_and_leaves_nothing(make_scene, tmp_path: Path)
 
 
 @pytest.mark.shared
-def test_real_photos_of_a_distorted_camera(shared: Path, tmp_path: Path):
+def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(
+    shared: Path, tmp_path: Path
+):
     capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
     scene = load_scene(capture, capture.model, tmp_path, max_size=300)
     assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}

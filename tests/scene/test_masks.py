@@ -1,4 +1,4 @@
-"""Masks: whose they are, what is not a mask, and what is left of what they hide."""
+"""Masks: to which image they belong, which files are refused, and how ignored pixels are filled."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene: MakeScene, read) -> 
     assert capture.image_names == names
 
 
-def test_pixels_are_prepared_anew_for_another_colour_behind_them(make_scene: MakeScene) -> None:
+def test_photographs_are_prepared_again_for_another_backdrop(make_scene: MakeScene) -> None:
     capture = read_photos("toy", with_masks(make_scene()), masks="masks")
     steps = {behind: masking_step(capture, behind) for behind in ("black", "white")}
     assert all(steps.values())
@@ -71,7 +71,7 @@ def test_pixels_are_prepared_anew_for_another_colour_behind_them(make_scene: Mak
     assert steps["white"].inputs["behind"] == "white"
 
 
-def test_a_mask_of_another_name_is_none(tmp_path: Path) -> None:
+def test_a_mask_file_with_another_name_is_not_used(tmp_path: Path) -> None:
     for name in ("a.jpg.png", "b.png"):
         save(tmp_path / name, half())
     save(tmp_path / "images" / "a.jpg", half())
@@ -80,7 +80,9 @@ def test_a_mask_of_another_name_is_none(tmp_path: Path) -> None:
         find_masks(tmp_path, tmp_path / "images", ["a.jpg", "b.jpg"])
 
 
-def test_masks_below_bare_photographs_are_no_photographs(make_scene: MakeScene) -> None:
+def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(
+    make_scene: MakeScene,
+) -> None:
     root = with_masks(make_scene()) / "images"
     (root.parent / "masks").rename(root / "masks")
     capture = read_photos("toy", root, masks="masks")
@@ -108,7 +110,7 @@ def test_a_mask_of_another_size_is_refused(make_scene: MakeScene) -> None:
         read_colmap("toy", root, masks="masks")
 
 
-def test_the_courtyard_has_no_masks() -> None:
+def test_masks_for_the_courtyard_are_refused() -> None:
     with pytest.raises(InputError, match="courtyard"):
         SceneConfig(name="courtyard", kind="courtyard", masks="masks")
 
@@ -145,7 +147,7 @@ def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path: Path) -> Non
         (np.stack([half()] * 4, -1), "not by transparency"),
     ],
 )
-def test_what_is_no_mask_is_refused_in_one_line_that_names_it(tmp_path: Path, pixels, said) -> None:
+def test_a_file_that_is_no_mask_is_refused_in_one_line(tmp_path: Path, pixels, said) -> None:
     path = save(tmp_path / "m.png", pixels)
     with pytest.raises(InputError, match=said) as caught:
         read_mask(path)
@@ -165,9 +167,7 @@ def test_a_damaged_mask_is_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 23), st.integers(1, 23), st.integers(0, 2**32 - 1))
-def test_what_is_filled_in_owes_nothing_to_what_was_there(
-    height: int, width: int, seed: int
-) -> None:
+def test_filled_pixels_depend_only_on_counted_pixels(height: int, width: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     counts = rng.random((height, width)) < rng.random()
     counts[rng.integers(height), rng.integers(width)] = True
@@ -180,7 +180,7 @@ def test_what_is_filled_in_owes_nothing_to_what_was_there(
     assert ((filled >= low) & (filled <= high)).all(), "means of what counts"
 
 
-def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> None:
+def test_a_hole_in_one_colour_gets_that_colour_and_a_hole_in_a_ramp_has_no_step() -> None:
     plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
     counts = np.ones((50, 60), bool)
     counts[10:40, 15:45] = False
@@ -188,12 +188,12 @@ def test_a_plane_is_filled_with_its_own_colour_and_a_ramp_without_a_step() -> No
     np.testing.assert_array_equal(fill_ignored(holed, counts), plain)
     ramp = np.broadcast_to(np.linspace(0, 240, 60)[:, None], (50, 60, 3)).astype(np.uint8)
     filled = fill_ignored(ramp, counts).astype(int)
-    # black in its place would make a step of 180
+    # filling with black would make a step of 180
     assert np.abs(np.diff(filled[25, :, 0])).max() < 60
 
 
-def test_between_two_pixels_the_filling_is_linear() -> None:
-    """Blocks of two pixels are 0 and 100; a finer pixel lies a quarter of one from its middle."""
+def test_filling_between_two_pixels_is_linear() -> None:
+    """Blocks of two pixels are 0 and 100; a pixel's centre is a quarter block from its block's."""
     row = np.array([[0, 7, 9, 100]], dtype=np.uint8)[..., None].repeat(3, 2)
     counts = np.array([[True, False, False, True]])
     assert fill_ignored(row, counts)[0, :, 0].tolist() == [0, 25, 75, 100]
@@ -204,7 +204,7 @@ def test_between_two_pixels_the_filling_is_linear() -> None:
     ("mask", "alpha", "backdrop", "copied"),
     [
         (None, 255, "black", True),
-        (None, 9, "black", True),  # as it is read over black anyway
+        (None, 9, "black", True),  # since reading blends it over black anyway
         (None, 255, "white", True),
         (None, 9, "white", False),
         (np.full((6, 8), 255, np.uint8), 255, "black", True),
@@ -213,7 +213,7 @@ def test_between_two_pixels_the_filling_is_linear() -> None:
         (half(8, 6), 255, "white", False),
     ],
 )
-def test_a_photograph_that_stays_as_it_is_is_copied(
+def test_a_photograph_without_changes_is_copied(
     tmp_path: Path, mask, alpha, backdrop, copied
 ) -> None:
     pixels = np.full((6, 8, 4), (200, 100, 50, alpha), np.uint8)
@@ -231,8 +231,8 @@ def test_a_photograph_that_stays_as_it_is_is_copied(
 
 
 @pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
-def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int) -> None:
-    """In its area is what has its centre there; on the edge it may belong to either side."""
+def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width: int, height: int) -> None:
+    """A pixel belongs to the area that its centre is in; on an edge, to either side."""
     counts = np.random.default_rng(1).random((36, 50)) > 0.05
     found = resize_mask(counts, width, height)
 
@@ -251,7 +251,7 @@ def test_a_resized_pixel_counts_where_all_in_its_area_do(width: int, height: int
 
 
 def prepared(root: Path, folder: Path, **options: object) -> Capture:
-    """The capture as the pipeline hands it on: `prepare` has been over it."""
+    """The capture with photographs and masks prepared as in the pipeline."""
     capture = read_colmap("toy", root, masks="masks", **options)  # type: ignore[arg-type]
     for name in capture.image_names:
         prepare_photograph(folder, capture.images, capture.masks, name)
@@ -265,14 +265,14 @@ def test_views_have_their_masks_at_the_final_size(make_scene: MakeScene, tmp_pat
         (1, half()),
         (2, half(20, 15)),
         (2, half(20, 15)),
-    ):  # and from the cache
+    ):  # the second time from the cache
         scene = load_scene(capture, capture.model, tmp_path / "cache", downscale)  # type: ignore[arg-type]
         np.testing.assert_array_equal(scene.train[0].mask, mask > 0)
         assert scene.train[0].counted == 0.5
 
 
 def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_path: Path) -> None:
-    """A photograph that is as its mask, white and black, stays so: what is white counts."""
+    """The photograph equals its mask, so after undistortion exactly its white pixels count."""
     root = make_scene(size=(120, 90), model="SIMPLE_RADIAL", params=(100, 60, 45, 0.15))
     for k, path in enumerate((root / "images").iterdir()):
         disc = np.hypot(*np.mgrid[-45:45, -60:60]) > 20 + k
@@ -286,7 +286,9 @@ def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_pa
     np.testing.assert_array_equal(view.mask, view.image[..., 0] == 255)
 
 
-def test_a_mask_of_which_nothing_is_left_is_named(make_scene: MakeScene, tmp_path: Path) -> None:
+def test_a_mask_without_counted_pixels_at_the_final_size_is_named(
+    make_scene: MakeScene, tmp_path: Path
+) -> None:
     root = with_masks(make_scene(size=(320, 240)))
     mask = np.zeros((240, 320), np.uint8)
     mask[100:103, 100:103] = 255
@@ -296,7 +298,7 @@ def test_a_mask_of_which_nothing_is_left_is_named(make_scene: MakeScene, tmp_pat
         load_scene(capture, capture.model, tmp_path / "cache", downscale=10)  # type: ignore[arg-type]
 
 
-def test_the_fingerprint_knows_masks_and_is_as_before_without(make_scene: MakeScene) -> None:
+def test_masks_change_the_fingerprint_only_if_they_are_used(make_scene: MakeScene) -> None:
     root = make_scene()
     before = read_colmap("toy", root).fingerprint
     with_masks(root)
@@ -306,7 +308,7 @@ def test_the_fingerprint_knows_masks_and_is_as_before_without(make_scene: MakeSc
     assert read_colmap("toy", root).fingerprint == before
 
 
-def test_what_is_prepared_keeps_exif_and_is_a_photograph_to_colmap(tmp_path: Path) -> None:
+def test_colmap_reads_the_same_focal_length_from_a_prepared_photograph(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "Canon", "Canon EOS"
     exif.get_ifd(0x8769)[0xA405] = 35  # focal length in 35 mm film

@@ -1,4 +1,4 @@
-"""Readers: which files are found, kept and held out, and what is said about bad folders."""
+"""Readers: which files are found, kept and held out, and errors for bad folders."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def test_a_colmap_folder_gives_photographs_and_model(make_scene, text: bool, spa
     assert not capture.exact_poses
 
 
-def test_the_older_three_file_layout(make_scene):
+def test_a_model_of_the_older_three_files_is_read(make_scene):
     root = make_scene()
     for file in ("rigs.bin", "frames.bin"):
         (root / "sparse/0" / file).unlink()
     assert len(read_colmap("toy", root).image_names) == 6
 
 
-def test_photos_in_images_or_directly_or_nested(make_scene):
+def test_photos_are_found_in_images_or_in_the_folder_or_in_subfolders(make_scene):
     names = ("cam1/01.PNG", "cam1/02.png", "cam2/01.JPEG", "x.bmp", "y.webp", "z.tif")
     root = make_scene(names=names[::-1])
     (root / "images" / ".hidden.png").write_bytes(b"no image")
@@ -49,7 +49,7 @@ def test_photos_in_images_or_directly_or_nested(make_scene):
     assert read_photos("toy", root, images="images/cam1/..").images == root / "images/cam1/.."
 
 
-def test_files_with_another_extension_and_missing_ones(make_scene, caplog):
+def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_scene, caplog):
     root = make_scene(names=tuple(f"cam/{k}.JPG" for k in range(6)))
     half = root / "images_2" / "cam"
     half.mkdir(parents=True)
@@ -83,7 +83,7 @@ def test_files_with_another_extension_and_missing_ones(make_scene, caplog):
         (["a.JPG", "a.jpeg"], ["a.png"], "a.png may be a.JPG or a.jpeg: give each"),
     ],
 )
-def test_names_match_their_files_or_an_error_names_both(wanted, files, matches):
+def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, matches):
     if isinstance(matches, dict):
         assert match_names(wanted, files) == matches
         return
@@ -104,9 +104,7 @@ def test_names_match_their_files_or_an_error_names_both(wanted, files, matches):
         ({"sparse/0": 4, "colmap/sparse/0": 6}, "sparse/0"),
     ],
 )
-def test_of_several_models_the_one_with_the_most_images_is_read(
-    make_scene, caplog, models, chosen, text: bool
-):
+def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chosen, text: bool):
     for sparse, count in models.items():
         root = make_scene(names=[f"{k}.png" for k in range(count)], sparse=sparse, text=text)
     capture = read_colmap("toy", root)
@@ -134,7 +132,7 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("mark", [b"", codecs.BOM_UTF8])
 @pytest.mark.parametrize("line_end", [b"\n", b"\r\n"])
-def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(
+def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
     make_scene, text: bool, mark, line_end
 ):
     names = [f"my  photo {k}.png" for k in range(6)]
@@ -162,7 +160,9 @@ def test_names_with_blanks_are_read_whole_after_any_mark_and_line_end(
     ],
 )
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
-def test_text_that_colmap_does_not_write_is_named(make_scene, change, said: str, stem: str):
+def test_wrong_encodings_and_decimal_commas_of_a_text_model_are_named(
+    make_scene, change, said: str, stem: str
+):
     root = make_scene(text=True, params=[50.5, 50.5, 20, 15])
     file = root / f"sparse/0/{stem}.txt"
     file.write_bytes(change(file.read_text().replace(" 5 ", " 5.5 ")))
@@ -203,7 +203,7 @@ LISTS = {  # name of a file: what it lists
         ("train", "first", r"00\.png for training and for testing", None),
     ],
 )
-def test_lists_say_what_is_trained_on_and_tested(make_scene, train, test, trained_on, tested_on):
+def test_lists_choose_the_training_and_test_views(make_scene, train, test, trained_on, tested_on):
     root = make_scene()
     for name, text in LISTS.items():
         (root / f"{name}.txt").write_text(text)
@@ -229,7 +229,7 @@ def test_a_split_without_views_is_refused():
             split_names(names, **options)
 
 
-def test_fingerprint_follows_content_not_place(make_scene, tmp_path: Path):
+def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path: Path):
     root = make_scene()
     copy = Path(shutil.copytree(root, tmp_path / "elsewhere"))
     first = read_colmap("toy", root)
@@ -241,7 +241,7 @@ def test_fingerprint_follows_content_not_place(make_scene, tmp_path: Path):
     assert read_colmap("toy", copy).fingerprint != first.fingerprint
 
 
-def test_a_folder_that_lacks_something_is_named(make_scene, tmp_path: Path):
+def test_missing_folders_images_and_models_are_named(make_scene, tmp_path: Path):
     with pytest.raises(InputError, match="does not exist"):
         read_photos("toy", tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"scene\.path is not set"):
@@ -265,7 +265,7 @@ def test_a_folder_that_lacks_something_is_named(make_scene, tmp_path: Path):
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "frames"])
 @pytest.mark.parametrize("keep", [0.0, 0.6])
-def test_truncated_model_is_one_clear_line(make_scene, file: str, keep: float):
+def test_a_truncated_model_is_named_in_one_line(make_scene, file: str, keep: float):
     root = make_scene()
     path = root / "sparse/0" / f"{file}.bin"
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
@@ -274,7 +274,7 @@ def test_truncated_model_is_one_clear_line(make_scene, file: str, keep: float):
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(
+def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(
     make_scene, tmp_path: Path
 ) -> None:
     assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
@@ -287,7 +287,7 @@ def test_a_scene_is_called_after_its_folder_and_a_missing_model_is_named(
     assert said.startswith(f"scene fern: {root / 'other'}: no COLMAP model here")
 
 
-def test_a_list_that_is_not_there_is_said_in_few_words(make_scene):
+def test_a_missing_list_is_named(make_scene):
     said = r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"
     with pytest.raises(InputError, match=said):
         read_colmap("toy", make_scene(), split=SplitRule(test_list="\\n"))

@@ -39,13 +39,13 @@ def some_rotation(seed: int) -> np.ndarray:
 
 
 def is_cyclic_run(found: set[int], order: list[int]) -> bool:
-    """Whether the places of ``found`` in the cyclic ``order`` are neighbours."""
+    """Whether ``found`` is one contiguous run of the cyclic ``order``."""
     inside = [index in found for index in order]
     return sum(a != b for a, b in zip(inside, inside[1:] + inside[:1], strict=True)) <= 2
 
 
 @given(st.integers(0, 99), st.integers(2, 6), st.booleans())
-def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(
+def test_a_ring_is_cut_by_azimuth_in_any_order_and_coordinates(
     seed: int, sectors: int, far: bool
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -63,7 +63,7 @@ def test_a_ring_is_cut_by_azimuth_whatever_its_names_and_gauge(
     assert all(is_cyclic_run(part, around) for part in parts)
 
 
-def test_azimuths_do_not_depend_on_heights_and_are_rounded_to_a_millionth_of_a_degree() -> None:
+def test_azimuths_do_not_depend_on_heights_and_are_rounded() -> None:
     angles = np.radians([*range(0, 360, 20), -3e-7])
     eyes = [
         np.array([3 * np.cos(a), 3 * np.sin(a), 1.0 + (k % 2) * (k < 18)])
@@ -74,7 +74,7 @@ def test_azimuths_do_not_depend_on_heights_and_are_rounded_to_a_millionth_of_a_d
     assert "gaps up to 20 degrees" in found.description
 
 
-def test_an_open_ring_begins_after_its_gap() -> None:
+def test_an_open_ring_starts_after_its_gap() -> None:
     degrees = [100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0]  # nothing from 260 to 380
     assert [degrees[k] for k in arrange_cameras(ring(degrees)).order] == sorted(degrees)
 
@@ -91,7 +91,7 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
     assert "one direction" in arrange_cameras(row).description
     assert arrange_cameras(row).order == (0, 2, 3, 1)
-    for side in (1, -1):  # the second camera fixes the direction, as the first stands at the mean
+    for side in (1, -1):  # the first camera is at the mean, so the second one fixes the sign
         places = [np.array([side * x, 0.0, 0.0]) for x in (0.0, 1.0, -1.0, 2.0, -2.0)]
         row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
         assert arrange_cameras(row).order == (3, 1, 0, 2, 4)
@@ -103,7 +103,7 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
 
 
 def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
-    """Those that look away do so on the line through it."""
+    """The cameras that look away have the centre exactly behind them."""
     for away, surrounds in ((1, True), (2, False)):
         around = ring([36.0 * k for k in range(10)])
         for k in range(away):
@@ -111,8 +111,8 @@ def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
         assert ("surround" in arrange_cameras(around).description) == surrounds
 
 
-def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
-    """All directions in which it looks are exact here, so it is above to the last digit."""
+def test_a_first_camera_straight_above_the_centre_is_accepted() -> None:
+    """The poses of the cameras above are exact, so they have no azimuth to the last digit."""
     around = np.array([[3.0, 0, 0], [0, 3, 0], [-3, 0, 0], [0, -3, 0]])
     level = [looking(place, np.zeros(3)) for place in around]
     above = np.array([[[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
@@ -122,7 +122,7 @@ def test_a_first_camera_straight_above_has_no_azimuth_to_count_from() -> None:
     assert sorted(found.order) == list(range(6))
 
 
-def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:
+def test_rounding_errors_do_not_change_the_order_of_a_ring() -> None:
     cameras = [ring_camera(k * 2 * np.pi / 48, 40, 30) for k in range(48)]
     noise = np.random.default_rng(0).normal(scale=1e-12, size=(48, 3))
     shaken = [
@@ -133,7 +133,9 @@ def test_an_exact_ring_is_cut_alike_whatever_the_last_digits_are() -> None:
 
 
 @given(st.integers(3, 60), st.integers(2, 9))
-def test_parts_differ_by_one_at_most_and_matched_ones_by_none(count: int, sectors: int) -> None:
+def test_sector_sizes_differ_by_at_most_one_and_matched_sizes_are_equal(
+    count: int, sectors: int
+) -> None:
     sizes = [len(sector_range(count, part, sectors)) for part in range(sectors)]
     assert sum(sizes) == count
     assert max(sizes) - min(sizes) <= 1
@@ -143,7 +145,7 @@ def test_parts_differ_by_one_at_most_and_matched_ones_by_none(count: int, sector
     assert all(set(part) <= set(range(count)) for part in matched)
 
 
-def test_nearness_is_the_least_angle_and_the_least_distance() -> None:
+def test_nearest_cameras_have_the_least_angle_and_the_least_distance() -> None:
     training, test = ring([0.0, 40.0, 90.0]), ring([10.0, 75.0])
     found = nearest_training_cameras(test, training, 2.0)
     for camera, entry in zip(test, found, strict=True):

@@ -1,4 +1,4 @@
-"""transforms.json: cameras by the documented formulas; what is missing, damaged or odd."""
+"""transforms.json: cameras by the documented formulas; missing, damaged and unusual files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ EYES = [np.array([3 * math.cos(a), 3 * math.sin(a), 1.0]) for a in np.linspace(0
 
 
 def write(folder: Path, edit: Callable[[Any], object] | None = None, **changes: Any) -> Path:
-    """A folder with six photographs and the file, with ``changes`` and then edited by ``edit``."""
+    """A folder with six photographs and a transforms.json with ``changes``, edited by ``edit``."""
     frames: list[dict[str, Any]] = []
     for k, eye in enumerate(EYES):
         path = folder / "images" / f"{k}.png"
@@ -75,7 +75,7 @@ def project(model: pycolmap.Reconstruction, name: str, point: np.ndarray) -> np.
     return model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * point)
 
 
-def test_a_point_falls_where_the_formulas_of_the_format_say(tmp_path: Path) -> None:
+def test_points_are_projected_by_the_formulas_of_the_format(tmp_path: Path) -> None:
     """x is right, y up, z towards the viewer: column cx + fl_x x/-z, row cy - fl_y y/-z."""
     capture = capture_of(write(tmp_path / "in"), tmp_path / "made")
     model = read_model(capture.model)  # type: ignore[arg-type]
@@ -88,8 +88,8 @@ def test_a_point_falls_where_the_formulas_of_the_format_say(tmp_path: Path) -> N
     assert above[1] < origin[1], "what is higher is further up in the picture"
 
 
-def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> None:
-    """Saved = applied_scale (R p + t): cameras and the PLY come back to where they were."""
+def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path: Path) -> None:
+    """The file holds applied_scale (R p + t); cameras and the PLY get their original places."""
     plain = capture_of(write(tmp_path / "plain"), tmp_path / "one")
     applied = np.array([[0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 3.0]])
     scale = 2.5
@@ -138,7 +138,9 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path: Path) -> No
         ({"is_fisheye": True}, "OPENCV_FISHEYE", [50, 51, 19.5, 15.5, 0, 0, 0, 0]),
     ],
 )
-def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, params) -> None:
+def test_intrinsics_are_read_from_the_file_or_from_each_frame(
+    tmp_path: Path, said, model, params
+) -> None:
     shared = read_transforms(write(tmp_path / "shared", **said)).images["images/3.png"][0]
 
     def move_to_frames(document: Any) -> None:
@@ -153,8 +155,8 @@ def test_intrinsics_of_the_file_or_of_each_frame(tmp_path: Path, said, model, pa
     assert frames["images/2.png"][0].params[0] == 60
 
 
-def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: Path) -> None:
-    """NeRF's synthetic scenes: focal = .5 w / tan(.5 angle); transforms_test.json held out."""
+def test_blender_scenes_with_their_angle_names_split_and_alpha_are_read(tmp_path: Path) -> None:
+    """NeRF's synthetic scenes: focal = .5 w / tan(.5 angle), test views in transforms_test.json."""
     angle = 0.6911112070083618
     for part, count in (("train", 5), ("test", 3), ("val", 2)):
         frames = []
@@ -164,7 +166,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
             pixels = np.zeros((40, 40, 4), np.uint8)
             pixels[10:30, 10:30] = (200, 40, 40, 255)
             pixels[5, 5] = (255, 0, 0, 128)
-            pixels[21, 24] = (10 * count, 10 * k, 0, 255)  # no photograph twice
+            pixels[21, 24] = (10 * count, 10 * k, 0, 255)  # makes all photographs different
             Image.fromarray(pixels).save(path)
             matrix = looking_at_origin(EYES[k]).tolist()
             frames.append(
@@ -178,7 +180,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
     assert capture.train_names == tuple(f"train/r_{k}.png" for k in range(5))
     camera = read_transforms(tmp_path).images["train/r_0.png"][0]
     assert camera.params == pytest.approx((0.5 * 40 / math.tan(0.5 * angle),) * 2 + (20, 20))
-    # the rule, not the files
+    # held out by scene.split, not by the files
     assert capture_of(tmp_path, tmp_path / "every").test_names == ("test/r_0.png",)
     assert not any(name.startswith("val/") for name in read_transforms(tmp_path).images)
     (tmp_path / "transforms_test.json").unlink()
@@ -201,7 +203,7 @@ def test_blenders_angle_its_missing_extension_its_parts_and_its_alpha(tmp_path: 
         assert picture.getpixel((5, 5))[1] == pytest.approx(127, abs=1)
 
 
-def test_a_file_that_names_masks_asks_for_their_folder(tmp_path: Path) -> None:
+def test_a_file_with_mask_paths_needs_the_folder_of_masks(tmp_path: Path) -> None:
     folder = write(tmp_path / "in", lambda d: d["frames"][1].update(mask_path="masks/1.png"))
     (folder / "masks" / "images").mkdir(parents=True)
     for k in range(6):
@@ -212,7 +214,7 @@ def test_a_file_that_names_masks_asks_for_their_folder(tmp_path: Path) -> None:
     assert found.masks["images/2.png"] == folder / "masks/images/2.png.png"
 
 
-def test_the_file_is_among_what_a_trial_is_made_of(tmp_path: Path) -> None:
+def test_the_file_is_a_source_of_the_capture_and_changes_its_fingerprint(tmp_path: Path) -> None:
     folder = write(tmp_path / "in")
     capture = capture_of(folder, tmp_path / "a")
     assert capture.read_from == (folder / "transforms.json",)
@@ -274,7 +276,7 @@ WRONG_FRAMES = [
         *((lambda d, edit=edit: edit(d["frames"][1]), said) for edit, said in WRONG_FRAMES),
     ],
 )
-def test_what_cannot_be_understood_is_one_line_that_names_the_file(
+def test_a_file_that_cannot_be_understood_is_named_in_one_line(
     tmp_path: Path, change, said
 ) -> None:
     folder = write(tmp_path / "in", change)
@@ -284,7 +286,7 @@ def test_what_cannot_be_understood_is_one_line_that_names_the_file(
     assert "\n" not in str(caught.value)
 
 
-def test_a_line_of_pixels_is_a_picture(tmp_path: Path) -> None:
+def test_images_one_pixel_wide_are_accepted_and_a_missing_side_is_measured(tmp_path: Path) -> None:
     folder = write(tmp_path / "in", w=1)
     for k in range(len(EYES)):
         Image.new("RGB", (1, 30)).save(folder / "images" / f"{k}.png")
@@ -314,7 +316,7 @@ def test_images_without_a_file_are_left_out(
     assert "1 of 6 images have no file: ./images/4.png" in caplog.text
 
 
-def test_the_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transforms_json_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read, files = transforms.read_bytes, []
     monkeypatch.setattr(transforms, "read_bytes", lambda path: files.append(path) or read(path))
     capture_of(write(tmp_path / "in"), tmp_path / "made")
@@ -344,7 +346,7 @@ def focal(side: float, degrees: float) -> float:
     ],
 )
 @pytest.mark.parametrize("of_each_frame", [False, True])
-def test_every_way_to_give_a_field_of_view(
+def test_focal_lengths_follow_from_every_way_to_give_a_field_of_view(
     tmp_path: Path, said, focal_x, focal_y, of_each_frame: bool
 ) -> None:
     edit = in_each_frame(**said) if of_each_frame else lambda document: document.update(said)
@@ -371,7 +373,9 @@ def test_higher_coefficients_distort_as_in_opencv(tmp_path: Path, said: dict[str
 
 
 @pytest.mark.parametrize("key", sorted(HARMLESS | set(REFUSED)))
-def test_what_says_nothing_changes_nothing_in_silence(tmp_path: Path, key: str, caplog) -> None:
+def test_known_keys_without_effect_are_ignored_without_a_warning(
+    tmp_path: Path, key: str, caplog
+) -> None:
     wanted = read_transforms(write(tmp_path / "in")).images
     values = (None,) if key.startswith("transform_matrix") else (None, 0, False, [0.0, 0.0])
     for value in (*values, *([1.5, "text", [1.0]] if key in HARMLESS else [])):
@@ -396,7 +400,7 @@ def test_unknown_keys_are_named_in_one_line(tmp_path: Path, caplog) -> None:
         ({"test": [4]}, (0, 1, 2, 3, 5), (4,)),
     ],
 )
-def test_nerfstudios_lists_of_names_are_the_split(
+def test_nerfstudios_lists_of_filenames_are_the_split(
     tmp_path: Path, lists, train, test, caplog
 ) -> None:
     def names(numbers) -> tuple[str, ...]:
@@ -417,7 +421,7 @@ def test_a_file_is_found_whatever_its_extension_and_capitals(tmp_path: Path, wri
     assert sorted(read_transforms(folder).images) == [f"images/{k}.png" for k in range(6)]
 
 
-def test_a_mark_of_utf8_is_passed_over_and_other_encodings_are_named(tmp_path: Path) -> None:
+def test_a_byte_order_mark_of_utf8_is_skipped_and_other_encodings_are_named(tmp_path: Path) -> None:
     folder = write(tmp_path / "in")
     file = folder / "transforms.json"
     text = file.read_text()

@@ -34,7 +34,7 @@ from tests.train.conftest import orbit_camera
         (["a.jpg", "a.v2.jpg"], (), {}),
     ],
 )
-def test_of_photographs_with_one_name_one_is_used(
+def test_one_of_several_photographs_with_the_same_stem_is_used(
     names: list[str], wanted: set[str], left_out: dict[str, str]
 ) -> None:
     assert copies_by_name(names, wanted) == left_out
@@ -84,7 +84,7 @@ def test_copies_across_lists_are_found(make_scene: Callable[..., Path]) -> None:
 
 
 def picture(seed: int) -> np.ndarray:
-    """A photograph of something: a smooth picture with fine detail, [H, W, 3] uint8."""
+    """A smooth picture with fine detail, [H, W, 3] uint8."""
     noise = np.random.default_rng(seed).normal(0, 12, (128, 160, 3))
     return (smooth_image(160, 128, seed) + noise).clip(0, 255).astype(np.uint8)
 
@@ -107,7 +107,7 @@ def scene_of(test: np.ndarray, other: np.ndarray, mask: np.ndarray | None = None
     [
         (lambda image: image.copy(), True, False),
         (encoded_again, False, True),
-        (lambda image: np.roll(image, 1, axis=1), False, True),  # the next of a burst
+        (lambda image: np.roll(image, 1, axis=1), False, True),  # the next shot of a burst
         (lambda image: (image * 0.8).astype(np.uint8), False, True),  # another exposure
         (lambda image: image[:, ::-1].copy(), False, False),
         (lambda image: picture(77), False, False),
@@ -136,7 +136,7 @@ def test_pixels_under_a_mask_do_not_make_photographs_different() -> None:
     assert without_copies(replace(scene, train=scene.train[:3])).twins.left_out == {}
 
 
-def test_a_split_without_training_views_of_its_own_is_refused() -> None:
+def test_a_split_whose_training_views_are_all_copies_is_refused() -> None:
     view = View("0.png", orbit_camera(0.1, 160, 128), picture(0))
     with pytest.raises(InputError, match="all training views are copies of test views"):
         without_copies(Scene("made", (replace(view, name="1.png"),), (view,)))
@@ -153,8 +153,10 @@ def test_flat_pictures_are_twins_only_if_they_are_equal(caplog: pytest.LogCaptur
 @pytest.mark.parametrize(
     ("capture", "most"), [("fox", 0.2), ("garfield", 0.0), ("monstree", 0.0), ("studio_room", 0.2)]
 )
-def test_neighbours_of_real_captures_are_no_twins(shared: Path, capture: str, most: float) -> None:
-    """In a walk around an object each view has neighbours; they are what training is for."""
+def test_few_neighbours_of_real_captures_are_near_twins(
+    shared: Path, capture: str, most: float
+) -> None:
+    """Neighbouring views of a walk around an object differ enough to be trained on."""
     files = sorted((shared / "data" / capture / "images").iterdir())[:40]
     views = []
     for file in files:

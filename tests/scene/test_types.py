@@ -1,4 +1,4 @@
-"""A camera: what it refuses, where it stands, and that another size changes no direction."""
+"""Cameras: values that are refused, centres, and resizing, which changes no direction."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ SOUND: dict[str, Any] = {
         *(("translation", value) for value in (np.zeros(2), np.array([0.0, np.nan, 0.0]))),
     ],
 )
-def test_only_what_is_no_camera_is_refused(name: str, value: object) -> None:
+def test_impossible_values_of_a_camera_are_refused(name: str, value: object) -> None:
     Camera(**SOUND)  # one pixel is a picture
     with pytest.raises(ValueError, match="camera: "):
         Camera(**(SOUND | {name: value}))
 
 
-def test_numbers_of_any_type_become_float64() -> None:
+def test_rotation_and_translation_become_float64() -> None:
     turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     camera = Camera(**(SOUND | {"rotation": turn, "translation": [1, 2, 3]}))
     assert camera.rotation.dtype == camera.translation.dtype == np.float64
     assert camera.center.tolist() == [-2, 1, -3]
 
 
-def test_a_camera_of_one_focal_length_has_it_on_both_sides() -> None:
+def test_one_focal_length_is_used_for_both_axes() -> None:
     for model, params in (
         ("SIMPLE_PINHOLE", (50.0, 20.0, 15.0)),
         ("PINHOLE", (50.0, 50.0, 20.0, 15.0)),
@@ -49,12 +49,12 @@ def test_a_camera_of_one_focal_length_has_it_on_both_sides() -> None:
         assert not camera.center.any()
 
 
-def test_its_centre_is_where_it_stands() -> None:
+def test_the_camera_centre_is_the_eye() -> None:
     eye = np.array([3.0, -2.0, 1.5])
     np.testing.assert_allclose(looking(eye, np.array([0.5, 0.0, 0.2])).center, eye, atol=1e-12)
 
 
-def test_a_point_stays_at_its_share_of_a_resized_picture() -> None:
+def test_a_point_keeps_its_relative_place_in_a_resized_image() -> None:
     camera = looking(np.array([3.0, -2.0, 1.5]), np.zeros(3), size=(64, 48))
     x, y, z = camera.rotation @ [0.1, 0.2, 0.3] + camera.translation
     places = [

@@ -117,7 +117,7 @@ def wanted_members(
             raise InputError(
                 f"{where}: the member {info.filename!r} has an unsafe name: give another --mirror"
             )
-        # A surrogate is what a damaged name decodes to.
+        # A damaged name may decode to surrogates.
         if len(name.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES or not name.isprintable():
             raise InputError(
                 f"{where}: the member {name!r:.80} has a name that no file can have: give another "
@@ -214,7 +214,7 @@ def _cause(error: Exception, member: zipfile.ZipInfo) -> Exception:
     return error
 
 
-STAGING = ".fetch"  # folder below the data folder for unfinished scenes
+STAGING = ".fetch"  # folder of unfinished scenes, below the data folder
 
 
 def missing_parts(data: Path, files: SceneFiles) -> tuple[str, ...]:
@@ -231,7 +231,7 @@ def fetch_scene(
     policy: RetryPolicy,
     say: Progress,
 ) -> str:
-    """Fetch the missing folders of a scene from its ``archive``; returns a line about them.
+    """Fetch the missing folders of a scene from its ``archive``; returns one line about them.
 
     ``where`` is the archive's address, for errors; ``say`` gets byte counts. The caller holds the
     lock of ``data``.

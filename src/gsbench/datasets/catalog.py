@@ -99,7 +99,7 @@ def _catalogued_scenes() -> dict[str, tuple[str, str]]:
 
 
 def how_to_get(scenes: Iterable[tuple[str, Path]]) -> str:
-    """Advice for missing (scene, folder): the commands that fetch those in the catalogue."""
+    """Advice for missing scenes and their folders: how to fetch those in the catalogue."""
     wanted = defaultdict(list)
     for scene, folder in scenes:
         dataset, catalogued = _catalogued_scenes().get(scene, ("", ""))

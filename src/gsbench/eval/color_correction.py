@@ -1,8 +1,9 @@
 """Metrics after an affine correction of a render's colours.
 
 It is for captures whose exposure or white balance changes. A phone chooses exposure anew for each
-photograph, and no renderer can know that of a test view. Mip-NeRF 360 (Barron et al. 2022) and
-gsplat therefore also report metrics after a map of the render's colours to those of the photograph.
+photograph, and no renderer can know the exposure of a test view. Mip-NeRF 360 (Barron et al. 2022)
+and gsplat therefore also report metrics after a map of the render's colours to those of the
+photograph.
 """
 
 import torch
@@ -11,19 +12,19 @@ from torch import Tensor
 from gsbench.eval.images import in_double_precision
 from gsbench.eval.metric import MaskedMetric, Metric
 
-ROUNDS = 5  # of Mip-NeRF 360's evaluation: each finds the clipped pixels of the last
-NO_CONTRAST = 1e-10  # singular values below, as a share of the largest, are rounding
-CLIPPED = 0.5 / 255  # a value so near to 0 or 1 is the end of the range of 8 bits
+ROUNDS = 5  # as in Mip-NeRF 360's evaluation; each leaves out the pixels that the last one clipped
+NO_CONTRAST = 1e-10  # smaller singular values, relative to the largest, are rounding errors
+CLIPPED = 0.5 / 255  # values this near to 0 or 1 round to an end of the 8-bit range
 
 
 def color_corrected(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """``image`` [H, W, 3] with its colours mapped to those of ``truth``, both in [0, 1].
+    """Map the colours of ``image`` [H, W, 3] to those of ``truth``, both in [0, 1].
 
-    In double precision. The map is affine, with a row a_c of four numbers for each channel c. It
-    minimises the sum over pixels of (a_c . (r, g, b, 1) - truth_c)^2. The result is clipped to [0,
-    1]. A pixel counts for a channel if ``mask`` [H, W] counts it, if no channel of the render is
-    clipped, and if the photograph's channel is not. This is done five times, each on the last
-    result.
+    The map is affine, with a row a_c of four numbers for each channel c. It minimises the sum over
+    pixels of (a_c . (r, g, b, 1) - truth_c)^2, in double precision, and the result is clipped to
+    [0, 1]. A pixel counts for a channel if ``mask`` [H, W] is True, no channel of the render is
+    clipped, and the photograph's channel is not clipped. A channel with fewer than four such pixels
+    stays as it is. This is done five times, each time with the last result.
     """
     corrected = in_double_precision(image).reshape(-1, 3)  # [P, 3]
     goal = in_double_precision(truth).reshape(-1, 3)  # [P, 3]
@@ -38,7 +39,7 @@ def color_corrected(image: Tensor, truth: Tensor, mask: Tensor | None = None) ->
             if len(y) < inputs.shape[1]:
                 mapped.append(corrected[:, channel])
                 continue
-            # The pseudoinverse also suits a render of one colour, where many maps are best.
+            # The pseudoinverse also works for a render of one colour, for which many maps are best.
             q, r = torch.linalg.qr(x)  # [U, 4], [4, 4]
             mapped.append(inputs @ (torch.linalg.pinv(r, rtol=NO_CONTRAST) @ (q.T @ y)))
         corrected = torch.stack(mapped, dim=1).clamp(0, 1)
@@ -50,10 +51,7 @@ def _unclipped(values: Tensor) -> Tensor:
 
 
 class Corrected:
-    """The metric ``inner`` after `color_corrected`.
-
-    With ``gain``, how much larger it is than without.
-    """
+    """The metric ``inner`` after `color_corrected`, or with ``gain`` its increase by that."""
 
     def __init__(self, inner: Metric, gain: bool = False) -> None:
         self._inner, self._gain = inner, gain

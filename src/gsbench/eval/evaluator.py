@@ -1,4 +1,4 @@
-"""The evaluator applies a protocol's metrics and the user's own to pairs of images."""
+"""The evaluator: it applies a protocol's metrics and the user's own to pairs of images."""
 
 import importlib.util
 import math
@@ -45,7 +45,7 @@ class MetricContext:
     device: torch.device
     weights: Path | None = None
     download: bool = True
-    # LPIPS, each loaded once
+    # LPIPS networks, each loaded once, or the error for missing weights
     networks: dict[str, Lpips | MissingWeightsError] = field(default_factory=dict, repr=False)
 
     def network(self, net: str) -> Lpips:
@@ -64,7 +64,7 @@ class MetricContext:
 class Psnr:
     """Peak signal-to-noise ratio in dB, at most the protocol's cap.
 
-    Identical images have an infinite PSNR.
+    The cap also replaces the infinite PSNR of identical images.
     """
 
     def __init__(self, context: MetricContext) -> None:
@@ -124,10 +124,7 @@ class Flip:
 
 
 class StructuralMetric:
-    """A metric of structure without weights, which no protocol changes.
-
-    Its authors' definition holds.
-    """
+    """A structural metric by its authors' definition, which is the same in all protocols."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor], min_side: int) -> None:
         self._function, self._min_side = function, min_side  # px
@@ -152,8 +149,8 @@ def _corrected(key: str) -> Callable[[MetricContext], Metric]:
     return lambda context: Corrected(MEASURES[key](context))
 
 
-# Each metric of `gsbench.eval.facts.METRICS` for a context. Raises UnavailableError if weights or
-# packages are missing.
+# Makes each metric of `gsbench.eval.facts.METRICS` for a context, or raises UnavailableError if
+# weights or packages are missing.
 MEASURES: dict[str, Callable[[MetricContext], Metric]] = {
     "psnr": Psnr,
     "ssim": Ssim,
@@ -222,7 +219,9 @@ class Evaluator:
         self._metrics: dict[str, Metric] = {}
         for facts in METRICS:
             if facts.setting == MORE and facts.key not in wanted:
-                continue  # not listed as unavailable, since older results do not know later metrics
+                # not listed as unavailable: that list is in the keys of results, which a new metric
+                # must not change
+                continue
             try:
                 if facts.key not in wanted:
                     raise UnavailableError(f"not asked for ({facts.setting})")
@@ -316,10 +315,7 @@ class Evaluator:
 
 
 def quantize(image: Tensor) -> Tensor:
-    """Round a floating point image in [0, 1] to uint8, as for a PNG.
-
-    ``floor(clamp(255 x + 0.5, 0, 255))``.
-    """
+    """Round a float image in [0, 1] to uint8 as in a PNG: ``floor(clamp(255 x + 0.5, 0, 255))``."""
     return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
 
 

@@ -47,23 +47,23 @@ def _lpips(variant: str, label: str, words: str) -> MetricFacts:
 def _bounded(
     key: str, label: str, direction: Literal[-1, 1], lowest: float, setting: str, words: str
 ) -> MetricFacts:
-    """A metric of at most 1 whose differences count from 0.005 on."""
+    """A metric of at most 1 whose smallest worthwhile difference is 0.005."""
     return MetricFacts(key, label, direction, 3, "", 0.005, setting, lowest, 1.0, words)
 
 
 def _structural(
     key: str, label: str, direction: Literal[-1, 1], highest: float, words: str
 ) -> MetricFacts:
-    """A metric of structure without weights, computed if ``eval.more`` names it."""
+    """A structural metric without weights files, computed if ``eval.more`` names it."""
     return MetricFacts(key, label, direction, 4, "", 0.002, MORE, 0.0, highest, words)
 
 
-# ends the key of a metric that is measured after an affine correction of the colours
+# the end of the key of a metric that is measured after an affine correction of the colours
 CORRECTED = "_cc"
 
 
 def _corrected(facts: MetricFacts) -> MetricFacts:
-    """``facts`` of the same metric after the correction, computed if ``eval.more`` names it."""
+    """The facts about this metric after a correction of the colours."""
     words = f"{facts.label} after a correction of the colours"
     key, label = f"{facts.key}{CORRECTED}", f"{facts.label} cc"
     return replace(facts, key=key, label=label, setting=MORE, words=words)
@@ -96,7 +96,7 @@ _CORRECTED = tuple(
 _ADDED = "what the correction of the colours adds to PSNR"
 GAIN = MetricFacts("cc_gain", "gain by cc", 0, 2, "dB", setting=MORE, words=_ADDED)
 METRICS = (*_PLAIN, *_CORRECTED, GAIN)
-# A fact about the trained model instead of its pictures, measured separately in the evaluation.
+# Measured of the trained model, not of its pictures, and separately in the evaluation.
 _RENDERS = "renders of the test views at one size"
 FPS = MetricFacts("fps", "speed", 1, 2, "frames/s", None, "eval.fps", 0.0, words=_RENDERS)
 ALL = (*METRICS, FPS)  # in the order of tables

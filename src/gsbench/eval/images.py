@@ -34,10 +34,7 @@ def as_batch(image: Tensor) -> Tensor:
 
 
 def check_pair(image: Tensor, target: Tensor) -> None:
-    """Raise ValueError unless both are floating point with the same shape.
-
-    It is [H, W, 3] or [B, 3, H, W].
-    """
+    """Raise ValueError unless both are floating point, of one shape [H, W, 3] or [B, 3, H, W]."""
     if image.shape != target.shape:
         raise ValueError(
             f"the images have different shapes: {tuple(image.shape)} and {tuple(target.shape)}"
@@ -68,7 +65,7 @@ def mix_channels(images: Tensor, weights: tuple[float, float, float]) -> Tensor:
 
 
 def halved(images: Tensor, padding: str) -> Tensor:
-    """Means [B, C, H / 2, W / 2] of 2x2 px of [B, C, H, W].
+    """Halve images [B, C, H, W] by means over 2x2 px.
 
     Odd sides are padded in torch's mode ``padding``.
     """

@@ -232,10 +232,9 @@ class Lpips:
 def load_lpips(
     net: str, folder: Path | None = None, download: bool = True, device: torch.device | str = "cpu"
 ) -> Lpips:
-    """Load an LPIPS network.
+    """Load an LPIPS network from ``folder`` or the usual places, else download its weights.
 
-    Its weights are searched in ``folder`` and the usual places, else downloaded. Raises
-    ``MissingWeightsError`` if they are not found.
+    Raises ``MissingWeightsError`` if they are not found.
     """
     backbone = BACKBONES[net]
     features = find_first_weights(backbone.features, folder, download)
@@ -244,10 +243,7 @@ def load_lpips(
 
 
 def find_first_weights(specs: tuple[WeightsFile, ...], folder: Path | None, download: bool) -> Path:
-    """Find one of the alternatives ``specs`` on this machine.
-
-    Else download the first, if allowed.
-    """
+    """Find one of the alternatives ``specs`` on this machine, or download the first if allowed."""
     for spec in specs[1:]:
         try:
             return find_weights(spec, folder, download=False)
@@ -261,8 +257,8 @@ def _feature_distance(
 ) -> Tensor:
     """Spatial mean of the weighted squared difference of unit feature vectors.
 
-    Maps [1, C, h, w], head [C]. ``weights`` [h, w] weight the positions in the mean; None: all
-    equal.
+    ``first`` and ``second`` are [1, C, h, w], ``head`` is [C]. ``weights`` [h, w] weight the
+    positions in the mean; None weights them equally.
     """
     if weights is not None:
         first, second = (

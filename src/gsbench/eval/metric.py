@@ -48,7 +48,7 @@ class MaskedMetric(Metric, Protocol):
     def measure_masked(self, image: Tensor, truth: Tensor, mask: Tensor) -> float:
         """The value of one view over the pixels that count.
 
-        ``mask`` [H, W] bool, and the images of `measure`.
+        ``mask`` is [H, W] bool; the images are those of `measure`.
         """
         ...
 
@@ -56,8 +56,8 @@ class MaskedMetric(Metric, Protocol):
 class UnavailableError(Exception):
     """Raised for a metric that cannot be computed.
 
-    Its message, one line, is the reason in results and tables. ``awaited`` (gsbench's own metrics
-    only) says that the metric can be computed after an installation or a download.
+    Its message is one line, the reason that results and tables show. ``awaited`` (gsbench's own
+    metrics only) says that the metric can be computed after an installation or a download.
     """
 
     def __init__(self, reason: str, awaited: bool = False) -> None:

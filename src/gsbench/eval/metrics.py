@@ -36,9 +36,9 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
     """Mean FLIP error of sRGB images: 0 identical, 1 worst.
 
-    The viewer sees ``ppd`` pixels per degree. Andersson et al. 2020, "FLIP: a difference evaluator
-    for alternating images", computed by NVIDIA's library ``flip-evaluator``. Raises
-    ModuleNotFoundError if it is not installed.
+    The viewer sees ``ppd`` pixels per degree. NVIDIA's library ``flip-evaluator`` computes it after
+    Andersson et al. 2020, "FLIP: a difference evaluator for alternating images". Raises
+    ModuleNotFoundError if the library is not installed.
     """
     check_pair(image, target)
     pairs = zip(*(as_batch(x).permute(0, 2, 3, 1) for x in (image, target)), strict=True)
@@ -48,7 +48,7 @@ def flip(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
 
 
 def flip_map(image: Tensor, target: Tensor, ppd: float = FLIP_PPD) -> Tensor:
-    """The FLIP error of every pixel, [H, W], of images [H, W, 3]; otherwise as `flip`."""
+    """The FLIP error of every pixel, [H, W], of images [H, W, 3]; see `flip`."""
     check_pair(image, target)
     _, errors = _mean_and_errors(image, target, ppd)
     return torch.as_tensor(errors, device=image.device).reshape(image.shape[:2])
@@ -70,9 +70,9 @@ GMSD_MIN_SIZE = 2  # px: one block of 2x2
 
 
 def gmsd(image: Tensor, target: Tensor) -> Tensor:
-    """Gradient magnitude similarity deviation of the luminance.
+    """Gradient magnitude similarity deviation of the luminance; 0 for identical images.
 
-    0 is for identical images, less is better. Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude
+    Xue, Zhang, Mou and Bovik 2014, "Gradient magnitude
     similarity deviation: a highly efficient perceptual image quality index", section II. Images are
     averaged over 2x2 px (odd sides padded with zeros), Prewitt's filter gives the gradients, and
     the value is the standard deviation of their similarity over pixels.

@@ -1,7 +1,4 @@
-"""The settings of an evaluation.
-
-The protocol, the metrics, and the declared metric of the verdict.
-"""
+"""The settings of an evaluation: protocol, metrics, and the declared metric of the verdict."""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Rendered pictures are matched with photographs by name, without guesses, and measured."""
+"""Matching rendered pictures with photographs by name, without guesses, and measuring them."""
 
 import re
 from collections import defaultdict
@@ -64,7 +64,7 @@ def match_pictures(
 def match_by_order(photographs: Sequence[str], pictures: Sequence[str]) -> Matching:
     """Match the k-th picture with the k-th photograph, both sorted with numbers by value.
 
-    Raises `InputError` if their numbers differ.
+    Raises `InputError` if there are not equally many.
     """
     if len(photographs) != len(pictures):
         raise InputError(
@@ -117,7 +117,7 @@ def _folded(words: Mapping[str, str]) -> dict[str, str]:
 def _stripped(words: Mapping[str, str]) -> dict[str, str]:
     """The words without the start and the end that all of them share.
 
-    These never contain digits next to the rest.
+    Digits next to the rest are kept, so that numbers stay whole.
     """
     if len(words) < 2:
         return dict(words)

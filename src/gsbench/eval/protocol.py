@@ -58,8 +58,5 @@ def get_protocol(name: str) -> Protocol:
 
 
 def protocol_of(identifier: str) -> Protocol | None:
-    """The protocol of an identifier such as ``paper-1``, ignoring the version.
-
-    It is None for an unknown name.
-    """
+    """The protocol of an identifier such as ``paper-1``, of any version; None if unknown."""
     return PROTOCOLS.get(identifier.rpartition("-")[0])

@@ -63,7 +63,7 @@ def ssim(
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """SSIM at every pixel and channel, [3, H, W], of two images [H, W, 3] in [0, 1].
 
-    They are padded with zeros.
+    The images are padded with zeros.
     """
     luminance, structure = ssim_parts(as_batch(image), as_batch(target), "zero")
     return (luminance * structure)[0]
@@ -72,10 +72,10 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 def ssim_parts(
     x: Tensor, y: Tensor, padding: SsimPadding, data_range: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Two factors of SSIM for images [B, C, H, W], [B, C, H', W'] each.
+    """The two factors of SSIM, [B, C, H', W'] each, of images [B, C, H, W].
 
-    Values are from 0 to ``data_range``. The first is luminance (eq. 6), the second contrast times
-    structure (eq. 9 times eq. 10, with C3 = C2 / 2).
+    Image values are from 0 to ``data_range``. The first factor is luminance (eq. 6), the second is
+    contrast times structure (eq. 9 times eq. 10, with C3 = C2 / 2).
     """
     moments = _blur(torch.cat([x, y, x * x, y * y, x * y]), padding)  # [5B, C, H', W']
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5)  # [B, C, H', W'] each

@@ -30,7 +30,8 @@ SCALES = len(SCALE_WEIGHTS)
 MULTISCALE_MIN_SIZE = (WINDOW_SIZE - 1) * 2 ** (SCALES - 1) + 1
 # Constants of IW-SSIM.
 BYTE_RANGE = 255.0  # its model of vision is for values from 0 to 255
-# variance of the visual noise: sigma_n², as in Sheikh and Bovik 2006, "Image information and..."
+# variance of the visual noise: sigma_n², as in Sheikh and Bovik 2006, "Image information and
+# visual quality"
 EYE_NOISE = 0.4
 BLOCK = 3  # px, side of the neighbourhood whose coefficients are modelled as one vector
 # the filter of the pyramid, which is multiplied by sqrt(2)
@@ -39,9 +40,9 @@ FLAT = 1e-15  # smaller variances count as 0
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Multi-scale structural similarity, the mean over the three channels.
+    """Multi-scale structural similarity, mean over channels: 1 for identical images, at least 0.
 
-    1 is for identical images; at least 0. Wang, Simoncelli and Bovik 2003, "Multiscale structural
+    Wang, Simoncelli and Bovik 2003, "Multiscale structural
     similarity for image quality assessment", eq. 7: contrast and structure at five scales, and
     luminance at the coarsest scale alone. Between scales, images are averaged over 2x2 px; the last
     line of an odd side is repeated. A negative mean of a scale counts as 0. Raises ValueError for a
@@ -101,7 +102,7 @@ def _iw_ssim(image: Tensor, target: Tensor) -> Tensor:
 def _laplacian_pyramid(image: Tensor) -> list[Tensor]:
     """Four bands of [1, 1, H, W] from the finest, then the low-pass rest.
 
-    Each is half as large as the one before.
+    Each has half the sides of the one before.
     """
     kernel = image.new_tensor(BINOMIAL) * math.sqrt(2)  # [5]
     bands = []
@@ -159,9 +160,10 @@ def _information(band: Tensor, target_band: Tensor, parent: Tensor | None) -> Te
 
 
 def _enlarged(band: Tensor) -> Tensor:
-    """[1, 1, h, w] enlarged twice.
+    """Enlarge [1, 1, h, w] to [1, 1, 2h, 2w].
 
-    Bilinear to 4h - 3 by 4w - 3, one line added on each side, every other line kept.
+    It is interpolated bilinearly to 4h - 3 by 4w - 3 and extrapolated by one line on each side;
+    then every other line is kept.
     """
     height, width = band.shape[-2:]
     fine = F.interpolate(
@@ -183,7 +185,7 @@ SCHARR = (3 / 16, 10 / 16, 3 / 16)
 T_PHASE, T_GRADIENT, T_CHROMA = 0.85, 160.0, 200.0  # T1; T2; T3 = T4, for values from 0 to 255
 CHROMA_POWER = 0.03  # lambda
 SIDE = 256  # px: larger images are shrunk by the whole number nearest to shorter side / SIDE
-# px; our choice: phases mean nothing in an image of less than three of the shortest waves
+# px; our choice: phases mean little in an image that holds few of the shortest waves
 FSIM_MIN_SIZE = 16
 # Phase congruency, Kovesi 1999, "Image features from phase congruency", with the settings of
 # section II of FSIM.
@@ -193,7 +195,7 @@ BANDWIDTH = 0.55  # sigma of a log-Gabor filter over its frequency
 ANGLE_SIGMA = math.pi / ORIENTATIONS / 1.2  # rad
 # cycles per px; a Butterworth filter that removes the corners of the spectrum
 LOW_PASS, LOW_PASS_ORDER = 0.45, 15
-# a response below the noise's mean plus so many standard deviations counts as zero
+# a response below the noise's mean plus this many standard deviations counts as zero
 NOISE_SIGMAS = 2.0
 NOISE_EXCESS = 1.7  # factor by which the noise is overestimated for this measure
 TINY = 1e-4  # avoids 0 / 0; for values from 0 to 255
@@ -221,7 +223,7 @@ def fsim(image: Tensor, target: Tensor) -> Tensor:
     features = torch.maximum(phase_x, phase_y)
     agreement = similarity(phase_x, phase_y, T_PHASE) * contrast
     # Opposite colours have a negative similarity, whose power is not real. As in piq and pyiqa, its
-    # size is used.
+    # absolute value is used.
     local = agreement * chroma.abs() ** CHROMA_POWER
     values = (local * features).flatten(1).sum(dim=1) / features.flatten(1).sum(dim=1)  # [B]
     return values[0] if image.ndim == 3 else values
@@ -258,9 +260,9 @@ def _noise(finest: Tensor, filters: Tensor) -> Tensor:
 
 
 def _log_gabor_filters(images: Tensor) -> Tensor:
-    """Spectra [O, S, H, W] for [B, 1, H, W].
+    """The spectra [O, S, H, W] of log-Gabor filters for images [B, 1, H, W].
 
-    A log-Gaussian over the frequency times a Gaussian over the angle.
+    Each is a log-Gaussian over the frequency times a Gaussian over the angle.
     """
     along = [_frequencies(size, images) for size in images.shape[-2:]]
     down, across = torch.meshgrid(along, indexing="ij")  # [H, W] each

@@ -32,9 +32,8 @@ def write_training_views(
 ) -> None:
     """Write ``views`` as a COLMAP folder: PNG files, PINHOLE cameras, and ``cloud`` as points.
 
-    ``normalization`` is undone: programs get the coordinates in which the scene was given.
-
-    The points have no observations, which would reveal what test views saw.
+    ``normalization`` is undone, so programs get the coordinates in which the scene was given. The
+    points have no observations, because these would reveal what test views saw.
     """
     check_picture_names([view.name for view in views], folder / IMAGES)
     (folder / IMAGES).mkdir(parents=True)
@@ -133,7 +132,7 @@ def collect_renders(
 
 
 def _files(output: Path, pattern: str) -> list[Path]:
-    """The files that fit ``pattern``, sorted; raises `TrainingError` naming others if none."""
+    """The sorted files that fit ``pattern``; if none does, a `TrainingError` names the others."""
     files = sorted(path for path in output.glob(pattern) if path.is_file())
     if not files:
         existing = sorted(path for path in output.rglob("*") if path.is_file())

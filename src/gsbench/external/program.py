@@ -14,7 +14,7 @@ from gsbench.system.isolate import CrashError, describe_exit, error_tail, run_is
 from gsbench.system.resources import MIB, peak_child_mb
 from gsbench.words import readable_time
 
-# between two measurements of the memory of the program and its children
+# longest pause between two measurements of the memory of the program and its children
 SECONDS_BETWEEN_LOOKS = 0.5
 # seconds; pauses double up to SECONDS_BETWEEN_LOOKS, so that short programs are measured too
 FIRST_LOOK = 0.02
@@ -67,8 +67,8 @@ def watch(
     """
     started = time.monotonic()
     program = subprocess.Popen(command, cwd=folder, env=dict(environment), stdin=subprocess.DEVNULL)
-    # The operating system tells a peak of single processes only, and programs have children: the
-    # sum is looked at again and again.
+    # The operating system reports peaks of single processes only. So the sum over the program and
+    # its children is measured repeatedly.
     pause, peak = FIRST_LOOK, 0.0
     while limit is None or time.monotonic() - started < limit:
         peak = max(peak, resident_memory_mb(program.pid))

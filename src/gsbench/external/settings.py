@@ -1,7 +1,7 @@
 """The settings of another program that trains in place of gsbench.
 
 It is chosen in the group ``densify``, because an arm of a table is an initialiser and a densifier.
-A placeholder ``{name}`` in its command is replaced when it runs. Loads no torch.
+A placeholder ``{name}`` in the command is replaced when the program runs. Loads no torch.
 """
 
 import os
@@ -41,7 +41,7 @@ Command = str | Sequence[str]  # one text is split as a shell would, but no shel
 
 
 def split_command(command: Command, key: str) -> list[str]:
-    """A command's words. Raises InputError, naming the setting ``key``, if empty or not closed."""
+    """Split a command into words; raises InputError naming ``key`` if it is empty or malformed."""
     try:
         words = shlex.split(command) if isinstance(command, str) else list(map(str, command))
     except ValueError as error:
@@ -153,7 +153,7 @@ class External:
                     f"densify.options.{name}: an option is one value with a name of its own, none "
                     f"of {', '.join(PLACEHOLDERS)}"
                 )
-        # An option's value may make a pattern lead out of the folder: it is checked as filled in.
+        # An option's value may make the pattern lead out of the folder, so values are filled in.
         examples = dict.fromkeys(PLACEHOLDERS, "1") | dict.fromkeys(FOLDERS, "/")
         pattern = fill_placeholders(self.result, examples | self.options, "densify.result")
         check_pattern(pattern)

@@ -24,7 +24,7 @@ WORK_FOLDER = "work"  # below the output folder, during a run
 REPORT_FILE = "report.json"
 GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians instead of points
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
-# of the images with a pose: fewer let the search for a mapping go on, and warn in the report
+# share of images with a pose; with fewer, the search for a mapping goes on, and the report warns
 REGISTERED_SHARE = 0.9
 Poses = Literal["shared", "own"]
 PointsFrom = Literal["all", "train"]

@@ -1,6 +1,6 @@
-"""The way of every initialiser that ends in COLMAP, station by station.
+"""The steps of every initialiser that reconstructs with COLMAP.
 
-Options (`options`), pairs, features, matches, geometry, mapping and alignment (`colmap`), report.
+Preparation, database, features and matches, mapping or triangulation, alignment, report.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class ReconstructionJob:
 
 
 def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
-    """Pass all stations from the photographs to model and report.
+    """Make a model from the photographs, write it, and return the report on it.
 
     Calls native code that can abort the process: run it isolated.
     """
@@ -135,7 +135,7 @@ def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
 
     from gsbench.init.colmap import database, mapping, reconstruct
 
-    # COLMAP writes a line for each image; the log is for what goes wrong
+    # without this, COLMAP logs a line for each image; the log is for warnings
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING)
     initializer, capture = job.initializer, job.capture
     timer = Timer(dict(job.preparation.seconds))
@@ -148,7 +148,7 @@ def build_model(job: ReconstructionJob, progress: Progress) -> InitReport:
             f"{initializer.name}: no pair of images shares enough matches: the photos need more "
             "overlap or texture"
         )
-    # not to be continued where an interrupted run left it
+    # an interrupted mapping is not continued but started again
     scratch = job.work_dir / "mapping"
     shutil.rmtree(scratch, ignore_errors=True)
     mapped = points = None

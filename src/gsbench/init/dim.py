@@ -202,7 +202,7 @@ class Dim(FeatureInitializer):
 
 @dataclass(frozen=True, kw_only=True)
 class SiftKornia(FeatureInitializer):
-    """kornia's SIFT, without weights, in the same steps as `Dim`: a substitute, not the same."""
+    """kornia's SIFT in the same steps as `Dim`: a substitute that needs no weights."""
 
     name: ClassVar[str] = "sift_kornia"
 

@@ -1,6 +1,7 @@
-"""Settings of the initialisers that end in COLMAP. Each station of their way reads its own here.
+"""Settings of the initialisers that reconstruct with COLMAP.
 
-They stand apart from the initialisers, so that a station knows what is set but not who runs it.
+They are apart from the initialisers, so that features, matching and mapping depend on settings and
+not on the initialisers that call them.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ from gsbench.scene.types import Array
 
 SIDE, MARGIN = 960, 60  # px
 MAX_POINTS = 200_000  # drawn; more would only cover each other
-VISIBLE_SHARE = 0.98  # of the points: distant outliers must not shrink the rest to a dot
+# share of the points in view; distant outliers must not shrink the rest to a dot
+VISIBLE_SHARE = 0.98
 # third over second singular value of the camera centres: below it they lie in a plane
 PLANE_RATIO = 0.5
 LINE_RATIO = 0.05  # second over first: below it they lie on a line
@@ -89,7 +90,7 @@ def view_from_above(centers: Array, rotations: Array, points: Array) -> Array:
 
 
 def _limits(flat: Array, centers: Array) -> tuple[Array, Array]:
-    """Lower left and upper right corner: all cameras, and most of the points."""
+    """The lower left and upper right corners of an area with all cameras and most points."""
     tail = (1 - VISIBLE_SHARE) / 2
     corners = centers
     if len(flat):

@@ -1,6 +1,7 @@
 """Initialisers that keep the reference's cameras and take points from elsewhere.
 
-A file holds points of any origin (laser scans, multi-view stereo), or a trained model.
+The points are those of the reference, random, or from a file. A file holds points of any origin
+(laser scans, multi-view stereo), or a trained model.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
 
 class GivenCameras(Initializer):
-    """Base of initialisers that keep the reference's cameras and make points, as dataclasses."""
+    """Base of initialisers that keep the reference's cameras. Subclasses are dataclasses."""
 
     def __post_init__(self) -> None:
         check_settings(self, "init")
@@ -58,7 +59,7 @@ class GivenCameras(Initializer):
         reference: Path | None = None,
         work_dir: Path | None = None,
     ) -> InitReport:
-        """Write model and report, without ``work_dir``. Raises ``InputError`` without cameras."""
+        """Write model and report without a ``work_dir``. Raises ``InputError`` without cameras."""
         if reference is None and capture.model is None:
             raise InputError(
                 f"init={self.name} needs cameras and scene {capture.name} came without: make them "
@@ -138,7 +139,7 @@ class Dataset(GivenCameras):
 
 
 class PlacedCloud(GivenCameras):
-    """Base of initialisers that put a new cloud under the reference's cameras, as dataclasses."""
+    """Base of initialisers that replace the reference's points. Subclasses are dataclasses."""
 
     def needs_reference(self, capture: Capture) -> bool:
         """Return whether `run` needs a ``reference`` because the capture came without cameras."""
@@ -204,7 +205,7 @@ class Carved(Random):
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         cloud = super().cloud(capture, model)
-        num_cameras = np.zeros(self.count, dtype=np.int64)  # [P] that have a point in view
+        num_cameras = np.zeros(self.count, dtype=np.int64)  # [P] that have each point in view
         for name in capture.train_names:
             num_cameras[points_in_view(cloud.points, name, model)[0]] += 1
         kept = num_cameras >= self.seen_by
@@ -249,12 +250,12 @@ TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
 
 
 def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Points [P, 3] float64 and colours [P, 3], or None without; the suffix tells the format.
+    """Read points [P, 3] float64 and colours [P, 3], or None for a file without colours.
 
-    A ``.ply`` file, text or binary, has vertices with x, y, z in any order and type, and colours as
-    whole numbers or in [0, 1]. A text file has the columns x, y, z, optionally followed by red,
-    green, blue. Raises ``InputError`` for a file that cannot be read, holds no point, or has a
-    coordinate or colour that is not a finite number.
+    The suffix tells the format. A ``.ply`` file, text or binary, has vertices with x, y, z in any
+    order and type, and colours as whole numbers or in [0, 1]. A text file has the columns x, y, z,
+    optionally followed by red, green, blue. Raises ``InputError`` for a file that cannot be read,
+    holds no point, or has a coordinate or colour that is not a finite number.
     """
     suffix = path.suffix.lower()
     require_regular(path)
@@ -302,7 +303,7 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
             return points, columns(names)
     if present.issuperset(DC_NAMES):  # a model of Gaussians
         dc = columns(DC_NAMES).astype(np.float64)
-        return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays, and is refused
+        return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
     return points, None
 
 
@@ -324,7 +325,7 @@ def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
     return values.round().clip(0, 255).astype(np.uint8)
 
 
-GREY = 128  # for points without a colour in the file that no training photograph shows
+GREY = 128  # for points without a colour in the file and out of view of all training cameras
 
 
 @dataclass(frozen=True, kw_only=True)

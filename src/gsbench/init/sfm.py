@@ -105,7 +105,7 @@ class Jittered(Sfm):
 
 
 def shifted_copies(points: Array, copies: int, shift: float, seed: int) -> Array:
-    """Shifted copies [copies P, 3] of ``points`` [P, 3]; each repetition has all in their order."""
+    """Shifted copies [copies P, 3] of ``points`` [P, 3]: all points in order, ``copies`` times."""
     from scipy.spatial import cKDTree  # takes a while to load
 
     distances, _ = cKDTree(points).query(

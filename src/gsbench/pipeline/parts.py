@@ -1,7 +1,4 @@
-"""The parts of a trial: the objects that its configuration describes.
-
-Errors name the configuration's key.
-"""
+"""The parts of a trial: the objects that its configuration describes. Errors name its keys."""
 
 import dataclasses
 import inspect
@@ -77,14 +74,12 @@ REQUIRED_METHODS = {  # of a user's class, by the group that names it
 class Parts:
     """The objects that the resolved configuration ``values`` describes.
 
-    Each is made at its first use and kept.
-
-    The first use raises InputError for a wrong key. It also runs the user's code if the class is
-    the user's own.
+    Each is made at its first use and kept. The first use raises InputError for a wrong key. It also
+    runs the user's code if the class is the user's own.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
-        # again: `values` may come from a config.yaml that nobody has composed
+        # checked again, because `values` may come from a config.yaml that gsbench did not compose
         check_permissions(values)
         self.values = values
         self.seed: int = values["seed"]
@@ -105,7 +100,7 @@ class Parts:
     @cached_property
     def initializer(self) -> Initializer:
         values = self.values["init"]
-        # else COLMAP takes all cores
+        # else COLMAP would take all cores
         if values.get("threads") == "auto" and values["_target_"].startswith(OWN):
             values = values | {"threads": self.threads}
         initializer: Initializer = build("init", values, self._allowed)
@@ -113,18 +108,18 @@ class Parts:
 
     @cached_property
     def trainer(self) -> Densifier | External:
-        """The trainer of the group densify: a densifier of gsbench's own, or another program."""
+        """The trainer of the group densify: a densifier, or another program."""
         trainer: Densifier | External = build("densify", self.values["densify"], self._allowed)
         return trainer
 
     @property
     def program(self) -> External | None:
-        """The program that trains instead of gsbench; None where gsbench trains."""
+        """The program that trains instead of gsbench; None if gsbench trains."""
         return self.trainer if isinstance(self.trainer, External) else None
 
     @cached_property
     def own_rasterizer(self) -> Rasterizer | None:
-        """The user's own rasterizer; None where the configuration names one of gsbench's."""
+        """The user's own rasterizer; None if the configuration names one of gsbench's."""
         return build_own_rasterizer(self.values["raster"], self._allowed)
 
     @cached_property
@@ -174,9 +169,7 @@ class Parts:
         return sorted({step for step in self.eval.at if step < self.train.iterations})
 
     def check(self, on_this_machine: bool) -> None:
-        """Raise InputError, which names the key, for what is known to fail.
-
-        Call it before any work.
+        """Raise InputError, naming the key, for settings that are known to fail.
 
         With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
         checked too.
@@ -278,8 +271,8 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
 def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> None:
     """Raise InputError for an option that the constructor of ``cls`` does not take.
 
-    An option that a user's class lacks mostly belongs to the choice (``densify=adc``) whose class
-    the user replaced.
+    If a user's class lacks an option, it usually belongs to the choice (``densify=adc``) whose
+    class the user replaced.
     """
     parameters = inspect.signature(cls).parameters
     unknown = next((name for name in options if name not in parameters), None)
@@ -300,9 +293,8 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
 def locate(target: str, group: str, allow_targets: list[str]) -> type:
     """The class at the import path ``package.module.Class``.
 
-    Raises InputError if ``group`` cannot use it.
-
-    Warns of code whose version the results cannot record.
+    Raises InputError if ``group`` cannot use it. Warns of code whose version the results cannot
+    record.
     """
     loaded_before = set(sys.modules)
     cls = load_class(target, group, allow_targets)
@@ -335,7 +327,7 @@ def make_evaluator(
 ) -> Evaluator:
     """The evaluator that the settings ``eval`` describe, with the user's own metrics ``extra``.
 
-    Looks for the weights of networks.
+    Making it looks for the weights of networks.
     """
     weights = None if options.weights is None else Path(options.weights).expanduser()
     protocol = get_protocol(options.protocol)

@@ -85,7 +85,7 @@ PUBLISHED_TRAINING = (
 class TrialSteps:
     """The steps of a trial. The result of each is kept in ``store`` under the step's key."""
 
-    # `steps` sets these three as it goes.
+    # `steps` sets these three attributes while it runs.
     photographs: Capture  # the photographs as the user gave them
     # the photographs as the steps see them: masked and transparent pixels are replaced
     capture: Capture
@@ -203,7 +203,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
     with _recorded_failures(values, folder):
         parts = Parts(values)
         parts.check(on_this_machine=True)
-        # raises now, not after hours of work, if it cannot run on this machine
+        # made here, so that one that cannot run on this machine raises before hours of work
         _ = parts.rasterizer
         torch.set_num_threads(parts.threads)
 
@@ -285,9 +285,9 @@ def _publish(
 
 # ---- the content of results.json
 
-# on whose versions a result depends
+# packages on whose versions a result depends
 PACKAGES = ("torch", "numpy", "numba", "pycolmap", "kornia", "gsplat")
-# fields that results.json takes from the training and from the evaluation as they are
+# fields that results.json copies from the training and from the evaluation without changes
 OF_TRAINING = (
     "iterations",
     "num_init_points",
@@ -312,7 +312,7 @@ def results_of(
 ) -> TrialRecord:
     """The results of the trial with the configuration ``values``.
 
-    ``capture`` are the photographs, ``raster`` is what rendered, ``entries`` are the steps' store
+    ``capture`` are the photographs, ``raster`` is the rasterizer, ``entries`` are the steps' store
     entries by stage. ``code`` maps the parts of gsbench's source that the steps used to their
     states.
     """
@@ -379,7 +379,7 @@ def results_of(
 
 
 def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
-    """The costs that nobody measured, each with the reason: for what other programs trained."""
+    """The costs that were not measured, each with the reason, if gsbench did not train."""
     unknown = {}
     if training.evaluated_from == FROM_RENDERS:
         unknown["gaussians"] = RENDERS_ALONE
@@ -392,7 +392,7 @@ def _unknown_costs(training: Training, is_ready_made: bool) -> dict[str, str]:
 
 
 def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
-    """The declaration of this trial's sweep about its metric, as it was when the trial ended."""
+    """The newest declaration of a sweep about this trial's primary metric; None without one."""
     primary = values["eval"].get("primary")
     declared = [
         one
@@ -405,7 +405,7 @@ def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
 def cloud_hash(init: Path) -> str:
     """The hash of what an initialiser made: cameras, poses and points, or Gaussians.
 
-    The step's key cannot stand for it: that is a hash of the inputs only.
+    The step's key cannot replace it, because that is a hash of the inputs only.
     """
     files = read_manifest(init).outputs
     model = (f"{MODEL_FOLDER.as_posix()}/", GAUSSIANS_FILE)
@@ -414,7 +414,7 @@ def cloud_hash(init: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
+    """The versions of Python, gsbench and the packages on which a result depends."""
     found = {"python": sys.version.split()[0], "gsbench": __version__}
     for package in PACKAGES:
         if version := version_of(package):

@@ -50,7 +50,7 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
     files = model_files(folder)
     if files[0].suffix == ".bin":
         return pycolmap.Reconstruction(folder)
-    # pycolmap takes the mark for a record
+    # pycolmap would read a byte order mark as a record
     if any(file.read_bytes().startswith(codecs.BOM_UTF8) for file in files):
         with tempfile.TemporaryDirectory() as copy:
             for file in files:
@@ -87,9 +87,9 @@ def camera_centers(model: pycolmap.Reconstruction) -> Array:
 
 
 def normalize_capture(capture: Capture, folder: Path) -> Capture:
-    """The capture in its advised normalisation, with the model that this writes to ``folder``.
+    """Move a capture to its advised normalisation, and write the moved model to ``folder``.
 
-    Returns the same capture if none is advised.
+    Returns the same capture if no normalisation is advised.
     """
     normalization = capture.advised_normalization
     if normalization.is_identity or capture.model is None:
@@ -140,7 +140,7 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
     model = read_model(capture.model)
     names = match_names(registered_names(model), capture.image_names)
     fitted = pycolmap.Reconstruction()
-    # The files of one camera may have several sizes, as where some were shrunk: then each
+    # The files of one camera may have several sizes, for example if some were shrunk. Then each
     # size gets a camera, and the first one keeps the id.
     next_camera_id = max(model.cameras, default=0) + 1
     camera_ids: dict[tuple[int, tuple[int, int]], int] = {}
@@ -226,7 +226,7 @@ def pinhole_camera(camera: pycolmap.Camera, cam_from_world: pycolmap.Rigid3d) ->
 def reference_cameras(model: pycolmap.Reconstruction, names: Iterable[str]) -> list[Camera]:
     """Cameras with the poses of the images ``names``, without distortion or principal points.
 
-    They tell where cameras stand and look. They are not for rendering.
+    They tell where cameras are and in which direction they look. They are not for rendering.
     """
     cameras = []
     for name in names:

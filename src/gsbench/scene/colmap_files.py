@@ -95,7 +95,7 @@ def check_model(folder: Path) -> None:
 def _walk_binary(
     file: Path, record: Callable[[bytes, int, ModelChecks], int], checks: ModelChecks
 ) -> None:
-    """Check a count and records; ``record`` checks one at an offset and returns the next offset."""
+    """Check a binary file; ``record`` checks a record at an offset and returns the next offset."""
     data = file.read_bytes()
     (count,) = _COUNT.unpack_from(data)
     offset = _COUNT.size
@@ -164,7 +164,7 @@ DECIMAL_COMMA = re.compile(r"(?:^|(?<=\s))-?\d+,\d+(?=\s|$)", re.MULTILINE)
 def _walk_text(
     file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks
 ) -> None:
-    """Check a file by lines, without comments; ``record`` gets a line and the lines after it."""
+    """Check a text file without comments; ``record`` gets a line and an iterator of later lines."""
     text = without_byte_order_mark(file.read_bytes()).decode()
     lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
     try:
@@ -253,7 +253,8 @@ _RECORDS = {
 }
 
 
-# of a quaternion, and 1 / MAX_LENGTH is the minimum: COLMAP normalises quaternions of any length
+# Largest length of a quaternion; the smallest is 1 / MAX_LENGTH. COLMAP normalises quaternions of
+# any length.
 MAX_LENGTH = 1e6
 MAX_SIDE = 1_000_000  # px
 # ids of cameras and images are 32-bit; the largest number means "no id" in COLMAP

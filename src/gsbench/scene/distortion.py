@@ -9,12 +9,12 @@ import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherw
 import numpy as np
 import pycolmap
 
-# Largest distance in px, anywhere in the image, between a camera's projection and a pinhole's that
-# is ignored. It is a tenth of the reprojection error that a good COLMAP model has (.3 to .5 px), so
-# poses are not known as precisely. Resampling costs more: it shifts the grid by up to half a pixel
-# and averages neighbours.
+# A camera whose projection differs nowhere in the image by more than this (px) from a pinhole's
+# counts as a pinhole. The limit is a tenth of the reprojection error of a good COLMAP model (.3 to
+# .5 px), so poses are less precise than that. Resampling costs more: it shifts the grid by up to
+# half a pixel and averages neighbours.
 MAX_IGNORED_DISTORTION = 0.05
-GRID = 33  # points a side at which the distance is measured, borders included
+GRID = 33  # points per side at which the distance is measured, borders included
 
 
 def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
@@ -46,8 +46,8 @@ def without_distortion(camera: pycolmap.Camera) -> pycolmap.Camera:
 def largest_distortion(camera: pycolmap.Camera) -> float:
     """The largest distance in px between a camera's projections and those of its pinhole.
 
-    It is measured for the rays on which the pinhole has the pixels of a grid over the image, and
-    NaN if the camera does not see one of them.
+    It is measured along the pinhole's rays through a grid of pixels that covers the image. The
+    result is NaN if the camera does not see one of these rays.
     """
     columns, rows = np.meshgrid(
         np.linspace(0, camera.width, GRID), np.linspace(0, camera.height, GRID)

@@ -1,6 +1,6 @@
 """Dividing photographs into training and test views, and the rest again for validation.
 
-Sectors need an order of cameras in which neighbours stand beside each other. Cameras that surround
+Sectors need an order of cameras in which neighbours are next to each other. Cameras that surround
 the scene are ordered by azimuth around its centre and up direction. Other cameras are ordered along
 the principal axis of their centres, so that planes across the axis separate the sectors.
 """
@@ -15,13 +15,13 @@ from gsbench.scene.options import MIN_IMAGES, TEST_EVERY, SplitRule
 from gsbench.scene.types import Array, Camera
 from gsbench.words import counted, some_of
 
-# degrees: cameras with a wider gap between azimuths stand on one side of the scene
+# degrees: cameras with a wider gap between azimuths are on one side of the scene
 SURROUNDED = 180.0
 OPEN_RING = 30.0  # degrees: the order begins after a gap wider than this, else at the first camera
 FACING = 0.9  # share of the cameras that must look towards the centre
 # smallest eigenvalue of the axes' normal matrix (at most 2/3) below which axes count as parallel
 PARALLEL = 1e-3
-# azimuths are rounded to so many decimals of a degree, so that all processors agree on ties
+# decimals of a degree to which azimuths are rounded, so that all processors agree on ties
 AZIMUTH_DECIMALS = 6
 
 
@@ -67,8 +67,8 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
 def sector_range(count: int, sector: int, sectors: int, exactly: int | None = None) -> range:
     """The positions of one of ``sectors`` contiguous parts of ``count`` ordered views.
 
-    The sizes of sectors differ by at most one. With ``exactly``, only so many positions from the
-    sector's start.
+    The sizes of sectors differ by at most one. With ``exactly``, the part has this many positions
+    from the sector's start.
 
     Examples:
         >>> [list(sector_range(7, sector, 3)) for sector in range(3)]
@@ -222,7 +222,7 @@ def hold_out(
     split = _divide(names, rule, lists, cameras)
     if not rule.validation:
         return split
-    if rule.by_lists:  # they are used up
+    if rule.by_lists:  # the lists held out the test views above and cannot divide the rest
         rule = replace(rule, split="every_nth", train_list=None, test_list=None)
     validation = _divide(split.train, rule, (None, None), cameras)
     away = f"the {counted(len(split.test), 'test view')} ({split.description}) put away unseen"

@@ -44,14 +44,14 @@ _FILTERS = {
     "bicubic": Image.Resampling.BICUBIC,
 }
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
-_WIDE_MODES = ("I", "F")  # 32-bit integer and float, which have no agreed value for white
+_WIDE_MODES = ("I", "F")  # 32-bit integers and floats, which have no agreed value for white
 
 Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
 
 SUFFIX = ".png"
 WHITE = np.uint8(255)
 IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
-# of pixels between black and the brightest value; a photograph given as a mask has far more
+# largest share of pixels between black and the brightest value; a photograph has far more
 MAX_GREY_SHARE = 0.05
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 
@@ -106,8 +106,8 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
     unmatched, free = dict.fromkeys(wanted), set(files)
     matches = {name: name for name in unmatched if name in free}
     for key_of in (stem_of, lambda path: path.casefold(), lambda path: stem_of(path).casefold()):
-        # Better matches come first and take their files, so that a name is never matched to another
-        # one's file.
+        # Better matches come first and take their files, so that no name is matched to the file of
+        # another name.
         free -= set(matches.values())
         by_key: dict[str, list[str]] = defaultdict(list)
         for file in free:
@@ -139,7 +139,7 @@ def stem_of(name: str) -> str:
 
 
 def check_picture_names(names: Iterable[str], folder: Path) -> None:
-    """Raise `InputError` for a view whose picture has a too long name or that of another view's."""
+    """Raise `InputError` if the picture of a view has too long a name, or that of another view."""
     view_of: dict[str, str] = {}
     for name in names:
         picture = png_name(name)

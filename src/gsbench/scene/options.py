@@ -121,7 +121,7 @@ EVERY_NTH = SplitRule()
 
 
 Backdrop = Literal["black", "white"]  # the colour under transparent pixels
-MAX_SIZE = 16_384  # px, a side of a view of the courtyard
+MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
 
 def folder_name(path: str | None) -> str:

@@ -37,7 +37,7 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-# names for messages; see `_find_sparse` for the others
+# the usual places, for messages; `_find_sparse` searches numbered folders too
 SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 
 
@@ -93,8 +93,8 @@ def read_colmap(
         lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]),
         mask_folder,
     )
-    # A scene with exact poses is the courtyard, whose units are those of the paper's threshold as
-    # they are.
+    # Only the courtyard has exact poses, and its units fit the paper's threshold without
+    # normalisation.
     if exact_poses:
         return capture
     return replace(capture, advised_normalization=find_normalization(camera_centers(model)))
@@ -206,7 +206,7 @@ def missing_folder(name: str, root: Path) -> str:
 
 
 def missing_model(name: str, root: Path, sparse: str | None) -> str:
-    """The reason why ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
+    """The message that ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
     try:
         _find_sparse(root, sparse)
     except InputError as error:
@@ -282,7 +282,7 @@ def _make_capture(
 
 
 def _resolve(wanted: Sequence[str] | None, names: Sequence[str], folder: Path) -> list[str] | None:
-    """The image files that a split list names; extensions may lack or differ."""
+    """The image files that a split list names; extensions may be missing or differ."""
     if wanted is None:
         return None
     matches = match_names(wanted, names)
@@ -295,7 +295,7 @@ def _resolve(wanted: Sequence[str] | None, names: Sequence[str], folder: Path) -
 
 
 def _read_lists(root: Path, split: SplitRule) -> tuple[list[str] | None, list[str] | None]:
-    """The training and the test list; ``split=list`` alone reads those of nerfbaselines."""
+    """The training and the test list; ``split=list`` without files reads those of nerfbaselines."""
     train, test = split.train_list, split.test_list
     if split.split == "list" and train is None and test is None:
         train = TRAIN_LIST if (root / TRAIN_LIST).is_file() else None

@@ -50,7 +50,7 @@ SPLIT_FILES = {
     "val": "transforms_val.json",
 }
 OPENGL = np.diag([1.0, -1.0, -1.0])  # from OpenCV's camera axes to OpenGL's, and back
-# with the world-to-camera rotation [3, 3] and translation [3]
+# camera model, world-to-camera rotation [3, 3] and translation [3]
 PosedCamera = tuple[CameraModel, Array, Array]
 ROTATION_TOLERANCE = 1e-3  # largest error of an entry, for matrices written with few digits
 PERSPECTIVE, FISHEYE = (
@@ -62,7 +62,7 @@ RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one 
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics(Record):
-    """Intrinsics, of all cameras of a file or of one frame."""
+    """Intrinsics of one frame, or of all cameras of a file."""
 
     camera_model: str | None = None
     is_fisheye: bool | None = None  # instant-ngp's key for OPENCV_FISHEYE
@@ -97,7 +97,7 @@ class FrameRecord(Intrinsics):
 
 @dataclass(frozen=True, kw_only=True)
 class TransformsRecord(Intrinsics):
-    """The content of ``transforms.json`` as it is written."""
+    """The content of ``transforms.json`` before its conversion."""
 
     frames: list[FrameRecord]
     applied_transform: Matrix | None = None
@@ -160,12 +160,13 @@ def find_files(folder: Path) -> dict[str, Path]:
             "that holds it, or take scene=colmap or scene=photos"
         )
     if "test" in files:
-        files.pop("val", None)  # reports on Blender's scenes use the training and test views alone
+        # published results on Blender's scenes use only the training and test views
+        files.pop("val", None)
     return files
 
 
 def read_transforms(folder: Path) -> Transforms:
-    """Read the cameras in ``folder``; raises InputError, one line, for a file not understood."""
+    """Read the cameras in ``folder``; raises InputError for a file that cannot be understood."""
     files = find_files(folder)
     records = {split: _read_record(path) for split, path in files.items()}
     find = _FileFinder(folder)
@@ -230,7 +231,7 @@ def names_of(kind: type[Record]) -> frozenset[str]:
 
 
 class _FileFinder:
-    """Finds the image that ``file_path`` means, as those of COLMAP models are (`match_names`)."""
+    """Finds the image that ``file_path`` names, as for COLMAP models (`match_names`)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -240,7 +241,7 @@ class _FileFinder:
         return list_images(self.folder)
 
     def __call__(self, path: Path, written: str) -> str | None:
-        """The name below the folder, or None without a file. Blender leaves out the extension."""
+        """The name below the folder, or None if no file fits. Blender writes no extension."""
         relative = _relative_path(path, written)
         if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
             return relative.as_posix()
@@ -253,7 +254,7 @@ class _FileFinder:
 def _named_split(
     path: Path, record: TransformsRecord, images: Collection[str]
 ) -> tuple[list[str], list[str]] | None:
-    """nerfstudio's lists of names: to train on, and to test on or else to validate on."""
+    """nerfstudio's lists: names to train on, and to test on or, without these, to validate on."""
     train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
     held_out = val if test is None else test
     if held_out is None:
@@ -382,7 +383,7 @@ def _focal_length(
 ) -> float | None:
     """The focal length in px along a side, given or from the field of view (radians or degrees).
 
-    None if nothing is given, and 0 for a field of view that is none.
+    None if nothing is given, and 0 if the field of view is not between 0 and 180 degrees.
     """
     if given is not None:
         return given

@@ -1,4 +1,4 @@
-"""The keys of ``transforms.json`` of other programs, and what becomes of unused ones.
+"""Checking keys of ``transforms.json`` that gsbench does not use: harmless, refused or unknown.
 
 Sources: nerfstudio's page "Data conventions" and its reader; instant-ngp's page "Tips for training
 NeRF models" and its loader (nerf_loader.cu), whose keys most exporters write (Metashape, Polycam
@@ -31,7 +31,7 @@ DEPTH = (
     "depth_unit_scale_factor",
 )
 OTHER_DATA = ("enable_ray_loading", "normal_file_path", "envmap")
-# `black_transparent` makes black pixels transparent, which lie over black.
+# `black_transparent` makes black pixels transparent, and these are blended over black.
 TRAINING = ("importance_sampling", "n_extra_learnable_dims", "black_transparent")
 NOTES = (
     "sharpness",
@@ -69,9 +69,10 @@ REFUSED = {
 def check_keys(
     path: Path, document: Any, file_keys: Collection[str], frame_keys: Collection[str]
 ) -> None:
-    """Look at all keys of a file that are not in ``file_keys`` or, of frames, ``frame_keys``.
+    """Check the keys of a file that gsbench does not use.
 
-    Raises InputError for a key of `REFUSED` whose value says something. Logs one line that names
+    ``file_keys`` are the used keys of the file, ``frame_keys`` those of a frame. Raises InputError
+    for a key of `REFUSED` whose value has an effect (`says_something`). Logs one line that names
     unknown keys.
     """
     unknown: set[str] = set()
@@ -94,7 +95,10 @@ def check_keys(
 
 
 def says_something(key: str, value: Any) -> bool:
-    """Return whether a value asks for something: not null, false, empty, or zeros alone."""
+    """Return whether a value has an effect: it is not null, false, empty or a list of zeros.
+
+    A matrix has an effect whatever its numbers are.
+    """
     if key.startswith("transform_matrix"):
         return value is not None
     if isinstance(value, list):

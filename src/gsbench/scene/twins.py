@@ -1,7 +1,7 @@
 """Photographs that a capture has twice: copies, and views that look nearly the same.
 
-A test view whose copy is trained on measures memory, so copies of test views are left out of
-training. Near twins, such as the next shot of a burst, are used and reported.
+If a copy of a test view is trained on, that test view measures memory. So copies of test views are
+left out of training. Near twins, such as the next shot of a burst, are used and reported.
 """
 
 import logging
@@ -33,15 +33,16 @@ SAME_FORMAT = {".jpeg": ".jpg", ".tiff": ".tif"}
 # to .92.
 GRID = 32  # px
 NEAR = 0.975  # correlation
-LEAST_CELLS = 64  # of a small picture, that both masks count; fewer say nothing
-LEAST_DEVIATION = 1.0  # of 255 grey values: smaller pictures of less have no content to compare
+LEAST_CELLS = 64  # cells that count in both small pictures; fewer are too few to compare
+LEAST_DEVIATION = 1.0  # of 255 grey values; a small picture that varies less has no content
 
 
 def copies_by_name(names: Sequence[str], wanted: Collection[str] = ()) -> dict[str, str]:
-    """Map each photograph whose path differs in the extension alone to the one that is used.
+    """Map each unused copy to the photograph used instead; their paths differ by the extension.
 
-    A name in ``wanted`` is used first; then the format that more of the ``names`` have, so that a
-    folder which has all photographs in one format is read in that format; then a JPEG.
+    Of such photographs, a name in ``wanted`` is used first; then the format that more of the
+    ``names`` have, so that a folder which has all photographs in one format is read in that format;
+    then a JPEG.
 
     Examples:
         >>> copies_by_name(["a.jpg", "a.png", "b.jpg"])
@@ -65,7 +66,7 @@ def _format(name: str) -> str:
 
 
 def copies_of_test_views(folder: Path, train: Sequence[str], test: Sequence[str]) -> dict[str, str]:
-    """Map each training file in ``folder`` with the bytes of a test file to that file.
+    """Map each training file in ``folder`` that equals a test file, byte by byte, to that file.
 
     Only files of equal size are read, so a capture without copies costs no reading.
     """
@@ -97,10 +98,10 @@ def report_left_out(folder: Path, left_out: Mapping[str, str], why: str) -> None
 
 
 def without_copies(scene: Scene) -> Scene:
-    """The scene without training views that have a test view's pixels, its near twins noted.
+    """Leave out training views that have the pixels of a test view, and record near twins.
 
-    Pixels are compared at their final size, where both masks count. Raises InputError if no
-    training view is left.
+    Pixels are compared at their final size, where both masks count. ``twins`` of the returned scene
+    holds both. Raises InputError if no training view is left.
     """
     small = {view.name: small_picture(view) for view in (*scene.train, *scene.test)}
     equal: dict[str, str] = {}
@@ -108,8 +109,8 @@ def without_copies(scene: Scene) -> Scene:
     for test in scene.test:
         for view in scene.train:
             value = likeness(small[test.name], small[view.name])
-            # Equal pixels are a costly question, asked of similar pictures only.
-            if value < NEAR:  # NaN, where little is to be compared, goes on
+            # Comparing all pixels is costly, so only similar pictures are compared.
+            if value < NEAR:  # false for NaN, so these are compared
                 continue
             if same_pixels(test, view):
                 equal[view.name] = test.name
@@ -152,10 +153,10 @@ def small_picture(view: View) -> SmallPicture:
 
 
 def likeness(one: SmallPicture, other: SmallPicture) -> float:
-    """The correlation of small pictures where both count; -1: other shape, NaN: too little.
+    """The correlation of two small pictures over the cells that count in both.
 
-    A correlation ignores brightness and contrast, which a camera's exposure changes between two
-    shots.
+    It is -1 if their shapes differ, and NaN if there is too little to compare. A correlation
+    ignores brightness and contrast, which a camera's exposure changes between two shots.
     """
     if one[0].shape != other[0].shape or not same_up_to_rounding(one[2], other[2]):
         return -1.0
@@ -169,7 +170,7 @@ def likeness(one: SmallPicture, other: SmallPicture) -> float:
 
 
 def same_pixels(one: View, other: View) -> bool:
-    """Return whether two views have the same pixels where both count, and any does."""
+    """Return whether views are equal where both masks count; False if no pixel counts in both."""
     if one.image.shape != other.image.shape:
         return False
     both = np.ones(one.image.shape[:2], bool)

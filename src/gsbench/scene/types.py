@@ -69,7 +69,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     def in_own_coordinates(self, normalization: Normalization) -> Camera:
-        """Return the camera as it stands in the coordinates in which the scene was given."""
+        """The camera in the coordinates in which the scene was given."""
         if normalization.is_identity:
             return self
         return replace(self, translation=-self.rotation @ normalization.undo(self.center))
@@ -135,8 +135,8 @@ class Capture:
     are further files of the user that the cameras were read from. ``advised_normalization`` maps
     the given coordinates to those in which the scene should be trained
     (`gsbench.scene.colmap.normalize_capture`). ``normalization`` is the map that was applied to
-    ``model`` already. ``left_out`` maps each photograph that is left out, since another has its
-    name or content, to that other.
+    ``model`` already. ``left_out`` maps each photograph that is left out to the one with the same
+    name or content.
     """
 
     name: str

@@ -55,8 +55,8 @@ def test_three_cameras_give_a_similarity_and_two_do_not() -> None:
 
 
 @pytest.mark.parametrize("away", [0.0, 1000.0])
-def test_wrong_cameras_do_not_move_the_alignment(away: float):
-    """Wherever the origin lies: captures by satellite positions stand far from it."""
+def test_wrong_cameras_do_not_change_the_alignment(away: float):
+    """The origin may be far away, as in captures with satellite positions."""
     centers, rotations, moved, moved_rotations = poses(30)
     centers, moved = centers + away, moved + away * TRUE_SCALE * TRUE_ROTATION.sum(axis=1)
     wrong = moved.copy()
@@ -64,7 +64,7 @@ def test_wrong_cameras_do_not_move_the_alignment(away: float):
     similarity = align_poses(centers, rotations, wrong, moved_rotations)
     assert similarity.scale == pytest.approx(TRUE_SCALE, rel=1e-9)
     np.testing.assert_allclose(similarity(centers), moved, atol=1e-8)
-    # plain least squares is moved
+    # wrong cameras do move plain least squares
     assert abs(fit_similarity(centers, wrong).scale - TRUE_SCALE) > 0.5
     angles = rotation_angles(transformed_rotations(similarity, rotations), moved_rotations)
     assert angles.max() < 1e-6
@@ -94,8 +94,8 @@ def test_rotation_angles_are_those_of_scipy(degrees: float):
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
-def test_what_counts_as_a_line_does_not_depend_on_the_scale(scale: float):
-    """A line is aligned by orientations, other centres without them."""
+def test_collinearity_does_not_depend_on_the_scale(scale: float):
+    """Cameras on a line are aligned by orientations, others by their centres alone."""
     centers, _, moved, _ = poses(9, seed=4)
     others = Rotation.random(9, rng=np.random.default_rng(5)).as_matrix()
     similarity = align_poses(scale * centers, others, moved, others)
@@ -112,7 +112,7 @@ def test_what_counts_as_a_line_does_not_depend_on_the_scale(scale: float):
 
 
 @pytest.mark.parametrize("count", [3, 40])
-def test_cameras_without_wrong_ones_are_fitted_by_least_squares(count: int):
+def test_without_wrong_cameras_all_are_fitted_by_least_squares(count: int):
     centers, rotations, moved, moved_rotations = poses(count, seed=2)
     moved = moved + np.random.default_rng(6).uniform(-0.01, 0.01, moved.shape)
     similarity = align_poses(centers, rotations, moved, moved_rotations)

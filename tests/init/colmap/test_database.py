@@ -35,7 +35,7 @@ def images(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def database(images: Path, tmp_path: Path) -> Path:
-    """Cameras and images without features; the names are given in no order."""
+    """Cameras and images without features; the names are given unsorted."""
     made.create_database(
         tmp_path / "database.db",
         made.unknown_camera_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None),
@@ -51,7 +51,9 @@ def database(images: Path, tmp_path: Path) -> Path:
         ("per_image", [{name} for name in SIZES]),
     ],
 )
-def test_who_shares_a_camera(images: Path, sharing: str, expected: list[set[str]]) -> None:
+def test_images_share_a_camera_by_size_folder_or_not_at_all(
+    images: Path, sharing: str, expected: list[set[str]]
+) -> None:
     groups = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", None)
     assert [set(names) for _, names in groups] == expected
     for camera, names in groups:
@@ -108,7 +110,7 @@ def write_geometries(database: Path, inliers: dict[tuple[str, str], np.ndarray])
             opened.write_two_view_geometry(*(ids[name] for name in pair), verified)
 
 
-def test_counts_are_of_pairs_with_inliers(database: Path) -> None:
+def test_verified_pairs_are_counted_only_with_inliers(database: Path) -> None:
     keypoints = {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)}
     made.write_keypoints(database, keypoints)
     matches, inliers = np.stack([np.arange(9)] * 2, axis=1), {"ab": 1, "bc": 7, "ac": 0}
@@ -123,27 +125,28 @@ def test_counts_are_of_pairs_with_inliers(database: Path) -> None:
     }
 
 
-def test_guessed_focal_lengths_become_known_ones(database: Path) -> None:
+def test_assumed_focal_lengths_count_as_known(database: Path) -> None:
     made.write_keypoints(database, dict.fromkeys(SIZES, np.ones((3, 2))))
     some, none = np.zeros((1, 2)), np.zeros((0, 2))
     matches = {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none}
     made.write_matches(database, matches)
     write_geometries(database, {("a.png", "b.png"): some})
     assert made.cameras_without_prior(database)
-    for factor in (0.9, 5.0):  # the second finds nothing unknown
+    for factor in (0.9, 5.0):  # at the second factor no focal length is unknown
         pairs = made.assume_focal_lengths(database, factor)
         assert pairs == [("a.png", "b.png"), ("b.png", "c.png")]
         assert not made.cameras_without_prior(database)
         with pycolmap.Database.open(database) as opened:
             assert [camera.focal_length for camera in opened.read_all_cameras()] == [36.0, 36.0]
-            assert opened.num_verified_image_pairs() == 0  # under other focal lengths
+            # they were verified with other focal lengths
+            assert opened.num_verified_image_pairs() == 0
 
 
 @pytest.mark.parametrize(("count", "each"), [(30, 50), (120, 50), (2100, 105)])
-def test_verification_tells_its_progress_in_parts(
+def test_verification_reports_progress_in_parts(
     database: Path, monkeypatch: pytest.MonkeyPatch, count: int, each: int
 ) -> None:
-    """Of fifty pairs, or of a twentieth of them; each is listed once, by its images' ids."""
+    """A part has 50 pairs, or a twentieth of all; each pair is listed once, by image ids."""
     pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
 
     def verify(path: Path, file: Path, options: object) -> None:
@@ -158,7 +161,7 @@ def test_verification_tells_its_progress_in_parts(
 
 
 @pytest.mark.parametrize(("threads", "each"), [(1, 8), (4, 8), (9, 18)])
-def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
+def test_features_are_extracted_from_eight_images_at_a_time_or_two_per_thread(
     images: Path, monkeypatch: pytest.MonkeyPatch, threads: int, each: int
 ) -> None:
     calls, told, names = [], [], [f"{number}.png" for number in range(40)]
@@ -177,7 +180,9 @@ def test_features_are_extracted_of_eight_images_at_a_time_or_two_a_thread(
         assert Path(call["reader_options"].mask_path) == (masks or Path())
 
 
-def test_what_colmap_cannot_read_gets_a_png_under_its_name(images: Path, tmp_path: Path) -> None:
+def test_images_that_colmap_cannot_read_become_png_under_the_same_name(
+    images: Path, tmp_path: Path
+) -> None:
     assert made.readable_images(images, list(SIZES), tmp_path / "work") == images
     Image.new("RGB", (40, 30), (1, 2, 3)).save(images / "left" / "c.WEBP", lossless=True)
     names = ["a.png", "left/c.WEBP"]
@@ -187,10 +192,10 @@ def test_what_colmap_cannot_read_gets_a_png_under_its_name(images: Path, tmp_pat
     assert (folder / "a.png").resolve() == images / "a.png"
     with Image.open(folder / "left" / "c.WEBP") as copy:
         assert (copy.format, copy.getpixel((3, 4))) == ("PNG", (1, 2, 3))
-    assert made.readable_images(images, names, tmp_path / "work") == folder  # made anew
+    assert made.readable_images(images, names, tmp_path / "work") == folder  # made again
 
 
-def test_masks_are_named_as_colmap_looks_for_them(images: Path, tmp_path: Path) -> None:
+def test_masks_have_the_names_that_colmap_expects(images: Path, tmp_path: Path) -> None:
     assert made.colmap_masks({}, tmp_path) is None
     given = {"a.png": images / "b.png", "left/b.png": images / "c.png"}
     for _ in range(2):
@@ -201,7 +206,7 @@ def test_masks_are_named_as_colmap_looks_for_them(images: Path, tmp_path: Path) 
         assert len([path for path in folder.rglob("*.png") if path.is_symlink()]) == 2
 
 
-def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
+def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images() -> None:
     model = pycolmap.Reconstruction()
     for number, focal in ((1, 50.0), (2, 60.0)):
         model.add_camera_with_trivial_rig(
@@ -223,18 +228,18 @@ def test_the_references_cameras_are_known_and_have_its_placed_images() -> None:
 @pytest.mark.parametrize(
     ("count", "processes", "size"), [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
 )
-def test_parts_are_small_enough_for_six_a_process(count: int, processes: int, size: int) -> None:
-    """Blocks of ``size`` images: sqrt(12 processes) of them, rounded up, of 2 to 16 images each."""
+def test_parts_are_small_enough_for_six_per_process(count: int, processes: int, size: int) -> None:
+    """sqrt(12 processes) blocks, rounded up, with ``size`` images each, at least 2 and at most 16."""
     assert matches._block_size(count, processes) == size
 
 
-def test_matching_is_divided_over_processes_and_tells_one_sum(
+def test_matching_is_divided_over_processes_and_reports_one_sum(
     database: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     jobs, told = [], []
 
     def match(function: object, job: matches.MatchingJob, progress: Progress, what: str) -> None:
-        """A process that finds one match in its first pair."""
+        """Act as a process that finds one match in its first pair."""
         jobs.append(job)
         assert made.image_ids(job.template) == {str(number): number for number in range(1, 6)}
         shutil.copyfile(job.template, job.result)

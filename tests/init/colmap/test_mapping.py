@@ -1,4 +1,4 @@
-"""Captures that COLMAP's defaults refuse: exact matches of a rig whose cameras are known."""
+"""Captures that COLMAP's defaults cannot place: exact matches between known cameras."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ VERIFICATION = verification_options(Sfm())
 def small_baseline(
     folder: Path, spread: float = 0.2, turn: float = 0.0
 ) -> tuple[Path, dict[str, np.ndarray]]:
-    """A database of exact matches of nine cameras side by side, looking ahead; the true centres.
+    """Exact matches of nine parallel cameras side by side: the database and the true centres.
 
-    ``spread`` is half the width of the rig, for points 3 to 9 away; at 0.2 no two cameras see one
-    under 11 degrees.
+    ``spread`` is half the width of the rig, for points at distances from 3 to 9. At 0.2, all angles
+    at points are below 11 degrees.
     """
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -2.2, 3), (3, 2.2, 9), (900, 3))
@@ -69,7 +69,7 @@ def small_baseline(
 
 
 def mapper_of(folder: Path, options: Sfm, progress: Any = no_progress) -> mapping._Mapper:
-    """For three images, and a database that need not be there."""
+    """A mapper for three images; its database does not exist."""
     return mapping._Mapper(folder / "a.db", folder, folder / "out", options, progress, 3)
 
 
@@ -79,7 +79,9 @@ def mapped(database: Path, mapper: Any) -> MappingResult:
 
 
 @pytest.mark.slow
-def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_path: Path) -> None:
+def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(
+    tmp_path: Path,
+) -> None:
     database, truth = small_baseline(tmp_path)
     with pytest.raises(InputError, match="found no pair of images to start from"):
         mapped(database, "incremental")
@@ -93,19 +95,19 @@ def test_a_small_baseline_without_a_focal_length_is_placed_by_another_way(tmp_pa
     similarity = similarity_to(result.model, true)
     assert similarity is not None
     centers, _, true_centers, _ = common_poses(result.model, true)
-    assert np.abs(similarity(centers) - true_centers).max() < 0.03  # of a rig 0.4 wide
+    assert np.abs(similarity(centers) - true_centers).max() < 0.03  # the rig is 0.4 wide
     (camera,) = result.model.cameras.values()
-    # which so small a baseline fixes weakly
+    # such a small baseline determines the focal length weakly
     assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.2)
 
 
-def test_the_global_mapper_alone(tmp_path: Path) -> None:
+def test_the_global_mapper_places_all_images(tmp_path: Path) -> None:
     database, _ = small_baseline(tmp_path)
     result = mapped(database, "global")
     assert (result.strategy, result.model.num_reg_images(), result.warnings) == ("global", 9, ())
 
 
-def test_where_the_defaults_do_nothing_else_is_tried(tmp_path: Path) -> None:
+def test_if_the_defaults_succeed_no_other_strategy_is_tried(tmp_path: Path) -> None:
     database, _ = small_baseline(tmp_path, spread=1.2)
     result = mapped(database, "auto")
     assert result.tried == (("incremental", 9),)
@@ -113,15 +115,15 @@ def test_where_the_defaults_do_nothing_else_is_tried(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mapper", [pytest.param("auto", marks=pytest.mark.slow), "global"])
-def test_copies_of_one_view_are_no_scene(tmp_path: Path, mapper: Any) -> None:
-    """Without parallax every way must be refused, not believed."""
+def test_copies_of_one_view_are_refused(tmp_path: Path, mapper: Any) -> None:
+    """Models without parallax are refused, whichever mapper made them."""
     database, _ = small_baseline(tmp_path, spread=0.0)
     with pytest.raises(InputError, match="structure from motion"):
         mapped(database, mapper)
 
 
 class Model:
-    """A reconstruction of which only the size is asked."""
+    """A stand-in for a reconstruction, which has a size only."""
 
     def __init__(self, images: int, points: int = 10) -> None:
         self.images, self.points = images, points
@@ -136,7 +138,7 @@ class Model:
 @pytest.mark.parametrize(
     ("found", "best", "tried"),
     [
-        ([[(9, 1)], [(10, 1)]], (9, 1), 1),  # of ten images: enough
+        ([[(9, 1)], [(10, 1)]], (9, 1), 1),  # enough of ten images
         ([[(8, 1)], [(10, 1)]], (10, 1), 2),
         ([[(8, 5)], [(8, 9)], [(7, 99)]], (8, 9), 3),
         ([[(8, 9)], [(8, 5)], []], (8, 9), 3),
@@ -144,7 +146,7 @@ class Model:
         ([[], [(3, 1)]], (3, 1), 2),
     ],
 )
-def test_ways_are_tried_until_one_places_nine_of_ten(
+def test_strategies_are_tried_until_one_places_nine_of_ten_images(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     found: list[list[tuple[int, int]]],
@@ -176,10 +178,10 @@ def test_ways_are_tried_until_one_places_nine_of_ten(
 
 @pytest.mark.parametrize("prior", [True, False])
 @pytest.mark.parametrize("mapper", ["incremental", "global", "auto"])
-def test_the_ways_of_a_mapper(
+def test_each_mapper_has_its_strategies_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mapper: Any, prior: bool
 ) -> None:
-    """From the defaults to assumed focal lengths, these only where none is known."""
+    """Assumed focal lengths come last, and only if no focal length is known."""
     calls: list[tuple[object, ...]] = []
 
     def note(name: str) -> Any:
@@ -201,13 +203,13 @@ def test_the_ways_of_a_mapper(
     }
     assert calls == expected[mapper]
     assert len({name for name, _ in ways}) == len(ways)
-    assert small < 16  # COLMAP's own
+    assert small < 16  # COLMAP's default
 
 
-def test_mapping_tells_its_progress_from_none_to_all(
+def test_mapping_reports_progress_from_no_image_to_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """COLMAP may place an image twice, in two models: more than all is never told."""
+    """COLMAP may place an image in two models; the progress never exceeds the number of images."""
     told: list[tuple[str, int, int]] = []
 
     def place(*_: object, next_image_callback: Any, options: Any) -> dict[int, Model]:
@@ -226,8 +228,8 @@ def test_mapping_tells_its_progress_from_none_to_all(
 
 
 @pytest.mark.parametrize(("share", "plausible"), [(0.9, False), (1.1, True)])
-def test_half_of_the_points_must_be_seen_under_an_angle(share: float, plausible: bool) -> None:
-    """Two cameras on either side of points at a distance of one; a third beside the first."""
+def test_a_model_needs_an_angle_at_half_of_its_points(share: float, plausible: bool) -> None:
+    """Two cameras see points at distance one under an angle; a third is at the first one's place."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
     model = model_with(
         {f"{x} {k}": camera_at([x, 0, 0]) for k, x in enumerate((-half, half, -half))}, 3
@@ -268,7 +270,7 @@ def test_settings_reach_colmaps_mappers(
     assert (adjustment.refine_focal_length, adjustment.refine_extra_params) == (refine, refine)
 
 
-def test_a_focal_length_is_assumed_in_a_copy_that_is_verified_anew(
+def test_focal_lengths_are_assumed_in_a_copy_whose_pairs_are_verified_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[Any, ...]] = []
@@ -291,7 +293,7 @@ def test_a_focal_length_is_assumed_in_a_copy_that_is_verified_anew(
     assert mapped_from == [copy, 2.0]
 
 
-def test_pairs_are_all_or_those_of_neighbours() -> None:
+def test_all_pairs_or_pairs_of_neighbours_are_selected() -> None:
     assert select_pairs("abcd", Sfm()) == list(itertools.combinations("abcd", 2))
     neighbours = select_pairs("abcd", Sfm(pairs="sequential", overlap=1))
     assert neighbours == [("a", "b"), ("b", "c"), ("c", "d")]

@@ -1,4 +1,4 @@
-"""Pairs of neighbours and of a preview: against a slow restatement in whole numbers."""
+"""Pairs of neighbours, and pairs from a preview against a slow version in whole numbers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def sets_of_descriptors(sizes: list[int]) -> list[np.ndarray]:
     return [part.clip(0, 255).astype(np.uint8) for part in parts]
 
 
-def test_counts_are_exact():
+def test_counts_of_agreements_are_exact():
     images = sets_of_descriptors([300, 256, 90, 1, 0])
     counts = count_agreements(images)
     for i, j in itertools.combinations(range(5), 2):
@@ -42,7 +42,7 @@ def test_counts_are_exact():
     assert not np.tril(counts).any()
 
 
-def test_descriptors_of_networks_count_as_well():
+def test_float_descriptors_of_networks_are_counted_too():
     rng = np.random.default_rng(1)
     base = rng.normal(size=(50, 64)).astype(np.float32)
     base /= np.linalg.norm(base, axis=1, keepdims=True)
@@ -50,7 +50,7 @@ def test_descriptors_of_networks_count_as_well():
 
 
 def test_each_image_keeps_its_best_partners():
-    # images on a line: the shared descriptors fall off with the distance
+    # images on a line: the nearer two images, the more descriptors they share
     rng = np.random.default_rng(2)
     world = rng.integers(0, 256, (600, 128)).astype(np.uint8)
     images = [world[20 * i : 20 * i + 200] for i in range(12)]
@@ -67,7 +67,7 @@ def test_images_without_any_feature_still_get_partners(partners: int):
     assert {image for pair in pairs for image in pair} == set(range(6))
 
 
-def test_sequential_has_near_neighbours_and_powers_of_two():
+def test_sequential_pairs_are_near_neighbours_and_powers_of_two():
     pairs = sequential_pairs(40, 4)
     assert sorted({j - i for i, j in pairs}) == [1, 2, 3, 4, 8]
     assert len(pairs) == len(set(pairs)) == sum(40 - step for step in (1, 2, 3, 4, 8))

@@ -38,13 +38,13 @@ def poses() -> dict[str, pycolmap.Rigid3d]:
 
 
 def model_of(poses: dict[str, pycolmap.Rigid3d]) -> pycolmap.Reconstruction:
-    """A model of cameras alone, whose ids are not those of a database."""
+    """A model without points whose image ids differ from the database's."""
     return model_with(dict(reversed(poses.items())), camera=camera())
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The points as every camera sees them, matched and verified."""
+    """A database of the points in all cameras, with verified matches."""
     folder = tmp_path_factory.mktemp("exact")
     (folder / "images").mkdir()
     keypoints = {}
@@ -63,7 +63,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_points_come_from_the_named_images_under_cameras_that_do_not_change(
+def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change(
     database: Path, tmp_path: Path
 ) -> None:
     said: list[tuple[str, int, int | None]] = []
@@ -85,9 +85,7 @@ def test_points_come_from_the_named_images_under_cameras_that_do_not_change(
         np.testing.assert_allclose(point.xyz, POINTS[index], atol=1e-3)
 
 
-def test_matches_that_contradict_the_cameras_triangulate_nothing(
-    database: Path, tmp_path: Path
-) -> None:
+def test_matches_that_contradict_the_cameras_are_refused(database: Path, tmp_path: Path) -> None:
     images = database.parent / "images"
     reference = model_of(dict(zip(NAMES, reversed(poses().values()), strict=True)))
     said = "no point could be triangulated under the reference cameras"

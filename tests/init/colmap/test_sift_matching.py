@@ -1,4 +1,4 @@
-"""Matching on several cores: what COLMAP gives on one thread, whatever the number of processes."""
+"""Matching in several processes gives the matches of COLMAP on one thread."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def read_matches(database: Path) -> tuple[dict[int, bytes], dict[int, tuple[byte
 
 @pytest.mark.parametrize("processes", [1, 3])
 @pytest.mark.slow
-def test_matches_are_those_of_colmap_on_one_thread(
+def test_matches_equal_those_of_colmap_on_one_thread(
     features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, processes: int
 ):
     database, pairs = features
@@ -107,7 +107,7 @@ def test_matches_are_those_of_colmap_on_one_thread(
     assert sum(len(matches) > 0 for matches in theirs[0].values()) > 10
     assert (told[0], max(told)) == (0, len(pairs))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["colmap.db", "database.db"]
-    # the names are the photographs' again
+    # the images have their own names again
     with pycolmap.Database.open(tmp_path / "database.db") as opened:
         assert {image.name for image in opened.read_all_images()} == {
             name for pair in pairs for name in pair
@@ -117,7 +117,7 @@ def test_matches_are_those_of_colmap_on_one_thread(
 def test_colmaps_matcher_never_gets_a_second_thread(
     features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Two threads in one process can spoil each other's matches, too rarely for a test."""
+    """Two threads in one process can corrupt matches, but too rarely to test for it."""
     database, pairs = features
     shutil.copy(database, tmp_path / "database.db")
     threads = []
@@ -136,13 +136,13 @@ def test_colmaps_matcher_never_gets_a_second_thread(
 
 
 @pytest.mark.slow
-def test_auto_leaves_out_what_a_preview_does_not_propose(
+def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     features: tuple[Path, list[tuple[str, str]]],
     bare_photos: Capture,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """Few images: all pairs, to the bit. More than (here) five: each with its best partners."""
+    """Few images get all pairs and the same bits; with more (here five), each gets best partners."""
     exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")
     auto = Sfm(threads=1, pairs="auto").run(bare_photos, tmp_path / "auto")
     assert auto.counts["pairs_left_out"] == 0

@@ -1,5 +1,4 @@
-"""The overlay draws what it says: one outline, of the right Gaussian, in its place, in the colour
-of its cause."""
+"""The overlay outlines the right Gaussians, in the right place and colour."""
 
 import math
 
@@ -26,7 +25,7 @@ def two_gaussians(means: list[list[float]], log_scales: torch.Tensor) -> Gaussia
     )
 
 
-def test_only_the_voluminous_is_outlined():
+def test_only_voluminous_gaussians_are_outlined():
     scales = torch.tensor([[1.0, 1.0, 1.0], [0.01, 0.01, 0.01]])
     gaussians = two_gaussians([[0.0, 0.0, 4.0], [1.0, 0.5, 4.0]], scales.log())
     camera = orbit_camera(0.0)
@@ -34,7 +33,7 @@ def test_only_the_voluminous_is_outlined():
     black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     picture = np.asarray(draw_ellipsoids(black, gaussians, causes, camera, 0.03))
     drawn, legend = np.split(picture, [camera.height])
-    assert len(legend) % 14 == 0  # px of a line
+    assert len(legend) % 14 == 0  # px, the height of a line
     in_legend = {tuple(color) for color in legend.reshape(-1, 3).tolist()}
     assert Cause.SPLIT_VOLUME.color in in_legend
     assert Cause.CLONE.color not in in_legend
@@ -42,15 +41,15 @@ def test_only_the_voluminous_is_outlined():
     assert {tuple(color) for color in drawn[rows, columns].tolist()} == {Cause.SPLIT_VOLUME.color}
     radius = math.sqrt((1.0 * camera.fx / 4) ** 2 + 0.3)  # one standard deviation and the blur, px
     distances = np.hypot(columns - (camera.cx - 0.5), rows - (camera.cy - 0.5))
-    assert np.abs(distances - radius).max() < 1.5  # a line of pixels
+    assert np.abs(distances - radius).max() < 1.5  # the outline is about one pixel wide
     assert abs(distances.mean() - radius) < 0.3
     assert abs(columns.mean() - (camera.cx - 0.5)) < 0.3
     assert abs(rows.mean() - (camera.cy - 0.5)) < 0.3
     angles = np.sort(np.arctan2(rows - (camera.cy - 0.5), columns - (camera.cx - 0.5)))
-    assert np.diff(angles, append=angles[0] + math.tau).max() < 0.3  # closed
+    assert np.diff(angles, append=angles[0] + math.tau).max() < 0.3  # the outline is closed
 
 
-def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch):
+def test_of_too_many_gaussians_the_most_voluminous_are_outlined(monkeypatch):
     monkeypatch.setattr(evaluate, "MAX_OUTLINES", 1)
     gaussians = two_gaussians([[0.0, 0.0, 4.0]] * 2, torch.tensor([[-0.5] * 3, [0.0] * 3]))
     camera = orbit_camera(0.0)
@@ -61,8 +60,8 @@ def test_of_too_many_the_most_voluminous_are_outlined(monkeypatch):
 
 
 @pytest.mark.parametrize("words_in_a_line", [3, 2, 1])
-def test_a_legend_stands_below_the_picture_word_by_word(words_in_a_line):
-    """Words of 11 px, each half of that after the one before, 14 px a line, 2 px from the left."""
+def test_the_legend_below_the_picture_is_wrapped(words_in_a_line):
+    """The font has 11 px, words are 5 px apart, lines 14 px high, and the margin is 2 px."""
     font = ImageFont.load_default(11)
     words = [
         ("title", (255, 255, 255)),

@@ -1,5 +1,4 @@
-"""What steps hand on: another program gets the training views and the settings, an initialiser its
-cameras."""
+"""What steps pass on: training views and settings to another program, cameras to an initialiser."""
 
 import json
 import shlex
@@ -98,9 +97,7 @@ def trainer(tmp_path: Path, model: str, cameras: bool = True, **settings: Any) -
 
 
 @pytest.mark.parametrize("cameras", [True, False])
-def test_a_program_is_given_the_training_views_and_the_settings(
-    views, tmp_path, monkeypatch, cameras
-):
+def test_a_program_gets_the_training_views_and_the_settings(views, tmp_path, monkeypatch, cameras):
     monkeypatch.setenv("GSBENCH_RUNS", "here")
     gaussians = random_gaussians(9, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "model.ply")
@@ -127,7 +124,7 @@ def test_a_program_is_given_the_training_views_and_the_settings(
     assert summary["trained_by"]["version"] == "7"
     assert summary["seconds"] > 0
     assert summary["peak_memory_mb"] > 0
-    assert (step.stage.version, step.inputs["contract"]) == (1, 1)  # raised by hand
+    assert (step.stage.version, step.inputs["contract"]) == (1, 1)  # numbers that developers raise
     assert sorted(path.name for path in folder.iterdir()) == [
         "events.jsonl",
         "lineage.npz",
@@ -173,7 +170,7 @@ def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(vi
 
 
 @pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
-def test_a_program_has_the_time_that_is_set(views, tmp_path, monkeypatch, minutes, limit):
+def test_a_program_runs_with_the_given_time_limit(views, tmp_path, monkeypatch, minutes, limit):
     given: list[Any] = []
     ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
     monkeypatch.setattr(train_steps, "run_program", lambda *rest: given.append(rest) or ended)
@@ -187,7 +184,7 @@ def test_a_program_has_the_time_that_is_set(views, tmp_path, monkeypatch, minute
     assert seconds == limit
 
 
-def test_a_program_gets_the_environment_without_gsbenchs_own(tmp_path, monkeypatch):
+def test_a_program_gets_the_environment_without_variables_of_gsbench(tmp_path, monkeypatch):
     for name, value in (("GSBENCH_X", "1"), ("KEPT", "2"), SAFE_PATH):
         monkeypatch.setenv(name, value)
     found = train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})
@@ -197,11 +194,11 @@ def test_a_program_gets_the_environment_without_gsbenchs_own(tmp_path, monkeypat
         None,
         "5",
     )
-    monkeypatch.setenv(SAFE_PATH[0], "1")  # the user's own
+    monkeypatch.setenv(SAFE_PATH[0], "1")  # the user's own value, not gsbench's
     assert train_steps.environment_of(trainer(tmp_path, "none"), {"seed": 5})[SAFE_PATH[0]] == "1"
 
 
-def test_a_training_leaves_its_model_its_lineage_and_its_summary(views, tmp_path, monkeypatch):
+def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkeypatch):
     told: list[tuple[Any, ...]] = []
     reset: list[torch.device] = []
     monkeypatch.setattr(
@@ -257,7 +254,7 @@ def test_renders_of_a_program_are_collected_for_the_test_views(views, tmp_path, 
     assert (summary["evaluated_from"], summary["num_gaussians"]) == ("renders", None)
 
 
-def test_training_starts_from_gaussians_where_the_initialiser_left_some(views):
+def test_training_starts_from_the_gaussians_of_the_initialiser_if_there_are_any(views):
     init, cpu = views.store.path(CLOUD_STEP), torch.device("cpu")
     assert len(train_steps.initial_gaussians(init, cpu)) == 7
     write_ply(random_gaussians(9, dtype=torch.float32), init / GAUSSIANS_FILE)
@@ -272,7 +269,7 @@ def test_a_program_without_a_result_is_named_with_its_log(views, tmp_path):
     assert not any((tmp_path / "built" / "work").glob("data/*"))
 
 
-def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(views, tmp_path):
+def test_the_version_that_a_program_prints_must_contain_the_set_one(views, tmp_path):
     write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
     for said, fits in (("other 7.1", True), ("other 8", False)):
         tells = f"{shlex.quote(sys.executable)} -c \"print('{said}')\""
@@ -289,7 +286,7 @@ def test_the_version_that_a_program_tells_must_be_the_one_that_is_set(views, tmp
                 step.build(folder)
 
 
-def test_a_program_is_not_told_of_masks(views, tmp_path):
+def test_a_program_is_refused_for_a_capture_with_masks(views, tmp_path):
     views.capture = replace(views.capture, masks={"0.png": tmp_path})
     with pytest.raises(InputError, match="gets no masks"):
         external_step(views, trainer(tmp_path, "none"), parts_of())
@@ -297,7 +294,7 @@ def test_a_program_is_not_told_of_masks(views, tmp_path):
 
 @dataclass
 class Noting:
-    """An initialiser that keeps what it was given."""
+    """An initialiser that writes down its reference."""
 
     count: int = 3
     name = "noting"
@@ -310,7 +307,7 @@ class Noting:
 
 
 @pytest.mark.parametrize("has_reference", [False, True])
-def test_an_initialiser_gets_the_cameras_that_stand_in_for_those_that_did_not_come(
+def test_an_initialiser_gets_the_reference_cameras_and_they_are_in_its_key(
     tmp_path, has_reference, monkeypatch
 ):
     told: list[tuple[Any, ...]] = []

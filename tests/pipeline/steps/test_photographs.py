@@ -1,5 +1,4 @@
-"""The photographs of a trial before anything looks at them: who makes them, what replaces pixels,
-what is kept."""
+"""The photographs of a trial: the steps that make them, replace pixels and keep the test views."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -30,11 +29,10 @@ from gsbench.scene.types import Capture
 
 @pytest.fixture
 def photographs(tmp_path) -> Path:
-    """Four photographs, the second of them transparent on its left half, and masks that ignore the
-    upper half."""
+    """Four photographs with masks that ignore the upper half; b is transparent on its left half."""
     for index, name in enumerate(("a", "b", "c", "d")):
         pixels = np.full((20, 30, 4), [10, 20, 30, 255], np.uint8)
-        pixels[19, 29, 2] += 0 if name == "b" else index  # no photograph twice
+        pixels[19, 29, 2] += 0 if name == "b" else index  # makes all photographs different
         pixels[:, :15, 3] = 0 if name == "b" else 255
         (tmp_path / "photos" / "images").mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels if name == "b" else pixels[..., :3]).save(
@@ -46,7 +44,7 @@ def photographs(tmp_path) -> Path:
     return tmp_path / "photos"
 
 
-def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs):
+def test_the_courtyard_has_a_step_and_photographs_are_read_directly(photographs):
     made = CaptureSource(
         SceneConfig(name="made", kind="courtyard", views=9, width=40, height=30, seed=3)
     ).step
@@ -66,9 +64,7 @@ def test_only_a_courtyard_and_cameras_in_a_file_are_made(photographs):
         CaptureSource(small).read(None)
 
 
-def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
-    photographs, tmp_path, monkeypatch
-):
+def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monkeypatch):
     told: list[tuple[int, int]] = []
     monkeypatch.setattr(
         scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts))
@@ -77,7 +73,7 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
         read_photos("own", str(photographs)),
         read_photos("own", str(photographs), masks="masks"),
     )
-    assert masking_step(bare, "black") is None  # as they are read anyway
+    assert masking_step(bare, "black") is None  # reading makes transparent pixels black anyway
     steps = [
         masking_step(capture, behind)
         for capture, behind in ((bare, "white"), (masks, "white"), (masks, "black"))
@@ -86,7 +82,7 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     for name, step in zip(("white", "both", "masks"), steps, strict=True):
         assert step is not None
         step.build(tmp_path / name)
-    # of four photographs, the last is told as all
+    # the progress ends at all four photographs
     assert told == [(done, 4) for done in (1, 2, 3, 4)] * 3
     read = {
         name: np.asarray(Image.open(tmp_path / name / "images" / "b.png").convert("RGB"))
@@ -102,7 +98,7 @@ def test_pixels_are_replaced_where_a_mask_or_a_colour_behind_them_asks_for_it(
     assert masked_capture(bare, tmp_path / "white").masks == {}
 
 
-def test_ground_truth_is_the_test_views_and_their_masks(tmp_path, tiny_scene):
+def test_ground_truth_has_the_test_views_and_their_masks(tmp_path, tiny_scene):
     counts = np.zeros((32, 40), dtype=bool)
     counts[:, 7:] = True
     scene = replace(tiny_scene, test=(tiny_scene.test[0], replace(tiny_scene.test[1], mask=counts)))
@@ -119,7 +115,7 @@ def test_ground_truth_is_the_test_views_and_their_masks(tmp_path, tiny_scene):
     np.testing.assert_array_equal(read_mask(tmp_path / "masks" / "08.png"), counts)
 
 
-def test_each_setting_that_changes_views_makes_another_key(tmp_path):
+def test_each_setting_that_changes_views_changes_the_key(tmp_path):
     capture = Capture("own", tmp_path, ("a", "b", "c"), ("a",), None, False, "0")
     init, store = Step(INIT, {}, lambda folder: None), Store(tmp_path / "store")
     base = SceneConfig(name="own", kind="photos", path=str(tmp_path))

@@ -1,4 +1,4 @@
-"""Alignment of a model to the reference: pose errors, and what the volume threshold means."""
+"""Alignment of a model to the reference, pose errors, and the volume threshold in its units."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gsbench.scene.types import Array, Capture, extent_of_centers
 
 @dataclass(frozen=True)
 class Alignment:
-    """The place of a model against the reference; None where it was not compared or aligned."""
+    """The comparison of a model with the reference; fields are None if there was none."""
 
     scale_to_reference: float | None = None  # None without a reference
     own_gauge: Gauge | None = None
@@ -39,10 +39,10 @@ def align(
     exact: bool,
     own_gauge: Path | None,
 ) -> Alignment:
-    """Compare estimated poses with the reference; with ``own_gauge``, move the model into its.
+    """Compare estimated poses with the reference, and move the model into the reference's gauge.
 
-    ``own_gauge`` is the folder for a copy of the model as it was before. ``exact`` says that the
-    reference is the truth.
+    ``own_gauge`` is the folder for a copy of the model before it is moved; if it is None, the model
+    is not moved. ``exact`` says that the reference is the truth.
     """
     if reference is None:
         return Alignment()
@@ -84,11 +84,11 @@ def training_centers(model: pycolmap.Reconstruction, capture: Capture) -> Array:
 
 
 def measure_gauge(extent: float, scale_to_reference: float | None) -> Gauge:
-    """Express the paper's V_th in a model with this scene extent."""
+    """Express the paper's V_th in the units of a model with the scene extent ``extent``."""
     in_reference = None
     if scale_to_reference is not None:
         in_reference = VOLUME_THRESHOLD * scale_to_reference**3
-    # of the sphere 4/3 pi r^3 = V_th
+    # a sphere of volume V_th: 4/3 pi r^3 = V_th
     radius = (3 * VOLUME_THRESHOLD / (4 * math.pi)) ** (1 / 3)
     return Gauge(
         scene_extent=extent,

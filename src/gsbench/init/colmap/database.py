@@ -98,7 +98,7 @@ def colmap_masks(masks: Mapping[str, Path], work_dir: Path) -> Path | None:
 def reference_camera_groups(
     reference: pycolmap.Reconstruction,
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
-    """The reference's cameras, as known ones, each with the sorted names of its posed images."""
+    """The reference's cameras, marked as known, each with the sorted names of its posed images."""
     groups: dict[int, list[str]] = {}
     for image in reference.images.values():
         if image.has_pose:
@@ -145,7 +145,7 @@ def unknown_camera_groups(
 
 @contextmanager
 def writable(path: Path) -> Iterator[pycolmap.Database]:
-    """The open database in one transaction: all changes within the context, or none."""
+    """Open a database in one transaction: all changes within the context are kept, or none."""
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         yield database
 
@@ -156,7 +156,7 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
     The ids follow the sorted names. Because they are fixed here, extraction and matching give the
     same database on any number of threads. Each camera gets its own rig.
     """
-    # An interrupted run may have left one; its ids may be of other images.
+    # An interrupted run may have left a database whose ids belong to other images.
     path.unlink(missing_ok=True)
     ids_of: dict[str, tuple[int, int]] = {}  # of camera and rig
     image_ids: dict[str, int] = {}
@@ -178,8 +178,7 @@ def create_database(path: Path, groups: CameraGroups) -> dict[str, int]:
 
 
 def write_keypoints(path: Path, keypoints: Mapping[str, NDArray[np.float32]]) -> None:
-    """Add ``keypoints`` [K, 2] by image name, in px of the image file; the centre of the first
-    pixel is (0.5, 0.5)."""
+    """Add ``keypoints`` [K, 2] by image name, in px of the image file, in COLMAP's convention."""
     ids = image_ids(path)
     with writable(path) as database:
         for name, points in keypoints.items():
@@ -222,7 +221,7 @@ def assume_focal_lengths(path: Path, factor: float) -> list[tuple[str, str]]:
 
 
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Write COLMAP's list of pairs, two names a line, without spaces (`image_ids_as_names`)."""
+    """Write COLMAP's list of pairs of names without spaces (see `image_ids_as_names`)."""
     path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
 
 

@@ -39,7 +39,7 @@ NO_PAIR = (
 
 @dataclass(frozen=True)
 class MappingResult:
-    """The best model, its strategy with its number of models, and what each strategy placed."""
+    """The best model, the strategy that made it, and how many models that strategy made."""
 
     model: pycolmap.Reconstruction
     models: int
@@ -184,7 +184,7 @@ def _model_size(model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 
 def _is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Return whether angles determine the depth of points; copies of one photograph have none."""
+    """Return whether rays meet at angles that determine depth; those of equal images do not."""
     posed = [image for image in model.images.values() if image.has_pose]
     centers = {image.image_id: image.projection_center() for image in posed}
     seen_twice = [point for point in model.points3D.values() if point.track.length() > 1]
@@ -214,7 +214,7 @@ def triangulate(
     The other images of the database are in the model with their cameras, but see no point.
     """
     progress("triangulate", 0, 1)
-    posed, unused = pycolmap.Reconstruction(), []  # with the ids of the database
+    posed, unused = pycolmap.Reconstruction(), []  # both with the ids of the database
     with pycolmap.Database.open(database) as opened:
         for camera in opened.read_all_cameras():
             posed.add_camera_with_trivial_rig(camera)
@@ -227,7 +227,7 @@ def triangulate(
                 posed.add_image_with_trivial_frame(image, pose)
             else:
                 unused.append((image, pose))
-    # COLMAP has a generator for the whole process beside the seeds in its options
+    # COLMAP has a random generator for the whole process, besides the seeds in its options
     pycolmap.set_random_seed(options.seed)
     output.mkdir(parents=True, exist_ok=True)
     model = pycolmap.triangulate_points(

@@ -118,7 +118,7 @@ def match_parts(job: MatchingJob, progress: Progress) -> None:
 
 
 def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
-    """Divide ``pairs`` into parts with few images, between two groups of ``block`` neighbours.
+    """Divide ``pairs`` into parts with few images: pairs of two groups of ``block`` neighbours.
 
     Small parts are merged up to the size of a full part.
 
@@ -139,7 +139,7 @@ def divide_pairs(pairs: Sequence[IdPair], block: int) -> list[list[IdPair]]:
 
 
 def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list[list[IdPair]]]:
-    """Distribute parts over processes, about equally many pairs each, and at least one part."""
+    """Distribute parts over at most ``processes`` shares with about equally many pairs."""
     shares: list[list[list[IdPair]]] = [[] for _ in range(max(1, min(processes, len(parts))))]
     for part in sorted(parts, key=len, reverse=True):
         min(shares, key=lambda share: sum(map(len, share))).append(part)
@@ -147,7 +147,7 @@ def distribute_parts(parts: Sequence[list[IdPair]], processes: int) -> list[list
 
 
 def _block_size(images: int, processes: int) -> int:
-    """Images on each side of a part, so that there are `PARTS_PER_PROCESS` per process."""
+    """Images on each side of a part, so that each process gets about `PARTS_PER_PROCESS` parts."""
     # k blocks of images make k (k + 1) / 2 parts
     blocks = math.ceil(math.sqrt(2 * PARTS_PER_PROCESS * processes))
     return min(max(math.ceil(images / blocks), 2), MAX_BLOCK)
@@ -180,7 +180,7 @@ def _copy_without_features(database: Path, target: Path) -> None:
 def _insert(
     target: Path, source: Path, tables: Sequence[str], images: Sequence[int] | None = None
 ) -> None:
-    """Copy rows of ``tables`` from one database to another, of all images or of some ids."""
+    """Copy the rows of ``tables`` from ``source`` to ``target``, of all images or of some ids."""
     condition = "" if images is None else f" WHERE image_id IN ({', '.join(map(str, images))})"
     with closing(sqlite3.connect(target)) as connection:
         connection.execute("ATTACH DATABASE ? AS source", (str(source),))

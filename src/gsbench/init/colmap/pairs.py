@@ -19,7 +19,7 @@ Pair = tuple[int, int]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Pair each image with the next ``overlap`` ones and those 1, 2, 4, … on, as COLMAP does.
+    """Pair each image with the next ``overlap`` ones and those 1, 2, 4, … after it, as in COLMAP.
 
     Examples:
         >>> sequential_pairs(6, 2)
@@ -31,7 +31,7 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 ALL_PAIRS_UP_TO = 30  # images, 435 pairs: a preview would not pay off
 STRONGEST = 256  # features of an image in the preview
-# of each image: gave at least 98 % of the points of all pairs on the dense captures that were tried
+# per image; gave at least 98 % of the points of all pairs on the dense captures that were tried
 PARTNERS = 24
 SQUARED_RATIO = 0.8**2  # of the distances to the best and the second-best match
 # scale that turns descriptors of unit length into whole numbers, as in COLMAP's SIFT
@@ -39,11 +39,11 @@ QUANTUM = 512.0
 
 
 def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTNERS) -> list[Pair]:
-    """Pair each image with the ``partners`` with the most matches; returns sorted (i, j), i < j.
+    """Pair each image with the ``partners`` images with which it has the most matches.
 
-    ``descriptors`` [K, D] belong to each image's strongest features, of which at most `STRONGEST`
-    are used. They are whole numbers, or floats of unit length. Among equal partners, those nearer
-    in the order of images come first.
+    Returns sorted pairs (i, j), i < j. ``descriptors`` [K, D] belong to each image's strongest
+    features, of which at most `STRONGEST` are used. They are whole numbers, or floats of unit
+    length. Among equal partners, those nearer in the order of images come first.
     """
     agreement = count_agreements(descriptors)
     agreement += agreement.T
@@ -58,7 +58,7 @@ def best_pairs(descriptors: Sequence[NDArray[np.generic]], partners: int = PARTN
 def proposed_pairs(
     names: Sequence[str], strongest: Callable[[str], NDArray[np.generic]]
 ) -> list[tuple[str, str]]:
-    """The pairs of ``pairs=auto``: all of up to `ALL_PAIRS_UP_TO` images, else the `best_pairs`.
+    """The pairs of ``pairs=auto``: all for up to `ALL_PAIRS_UP_TO` images, else the `best_pairs`.
 
     ``strongest`` returns the descriptors of an image's strongest features.
     """
@@ -72,7 +72,7 @@ def _named(pairs: Sequence[Pair], names: Sequence[str]) -> list[tuple[str, str]]
 
 
 def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.int64]:
-    """Count mutual nearest neighbours that pass the ratio test, for images i < j; [N, N].
+    """Count mutual nearest neighbours that pass the ratio test, for images i < j, as [N, N].
 
     Descriptors are whole numbers here, and their products stay below 2^24. They are exact in
     float32, so the counts are the same on every machine and with any number of threads.
@@ -80,7 +80,7 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
     count = len(descriptors)
     width = max(part.shape[1] for part in descriptors)
     table = np.zeros((count, STRONGEST, width), dtype=np.float32)
-    # infinite for empty rows: never the nearest
+    # infinite for empty rows, which are then never the nearest
     squares = np.full((count, STRONGEST), np.inf, dtype=np.float32)
     for index, part in enumerate(descriptors):
         strongest = part[:STRONGEST].astype(np.float32)
@@ -106,7 +106,7 @@ def count_agreements(descriptors: Sequence[NDArray[np.generic]]) -> NDArray[np.i
 
 
 def select_pairs(names: Sequence[str], options: ColmapOptions) -> list[tuple[str, str]]:
-    """The pairs of names to match; for ``auto`` and ``lowres`` all, of which some remain later."""
+    """The pairs of names to match; for ``auto`` and ``lowres`` all, since these drop some later."""
     if options.pairs == "sequential":
         return _named(sequential_pairs(len(names), options.overlap), names)
     return list(combinations(names, 2))

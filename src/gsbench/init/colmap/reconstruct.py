@@ -16,7 +16,7 @@ from gsbench.scene.types import Array, Capture
 
 
 def load_reference(capture: Capture, reference: Path | None) -> pycolmap.Reconstruction | None:
-    """The reference model, fitted to the image files and the capture's images; None if none."""
+    """The model ``reference``, else the capture's, fitted to the image files; None without both."""
     if reference is not None:
         capture = replace(capture, model=reference)
     return None if capture.model is None else read_reference(capture)
@@ -49,7 +49,7 @@ def common_poses(
 def keep_training_points(
     model: pycolmap.Reconstruction, names: Collection[str], images: Path
 ) -> TrainingPoints:
-    """Keep the points that at least two of the images ``names`` see, with those observations alone.
+    """Keep the points that at least two of the images ``names`` see, with only those observations.
 
     Positions do not change. Colours are read again, from the photographs in the folder ``images``.
     """
@@ -65,7 +65,7 @@ def keep_training_points(
         copy = pycolmap.Point3D(xyz=np.array(point.xyz), error=point.error, track=track)
         # `point` and `seen` are views into the model, and invalid from here on
         model.delete_point3D(point_id)
-        if len(dict(observations)) < MIN_TRACK:  # images, not observations
+        if len(dict(observations)) < MIN_TRACK:  # an image may see a point twice
             continue
         model.add_point3D_with_id(point_id, copy)
         for image_id, index in observations:

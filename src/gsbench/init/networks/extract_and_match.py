@@ -35,7 +35,7 @@ LOWRES_MATCHES = 20  # pairs with more matches are matched at full size
 
 @dataclass(frozen=True)
 class NetworkJob:
-    """Inputs of the isolated process. Weights are checked files, or None where none is needed."""
+    """Inputs of the isolated process. Weights are checked files, or None if not needed."""
 
     options: FeatureOptions
     settings: FeatureSettings
@@ -134,7 +134,7 @@ def _extract_all(
     for done, name in enumerate(names, start=1):
         features = store.read_features(name)
         if features is None:
-            # only where an image needs it: a run that is continued may need no network
+            # loaded when an image needs it, since a run that is continued may need no network
             extractor = extractor or EXTRACTORS[settings.extractor](
                 settings, job.extractor_weights, device
             )

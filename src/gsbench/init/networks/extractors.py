@@ -1,4 +1,4 @@
-"""Networks that find features, by name, and features of an image from one of them."""
+"""Extractors of local features, by name, and the features that one finds in an image."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsbench.weights import MissingWeightsError, load_state
 
 GPU_MEMORY_HINT = "lower init.max_image_size or init.max_keypoints, or set init.device=cpu"
 SUPERPOINT_BORDER = 4  # px without keypoints, as in deep-image-matching
-# of SuperPoint's tensors in a LightGlue checkpoint of transformers
+# in the names of SuperPoint's tensors in a LightGlue checkpoint of transformers
 LIGHTGLUE_DETECTOR_PREFIX = "keypoint_detector."
 
 # Finds features in an image [1, 3, H, W], RGB in [0, 1]: keypoints [K, 2] in px with the centre of
@@ -30,7 +30,7 @@ Extractor = Callable[[Tensor], Found]
 def extract_features(
     path: Path, extractor: Extractor, settings: FeatureSettings, device: torch.device
 ) -> Features:
-    """The strongest features of an image, shrunk to the size that ``settings`` has for the network.
+    """Shrink an image to ``settings.max_image_size`` and find its strongest features.
 
     Raises ``InputError`` if the image cannot be read or the device runs out of memory.
     """
@@ -55,14 +55,14 @@ def extract_features(
 def load_into(
     network: torch.nn.Module, state: Mapping[str, Tensor], path: Path, device: torch.device
 ) -> None:
-    """Load ``state``, with all parameters, into ``network`` on ``device``; buffers may lack."""
+    """Load all parameters in ``state`` into ``network`` on ``device``; buffers may be missing."""
     try:
         missing, unexpected = network.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:
         raise MissingWeightsError(
             f"weights file {path} has tensors of other shapes than the network: replace it"
         ) from error
-    # Buffers are constants that a network makes itself, and checkpoints of others often lack them.
+    # Buffers are constants that a network makes itself, and published checkpoints often lack them.
     learned = {name for name, _ in network.named_parameters()}
     missing = sorted(learned.intersection(missing))
     if missing or unexpected:

@@ -40,8 +40,10 @@ class Features:
 
     @property
     def colmap_keypoints(self) -> NDArray[np.float32]:
-        """Keypoints [K, 2] in px of the file, with the centre of the first pixel at (0.5, 0.5), as
-        in COLMAP."""
+        """Keypoints [K, 2] in px of the file, in COLMAP's convention.
+
+        The centre of the first pixel is (0.5, 0.5).
+        """
         scale = np.array(self.file_size, dtype=np.float64) / self.network_size
         return ((self.keypoints.astype(np.float64) + 0.5) * scale).astype(np.float32)
 
@@ -74,7 +76,7 @@ class FeatureSettings:
 
     @classmethod
     def of(cls, options: object, **others: Any) -> FeatureSettings:
-        """The settings that ``options`` has under the same names, unless ``others`` has them."""
+        """The settings in attributes of ``options``, replaced or completed by ``others``."""
         names = [entry.name for entry in fields(cls) if hasattr(options, entry.name)]
         return cls(**({name: getattr(options, name) for name in names} | others))
 

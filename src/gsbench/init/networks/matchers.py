@@ -20,7 +20,7 @@ Matcher = Callable[[Features, Features], Matches]
 
 
 def mutual_nearest_matcher(max_ratio: float, device: torch.device) -> Matcher:
-    """Match descriptors that are each other's nearest and pass the ratio test both ways."""
+    """A matcher of mutual nearest neighbours that pass the ratio test in both directions."""
     from kornia.feature import match_smnn
 
     def match_features(first: Features, second: Features) -> Matches:
@@ -40,7 +40,7 @@ def lightglue_matcher(
     """kornia's LightGlue, with weights for the features of one extractor."""
     from kornia.feature import LightGlue
 
-    # Without a name of features, kornia does not download weights.
+    # kornia downloads weights unless the name of the features is None.
     no_name: Any = None
     layout = dict(LightGlue.features[extractor])
     layout.pop("weights", None)

@@ -1,4 +1,4 @@
-"""Evaluation: renders the test views at 8 bits, as the PNGs hold them, and measures them."""
+"""Rendering the test views at 8 bits, as PNG files store them, and measuring them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ TIMED_RENDERS = 5  # of each view, to measure the speed
 def evaluate_step(views: Views, trained: Step, parts: Parts) -> Step:
     """The step that renders and measures the model of ``trained`` and its earlier snapshots.
 
-    Where another program left renders instead of a model, the step measures those. ``eval.maps``
+    If another program left renders instead of a model, the step measures those. ``eval.maps``
     adds a picture of the large Gaussians; ``eval.fps`` is the image size at which the speed of
     rendering is measured.
     """
@@ -198,13 +198,13 @@ def _write_metrics(
 ) -> None:
     """Write the metrics of each view and their means.
 
-    Each view's row also says how near the training views are, and which share of its pixels counts
-    under masks.
+    The row of a view also has its nearness to the training views and, with masks, the share of its
+    pixels that count.
     """
     cameras, training = ([view.camera for view in views] for views in (scene.test, scene.train))
     near = nearest_training_cameras(cameras, training, scene.extent)
     masked = any(view.mask is not None for view in [*scene.train, *scene.test])
-    # The further columns are no metrics, so they stay out of `per_view`, whose means are taken.
+    # These columns are no metrics, so they are not in `per_view`, from which means are taken.
     rows = {name: dict(row) for name, row in per_view.items()}
     for view, distances in zip(scene.test, near, strict=True):
         counted = {COUNTED: view.counted} if masked else {}
@@ -241,7 +241,7 @@ def one_color_psnr(scene: Scene, protocol: Protocol) -> float | None:
 
 
 def summary_of(evaluator: Evaluator, per_view: Mapping[str, Mapping[str, float]]) -> Evaluation:
-    """The means, the missing metrics and why, and the facts about a user's metrics."""
+    """The means, the missing metrics with reasons, and the facts about the user's metrics."""
     return Evaluation(
         metrics=summarize(per_view, evaluator.unavailable),
         unavailable=dict(evaluator.unavailable),
@@ -278,11 +278,9 @@ def draw_ellipsoids(
 ) -> Image.Image:
     """The view ``render`` [H, W, 3] with outlines of Gaussians above ``volume_threshold``.
 
-    The threshold is in cubed scene units.
-
-    An outline is the projected ellipsoid of one standard deviation. Its colour tells the rule that
-    made the Gaussian (``causes`` [N], see ``Cause``). At most the 1500 most voluminous are drawn. A
-    legend stands below the view.
+    The threshold is in cubed scene units. An outline is the projected ellipsoid of one standard
+    deviation. Its colour tells which rule made the Gaussian (``causes`` [N], see ``Cause``). At
+    most the 1500 most voluminous Gaussians are drawn. A legend is below the view.
     """
     volumes = log_volume(gaussians.log_scales)  # [N]
     large = (volumes > math.log(volume_threshold)) & (gaussians.opacities > MIN_OPACITY)

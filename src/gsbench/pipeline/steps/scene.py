@@ -139,8 +139,8 @@ def _transforms_step(transforms: Transforms) -> Step:
 def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
     """The step that replaces masked and transparent pixels before any other step sees them.
 
-    None for a capture without masks whose transparent pixels become black: images are read so
-    anyway.
+    None for a capture without masks if transparent pixels become black, because reading an image
+    makes them black anyway.
     """
     if not capture.masks and backdrop == "black":
         return None
@@ -176,7 +176,7 @@ def masked_capture(capture: Capture, folder: Path) -> Capture:
 
 
 def normalizing_step(capture: Capture) -> Step | None:
-    """The step that moves the model to the coordinates of the training; None if it stays.
+    """The step that moves the model to the coordinates of the training; None if they are the same.
 
     It comes before the initialisation, so triangulation and the reading of points work there too.
     """
@@ -220,9 +220,9 @@ class Views:
 
     @cached_property
     def scene(self) -> Scene:
-        """The undistorted, shrunk views; no copy of a test view is trained. ``init`` must be built.
+        """The undistorted, shrunk views, without training views that are copies of test views.
 
-        Prepared images are cached in the store.
+        ``init`` must be built. Prepared images are cached in the store.
         """
         with progress("scene") as report:
             scene = load_scene(
@@ -271,7 +271,7 @@ def init_step(
     reference: Step | None = None,
     user: UserCode = NO_USER_CODE,
 ) -> Step:
-    """The initialiser's step.
+    """The step that runs the initialiser.
 
     ``reference`` is the step that reconstructs cameras for a capture without them.
     """
@@ -295,10 +295,7 @@ def init_step(
 
 
 def check_readable(capture: Capture, report: Progress) -> None:
-    """Decode every photograph once, so that a damaged file is named before hours of work.
-
-    Raises InputError.
-    """
+    """Decode every photograph once; raises InputError for a damaged one before hours of work."""
     with ThreadPoolExecutor(max_workers=available_threads()) as pool:
         made = pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)
         for done, _ in enumerate(made, 1):

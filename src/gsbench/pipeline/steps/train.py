@@ -133,7 +133,7 @@ def check_points(
     normalization: Normalization,
 ) -> InitialCloud:
     """Check the points that training starts from against the training views (`check_start`)."""
-    # A user's initialiser may be of any class.
+    # A user's initialiser may lack the attribute.
     return check_start(
         points, colors, scene, getattr(parts.initializer, "random_points", False), normalization
     )
@@ -247,7 +247,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         count = collect_result(trainer, views, output, values, folder)
         shutil.rmtree(work)
         (folder / EVENTS).write_text("")
-        # The record keeps the names of the folders in the command, since the folders vanish.
+        # The record has placeholders instead of the folders in the command, which are deleted.
         nameless = values | {name: f"{{{name}}}" for name in places}
         summary = {
             "evaluated_from": FROM_MODEL if trainer.leaves_model else FROM_RENDERS,
@@ -268,8 +268,8 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
         lineage = None if count is None else Lineage(count)
         _write_training(folder, summary, lineage, views, device, start)
 
-    # Its own version: changes of gsbench's trainer do not concern it. A stopped program starts from
-    # the beginning.
+    # The stage has its own version, because changes of gsbench's trainer do not affect it. It is
+    # not resumable, because a stopped program starts from the beginning.
     stage = replace(TRAIN, version=1, resumable=False)
     return step_of(stage, inputs, build)
 
@@ -282,9 +282,10 @@ def filled_command(trainer: External, values: Mapping[str, object]) -> list[str]
 def collect_result(
     trainer: External, views: Views, output: Path, values: Mapping[str, object], folder: Path
 ) -> int | None:
-    """Move the model or the renders from ``output`` to ``folder``; returns a model's Gaussians.
+    """Move the model or the renders from ``output`` to ``folder``.
 
-    Raises TrainingError, with the log's path, if the program left something else.
+    Returns the number of Gaussians of a model, and None for renders. Raises TrainingError, with the
+    log's path, if the program left something else.
     """
     pattern = fill_placeholders(trainer.result, values, "densify.result")
     try:
@@ -301,7 +302,7 @@ def collect_result(
 
 def environment_of(trainer: External, values: Mapping[str, object]) -> dict[str, str]:
     """The program's environment: gsbench's without its variables, and ``densify.environment``."""
-    # Without SAFE_PATH, too: a train.py must find the modules beside it.
+    # SAFE_PATH is left out too, because a train.py must find the modules beside it.
     environment = {
         name: value
         for name, value in os.environ.items()
@@ -326,7 +327,7 @@ def check_version(
         fill_placeholders(word, values, key) for word in split_command(trainer.version_command, key)
     ]
     try:
-        # In an empty folder: `python -c` would import modules that lie in the current one.
+        # It runs in an empty folder, because `python -c` imports modules of the current folder.
         with tempfile.TemporaryDirectory(prefix="gsbench-version-") as empty:
             done = subprocess.run(
                 command,
