@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 VARIABLE = "MLFLOW_TRACKING_URI"
 LOCK = ".mlflow.lock"  # in the runs folder: one process at a time makes tables and experiments
-# else its page opens in the view for chat models
+# Without this tag, the experiment's page opens in the view for chat models.
 KIND = {"mlflow.experimentKind": "custom_model_development"}
-# Environment against printing, telemetry and hanging for minutes.
+# Environment variables against printing, telemetry and waits of minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",

@@ -85,7 +85,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a trial in a tracker, in Markdown (``note``) and in numbers."""
+    """What a tracker shows of a finished trial; ``note`` is in Markdown."""
 
     note: str
     scalars: Sequence[Scalar]
@@ -158,7 +158,7 @@ class Sink(Protocol):
     def log(self, scalars: Sequence[Scalar]) -> None:
         """Log numbers.
 
-        Some may be repetitions: a process may be killed between sending and noting that.
+        Some may have been sent before, by a process that was killed before it could record that.
         """
 
     def complete(self, summary: Summary) -> None:
@@ -325,7 +325,7 @@ def _read_picture(path: Path) -> Array:
 def _seconds(record: Mapping[str, float]) -> float:
     """The training time of a record.
 
-    Without one, a function of its iteration, so that each reading gives the same.
+    For a record without a time it is computed from the iteration, so that each reading agrees.
     """
     return float(record.get("seconds", record["step"] / 1000))
 
