@@ -134,7 +134,7 @@ class ArmSearch:
         return None if record is None else record.metrics.get(self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
-        """Judge a point by the mean of its trials; it has failed if one of them lacks the metric."""
+        """Judge a point by the mean of its trials; it failed if one of them lacks the metric."""
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]

@@ -242,7 +242,7 @@ def check_composed(
 
 
 def _differing(given: Any, installed: Any) -> Any:
-    """The part of ``given`` that differs from ``installed``: some entries of a mapping, else all."""
+    """The part of ``given`` that differs from ``installed``: entries of a mapping, or all."""
     if not isinstance(given, dict) or not isinstance(installed, dict):
         return given
     differing = {
