@@ -174,7 +174,7 @@ def _simulated(kind: Kind, drawn: Drawn, effect: float) -> list[tuple[str, str]]
 
 
 def _is_true(word: str, truth: float) -> bool:
-    """Return whether the verdict ``word`` on the claim "more" fits the true difference ``truth``."""
+    """Return whether the verdict ``word`` on the claim "more" is right for the real difference."""
     return {
         "supported": truth > 0,
         "refuted": truth < 0,
