@@ -33,7 +33,7 @@ ONE_ARM = "one arm fails"
 
 @dataclass(frozen=True)
 class Rule:
-    """Which variances a rule uses, and how many degrees of freedom it counts for their sum.
+    """A rule: the variances that it uses, and the degrees of freedom that it counts for their sum.
 
     ``units`` is "pairs", "arms" (both of each scene), or "larger" (the larger of these two sums).
     The degrees are ``factor`` times Satterthwaite's, and at least those of one variance.

@@ -82,7 +82,7 @@ RULES: Mapping[str, Rule] = {
 
 @dataclass(frozen=True)
 class Rates:
-    """How well a rule does, on average over nights."""
+    """Rates of a rule over many nights."""
 
     false: float  # share of kept ideas that are no better
     found: float  # share of good ideas that are kept

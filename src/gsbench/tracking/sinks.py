@@ -85,7 +85,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a tracker shows of a finished trial; ``note`` is in Markdown."""
+    """The parts of a finished trial that a tracker shows; ``note`` is in Markdown."""
 
     note: str
     scalars: Sequence[Scalar]
