@@ -98,7 +98,7 @@ def plan(seed: int = 0) -> list[Row]:
 
 
 class Runner:
-    """Runs rows of parts in ``seconds``; what a part says and how it ends is in $OUT at once."""
+    """Runs rows of parts in ``seconds``; a part's output and end are written to $OUT at once."""
 
     def __init__(self, verb: str, seconds: float) -> None:
         self.archive, self.records = OUT / f"gpu_day-{verb}.tar.gz", RESULTS / f"parts-{verb}.jsonl"

@@ -119,7 +119,7 @@ def reached(start: str) -> set[str]:
 
 
 def room(module: str) -> str:
-    """The folder below ``gsbench`` that contains a module; a file beside the folders is a room, too."""
+    """The room of a module: its folder below ``gsbench``, or itself if it is in none."""
     parts = module.split(".")
     return parts[1] if parts[0] == "gsbench" and len(parts) > 1 else ""
 

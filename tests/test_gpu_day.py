@@ -174,7 +174,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day: Day) ->
         "results/proof-triton.log",
     } <= set(files)
     assert "broken on purpose" in said  # the end of what it wrote
-    for name in ("proof-triton", "train-volumetric-0"):  # what a part left behind has ended, too
+    for name in ("proof-triton", "train-volumetric-0"):  # the child of a part has ended, too
         child = Path("/proc") / (day.state / "results" / f"{name}.out").read_text().strip()
         assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
     table = (day.out / "table.md").read_text()

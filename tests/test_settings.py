@@ -1,4 +1,4 @@
-"""Values are checked by the annotations of dataclasses, gsbench's and users'; errors name the key."""
+"""Values are checked by the annotations of gsbench's and users' dataclasses."""
 
 from __future__ import annotations
 

@@ -216,7 +216,7 @@ def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str
     (unless ``infinite``) and at most ``most`` values, where a YAML alias counts each time it is
     used.
     """
-    # what is left to check, with its place: the keys that lead there
+    # values still to check, each with its place: the keys that lead there
     containers: deque[tuple[tuple[Any, ...], Any]] = deque([((), [value])])
     count = 0
     while containers:

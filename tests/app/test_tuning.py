@@ -147,7 +147,7 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert {one["densify"][KEYS[arm]] for one in own} == {closest}
         assert not any(one["scene"]["validation"] for one in own)
     assert all(isinstance(one.values["densify"]["stop"], int) for one in fake.tuning("volumetric"))
-    # the arm as it is comes first
+    # the arm's own values are the first point
     assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002
 
 
@@ -245,7 +245,7 @@ def test_failed_points_count_in_the_budget_and_an_arm_without_a_judged_point_end
     )
 
 
-def test_a_typed_value_takes_the_place_of_an_interval(sweep, runs):
+def test_a_typed_value_replaces_an_interval(sweep, runs):
     fake = Fake()
     assert sweep(fake, "densify.stop=200", "hydra.sweeper.tune.points=1") == 0
     assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {200}

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsbench.raster.staged import Readback
 
 OWN_CODE = "gsbench."
-# Operations whose result, or its size, the host has to know before it goes on.
+# Operations whose result, or its size, the host must know before it continues.
 WAITING = frozenset(
     {
         "_local_scalar_dense",

@@ -99,7 +99,7 @@ def test_times_on_a_gpu_are_those_of_kernels_alone() -> None:
     )
 
 
-def test_whole_steps_leave_the_scene_as_it_is() -> None:
+def test_whole_steps_do_not_change_the_scene() -> None:
     stepper = Stepper("cpu", Setting("trained", 40, 30, 50, threads=1))
     before = [
         tensor.detach().clone() for tensor in stepper.trainer.gaussians.values.tensors().values()

@@ -150,7 +150,7 @@ def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
 # ---- Hydra's own files and logs
 
 
-def test_hydra_writes_its_files_where_it_is_told(gsbench, tmp_path):
+def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
     words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr

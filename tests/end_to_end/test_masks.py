@@ -157,7 +157,7 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     assert json.loads((folder / "results.json").read_text())["hashes"] == first["hashes"]
 
 
-def test_bad_masks_end_in_one_line_before_any_work(captures, tmp_path, capfd):
+def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, capfd):
     capture = tmp_path / "bad"
     shutil.copytree(captures[0], capture)
     mask = sorted((capture / "masks").iterdir())[2]

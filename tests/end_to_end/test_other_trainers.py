@@ -273,7 +273,7 @@ BAD_RENDERS = {
 
 
 @pytest.mark.parametrize(("arm", "expected"), [("cloud", BAD), ("painter", BAD_RENDERS)])
-def test_each_bad_program_is_one_line_and_the_other_trials_go_on(
+def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
     trainers, tmp_path, monkeypatch, capsys, arm, expected
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))

@@ -242,9 +242,7 @@ def test_options_of_the_command_line():
         parse(["--config-dir", "/nowhere"])
 
 
-def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     words = [
         "-m",
@@ -257,7 +255,7 @@ def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
         InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"
     ):
         launch(words)
-    assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # nothing to clean up after the mend
+    assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # no trial has begun
     assert launch([*words, "--dry-run"]) == 0
     assert "scene truck: the folder" in capsys.readouterr().out
 
@@ -417,7 +415,7 @@ def test_awaited_metrics_are_not_inferred_from_the_texts_of_reasons():
     assert not why_not_done(values, ["lpips_vgg"])
 
 
-def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs):
+def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2,3"], multirun=True)
     add_to_plan(trials[:2])
     add_to_plan(trials)
@@ -442,7 +440,7 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs):
     assert len(states_of_experiment(runs / "x")) == 3
 
 
-def test_damaged_plan_is_named_and_the_next_command_mends_it(runs, caplog):
+def test_a_damaged_plan_is_named_and_the_next_command_repairs_it(runs, caplog):
     (runs / "x").mkdir(parents=True)
     (runs / "x" / "plan.json").write_text("{")
     assert read_plan(runs / "x") == {}
@@ -590,7 +588,7 @@ def test_storage_errors_are_recognised(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
-def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, refused):
+def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkeypatch, refused):
     def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 

@@ -96,7 +96,7 @@ def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -
 
 
 def test_sources_include_every_module_that_kernels_import() -> None:
-    """Exceptions are modules that only prepare calls of kernels: memory, threads, cameras, words."""
+    """Modules that only prepare calls of kernels are exceptions."""
     known = {path.relative_to(PACKAGE).as_posix() for path in sources(PACKAGE)}
     around = {
         "logs.py",

@@ -353,7 +353,7 @@ def _key_and_value(word: str) -> tuple[str, Any]:
 def hydra_ready() -> Iterator[None]:
     """Initialise Hydra with gsbench's configuration folder within the block."""
     register_schemas()
-    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of ours
+    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of this kind
         yield
         return
     try:

@@ -163,7 +163,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
             f"{group}.{TARGET}={target} cannot be imported: {module_name} has no "
             f"{name}{did_you_mean(name, dir(module))}"
         )
-    # A name that an allowed module merely imports (`mine.Popen`) is somebody else's code.
+    # A name that an allowed module merely imports (`mine.Popen`) is the code of another module.
     defined_as = f"{getattr(cls, '__module__', None)}.{getattr(cls, '__qualname__', name)}"
     if isinstance(cls, type) and not is_allowed(defined_as, (PACKAGE, *allowed)):
         advice = permission_advice([defined_as.split(".")[0]], allowed)

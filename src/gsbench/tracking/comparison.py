@@ -62,7 +62,7 @@ def publish(home: Path, uri: str | None) -> str:
 def _set(client: MlflowClient, experiment_id: str, tags: dict[str, str]) -> None:
     present = client.get_experiment(experiment_id).tags
     note = present.get(NOTE)
-    if note and OWN_NOTE not in note:  # somebody wrote a description
+    if note and OWN_NOTE not in note:  # a user wrote the description
         tags = {VIEW: tags[VIEW]}
     for key, value in tags.items():
         if len(value) <= MAX_TAG and present.get(key) != value:

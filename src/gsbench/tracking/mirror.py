@@ -243,8 +243,8 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             yield f"left out: {error}"
             continue
         options = values["tracking"] | ({"uri": uri} if uri else {})
-        # The runs folder may be somebody else's: it must not make us send files or passwords to an
-        # address of theirs.
+        # The runs folder may be a stranger's. It must not make gsbench send files or passwords to
+        # the stranger's address.
         if address := untyped_address(options, uri):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "

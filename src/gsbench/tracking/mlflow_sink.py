@@ -124,8 +124,8 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
 
     if client.tracking_uri != default_uri(runs):
         return
-    # The runs folder may be somebody else's, and its database name a server that would get files
-    # and our password.
+    # The runs folder may be a stranger's, and its database may name a server that would get files
+    # and the user's password.
     place = Path(local_file_uri_to_path(address))
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(

@@ -61,7 +61,7 @@ def picture_key(view: str, kind: str) -> str:
 def arm_name(densify: str, init: str) -> str:
     """The name of an arm.
 
-    What is compared most often comes first, since trackers cut long names at their end.
+    The densifier is compared most often. It comes first, since trackers cut long names at the end.
     """
     return f"{densify} · {init}"
 
@@ -334,7 +334,7 @@ def _seconds(record: Mapping[str, float]) -> float:
 
 
 class TensorBoardSink:
-    """The event files of one trial. They cannot be edited, so a continued trial is written anew."""
+    """The event files of one trial. They cannot be edited, so a continued trial starts anew."""
 
     name, state_file = "TensorBoard", "tensorboard.json"
 
@@ -383,7 +383,7 @@ class TensorBoardSink:
 
 # ---- Weights & Biases: ``tracking.uri`` is its server, else WANDB_BASE_URL and WANDB_MODE decide
 
-# our own axis: W&B's step must only grow, and the two files of curves are read one after the other
+# gsbench's axis: W&B's step must only grow, and two files of curves are read one after the other
 STEP = "iteration"
 
 

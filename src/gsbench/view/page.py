@@ -96,7 +96,7 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
 
 
 def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The path through the cameras and back, shown until somebody takes the mouse."""
+    """The path through the cameras and back, shown until the user takes the mouse."""
     stops = [*cameras, cameras[0]]
     # for each key, the numbers of all stops one after another
     values = {key: np.ravel([stop[key] for stop in stops]).tolist() for key in cameras[0]}
