@@ -30,8 +30,10 @@ GENERATED = {"settings.md": "settings", "results.md": "results"}
 
 
 def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
-    """The text of a page in ``folder`` with links that work on the site. Blocks of code stay
-    unchanged."""
+    """The text of a page in ``folder`` with links that work on the site.
+
+    Blocks of code stay unchanged.
+    """
 
     def replace(match: re.Match[str]) -> str:
         text, target, anchor = match["text"], match["target"], match["anchor"] or ""

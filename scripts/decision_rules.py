@@ -1,5 +1,4 @@
-"""Rules for the test of the mean over scenes, simulated: for "Rules that were tried" in
-docs/verdict.md.
+"""Simulate rules for the test of the mean over scenes (docs/verdict.md, "Rules that were tried").
 
     python scripts/decision_rules.py                   print the table (about ten minutes)
     python scripts/decision_rules.py --draws 4000      print it from fewer draws
@@ -34,8 +33,11 @@ ONE_ARM = "one arm fails"
 
 @dataclass(frozen=True)
 class Rule:
-    """Variances of "pairs", of both "arms" of each scene, or the "larger" of both sums, and the
-    degrees of freedom: ``factor`` times Satterthwaite's, at least those of one variance."""
+    """A rule: the variances that it uses, and the degrees of freedom that it counts for their sum.
+
+    ``units`` is "pairs", "arms" (both of each scene), or "larger" (the larger of these two sums).
+    The degrees are ``factor`` times Satterthwaite's, and at least those of one variance.
+    """
 
     units: str
     name: str
@@ -47,8 +49,10 @@ class Rule:
     equal_noise: bool = False  # levels of looks from equally noisy scenes alone
 
     def degrees(self, variances: Array, each: Array, seeds: int) -> tuple[Array, Array]:
-        """The variances to use [D, C], and the degrees of freedom [D] of their sum, from variances
-        that have ``each`` [C] degrees."""
+        """The variances to use [D, C], and the degrees of freedom [D] of their sum.
+
+        The given variances [D, C] have ``each`` [C] degrees.
+        """
         if self.moderated and len(each) > 1:
             return _moderate(variances, each)
         shift = 2 if self.unbiased else 0
@@ -62,7 +66,7 @@ def _matched(variances: Array, each: Array) -> Array:
 
 
 def _moderate(variances: Array, each: Array) -> tuple[Array, Array]:
-    """Smyth, Stat. Appl. Genet. Mol. Biol. 3 (2004) 3, section 6.2."""
+    """As in limma: Smyth, Stat. Appl. Genet. Mol. Biol. 3 (2004) 3, section 6.2."""
     half = each[0] / 2
     logs = np.log(variances) - special.digamma(half) + math.log(half)
     excess = np.maximum(logs.var(axis=1, ddof=1) - special.polygamma(1, half), 1e-3)
@@ -104,8 +108,10 @@ RULES = [
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Trainings of ``baseline`` [D, S, MANY] and ``arm`` [D, S, K], the ``effect`` to add to these,
-    and the ``truth`` [D] without it."""
+    """Trainings of ``baseline`` [D, S, MANY] and ``arm`` [D, S, K].
+
+    ``effect`` is added to those of the arm; ``truth`` [D] is the real difference without it.
+    """
 
     baseline: Array
     arm: Array
@@ -139,7 +145,7 @@ def p_values(mean: Array, error: Array, degrees: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def calibration(scenes: int, seeds: int) -> list[Draws]:
-    """Draws with equal noise, with a noisy scene, and with one arm of a scene that alone counts."""
+    """Draws with equal noise, with a noisy scene, and with noise that is nearly all in one arm."""
     deviations = [np.ones((scenes, 2)) for _ in range(3)]
     deviations[1][0] = NOISY
     deviations[2][0, 1] = 1e3 * NOISY
@@ -277,7 +283,7 @@ def power(rule: Rule, draws: int, scenes: int, seeds: int) -> float:
 
 
 def table(draws: int) -> str:
-    """The table: a rule a row."""
+    """The table in Markdown: one row for each rule."""
     cells: dict[Rule, list[str]] = {rule: [rule.units, rule.name] for rule in RULES}
     in_grid: dict[Rule, list[tuple[float, str]]] = {rule: [] for rule in RULES}
     in_rows: dict[Rule, list[tuple[float, str]]] = {rule: [] for rule in RULES}

@@ -1,5 +1,4 @@
-"""docs/fidelity.md: each arm with its source, the parts compared with a restatement, and the
-largest difference.
+"""Write docs/fidelity.md: how far each arm is from a restatement of its source.
 
     python scripts/fidelity.py            say whether the page agrees with what the tests measure
     python scripts/fidelity.py --write    write it
@@ -57,8 +56,7 @@ one pixel off the mean. In gsbench small pictures have 8 bits.
 
 @dataclass(frozen=True)
 class Arm:
-    """A row of the page: an arm's source, the compared parts, the tests that compare them, and
-    deviations."""
+    """A row of the page: an arm's source, what is compared, the tests of that, and deviations."""
 
     source: str
     compared: str
@@ -103,8 +101,7 @@ def calls_of(function: Any) -> Iterator[dict[str, Any]]:
 
 
 def measured(arm: str) -> float:
-    """The largest difference that the tests of an arm measure. Raises AssertionError if one
-    fails."""
+    """The largest difference that the tests of an arm measure. Raises AssertionError if one fails."""
     sys.path.insert(0, str(ROOT))
     try:
         restatement = importlib.import_module("tests.densify.restatement")

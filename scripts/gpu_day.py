@@ -1,6 +1,7 @@
 """The Python part of gpu_day.sh. Parts of a row run side by side, rows one after the other.
 
-A row has an absolute end: a part that hangs takes no time from later rows; one that is fast gives.
+A row has an absolute end: a part that hangs takes no time from later rows. A fast row leaves them
+more.
 """
 
 import contextlib
@@ -97,7 +98,7 @@ def plan(seed: int = 0) -> list[Row]:
 
 
 class Runner:
-    """Runs rows of parts in ``seconds``; what a part says and how it ends is in $OUT at once."""
+    """Runs rows of parts in ``seconds``; a part's output and end are written to $OUT at once."""
 
     def __init__(self, verb: str, seconds: float) -> None:
         self.archive, self.records = OUT / f"gpu_day-{verb}.tar.gz", RESULTS / f"parts-{verb}.jsonl"
@@ -197,7 +198,7 @@ def signal_session(session: int, *signals: int) -> None:
 
 
 def rest(names: tuple[str, ...]) -> list[Row]:
-    """Rows of the named parts, else of what did not end well in `all`, else of the next seed."""
+    """Rows of the named parts; without names, of those that failed before, or of the next seed."""
     done = {name for name, record in read_ends(RESULTS).items() if record["end"] == 0}
     parts = [part for row in plan() for part in row.parts]
     seed = sum(f"train-{ARMS[0]}-{seed}" in done for seed in SEEDS)

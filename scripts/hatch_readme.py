@@ -1,7 +1,7 @@
-"""Build hook: gives the README on the package index absolute links, from the address in
-``[project.urls]``.
+"""Build hook: gives the README on the package index absolute links.
 
-In the repository its links stay relative, so that they work in every clone and on every forge.
+They begin with the address in ``[project.urls]``. In the repository its links stay relative, so
+that they work in every clone and on every forge.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 
 
 def absolute_links(markdown: str, repository: str) -> str:
-    """The text with absolute links into the repository. Links within the page and blocks of code
-    stay unchanged."""
+    """The text with absolute links into the repository.
+
+    Links within the page and blocks of code stay unchanged.
+    """
 
     def replace(match: re.Match[str]) -> str:
         target = match["target"]

@@ -1,5 +1,4 @@
-"""Install into the environment of this Python: by uv, which is ten times as quick as pip, otherwise
-by pip.
+"""Install into the environment of this Python by uv, ten times as quick as pip, else by pip.
 
     python scripts/install.py -e . --group dev
 
@@ -28,8 +27,7 @@ PASSED_SETTINGS = {
 
 
 def main(words: list[str]) -> int:
-    """Install the packages that ``words`` name; returns the exit code of the last program that
-    tried."""
+    """Install the packages that ``words`` name; returns the exit code of the last program."""
     what = " ".join(words)
     uv = find_uv()
     if uv is not None:
@@ -56,8 +54,7 @@ def main(words: list[str]) -> int:
 
 
 def find_uv() -> str | None:
-    """The program uv: on the PATH, or in this environment, where pip installs it if needed; None if
-    that fails."""
+    """The program uv on the PATH or in this environment; None if pip cannot install it here."""
     own = Path(sys.executable).with_name("uv")
     if found := shutil.which("uv") or shutil.which(own):
         return found
@@ -68,8 +65,10 @@ def find_uv() -> str | None:
 
 
 def uv_settings() -> dict[str, str]:
-    """The variables for uv with the values of pip's settings. If pip lists a setting twice, the
-    later counts."""
+    """The variables for uv with the values of pip's settings.
+
+    If pip lists a setting twice, the later one counts.
+    """
     listing = subprocess.run(
         [*PIP, "config", "list"], capture_output=True, text=True, check=False
     ).stdout

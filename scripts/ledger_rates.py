@@ -82,18 +82,17 @@ RULES: Mapping[str, Rule] = {
 
 @dataclass(frozen=True)
 class Rates:
-    """``false``: mean share of kept ideas that are no better. ``found``: share of good ideas that
-    are kept. ``seeds``: trained for an idea."""
+    """Rates of a rule over many nights."""
 
-    false: float
-    found: float
-    seeds: float
+    false: float  # share of kept ideas that are no better
+    found: float  # share of good ideas that are kept
+    seeds: float  # trained for an idea
 
 
 def simulate(
     rule: Rule, least: float, real: float, effect: float, adaptive: bool, nights: int
 ) -> Rates:
-    """Nights where a share ``real`` of the ideas gains ``effect`` times ``least``, others 0."""
+    """Simulate nights in which a share ``real`` of the ideas gains ``effect`` times ``least``."""
     rng = np.random.default_rng([round(100 * real), round(10 * effect), adaptive])
     baseline = rng.normal(0, 0.5**0.5, (nights, SCENES, SEEDS))
     kept, false, good, found, trained = (np.zeros(nights, dtype=np.int64) for _ in range(5))

@@ -29,8 +29,10 @@ SCRATCH = re.compile(r"(/[\w.-]+)*/gsbench-\w+(?=/|\b)")
 
 
 def main(names: list[str]) -> int:
-    """Run the notebooks whose names begin with one of ``names``, or all; returns the number of too
-    large ones."""
+    """Run the notebooks whose names begin with one of ``names``, or all.
+
+    Returns the number of notebooks that are too large.
+    """
     too_large = 0
     for source in sorted(NOTEBOOKS.glob("*.py")):
         if names and not source.name.startswith(tuple(names)):

@@ -36,8 +36,7 @@ def pixels(path: Path) -> NDArray[np.float64]:
 
 
 def initial_cloud(model: Path, view: str, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The points of a COLMAP model as the camera of ``view`` sees them, near points in front: [H,
-    W, 3]."""
+    """The points of a COLMAP model as the camera of ``view`` sees them, [H, W, 3] in [0, 1]."""
     reconstruction = pycolmap.Reconstruction(model)
     (image,) = (
         entry

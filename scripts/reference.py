@@ -1,8 +1,8 @@
-"""Pages of the site that are generated from the code: all settings, the keys of ``results.json``,
-the public names.
+"""Pages of the site that are generated from the code.
 
-``python scripts/reference.py settings|results|api`` prints one of them as Markdown, ``schema`` the
-JSON Schema.
+They list all settings, the keys of ``results.json``, and the public names. ``python
+scripts/reference.py settings|results|api`` prints one of them as Markdown, ``schema`` the JSON
+Schema.
 """
 
 from __future__ import annotations
@@ -72,8 +72,7 @@ def comments_of(cls: type) -> dict[str, str]:
 
 @cache
 def yaml_comments_of(group: str) -> dict[str, str]:
-    """The comments at the ends of lines, by key, in a group's files; of several for one key the
-    first."""
+    """The comments at the ends of lines in a group's files, by key; the first one of a key."""
     comments: dict[str, str] = {}
     for file in sorted((ROOT / "conf" / group).rglob("*.yaml")):
         for key, words in YAML_COMMENT.findall(file.read_text(encoding="utf-8")):
@@ -241,8 +240,7 @@ def as_markdown(text: str) -> str:
 
 
 def public_names() -> dict[str, list[str]]:
-    """The public names by module: those in the ``__all__`` of a package, and those that the
-    documents import."""
+    """The public names by module: a package's ``__all__``, and what the documents import."""
     public: dict[str, set[str]] = {}
     for file in sorted((ROOT / "src" / "gsbench").glob("*/__init__.py")):
         module = f"gsbench.{file.parent.name}"

@@ -1,13 +1,13 @@
-"""Simulated checks of claims whose truth is known: how often each verdict is wrong, for the table
-of docs/verdict.md.
+"""Simulate checks of claims whose truth is known, for the table of docs/verdict.md.
 
     python scripts/untruths.py                 write the table into the page (two minutes)
     python scripts/untruths.py --checks 200    print it from fewer checks
 
-A check has four claims that share an error rate of 5 %. It looks at 2, 3 and 4 seeds, and trains no
-further once a claim is decided. Differences are in standard deviations of a pair of trainings;
-`LEAST` is the least effect that matters. The table is made by the fast simulator of
-``decision_rules.py``, which decides as the judge does (the tests compare them).
+The table says how often each verdict is wrong. A check has four claims that share an error rate of
+5 %. It looks at 2, 3 and 4 seeds, and trains no further once a claim is decided. Differences are in
+standard deviations of a pair of trainings; `LEAST` is the least effect that matters. The table is
+made by the fast simulator of ``decision_rules.py``, which decides as the judge does (the tests
+compare them).
 """
 
 from __future__ import annotations
@@ -75,8 +75,10 @@ def normal(rng: np.random.Generator, scenes: int = 3) -> tuple[list[Array], Arra
 
 
 def standing_out(rng: np.random.Generator) -> tuple[list[Array], Array, Array]:
-    """Eight scenes of a population where one in eight gains .044 and the others lose .0063;
-    deviations are .005."""
+    """Eight scenes of a population where one in eight gains .044 and the others lose .0063.
+
+    The deviation of a pair of trainings is .005.
+    """
     rows, _, _ = normal(rng, 8)
     return rows, np.where(rng.random(8) < 1 / 8, 0.044, -0.0063) / 0.005, np.zeros(8)
 
@@ -86,8 +88,10 @@ def noisy(rng: np.random.Generator) -> tuple[list[Array], Array, Array]:
 
 
 def failing(rng: np.random.Generator, arms: tuple[int, ...]) -> tuple[list[Array], Array, Array]:
-    """One training in ten of each of these ``arms`` is worse by ten deviations, which changes the
-    true mean."""
+    """One training in ten of each of these ``arms`` is worse by ten deviations.
+
+    That changes the true mean.
+    """
     rows, effects, _ = normal(rng)
     for row in rows:
         for arm in arms:
@@ -111,8 +115,10 @@ KINDS = {
 
 
 def rates(kind: Kind, effect: float, checks: int, seed: int = 0, fast: bool = False) -> Rates:
-    """The rates over ``checks`` simulated checks, by the judge or by the ``fast`` simulator. The
-    real ``effect`` is in units of the least that matters."""
+    """The rates over ``checks`` simulated checks, by the judge or by the ``fast`` simulator.
+
+    The real ``effect`` is in units of the least that matters.
+    """
     rng = np.random.default_rng([seed, round(1000 * effect)])
     drawn = [kind.draw(rng) for _ in range(checks * kind.claims)]
     real = effect * LEAST
@@ -168,8 +174,7 @@ def _simulated(kind: Kind, drawn: Drawn, effect: float) -> list[tuple[str, str]]
 
 
 def _is_true(word: str, truth: float) -> bool:
-    """Return whether the verdict ``word`` on the claim "more" is right if ``truth`` is the real
-    difference."""
+    """Return whether the verdict ``word`` on the claim "more" is right for the real difference."""
     return {
         "supported": truth > 0,
         "refuted": truth < 0,
@@ -209,8 +214,7 @@ EFFECTS = (0.0, 0.5, 1.0, 2.0)
 
 
 def table(checks: int) -> str:
-    """The table: for each kind of sweep and real effect, how often each verdict occurs, and how
-    often it is wrong."""
+    """The table: how often each verdict occurs and is wrong, by kind of sweep and real effect."""
     lines = [
         "| differences | effect | supported | refuted | too small | undecided | untrue: supported "
         "| refuted | "

@@ -1,13 +1,12 @@
-"""Simulated rounds of votes whose truth is known: how often a verdict is wrong, for the table of
-docs/verdict.md.
+"""Simulate rounds of votes whose truth is known, for the tables of docs/verdict.md.
 
     python scripts/vote_untruths.py                  write the tables into the page (three minutes)
     python scripts/vote_untruths.py --rounds 200     print it from fewer rounds
 
-The log-odds of a vote for the arm are the sum of a real effect, of person, scene and view; a fifth
-of the votes say "no difference". A statement about people is about these views: it is wrong unless
-it has the sign that the median person has on them. A statement about scenes is about these people,
-in the same way.
+The tables say how often a verdict is wrong. The log-odds of a vote for the arm are the sum of a
+real effect and of a person's, a scene's and a view's own; a fifth of the votes say "no difference".
+A statement about people is about these views: it is wrong unless it has the sign that the median
+person has on them. A statement about scenes is about these people, in the same way.
 """
 
 from __future__ import annotations
@@ -52,11 +51,11 @@ EFFECTS = (0.0, 1.0)
 
 
 def rates(kind: Kind, effect: float, rounds: int, seed: int = 0) -> list[float]:
-    """The shares of rounds: people decided, wrongly; scenes decided, wrongly; both, wrongly; all
-    votes, wrongly.
+    """The shares of rounds in which a statement is decided, and in which it is decided wrongly.
 
-    "Both" needs the same outcome for people and scenes, and is about people and scenes like these.
-    "All votes" is a binomial test that takes every vote as independent.
+    The two shares are for each of four statements: about people, about scenes, about both, and from
+    all votes. "Both" needs the same outcome for people and scenes, and is about people and scenes
+    like these. "All votes" is a binomial test that takes every vote as independent.
     """
     rng = np.random.default_rng([seed, round(1000 * effect)])
     counts = np.zeros(8)
@@ -95,11 +94,10 @@ def naive(votes: NDArray[np.int_]) -> int:
 
 
 def ranking_misses(people: int, scenes: int, rounds: int) -> float:
-    """The share of intervals of a ranking of three arms that miss the arm's chance over all people
-    and scenes.
+    """The share of intervals of a ranking that miss the arm's chance over all people and scenes.
 
-    The arms' strengths are 0, 0.5 and 1 (log-odds); each person and each scene has its own, with a
-    deviation of 0.7. Three views of each scene show each pair of arms.
+    The strengths of the three arms are 0, 0.5 and 1 (log-odds); each person and each scene has its
+    own, with a deviation of 0.7. Three views of each scene show each pair of arms.
     """
     rng = np.random.default_rng([people, scenes])
     real, deviation, views = np.array([0.0, 0.5, 1.0]), 0.7, 3
@@ -129,8 +127,7 @@ SECTION = re.compile(r"(<!-- votes -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def table(rounds: int) -> str:
-    """The table: for each kind of round and real effect, how often each statement decides, and how
-    often wrongly."""
+    """The table: how often each statement decides, and how often wrongly, by kind and effect."""
     lines = [
         "| votes | effect | people decide | wrong | scenes decide | wrong | both | wrong | all "
         "votes as one | wrong |"

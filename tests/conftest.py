@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def script(name: str) -> Any:
-    """A file of scripts/ as a module."""
+    """Load a file of scripts/ as a module."""
     specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     assert specification is not None
     assert specification.loader is not None
@@ -40,8 +40,7 @@ def script(name: str) -> Any:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder with development data beside the checkout; the test is skipped where it is
-    absent."""
+    """The folder with development data beside the checkout; skips if it is absent."""
     folder = ROOT.parent / "shared"
     if not (folder / "data").is_dir():
         pytest.skip(f"needs the development data in {folder}")
@@ -50,7 +49,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def shared_weights(shared: Path) -> Path:
-    """The folder with small network weights; the test is skipped where it is absent."""
+    """The folder with small network weights; skips if it is absent."""
     if not (shared / "weights").is_dir():
         pytest.skip(f"needs the weights in {shared / 'weights'}")
     return shared / "weights"
@@ -58,23 +57,21 @@ def shared_weights(shared: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forget what the program, called within a test, tells its children of where not to import
-    from."""
-    monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that it is known here, and put back at the end
+    """Restore PYTHONSAFEPATH after each test: the program sets it for its children."""
+    monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that monkeypatch knows it, and restores it
     monkeypatch.delenv("PYTHONSAFEPATH")
 
 
 @pytest.fixture
 def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    """Catch gsbench's own lines, too, whose logger passes nothing on once a command has run, in
-    whichever order."""
+    """Catch gsbench's log lines, too: its logger does not propagate them once a command has run."""
     from gsbench.logs import LOGGER, set_up_logging
 
     handlers, propagate = LOGGER.handlers[:], LOGGER.propagate
     set_up_logging()
     LOGGER.addHandler(caplog.handler)
     yield caplog
-    # a stream that this test had is closed then
+    # the stream of this test's handlers is closed by then
     LOGGER.handlers[:], LOGGER.propagate = handlers, propagate
 
 
@@ -101,7 +98,7 @@ def said(capsys):
 
 @pytest.fixture
 def refused(capsys):
-    """A function that runs a command line, which must be refused, and returns the line of why."""
+    """A function that runs a command line, which must be refused, and returns the error's line."""
     from gsbench.cli import run
 
     def call(*words: object) -> str:

@@ -1,4 +1,4 @@
-"""The record of a finished trial, for tests that need one to be there."""
+"""The records of a finished trial and of a search, for tests that need one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsbench.runs.trial_record import TrialRecord
 
 
 def record_of(values: dict[str, Any], **changes: Any) -> TrialRecord:
-    """A finished trial with the configuration ``values``; ``changes`` are fields of the record."""
+    """The record of a finished trial with the configuration ``values``; ``changes`` are fields."""
     fields = {
         "status": "complete",
         "experiment": values["name"],
@@ -32,7 +32,7 @@ def record_of(values: dict[str, Any], **changes: Any) -> TrialRecord:
 
 
 def write_results(folder: Path, values: dict[str, Any], **changes: Any) -> TrialRecord:
-    """Write ``results.json`` alone, without a record of what the trial was made of."""
+    """Write ``results.json`` without a record of the trial's inputs (``made_of``)."""
     record = record_of(values, **changes)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(record.to_json()))
@@ -40,7 +40,7 @@ def write_results(folder: Path, values: dict[str, Any], **changes: Any) -> Trial
 
 
 def search_record(points: list[dict[str, Any]]) -> dict[str, Any]:
-    """``tuning.json`` of a search with these points, for the settings of ``volumetric``."""
+    """The content of ``tuning.json`` for a search with these points, for the arm ``volumetric``."""
     return {
         "sweep": "vth",
         "arm": "sfm-volumetric",

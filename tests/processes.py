@@ -1,4 +1,4 @@
-"""Child processes of tests, and what they have written so far."""
+"""Child processes of tests: their signals, whether they run, and the files that they write."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ import psutil
 
 
 def heed_interrupts() -> None:
-    """For ``preexec_fn``: what runs in the background of a shell, as tests may, hands an ignored
-    SIGINT on."""
+    """Restore SIGINT in a child (``preexec_fn``): tests in the background of a shell ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def is_running(pid: int) -> bool:
-    """Whether there is such a process and it has not ended; one that nobody has waited for yet
-    has."""
+    """Return whether a process exists and has not ended; a zombie has ended."""
     try:
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -25,8 +23,7 @@ def is_running(pid: int) -> bool:
 
 
 def bytes_written(folder: Path, pattern: str) -> int:
-    """Bytes in the files of ``folder`` that match ``pattern``, while their writer may rename or
-    remove any of them."""
+    """Count the bytes in files of ``folder`` that match ``pattern``; files may vanish meanwhile."""
     total = 0
     for path in folder.glob(pattern):
         with suppress(FileNotFoundError):

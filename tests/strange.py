@@ -1,5 +1,4 @@
-"""A place where a user types, with files of a stranger's: modules that leave a mark when they are
-imported."""
+"""A working folder with a stranger's files: modules that leave a mark when they are imported."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ class Calls(Callback):
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The folder where the user types: it holds modules that were never allowed, and `mine`."""
+    """The working folder of a command, with modules that were never allowed, and ``mine``."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
@@ -52,7 +51,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def no_trial(trials: Any) -> Any:
-    """In the place of what runs trials."""
+    """Stand in for a function that runs trials."""
     raise InputError("the trials began")
 
 

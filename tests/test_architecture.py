@@ -1,5 +1,4 @@
-"""Who may know whom (docs/architecture.md): read from the import statements, those inside functions
-included."""
+"""The rules of docs/architecture.md on imports between modules, also on those inside functions."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ LIBRARY = ("train", "densify", "raster", "eval", "scene", "gaussians", "init", "
 WITHOUT_TORCH = ("analysis", "runs", "datasets", "system", "config", "claims", "cli")
 KNOW_HYDRA = {"app", "config"}
 HYDRA = {"hydra", "omegaconf"}
-# What a room may import of a room below it, where that is less than all.
+# The only modules that a room may import from a room below it.
 ONLY = {
     # tables of facts, which load no torch
     ("analysis", "eval"): {"gsbench.eval.facts", "gsbench.eval.protocol"},
@@ -61,7 +60,7 @@ TYPES_ONLY = "if TYPE_CHECKING:\n    {}\nelse:\n    pass"
 
 
 def modules() -> dict[str, Path]:
-    """Every module of gsbench by its dotted name; a package goes by its own."""
+    """The file of every module of gsbench, by its dotted name; ``__init__`` by its package's."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = ("gsbench", *path.relative_to(PACKAGE).with_suffix("").parts)
@@ -93,8 +92,7 @@ def imports_of(path: Path, inside_functions: bool = True, for_types: bool = Fals
 
 @functools.cache
 def arrows(inside_functions: bool = True, for_types: bool = False) -> dict[str, set[str]]:
-    """For each module of gsbench, the modules of gsbench that it imports, and the names of foreign
-    packages."""
+    """For each module of gsbench, its imports: modules of gsbench, and names of other packages."""
     known = modules()
     graph: dict[str, set[str]] = {}
     for name, path in known.items():
@@ -110,7 +108,7 @@ def arrows(inside_functions: bool = True, for_types: bool = False) -> dict[str, 
 
 
 def reached(start: str) -> set[str]:
-    """A module and all modules of gsbench that it imports, directly or through others."""
+    """The module ``start`` and all modules of gsbench that it imports, also through others."""
     found, waiting = set[str](), [start]
     while waiting:
         name = waiting.pop()
@@ -121,8 +119,7 @@ def reached(start: str) -> set[str]:
 
 
 def room(module: str) -> str:
-    """The folder below ``gsbench`` in which a module stands; a file beside the folders is a room of
-    its own."""
+    """The room of a module: its folder below ``gsbench``, or itself if it is in none."""
     parts = module.split(".")
     return parts[1] if parts[0] == "gsbench" and len(parts) > 1 else ""
 
@@ -139,8 +136,7 @@ def by_room(graph: Graph) -> dict[str, set[str]]:
 
 
 def circle(graph: Graph) -> list[str]:
-    """The members of a circle of arrows in order, the first named again at the end; empty where
-    there is none."""
+    """The members of a circle of arrows in order, with the first again at the end; [] if none."""
     done: set[str] = set()
 
     def visit(name: str, way: list[str]) -> list[str]:
@@ -171,8 +167,10 @@ def upward(graph: Graph) -> list[str]:
 
 
 def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
-    """A shortest chain of imports from a module to one of ``goals``; importing a module runs the
-    packages it is in."""
+    """A shortest chain of imports from a module to one of ``goals``; [] if none.
+
+    Importing a module also runs the packages that contain it.
+    """
     goals, ways = set(goals), {start: [start]}
     pending = [start]
     while pending:
@@ -189,7 +187,7 @@ def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
 
 
 def test_no_circle_of_files() -> None:
-    """Imports for type checkers count: a reader follows them, too."""
+    """Imports for type checkers count, since readers follow them, too."""
     found = circle(arrows(for_types=True))
     assert not found, f"{' imports '.join(found)}: the last of these imports closes a circle"
 
@@ -229,7 +227,7 @@ def test_the_ground_floor_is_small() -> None:
 
 
 @pytest.mark.parametrize(("above", "below"), sorted(ONLY))
-def test_a_room_that_may_see_a_part_of_another(above: str, below: str) -> None:
+def test_some_rooms_import_only_parts_of_others(above: str, below: str) -> None:
     for module, targets in arrows().items():
         if room(module) == above:
             seen = {target for target in targets if room(target) == below}
@@ -250,7 +248,7 @@ def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name: str
 
 
 @pytest.mark.parametrize("name", WITHOUT_TORCH)
-def test_what_answers_at_once_loads_no_torch(name: str) -> None:
+def test_rooms_of_quick_commands_load_no_torch(name: str) -> None:
     graph = arrows(inside_functions=False)
     for module in graph:
         if room(module) == name and not module.startswith(MAY_LOAD_TORCH):
@@ -258,11 +256,11 @@ def test_what_answers_at_once_loads_no_torch(name: str) -> None:
             assert not way, " imports ".join(way)
 
 
-# the second is about torch alone
+# gsbench.system.device is only about torch
 MAY_LOAD_TORCH = ("gsbench.system.resources", "gsbench.system.device")
 
 
-def test_hydra_is_known_in_two_rooms() -> None:
+def test_only_two_rooms_import_hydra() -> None:
     for module, targets in arrows().items():
         assert not targets & HYDRA or room(module) in KNOW_HYDRA, (
             f"{module} imports {targets & HYDRA}"
@@ -270,14 +268,14 @@ def test_hydra_is_known_in_two_rooms() -> None:
 
 
 @pytest.mark.parametrize("library", sorted(HYDRA))
-def test_what_hydra_does_not_promise_to_keep_is_imported_nowhere(library: str) -> None:
+def test_private_modules_of_hydra_are_not_imported(library: str) -> None:
     internal = re.compile(rf"{library}\._")
     known = {name for name, path in modules().items() if any(map(internal.match, imports_of(path)))}
     assert not known
 
 
-def test_verbs_do_not_know_each_other() -> None:
-    # how all of them read their words; which there are
+def test_verbs_do_not_import_each_other() -> None:
+    # the arguments of all verbs, and the list of verbs
     shared = {"gsbench.verbs.arguments", "gsbench.verbs"}
     for module, targets in arrows().items():
         if room(module) == "verbs":

@@ -113,9 +113,7 @@ def make_experiment(runs: Path) -> list[Path]:
     return folders
 
 
-def test_status_lists_what_deserves_attention(
-    runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_status_lists_unfinished_trials(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folders = make_experiment(runs)
     assert cli.run(["status", "x"]) == 1
     lines = capsys.readouterr().out.splitlines()
@@ -153,7 +151,7 @@ def test_retry_runs_the_unfinished_with_their_own_settings(
     assert {TrialFolder.of(t.values).runs for t in ran} == {runs}
 
 
-def test_retry_of_a_trial_without_a_plan_takes_its_own_configuration(runs: Path) -> None:
+def test_retry_of_a_trial_without_a_plan_uses_its_configuration(runs: Path) -> None:
     folders = make_experiment(runs)
     (runs / "x" / "plan.json").unlink()
     again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
@@ -187,7 +185,7 @@ def test_a_second_retry_without_a_plan_runs_the_same_trial(
 
 
 def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
-    """A complete trial as the readers of results see it, with its model in the store."""
+    """Write a complete trial with a model and an initial cloud in the store; returns its folder."""
     values = compose_one(["name=x", "densify=adc"]).values
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
@@ -273,7 +271,7 @@ def test_doctor_on_a_runs_folder(runs: Path) -> None:
     assert next(machine.check_runs(Path("/proc/nowhere"))).verdict == "bad"
 
 
-def test_a_stop_while_a_native_module_is_imported_is_told_as_a_stop(
+def test_ctrl_c_while_a_native_module_is_imported_is_reported_as_a_stop(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stopped(argv: list[str]) -> int:

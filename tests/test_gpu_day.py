@@ -1,7 +1,4 @@
-"""scripts/gpu_day.sh without a GPU.
-
-No line of it may fail for the first time where time is short.
-"""
+"""scripts/gpu_day.sh without a GPU: every line is tried before the short time on a GPU."""
 
 from __future__ import annotations
 
@@ -23,8 +20,8 @@ from tests.raster.conftest import interpreter_fault
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "scripts" / "gpu_day.sh"
-# In place of Python: parts fail, hang, or are killed as a test wants; others give what real ones
-# give. Anything else, such as the script itself, is run by Python.
+# Stands in for Python: parts fail, hang or are killed as a test wants, and others print what real
+# ones print. Python runs everything else, such as the script itself.
 STAND_IN = r"""#!{python} -IS
 import json, os, signal, sys, time
 words = sys.argv[1:]
@@ -98,7 +95,7 @@ class Day:
         }
 
     def bring(self) -> None:
-        """An archive as `wheels` makes it."""
+        """Make an archive like that of the verb ``wheels``."""
         brought = Path(self.environment["GPU_DAY_BROUGHT"])
         (brought / "site").mkdir(parents=True)
         with tarfile.open(brought / "brought.tar.xz", "w:xz") as archive:
@@ -124,7 +121,7 @@ class Day:
         return process.returncode, said
 
     def results(self, verb: str) -> dict[str, Any]:
-        """How each part ended, of the archive in $OUT; and the names of its files below "files"."""
+        """The end of each part in the archive in $OUT; "files" has the names of the files in it."""
         with tarfile.open(self.out / f"gpu_day-{verb}.tar.gz") as archive:
             file = archive.extractfile(f"results/parts-{verb}.jsonl")
             assert file is not None
@@ -142,7 +139,7 @@ def day(tmp_path: Path) -> Day:
 
 
 @pytest.mark.slow
-def test_parts_that_fail_hang_or_are_killed_cost_no_other_part(day: Day) -> None:
+def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day: Day) -> None:
     faults = {
         "proof-triton": ("doctor --json --prove --raster triton", "hang"),
         "contract": ("test_contract.py -k triton", "kill"),
@@ -177,7 +174,7 @@ def test_parts_that_fail_hang_or_are_killed_cost_no_other_part(day: Day) -> None
         "results/proof-triton.log",
     } <= set(files)
     assert "broken on purpose" in said  # the end of what it wrote
-    for name in ("proof-triton", "train-volumetric-0"):  # what a part left behind has ended, too
+    for name in ("proof-triton", "train-volumetric-0"):  # the child of a part has ended, too
         child = Path("/proc") / (day.state / "results" / f"{name}.out").read_text().strip()
         assert not child.exists() or "\nState:\tZ" in (child / "status").read_text()
     table = (day.out / "table.md").read_text()
@@ -217,7 +214,7 @@ def test_a_killed_command_leaves_the_results_so_far_and_no_process(day: Day) -> 
     assert (rest["train-adc-0"], rest["memcheck"]) == (0, 0)
 
 
-def test_named_parts_and_a_name_that_is_none(day: Day) -> None:
+def test_named_parts_run_and_an_unknown_name_is_refused(day: Day) -> None:
     code, said = day.run("rest", "60", "bits", "train-adc-3")
     assert code == 0, said
     assert day.results("rest").keys() == {"install", "bits", "train-adc-3", "files"}
@@ -235,8 +232,8 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
     }
 
 
-def test_what_it_brings(tmp_path: Path, shared: Path) -> None:
-    """The packages and the trackless scene, of which a training takes the same points."""
+def test_the_archive_has_packages_scene_and_weights(tmp_path: Path, shared: Path) -> None:
+    """The scene has no tracks, but gives a training the same points."""
     from gsbench.scene.colmap import model_points, read_reference
     from gsbench.scene.readers import read_colmap
 
@@ -294,7 +291,7 @@ def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day
     assert "- memcheck: not tried, since" in day.run("table", str(day.out))[1]
 
 
-def test_words_that_it_does_not_know(tmp_path: Path) -> None:
+def test_an_unknown_verb_prints_the_usage(tmp_path: Path) -> None:
     code, said = Day(tmp_path).run("everything")
     assert code == 2
     assert "scripts/gpu_day.sh wheels" in said

@@ -1,4 +1,4 @@
-"""`scripts/install.py`: uv where it can be had, with the places that pip was told, else pip."""
+"""`scripts/install.py` installs by uv with the indexes of pip's settings, else by pip."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def install() -> ModuleType:
     return script("install")
 
 
-def test_places_that_pip_was_told_are_handed_on(
+def test_indexes_of_pips_settings_are_passed_to_uv(
     install: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listed = "global.index-url='https://a.org/simple'\nglobal.timeout='9'\n:env:.extra-index-url='https://b.org'\n"
@@ -34,7 +34,7 @@ def test_places_that_pip_was_told_are_handed_on(
 @pytest.mark.parametrize(
     ("uv", "code", "last"), [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")]
 )
-def test_pip_does_what_uv_does_not(
+def test_pip_installs_if_uv_is_missing_or_fails(
     install: ModuleType, monkeypatch: pytest.MonkeyPatch, uv: str | None, code: int, last: str
 ) -> None:
     ran: list[list[str]] = []

@@ -1,4 +1,4 @@
-"""What is shown and logged holds nothing that a terminal obeys, whoever wrote it."""
+"""Printed and logged text has no characters that control a terminal, whoever wrote it."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ TURNING = set("LRE RLE LRO RLO PDF LRI RLI FSI PDI".split())  # noqa: SIM905
 
 
 @pytest.mark.parametrize("text", CONTROL_CHARACTERS)
-def test_control_characters_are_written_out(text: str) -> None:
+def test_control_characters_are_escaped(text: str) -> None:
     shown = printable(f"a {text} b")
     assert shown.isprintable()
     assert shown.encode("ascii").decode("unicode_escape") == f"a {text} b"
 
 
 @given(st.text(st.characters(exclude_categories=[])))
-def test_nothing_that_a_terminal_obeys_is_left_and_nothing_else_is_changed(text: str) -> None:
+def test_all_characters_that_control_a_terminal_are_escaped_and_no_others(text: str) -> None:
     shown = printable(text)
     assert not [
         c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t"
@@ -58,16 +58,16 @@ def test_nothing_that_a_terminal_obeys_is_left_and_nothing_else_is_changed(text:
         "\u061c\u200e\u200f"
     ):
         assert shown == text
-    shown.encode()  # half characters, as names of files may have, cannot be
+    shown.encode()  # fails for surrogates, which names of files may have
 
 
-def test_words_of_all_languages_stay() -> None:
+def test_text_in_any_language_is_unchanged() -> None:
     for text in ("größe 大きさ حجم 🏔️👩‍🔬", "a\tb\nc"):
         assert printable(text) == text
 
 
 @pytest.mark.parametrize("text", CONTROL_CHARACTERS)
-def test_neither_what_is_printed_nor_what_is_logged_reaches_a_terminal_as_it_is(
+def test_control_characters_in_prints_logs_and_errors_are_escaped(
     text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(argv: list[str]) -> int:
@@ -95,7 +95,7 @@ def test_neither_what_is_printed_nor_what_is_logged_reaches_a_terminal_as_it_is(
         LOGGER.removeHandler(handler)
 
 
-def test_streams_come_back_and_stay_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_are_restored_and_keep_their_methods(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", stream)
     with printable_output():
@@ -110,7 +110,7 @@ def test_streams_come_back_and_stay_streams(monkeypatch: pytest.MonkeyPatch) -> 
     assert logging.getLogger("gsbench") is LOGGER
 
 
-def test_lines_go_to_what_is_stderr_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_lines_go_to_the_present_stderr(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LOGGER, "handlers", [])
     set_up_logging()
     closed, now = io.StringIO(), io.StringIO()

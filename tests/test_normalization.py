@@ -1,4 +1,4 @@
-"""The frame of a training: none for models as COLMAP leaves them, COLMAP's own for all others."""
+"""The frame of a training: models as COLMAP leaves them keep theirs, all others get COLMAP's."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def as_colmap_leaves(centers: np.ndarray) -> np.ndarray:
 
 
 @given(SEEDS, st.integers(8, 200))
-def test_models_as_colmap_leaves_them_are_not_touched(seed: int, count: int) -> None:
+def test_models_that_colmap_normalized_keep_their_coordinates(seed: int, count: int) -> None:
     assert find_normalization(as_colmap_leaves(cameras(seed, count))) is IDENTITY
 
 
 @given(SEEDS, st.integers(3, 60), st.floats(-4, 4), st.floats(0, 7))
-def test_a_similarity_leaves_the_normalized_cameras_as_they_are(
+def test_normalized_cameras_do_not_depend_on_a_similarity(
     seed: int, count: int, log_scale: float, log_shift: float
 ) -> None:
     centers = cameras(seed, count)
@@ -63,7 +63,9 @@ def test_a_similarity_leaves_the_normalized_cameras_as_they_are(
 
 
 @given(SEEDS, st.integers(8, 40), st.floats(3, 12))
-def test_one_camera_far_off_does_not_decide(seed: int, count: int, log_distance: float) -> None:
+def test_one_camera_far_away_hardly_changes_the_scale(
+    seed: int, count: int, log_distance: float
+) -> None:
     centers = as_colmap_leaves(cameras(seed, count))
     before = find_normalization(centers)
     centers[seed % count] += 10**log_distance * np.array([0.2, -0.9, 0.4])
@@ -80,13 +82,15 @@ def test_a_rotation_changes_the_scale_by_less_than_two() -> None:
 
 
 @pytest.mark.parametrize("centers", [np.zeros((0, 3)), np.ones((5, 3)), np.full((3, 3), 5.4e6)])
-def test_cameras_at_one_place_have_no_size_to_go_by(centers: np.ndarray) -> None:
+def test_cameras_at_one_place_are_not_normalized(centers: np.ndarray) -> None:
     assert find_normalization(centers) is IDENTITY
 
 
 @pytest.mark.parametrize(
     ("center", "scale"), [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)]
 )
-def test_a_normalization_from_a_file_must_make_sense(center: tuple, scale: float) -> None:
+def test_a_normalization_needs_finite_numbers_and_a_positive_scale(
+    center: tuple, scale: float
+) -> None:
     with pytest.raises(ValueError, match="positive scale"):
         Normalization(center, scale)

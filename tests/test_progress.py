@@ -16,7 +16,7 @@ def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
     with progress("train") as report:
         for done in range(1, 5):
             report("iteration", done, 4)
-        report("iteration", 4, 4)  # said already
+        report("iteration", 4, 4)  # logged already
         report("export", 1, 1)
     assert [record.getMessage().rstrip() for record in caplog.records] == [
         "train: iteration 1/4",

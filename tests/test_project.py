@@ -1,4 +1,4 @@
-"""Facts about the project that stand in more than one file of its root agree."""
+"""Files in the root of the project agree on facts that several of them state."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def test_the_lock_has_the_versions_of_the_constraints() -> None:
     assert different == {}, "make lock"
 
 
-def test_every_constraint_is_of_a_package_that_something_needs() -> None:
+def test_every_constraint_is_of_a_locked_package() -> None:
     assert set(constraints()) - {normal(package["name"]) for package in locked()} == set()
 
 
-def test_the_lock_locks_what_the_project_file_asks_for() -> None:
+def test_the_lock_has_the_requirements_of_the_project_file() -> None:
     (own,) = (package for package in locked() if "editable" in package["source"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
@@ -80,7 +80,7 @@ def test_the_lock_locks_what_the_project_file_asks_for() -> None:
     ), "make lock"
 
 
-def test_the_lock_names_public_places_only() -> None:
+def test_the_lock_names_public_addresses_only() -> None:
     text = (ROOT / "uv.lock").read_text()
     assert {
         urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', text)
@@ -90,7 +90,7 @@ def test_the_lock_names_public_places_only() -> None:
     assert [source["editable"] for source in sources if "editable" in source] == ["."]
 
 
-def test_one_version() -> None:
+def test_all_files_state_the_same_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == gsbench.__version__
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
@@ -98,14 +98,14 @@ def test_one_version() -> None:
     assert newest.group(1) == gsbench.__version__.removesuffix(".dev0")
 
 
-def test_the_check_before_a_commit_formats_as_ours_does() -> None:
+def test_the_pre_commit_hook_uses_the_pinned_ruff() -> None:
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
     (ruff,) = (entry for entry in hooks if entry["repo"].endswith("/ruff-pre-commit"))
     assert ruff["rev"] == f"v{constraints()['ruff']}"
 
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
-def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None:
+def test_workflows_call_existing_targets_and_files(workflow: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     called = {
         name
@@ -118,7 +118,7 @@ def test_workflows_call_targets_and_files_that_there_are(workflow: Path) -> None
             assert (ROOT / name).exists()
 
 
-def test_the_scripts_that_make_runs_are_there() -> None:
+def test_the_scripts_that_make_calls_exist() -> None:
     assert [
         name
         for name in re.findall(r"scripts/\S+", (ROOT / "Makefile").read_text())
@@ -140,7 +140,7 @@ def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
     assert wanted <= set(" ".join(calls).split())
 
 
-def test_linux_is_tested_from_the_oldest_python_that_is_promised() -> None:
+def test_linux_is_tested_from_the_oldest_supported_python() -> None:
     (tests,) = (path for path in WORKFLOWS if path.stem == "tests")
     tested = yaml.safe_load(tests.read_text())["jobs"]["linux"]["strategy"]["matrix"]["python"]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -148,13 +148,13 @@ def test_linux_is_tested_from_the_oldest_python_that_is_promised() -> None:
     assert tested == sorted(tested, key=lambda version: int(version.split(".")[1]))
 
 
-def test_the_core_of_the_tests_is_there() -> None:
+def test_the_core_tests_exist() -> None:
     for name in (ROOT / "tests" / "core.txt").read_text().split():
         assert (ROOT / name).exists(), name
 
 
 def test_the_site_has_every_document() -> None:
-    """Quickly, without building it: `make docs` finds links that lead nowhere."""
+    """This test is quick and does not build the site; `make docs` finds broken links."""
 
     class Loader(yaml.SafeLoader):
         """Reads the tag for environment variables as a list."""
@@ -199,7 +199,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
         ),
         ("[a](https://example.org)", "docs", None, "[a](https://example.org)"),
         ("![a](demo.jpg)", "docs", None, "![a](demo.jpg)"),
-        # is left to MkDocs, which refuses it
+        # a broken link is kept, so that the build refuses it
         ("[a](nowhere.md)", "docs", REPOSITORY, "[a](nowhere.md)"),
         (
             "[a](../../../../../../etc/passwd)",
@@ -210,7 +210,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
         ("```\n[a](../conf/densify/)\n```", "docs", None, "```\n[a](../conf/densify/)\n```"),
     ],
 )
-def test_links_lead_on_from_the_site(
+def test_links_are_rewritten_for_the_site(
     link: str, folder: str, repository: str | None, wanted: str
 ) -> None:
     assert script("build_site").with_site_links(link, ROOT / folder, repository) == wanted

@@ -1,7 +1,4 @@
-"""Values are held against the annotations of dataclasses, gsbench's and a user's.
-
-The line names the key.
-"""
+"""Values are checked by the annotations of gsbench's and users' dataclasses."""
 
 from __future__ import annotations
 
@@ -41,7 +38,7 @@ class Options:
     plain: int = 3
     farthest: float = math.inf
     folder: Path = Path()
-    foreign: Decimal | None = None  # what only type checkers import is not checked
+    foreign: Decimal | None = None  # not checked, since only type checkers import its type
     state: int = field(init=False, default=-1)
 
 
@@ -77,7 +74,7 @@ class Options:
         ("folder", 3.5, "options.folder must be of type Path, got 3.5"),
     ],
 )
-def test_words_for_what_is_not_allowed(name: str, given: Any, words: str) -> None:
+def test_errors_state_the_key_the_rule_and_the_value(name: str, given: Any, words: str) -> None:
     with pytest.raises(InputError) as error:
         check_values(Options, {name: given}, "options")
     assert str(error.value) == words
@@ -97,7 +94,7 @@ def test_values_are_converted_to_their_type() -> None:
     assert [type(result[name]) for name in ("count", "rate", "label")] == [int, float, str]
 
 
-def test_the_authors_default_may_be_what_no_user_may_give() -> None:
+def test_a_default_of_the_class_may_break_its_own_rule() -> None:
     assert check_values(Options, {"farthest": math.inf}, "options") == {"farthest": math.inf}
     with pytest.raises(InputError, match="farthest must be a number, got -inf"):
         check_values(Options, {"farthest": -math.inf}, "options")
@@ -138,10 +135,7 @@ def test_library_callers_get_the_same_errors(make: Any, key: str) -> None:
 
 @dataclass
 class Own(ADC):
-    """A user's class.
-
-    Its own fields carry no rule but their type, and its author knows nothing of this module.
-    """
+    """A user's class, whose own field has no rule but its type."""
 
     patience: int = 5
 
@@ -163,7 +157,7 @@ ANYTHING = st.recursive(
 
 
 @given(st.sampled_from([one.name for one in dataclasses.fields(Options) if one.init]), ANYTHING)
-def test_any_value_is_taken_or_refused_in_one_line(name: str, value: Any) -> None:
+def test_any_value_is_accepted_or_refused_in_one_line(name: str, value: Any) -> None:
     options = dataclasses.replace(Options(), **{name: value})
     refusal = ""
     try:
@@ -177,11 +171,11 @@ def test_any_value_is_taken_or_refused_in_one_line(name: str, value: Any) -> Non
     number = getattr(options, name)
     if isinstance(number, float):
         assert math.isfinite(number) or number == Options.farthest
-    check_settings(options, "options")  # what was taken once is taken again, unchanged
+    check_settings(options, "options")  # an accepted value is accepted again, unchanged
     assert getattr(options, name) == number
 
 
-def test_annotations_in_words() -> None:
+def test_annotations_are_described_in_words() -> None:
     assert describe(PositiveInt | Literal["auto"]) == "a whole number above 0 or 'auto'"
     assert describe(Annotated[float, Interval(le=2)]) == "a number of at most 2"
     assert describe(dict[str, Any]) == "a mapping {key: value}"

@@ -1,4 +1,4 @@
-"""Weights files: where they are found, and what is refused."""
+"""Weights files: search, download, and refusal of wrong files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_search_order_is_argument_environment_cache(
 
 
 @pytest.mark.parametrize("digits", [16, 64])
-def test_wrong_checksum_is_refused_and_a_right_copy_elsewhere_taken(
+def test_a_file_with_a_wrong_checksum_is_refused_unless_a_right_copy_is_found(
     tmp_path: Path, empty_caches: Path, digits: int
 ):
     folder = tmp_path / "mine"
@@ -114,7 +114,7 @@ def test_download_is_checked_and_kept(server: Server, empty_caches: Path):
     assert len(server.requests) == 1
 
 
-def test_download_says_how_far_it_is(
+def test_a_download_logs_its_progress(
     server: Server, empty_caches: Path, caplog: pytest.LogCaptureFixture
 ):
     caplog.set_level(logging.INFO, "gsbench")
@@ -169,8 +169,7 @@ def test_download_that_ends_early_or_is_damaged_leaves_nothing(
     assert list(empty_caches.iterdir()) == []
 
 
-def test_without_a_network_the_answer_comes_at_once():
-    """One attempt, and no waiting for another."""
+def test_without_a_network_there_is_one_attempt():
     with pytest.raises(
         MissingWeightsError, match=r"the download failed: .*1 failures in a row .*refused"
     ):
@@ -178,7 +177,7 @@ def test_without_a_network_the_answer_comes_at_once():
 
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])
-def test_state_round_trip(tmp_path: Path, name: str):
+def test_tensors_are_read_from_both_formats(tmp_path: Path, name: str):
     path = tmp_path / name
     if name.endswith("safetensors"):
         pytest.importorskip("safetensors.torch").save_file(STATE, path)
@@ -189,7 +188,7 @@ def test_state_round_trip(tmp_path: Path, name: str):
     torch.testing.assert_close(state["a.weight"], STATE["a.weight"])
 
 
-def test_state_within_a_checkpoint(tmp_path: Path):
+def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path: Path):
     torch.save({"epoch": 3, "extractor": STATE}, tmp_path / "net.pth")
     assert load_state(tmp_path / "net.pth", entry="extractor").keys() == STATE.keys()
     with pytest.raises(MissingWeightsError, match="no entry 'model'"):
@@ -222,7 +221,7 @@ def test_code_in_a_file_is_not_run(tmp_path: Path, how: str):
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors"])
 @pytest.mark.parametrize("content", [b"", b"<html>404</html>", "half"])
-def test_truncated_and_foreign_files(tmp_path: Path, name: str, content: bytes | str):
+def test_truncated_and_foreign_files_are_refused(tmp_path: Path, name: str, content: bytes | str):
     path = tmp_path / name
     if content == "half":
         if name.endswith("safetensors"):

@@ -1,7 +1,4 @@
-"""Every word on the command line is understood, or refused before any work.
-
-Exit code 2 and one line that says why.
-"""
+"""Every word on the command line is understood, or refused before any work in one line."""
 
 from __future__ import annotations
 
@@ -224,7 +221,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_what_is_not_understood_is_refused(
+def test_a_wrong_command_is_refused_in_one_line(
     command: str, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(shlex.split(command)) == 2
@@ -235,7 +232,7 @@ def test_what_is_not_understood_is_refused(
 
 
 @pytest.mark.parametrize("command", ["", "-m", "--multirun"])
-def test_no_setting_is_a_question(
+def test_a_command_without_settings_prints_the_usage(
     command: str, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(shlex.split(command)) == 0
@@ -246,7 +243,7 @@ def test_no_setting_is_a_question(
 @pytest.mark.parametrize(
     "command", ["check {} --dry-run allow_targets=[x]", "check --dry-run allow_targets=[x] {}"]
 )
-def test_permission_counts_wherever_it_stands(
+def test_a_permission_may_stand_anywhere_in_a_command(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(shlex.split(command.format("nosuch.yaml"))) == 2
@@ -255,7 +252,7 @@ def test_permission_counts_wherever_it_stands(
 
 @pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])
 @pytest.mark.parametrize("runs", ["file", "file/below", "~nosuchuser/x", ""])
-def test_a_runs_folder_that_cannot_be(
+def test_a_name_that_cannot_be_a_runs_folder_is_refused(
     runs: str,
     command: str,
     place: Path,
@@ -270,14 +267,14 @@ def test_a_runs_folder_that_cannot_be(
     assert "full" not in line
 
 
-def test_a_runs_folder_that_cannot_be_made(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_runs_folder_that_cannot_be_made_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     if not Path("/proc/self").exists():
         pytest.skip("needs /proc, where nobody can make a folder")
     assert cli.run(["runs=/proc/nowhere", "tracking=none"]) == 2
     assert "/proc/nowhere cannot be the runs folder" in capsys.readouterr().err
 
 
-def test_a_few_through_a_process_of_their_own(place: Path) -> None:
+def test_errors_of_a_separate_process_are_one_line(place: Path) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     for command in ("+extra=1", "-m seed=range(0,0)", "=3"):
         argv = [sys.executable, "-m", "gsbench.cli", *shlex.split(command)]
@@ -298,7 +295,7 @@ def test_a_few_through_a_process_of_their_own(place: Path) -> None:
         ["~densify.cap"],
     ],
 )
-def test_what_is_meant_is_understood(words: list[str]) -> None:
+def test_unusual_but_right_words_are_accepted(words: list[str]) -> None:
     (trial,) = compose_trials(words)
     assert trial.values["launch"]["sbatch"] == (
         {"constraint": "a100"} if words[0] == "launch=slurm" else {}
@@ -319,7 +316,7 @@ def test_report_writes_into_a_folder_as_tables_does(place: Path) -> None:
     assert file_at(Path("folder.html"), "x") == Path("folder.html/x-report.html")
 
 
-# ---- property: any value of any setting is taken and then stays, or refused in one line
+# ---- property: any value of any setting is accepted and then stays, or is refused in one line
 
 SCHEMA_KEYS = [
     (group, entry.name)
@@ -337,7 +334,9 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(key=st.sampled_from(SCHEMA_KEYS), value=VALUES)
-def test_any_value_of_any_setting(key: tuple[str, str], value: Any) -> None:
+def test_any_value_of_any_setting_is_kept_or_refused_in_one_line(
+    key: tuple[str, str], value: Any
+) -> None:
     group, name = key
     try:
         once = check_values(GROUP_SCHEMAS[group], {name: value}, group)
@@ -349,7 +348,7 @@ def test_any_value_of_any_setting(key: tuple[str, str], value: Any) -> None:
     assert check_values(GROUP_SCHEMAS[group], once, group) == once
 
 
-# ---- what was valid keeps its identity: a changed hash is a trial that is computed anew
+# ---- valid configurations keep their hashes: a changed hash is a trial that is computed again
 
 HASHES = {
     (): "5d59aece011332a8ab4b106f91ac3a6cc962543c4b3f993c9e6b4cfa67b2faa7",

@@ -1,7 +1,7 @@
-"""The command line: ``gsbench`` is a Hydra app, and a first word without ``=``, ``+``, ``~`` or
-``-`` is a verb.
+"""The command line ``gsbench``: a Hydra app, and verbs.
 
-Nothing here loads torch, so that ``--help`` and the verbs that only read files answer at once.
+A first word without ``=``, ``+``, ``~`` or ``-`` is a verb. Nothing here loads torch, so that
+``--help`` and the verbs that only read files answer at once.
 """
 
 import sys
@@ -72,16 +72,14 @@ def run(argv: list[str]) -> int:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Return whether a Ctrl-C caused an error: a native module that it stops while loading raises
-    ImportError."""
+    """Return whether a Ctrl-C caused an error, such as the ImportError of a half-loaded module."""
     return error is not None and (
         isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__ or error.__context__)
     )
 
 
 def _refuse(error: GsbenchError, code: int) -> int:
-    """Print an error as one line, also if a file's name or a library's message has line breaks or
-    odd bytes."""
+    """Print an error as one line, also if it quotes line breaks or odd bytes; returns ``code``."""
     print(
         "gsbench: " + " ".join(str(error).split()).encode("utf-8", "backslashreplace").decode(),
         file=sys.stderr,

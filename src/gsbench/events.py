@@ -12,8 +12,8 @@ from typing import ClassVar
 class Cause(IntEnum):
     """Cause of a Gaussian's existence.
 
-    Its number in ``lineage.npz``, words, and a colour (r, g, b) for pictures. The colours are from
-    Okabe and Ito (2008), so that colour-blind people can distinguish them.
+    A cause has a number in ``lineage.npz``, words, and a colour (r, g, b) for pictures. The colours
+    are from Okabe and Ito (2008), so that colour-blind people can distinguish them.
     """
 
     words: str

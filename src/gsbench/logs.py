@@ -20,7 +20,7 @@ LOGGER = logging.getLogger("gsbench")
 
 
 class _Printable(logging.Formatter):
-    """Makes log lines `printable`: they may quote control characters of others."""
+    """Makes log lines `printable`, since they may quote control characters from elsewhere."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -64,7 +64,7 @@ class _CurrentStderrHandler(logging.StreamHandler[TextIO]):
 
 
 class _RootHandler(logging.Handler):
-    """Passes log lines on to the root logger's handlers of somebody else, such as Hydra."""
+    """Passes log lines on to the root logger's handlers, which another library may have added."""
 
     def emit(self, record: logging.LogRecord) -> None:
         logging.getLogger().handle(record)
@@ -73,8 +73,9 @@ class _RootHandler(logging.Handler):
 def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bool = False) -> None:
     """Show gsbench's log lines of level INFO and above on stderr.
 
-    ``through_root``: by the root logger's handlers, too. If one of these writes to the terminal,
-    gsbench does not. ``verbose`` shows debug lines: True, gsbench's; names of loggers, theirs.
+    With ``through_root``, the root logger's handlers get them, too; if one of these writes to the
+    terminal, gsbench does not. ``verbose`` also shows debug lines: gsbench's if it is True, else
+    those of the loggers that it names.
     """
     names = (
         [verbose]

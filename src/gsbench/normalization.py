@@ -1,11 +1,11 @@
 """The frame in which a scene is trained.
 
-The given coordinates, or moved to the origin and scaled to an ordinary size. 3DGS has constants in
-world units: its near plane (0.2), the least distance between initial points, and the volume
-threshold of arXiv 2508.05187, "in the units of the COLMAP model". COLMAP leaves its models with the
-cameras around the origin, in a box with a diagonal of 10 units, so these constants fit such models.
-A capture in kilometres would lie before the near plane, and at UTM coordinates (5e5, 5.4e6) float32
-has steps of half a metre.
+It has the given coordinates, or they are moved to the origin and scaled to an ordinary size. 3DGS
+has constants in world units: its near plane (0.2), the least distance between initial points, and
+the volume threshold of arXiv 2508.05187, "in the units of the COLMAP model". COLMAP leaves its
+models with the cameras around the origin, in a box with a diagonal of 10 units, so these constants
+fit such models. A capture in kilometres would lie before the near plane, and at UTM coordinates
+(5e5, 5.4e6) float32 has steps of half a metre.
 
 So a model far from the origin, or of another order of size, is trained in COLMAP's frame. All
 results are given back in its own coordinates. Ordinary models are not touched, so their results
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 # units: the diagonal of the cameras' box after COLMAP's Reconstruction::Normalize
 COLMAP_SIZE = 10.0
 TRIMMED = 0.1  # the share of cameras left out at each end of each axis, as COLMAP does
-MIN_TRIMMED = 6  # cameras; of fewer none is left out
+MIN_TRIMMED = 6  # cameras; with fewer, none is left out
 # A size within this factor of COLMAP's stays. At a third of it, the near plane is at 0.6 of
 # COLMAP's units. None of 660,000 observations of two real captures (bonsai, herz_jesus_p25) is
 # nearer than 1.
@@ -56,7 +56,7 @@ class Normalization:
     def is_far(self) -> bool:
         """Return whether the scene's own coordinates need float64.
 
-        It lies far from the origin for its size.
+        They do if it lies far from the origin for its size.
         """
         return self.scale * max(map(abs, self.center)) > MAX_DISTANCE * COLMAP_SIZE
 

@@ -1,4 +1,4 @@
-"""Small JSON and YAML files, read with limits: others may have written or damaged them.
+"""Reading of small JSON and YAML files within limits: others may have written or damaged them.
 
 Only regular files of at most `MAX_BYTES` are opened, so that a FIFO or a device cannot block the
 reader. Links are not followed; a user's own file is read by its `resolved` path. The content has at
@@ -91,7 +91,7 @@ def without_byte_order_mark(content: bytes) -> bytes:
 
 
 def resolved(path: Path) -> Path:
-    """The path without links to which a user's ``path`` leads."""
+    """A user's ``path`` with its links resolved."""
     return Path(os.path.realpath(path))
 
 
@@ -216,7 +216,7 @@ def fault_of(value: Any, most: int | None = None, infinite: bool = False) -> str
     (unless ``infinite``) and at most ``most`` values, where a YAML alias counts each time it is
     used.
     """
-    # with their places: the keys that lead there
+    # values still to check, each with its place: the keys that lead there
     containers: deque[tuple[tuple[Any, ...], Any]] = deque([((), [value])])
     count = 0
     while containers:
@@ -333,10 +333,7 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def describe_misfit(error: ValidationError) -> str:
-    """Describe the first fault.
-
-    ``is damaged: metrics.psnr is '27' (input should be a valid number)``.
-    """
+    """Describe the first fault: ``is damaged: psnr is '27' (input should be a valid number)``."""
     first: ErrorDetails = error.errors(include_url=False)[0]
     key, kind = ".".join(str(part) for part in first["loc"]), first["type"]
     if kind == "json_invalid":

@@ -88,7 +88,7 @@ def check_settings(settings: Any, group: str) -> None:
 
 
 def check_values(cls: type, values: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """``values``, options of the dataclass ``cls``, converted to the types of its annotations.
+    """Convert ``values``, options of the dataclass ``cls``, to the types of its annotations.
 
     Raises InputError for the first unknown or forbidden option. Its message starts with the name of
     ``group`` and a dot, or with the option for the root group ``""``.
@@ -165,10 +165,7 @@ def _converted(value: Any, field: dataclasses.Field[Any], cls: type, key: str) -
 
 
 def _has_too_large(value: Any) -> bool:
-    """Return whether a value has a whole number of more than 64 bits.
-
-    torch and JSON need fewer.
-    """
+    """Return whether a value has a whole number of more than 64 bits, too large for torch."""
     if isinstance(value, Mapping):
         return any(map(_has_too_large, value.values()))
     if isinstance(value, list | tuple):
@@ -198,7 +195,7 @@ def _adapters(cls: type) -> dict[str, tuple[Any, TypeAdapter[Any]]]:
 def _hint(cls: type, name: str) -> Any:
     """The annotation of a field with its constraints.
 
-    Any if it uses a name that only type checkers import.
+    It is Any if the annotation uses a name that only type checkers import.
     """
     owner = next(base for base in cls.__mro__ if name in inspect.get_annotations(base))
     holder = types.SimpleNamespace(__annotations__={name: inspect.get_annotations(owner)[name]})

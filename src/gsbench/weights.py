@@ -31,7 +31,7 @@ ONE_TRY = downloads.RetryPolicy(timeout=10.0, tries=1)
 
 
 class MissingWeightsError(InputError):
-    """Raised for a weights file that is neither found nor downloaded, or a wrong one."""
+    """Raised if a weights file is neither found nor downloaded, or has the wrong content."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,10 @@ def find_all_weights(
 
 
 def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None) -> list[str]:
-    """The sha256 of files of ``specs`` that the user put there and nobody published.
+    """The sha256 of the user's own files for those ``specs`` that have no published checksum.
 
     Such a file can be any file of the right shapes. Files in the torch hub cache were downloaded
-    from the address.
+    from the published address, so they are left out.
     """
     users = [
         (place, sub_folders)
@@ -109,9 +109,9 @@ def digests_of_unpinned(specs: Sequence[WeightsFile], folder: Path | None = None
 
 
 def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path | None:
-    """The first file with the right checksum.
+    """The first file with the right checksum; None if there is no file.
 
-    Raises ``MissingWeightsError`` if all files found have a wrong one.
+    Raises ``MissingWeightsError`` if all files found have a wrong checksum.
     """
     faults = []
     for folder, sub_folders in folders:
@@ -132,9 +132,9 @@ def _find_local(spec: WeightsFile, folders: Sequence[tuple[Path, bool]]) -> Path
 def load_state(path: Path, entry: str | None = None) -> dict[str, Tensor]:
     """The tensors in ``path``, on the CPU, by name.
 
-    It is a .safetensors file, or one of PyTorch, read with ``weights_only``. ``entry`` is the key
-    of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file is
-    truncated, is not a weights file, or holds anything but tensors.
+    ``path`` is a .safetensors file, or one of PyTorch, read with ``weights_only``. ``entry`` is the
+    key of the tensors in a PyTorch file that holds more. Raises ``MissingWeightsError`` if the file
+    is truncated, is not a weights file, or holds anything but tensors.
     """
     import torch
 

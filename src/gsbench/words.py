@@ -1,7 +1,4 @@
-"""Text for people.
-
-Readable numbers, lists of names, suggestions for wrong words, and safe output.
-"""
+"""Text for people: readable numbers, lists of names, suggestions for wrong words, safe output."""
 
 import difflib
 import re
@@ -22,7 +19,7 @@ PATH_IN_TEXT = re.compile(r"""(?<![^\s=(['"`])(?:~[\w.-]*)?/[^\s,;:'"`)\]]+""")
 
 
 def counted(count: int, noun: str) -> str:
-    """``1 trial``, ``2 trials``."""
+    """A number with its noun: ``1 trial``, ``2 trials``."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -43,10 +40,7 @@ def least_text(least: float, relative: bool) -> str:
 
 
 def signed(value: float, spec: str) -> str:
-    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``) with a minus sign.
-
-    +0.50, −3.0%.
-    """
+    """A number with its sign, formatted by ``spec`` (``.2f``, ``.1%``): ``+0.50``, ``−3.0%``."""
     return true_minus(f"{value:+{spec}}")
 
 
@@ -87,7 +81,7 @@ def without_folders(text: str) -> str:
 def is_path(value: str) -> bool:
     """Return whether a text can be a path.
 
-    Not empty, without control characters or an unknown ``~user``.
+    It must not be empty, and have neither control characters nor an unknown ``~user``.
     """
     try:
         return value.strip() != "" and value.isprintable() and bool(Path(value).expanduser())
@@ -96,7 +90,7 @@ def is_path(value: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """``text`` with its control characters escaped: a terminal shows them, and does not act.
+    """``text`` with control characters escaped: a terminal shows them, and does not act on them.
 
     Examples:
         >>> printable("red \\x1b[31m")
@@ -108,7 +102,7 @@ def printable(text: str) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Names in a sentence: ``a``, ``a and b``, ``a, b and c``."""
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 

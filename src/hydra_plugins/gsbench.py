@@ -1,5 +1,4 @@
-"""Plug-ins by which Hydra finds gsbench's launcher and sweeper. Their work is done in
-``gsbench.app``.
+"""Plug-ins by which Hydra finds gsbench's launcher and sweeper; ``gsbench.app`` does their work.
 
 Hydra imports this file whenever any Hydra app in the same environment starts, so it imports only
 Hydra.
@@ -18,8 +17,10 @@ from omegaconf import DictConfig
 
 
 class GsbenchLauncher(Launcher):
-    """Runs the jobs of another sweeper as the settings ``launch`` say. gsbench's own sweeper runs
-    its trials itself."""
+    """Runs the jobs of another sweeper as the settings ``launch`` say.
+
+    gsbench's own sweeper runs its trials itself.
+    """
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -37,7 +38,7 @@ class GsbenchLauncher(Launcher):
 class GsbenchSweeper(Sweeper):
     """Runs the grid of all listed values, or several joined grids, as one batch.
 
-    ``tune`` says how intervals are searched before. ``grids`` is always empty here: gsbench reads
+    ``tune`` says how intervals are searched first. ``grids`` is always empty here: gsbench reads
     the grids before Hydra makes this object, because Hydra would resolve them.
     """
 

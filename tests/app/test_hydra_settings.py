@@ -1,4 +1,4 @@
-"""Hydra's own settings: what of them is read, and the advice of errors."""
+"""Hydra's own settings: which ones take effect, and what errors advise."""
 
 import pytest
 
@@ -13,9 +13,8 @@ pytestmark = pytest.mark.usefixtures("runs")
 SWEEP = ["densify=adc,none", "seed=0,1", "init=random", "tracking=none"]
 
 
-def test_a_sweep_has_one_time():
-    """Microseconds, so that two of them never agree by chance; each densifier is a composition of
-    its own."""
+def test_now_is_the_same_in_all_trials_of_a_sweep():
+    """Microseconds never agree by chance; each densifier is composed by itself."""
     trials = compose_trials(
         [*SWEEP, "name=x-${now:%H%M%S%f}", "scene.name=y-${now:%f}"], multirun=True
     )
@@ -52,7 +51,7 @@ def test_a_sweep_has_one_time():
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(words, text, refused):
+def test_impossible_settings_are_refused_in_one_line(words, text, refused):
     if "hydra/launcher=joblib" in words:
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     line = refused(*words, "--dry-run")
@@ -71,13 +70,13 @@ def test_what_cannot_be_is_refused_in_a_line(words, text, refused):
     ],
     ids=" ".join,
 )
-def test_what_is_hydras_is_taken_and_a_look_writes_nothing(words, runs, said):
+def test_hydras_own_settings_are_accepted_and_a_dry_run_writes_nothing(words, runs, said):
     assert f"{1 + ('-m' in words)} trial" in said(*words, "--dry-run")
     assert list(runs.parent.iterdir()) == []
 
 
-def test_settings_read_hydras_node():
-    """Each job's own number, although trials that differ in the seed share a composition."""
+def test_settings_can_read_hydras_node():
+    """Each job gets its own number, although trials that differ in the seed share a composition."""
     words = [
         "name=x-${hydra:runtime.choices.densify}-${hydra:job.num}",
         "init=random",
@@ -95,21 +94,21 @@ def test_settings_read_hydras_node():
     assert trial.values["name"] == "x-volumetric"
 
 
-def test_a_search_is_not_called_a_trial(said):
+def test_a_dry_run_calls_an_interval_a_search_and_not_a_trial(said):
     out = said("-m", "densify.volume_threshold=interval(.01,1)", "--dry-run")
     assert "search" in out
     assert "20 points" in out
     assert "1 trial" not in out
 
 
-def test_a_glob_of_characters_works_as_it_is_advised(said):
+def test_a_glob_in_the_quotes_that_the_error_advises_works(said):
     assert "sfm-adc" in said("-m", 'densify=glob("[av]*")', "--dry-run")
 
 
 @pytest.mark.parametrize(
     "words", [["--config-dir", "own", "--help"], ["-h", "--config-dir=own"], ["-m", "--help"]]
 )
-def test_help_is_given_wherever_it_is_asked_for(words, tmp_path, said):
+def test_help_is_printed_wherever_its_option_stands(words, tmp_path, said):
     (tmp_path / "own" / "densify").mkdir(parents=True)
     (tmp_path / "own" / "densify" / "patient.yaml").write_text("defaults: [adc]\n")
     out = said(*words)
@@ -128,6 +127,6 @@ def test_help_is_given_wherever_it_is_asked_for(words, tmp_path, said):
         "hydra[searchpath]=extend_list('pkg://strange')",
     ],
 )
-def test_no_package_is_searched_however_it_is_written(word):
+def test_every_spelling_of_a_search_path_to_a_package_is_refused(word):
     with pytest.raises(InputError):
         check_search_path([word], [])

@@ -1,5 +1,4 @@
-"""Several grids in one experiment: what trials they make, and that plan, dry run and retry see one
-experiment."""
+"""Several grids in one experiment: the trials that they make, and plan, dry run and retry."""
 
 from pathlib import Path
 
@@ -34,7 +33,7 @@ def arms(*words: str) -> list[tuple[str, int]]:
     ]
 
 
-def test_words_are_shared_own_or_given():
+def test_each_grid_gets_its_own_the_shared_and_the_typed_words():
     grids = [
         {"densify": "adc"},
         {"densify": "volumetric", "densify.volume_threshold": "1,2", "seed": "7"},
@@ -47,7 +46,7 @@ def test_words_are_shared_own_or_given():
     assert words_of_grids({"seed": "0,1"}, [], given) == [["seed=0,1", *given]]
 
 
-def test_thresholds_beside_a_baseline_that_knows_none():
+def test_a_baseline_without_the_setting_is_compared_with_arms_that_have_it():
     trials = compose_trials(["+experiment=threshold"])
     places = ["/".join(TrialFolder.of(trial.values).path.parts[-2:]) for trial in trials]
     assert len(places) == len(set(places)) == 21
@@ -60,7 +59,7 @@ def test_thresholds_beside_a_baseline_that_knows_none():
         assert compose_one(trial.overrides).values == trial.values  # as `retry` composes it
 
 
-def test_the_command_line_speaks_to_every_grid_that_knows_the_setting():
+def test_a_typed_setting_reaches_every_grid_that_has_it():
     own = arms("+experiment=threshold", "densify.volume_threshold=0.5,0.7", "seed=4")
     assert own == [("adc", 4), ("volumetric-0.5", 4), ("volumetric-0.7", 4)]
     trials = compose_trials(
@@ -107,7 +106,7 @@ def test_grids_in_a_users_own_experiment(tmp_path):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_is_refused_in_a_line(words, text, refused):
+def test_impossible_joins_of_grids_are_refused_in_one_line(words, text, refused):
     line = refused(*["-m", *words] if len(words) < 2 and "grids" not in words[0] else words)
     assert text in line
 

@@ -1,5 +1,4 @@
-"""A sweep in planned looks: which trials each look launches, when it stops, and that a stopped one
-goes on."""
+"""A sweep in planned looks: which trials each look launches, when it stops, how it continues."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -31,8 +30,10 @@ SWEEP = [*BASE, "densify=adc,volumetric", "seed=0,1,2,3", "eval.primary=psnr"]
 
 
 class Fake:
-    """Made-up results in the place of trained ones: ``psnr`` of an arm on a seed; ``stops_at``
-    raises there."""
+    """Stands in for trainings: gives ``psnr`` of arm and seed.
+
+    Trials with the seed ``fails`` fail; at the seed ``stops_at`` comes a Ctrl-C.
+    """
 
     def __init__(
         self,
@@ -83,7 +84,7 @@ def noise(arm: str, seed: int) -> float:
 
 
 def clear(arm: str, seed: int) -> float:
-    """Volumetric gains much, ``adc-2`` nothing; seeds differ by a hair."""
+    """Volumetric gains much, other arms nothing; seeds hardly differ."""
     return 26 + 2 * (arm == "volumetric") + 1e-3 * np.sin(seed + len(arm))
 
 
@@ -105,7 +106,7 @@ def test_a_decided_sweep_given_again_runs_nothing(sweep, runs, caplog):
 
 
 def verdicts_of(runs: Path) -> list[Verdict]:
-    """The verdicts of the sweep by what was last declared for it."""
+    """The verdicts on the questions that were last declared for the sweep."""
     return judge(read_experiment(runs / "stop").trials, read_declarations(runs / "stop")[-1])
 
 
@@ -119,7 +120,7 @@ def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep, runs):
 
 
 @pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
-def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing(sweep, runs, psnr):
+def test_all_seeds_of_planned_looks_are_declared_beforehand(sweep, runs, psnr):
     assert sweep(Fake(psnr)) == 0
     experiment = read_experiment(runs / "stop")
     found = active_declaration(experiment.folder, experiment.trials)
@@ -133,7 +134,7 @@ def test_seeds_of_planned_looks_are_declared_at_once_and_cost_the_metric_nothing
     assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
 
 
-def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(sweep, runs, caplog):
+def test_a_decided_pair_gets_no_more_seeds_and_pairs_share_the_error_rate(sweep, runs, caplog):
     fake = Fake(lambda arm, seed: clear(arm, seed) if arm != "mcmc" else noise(arm, seed))
     with caplog.at_level(logging.INFO):
         assert sweep(fake, "densify=adc,volumetric,mcmc") == 0
@@ -143,18 +144,18 @@ def test_a_decided_pair_gets_no_seeds_and_the_pairs_share_the_error_rate(sweep, 
     assert "2 of 12 trials were not needed" in caplog.text
 
 
-def test_stopped_at_any_trial_it_goes_on_with_the_same_plan(sweep, runs):
+def test_a_stopped_sweep_continues_with_the_same_plan(sweep, runs):
     assert sweep(Fake(noise, stops_at=2)) == cli.INTERRUPTED
     (plan,) = read_declarations(runs / "stop")
     fake = Fake(noise)
     assert sweep(fake) == 0
-    # what is done is handed over, and skipped there
+    # finished trials are handed over, and skipped there
     assert [len(batch) for batch in fake.batches] == [4, 2, 2]
     assert read_declarations(runs / "stop") == [plan]
     assert not any(verdict.late for verdict in verdicts_of(runs))
 
 
-def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep, runs):
+def test_a_failed_seed_ends_the_looks_and_repeating_it_decides(sweep, runs):
     assert sweep(Fake(clear, fails=1)) == 1
     (verdict,) = verdicts_of(runs)
     assert not verdict.final
@@ -164,7 +165,7 @@ def test_a_failed_seed_ends_the_looks_and_its_return_decides(sweep, runs):
 
 
 @pytest.mark.slow
-def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep, runs):
+def test_more_seeds_after_looking_are_a_new_plan_whose_verdict_is_late(sweep, runs):
     assert sweep(Fake(noise)) == 0
     for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
         file.write_text(
@@ -177,7 +178,7 @@ def test_more_seeds_after_looking_are_another_plan_and_lose_the_place(sweep, run
 
 
 @pytest.mark.slow
-def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep):
+def test_another_hydra_launcher_gets_one_look_at_a_time(sweep):
     fake = Fake(noise)
     assert sweep(fake, "hydra/launcher=basic", "launch=serial") == 0
     assert len(fake.batches) == 8  # a call for each trial
@@ -185,7 +186,7 @@ def test_another_launcher_of_hydras_gets_one_look_at_a_time(sweep):
 
 
 def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, capsys, said):
-    """Arms that differ in a setting alone are told apart as in the report."""
+    """Arms that differ in one setting only have names of their own, as in the report."""
     fake = Fake(clear)
     assert (
         sweep(
@@ -224,7 +225,9 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_what_cannot_be_looked_at_is_refused_before_any_trial(sweep, runs, words, message, capsys):
+def test_a_sweep_that_cannot_stop_early_is_refused_before_any_trial(
+    sweep, runs, words, message, capsys
+):
     fake = Fake(clear)
     assert sweep(fake, *words) == 2
     (line,) = [
@@ -235,7 +238,7 @@ def test_what_cannot_be_looked_at_is_refused_before_any_trial(sweep, runs, words
     assert not runs.exists()
 
 
-def test_one_trial_is_no_sweep(runs, refused):
+def test_stop_when_decided_is_refused_for_a_single_trial(runs, refused):
     assert "adds seeds to a sweep" in refused(*TINY, "launch.stop_when_decided=true")
 
 

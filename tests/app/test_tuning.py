@@ -1,5 +1,4 @@
-"""Tuning parity with trials that take no time: what is declared, searched and chosen, and that
-nobody is favoured."""
+"""Tuning parity, with trials that take no time: what is declared, searched and chosen for arms."""
 
 import dataclasses
 import json
@@ -57,8 +56,10 @@ BEST = {"adc": 3e-4, "volumetric": 0.01}
 
 
 class Fake:
-    """Made-up results in the place of trained ones, best at `BEST`; ``stops`` and ``fails`` are
-    numbers of trials."""
+    """Stands in for trainings, whose results are best at `BEST`.
+
+    Ctrl-C comes in the trial with the number ``stops``; those with numbers in ``fails`` fail.
+    """
 
     def __init__(
         self, stops: int | None = None, fails: Sequence[int] = (), own_metric: bool = False
@@ -146,14 +147,16 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
         assert {one["densify"][KEYS[arm]] for one in own} == {closest}
         assert not any(one["scene"]["validation"] for one in own)
     assert all(isinstance(one.values["densify"]["stop"], int) for one in fake.tuning("volumetric"))
-    # the arm as it is comes first
+    # the arm's own values are the first point
     assert fake.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002
 
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
 @pytest.mark.slow
 @pytest.mark.slow
-def test_killed_anywhere_it_goes_on_and_chooses_the_same(stops, sweep, runs, tmp_path, monkeypatch):
+def test_a_killed_tuning_continues_and_chooses_the_same_values(
+    stops, sweep, runs, tmp_path, monkeypatch
+):
     whole = Fake()
     assert sweep(whole) == 0
     expected = [tuning(runs, arm) for arm in KEYS]
@@ -165,7 +168,7 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(stops, sweep, runs, tmp
     assert [tuning(tmp_path / "again", arm) for arm in KEYS] == expected
     again = Fake()
     assert sweep(again) == 0
-    assert again.batches == [4]  # what is tuned is not even asked for
+    assert again.batches == [4]  # the finished points are not launched again
 
 
 @pytest.mark.parametrize(
@@ -177,7 +180,7 @@ def test_killed_anywhere_it_goes_on_and_chooses_the_same(stops, sweep, runs, tmp
     ],
 )
 @pytest.mark.slow
-def test_no_record_sets_what_was_not_searched(strange, sweep, runs):
+def test_settings_added_to_a_record_are_ignored(strange, sweep, runs):
     assert sweep(Fake()) == 0
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
     record = json.loads(file.read_text())
@@ -219,7 +222,7 @@ def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep, runs):
 
 
 @pytest.mark.slow
-def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the_sweep(
+def test_failed_points_count_in_the_budget_and_an_arm_without_a_judged_point_ends_the_sweep(
     sweep, runs, capsys
 ):
     assert sweep(Fake(fails=[0])) == 1
@@ -242,7 +245,7 @@ def test_points_that_fail_are_part_of_the_budget_and_an_arm_without_any_ends_the
     )
 
 
-def test_a_typed_value_takes_the_place_of_an_interval(sweep, runs):
+def test_a_typed_value_replaces_an_interval(sweep, runs):
     fake = Fake()
     assert sweep(fake, "densify.stop=200", "hydra.sweeper.tune.points=1") == 0
     assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {200}
@@ -297,7 +300,7 @@ def test_an_interval_searches_one_arm(runs, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_metric_of_ones_own_is_made_best_in_the_direction_of_its_class(sweep, runs, monkeypatch):
+def test_a_users_metric_is_optimised_in_the_direction_of_its_class(sweep, runs, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     Path("own.py").write_text(
         "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
@@ -323,7 +326,7 @@ def notes(runs: Path, *words: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_sheet_says_budget_views_points_and_what_was_chosen(sweep, runs):
+def test_the_fairness_table_states_budget_views_points_and_chosen_values(sweep, runs):
     assert sweep(Fake()) == 0
     adc, volumetric = notes(runs)
     best = chosen(runs, "volumetric")
@@ -349,7 +352,7 @@ SENTENCE = (
 
 
 @pytest.mark.slow
-def test_an_arm_that_was_tuned_more_is_said_in_headline_and_tables(sweep, runs):
+def test_unequal_tuning_is_stated_in_headline_and_tables(sweep, runs):
     assert sweep(Fake(), file=UNEVEN) == 0
     lines = notes(runs)
     assert f"Tuning. {SENTENCE}" in lines
@@ -383,7 +386,7 @@ def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep, ru
         for line in lines
     )
     file.write_text("{")
-    assert notes(runs)  # a record that is damaged takes nothing else with it
+    assert notes(runs)  # a damaged record does not hide the others
 
 
 # --- bad input

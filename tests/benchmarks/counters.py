@@ -1,5 +1,4 @@
-"""For those who work on speed: the time of a step by kernel, and how often it makes the host wait
-for a GPU."""
+"""For work on speed: the time of a step by kernel, and its number of waits for a GPU."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsbench.raster.staged import Readback
 
 OWN_CODE = "gsbench."
-# Operations whose result, or its size, the host has to know before it goes on.
+# Operations whose result, or its size, the host must know before it continues.
 WAITING = frozenset(
     {
         "_local_scalar_dense",
@@ -34,16 +33,14 @@ WAITING = frozenset(
 )
 INDEXING = frozenset({"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"})
 COPYING = frozenset({"_to_copy", "copy_"})
-MAKING = "lift_fresh"  # a tensor of Python numbers: an upload where it is for a device
+MAKING = "lift_fresh"  # a tensor of Python numbers: an upload if it is for a device
 
 
 @contextmanager
 def timed_kernels() -> Iterator[Counter[str]]:
-    """Processor time, ms, by compiled kernel of gsbench on the CPU within the block, of all threads
-    together.
+    """Measure the processor time, ms, of each compiled kernel within the block, over all threads.
 
-    Every kernel that a module of gsbench has a name for is replaced by one that is timed, until the
-    block ends.
+    Until the block ends, every kernel in a module of gsbench is replaced by one that is timed.
     """
     times: Counter[str] = Counter()
     replaced: list[tuple[dict[str, Any], str, Any]] = []
@@ -76,12 +73,12 @@ def _timed_call(kernel: Any, times: Counter[str]) -> Callable[..., Any]:
 
 @contextmanager
 def counting_waits(pretend: bool = False) -> Iterator[Counter[str]]:
-    """Count, by operation, what would make the host wait for a CUDA device within the block.
+    """Count the operations within the block that would make the host wait for a CUDA device.
 
-    That is reading a value, a size that depends on values (``nonzero``, an index that is a mask), a
-    copy between device and host that is not asynchronous, and a `Readback` that has not arrived
-    when it is asked for. With ``pretend`` every tensor on the CPU counts as one on a device: what
-    is made of Python numbers would be an upload.
+    These read a value, need a size that depends on values (``nonzero``, an index that is a mask),
+    copy between device and host synchronously, or ask for a `Readback` that has not arrived. With
+    ``pretend``, every tensor on the CPU counts as one on a device, so that a tensor of Python
+    numbers is an upload.
     """
     counts: Counter[str] = Counter()
     before = Readback.waits

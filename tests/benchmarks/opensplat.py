@@ -1,12 +1,11 @@
-"""What a training iteration costs in OpenSplat and in ``raster=cpu``: the same model, cameras and
-photographs in turns.
+"""Time a training iteration in OpenSplat and in ``raster=cpu``, in turns, with the same inputs.
 
     python -m tests.benchmarks.opensplat [WIDTHxHEIGHT COUNT]
 
 The model is the trained-like scene of `gsbench bench`, seen by two cameras side by side;
-photographs are noise. Nothing grows, and either's optimiser steps in every iteration. Both are kept
-on one core, so that OpenSplat starts one thread. Times are of the processor, of whole iterations:
-OpenSplat's between two lines of its log, when it has warmed up.
+photographs are noise. Nothing grows, and both optimisers step in every iteration. Both programs are
+kept on one core, so that OpenSplat starts one thread. Times are processor times of whole
+iterations. OpenSplat's time is that between two lines of its log, after its warm-up.
 """
 
 from __future__ import annotations
@@ -43,9 +42,10 @@ from gsbench.train.trainer import Trainer
 
 PROGRAM = "opensplat"
 TURNS, ITERATIONS = 5, 6  # of each turn, after the warm-up
-# of the unit in which Gaussians lie 2 to 24 deep; not 0, since OpenSplat divides by it
+# the cameras' distance from the origin, in the unit in which Gaussians lie 2 to 24 deep; not 0,
+# since OpenSplat divides by it
 BESIDE = 0.5
-# the iteration that the model is said to be of: all degrees of harmonics are in use
+# the iteration that the model's file states: all degrees of harmonics are in use by then
 LONG_AGO = 3000
 FIRST_LINE, COMMENT = (
     b"format binary_little_endian 1.0\n",
@@ -54,7 +54,7 @@ FIRST_LINE, COMMENT = (
 
 
 def two_views(width: int, height: int) -> tuple[View, ...]:
-    """Noise, as seen by a camera on either side of the origin."""
+    """Two views of noise, whose cameras are on either side of the origin."""
     middle, noise = frontal_camera(width, height), np.random.default_rng(0)
     found = []
     for name, side in (("0.png", -BESIDE), ("1.png", BESIDE)):
@@ -64,7 +64,7 @@ def two_views(width: int, height: int) -> tuple[View, ...]:
 
 
 def write_inputs(folder: Path, gaussians: Gaussians, views: tuple[View, ...]) -> Path:
-    """Write what OpenSplat trains on to ``folder``; returns the model from which it goes on."""
+    """Write OpenSplat's inputs to ``folder``; returns the model from which it continues."""
     points = gaussians.means.double().numpy()
     write_training_views(
         folder, views, PointCloud(points, np.full(points.shape, 128, dtype=np.uint8))
@@ -77,7 +77,7 @@ def write_inputs(folder: Path, gaussians: Gaussians, views: tuple[View, ...]) ->
 
 
 def milliseconds_of_opensplat(folder: Path, model: Path) -> float:
-    """Processor time of an iteration of OpenSplat, which goes on from ``model``."""
+    """Processor time of an iteration of OpenSplat, which continues from ``model``."""
     first, last = LONG_AGO + WARM_UP_STEPS, LONG_AGO + WARM_UP_STEPS + ITERATIONS
     never = [word for name in ("--densify-from", "--densify-until") for word in (name, str(NEVER))]
     words = [
@@ -101,7 +101,7 @@ def milliseconds_of_opensplat(folder: Path, model: Path) -> float:
 
 
 class Ours:
-    """A training of ``raster=cpu`` on one thread that stays where it is."""
+    """A training of ``raster=cpu`` on one thread that does not change its model."""
 
     def __init__(self, gaussians: Gaussians, views: tuple[View, ...]) -> None:
         densifier = ADC(

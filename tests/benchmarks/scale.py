@@ -1,5 +1,4 @@
-"""An experiment of thousands of finished trials, made by copying, and how long verbs take to read
-it.
+"""Time how long verbs take to read an experiment of thousands of finished, made-up trials.
 
     python -m tests.benchmarks.scale FOLDER [SCENES ARMS SEEDS]
 
@@ -29,7 +28,7 @@ DENSIFIERS = "adc absgrad absgs edgeaware longaxis mcmc pixelgs revised taming v
 
 
 def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
-    """Settings as many as a trial's; every second arm is a variant of the one before."""
+    """As many settings as a real trial has; every second arm is a variant of the one before."""
     groups = {
         group: {f"setting_{k}": k / 7 for k in range(20)}
         for group in ("scene", "init", "train", "eval")
@@ -57,7 +56,7 @@ def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
 
 
 def write_trial(values: dict[str, Any], psnr: float) -> None:
-    """The files of a finished trial, as `gsbench.runs.trial_folder` leaves them."""
+    """Write the files of a finished trial, as `gsbench.runs.trial_folder` leaves them."""
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
     views = [psnr + k / 10 for k in range(-3, 4)]
@@ -102,7 +101,7 @@ def write_trial(values: dict[str, Any], psnr: float) -> None:
 
 
 def write_all(runs: Path, scenes: int, arms: int, seeds: int) -> int:
-    """The trials of every scene, arm and seed; how many they are."""
+    """Write the trials of every scene, arm and seed; returns their number."""
     for scene in range(scenes):
         for arm in range(arms):
             for seed in range(seeds):

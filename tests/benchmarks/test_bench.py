@@ -35,7 +35,7 @@ pytestmark = pytest.mark.slow
 KEYS = {"raster", "size", "count", "forward_ms", "backward_ms", "step_ms", "peak_memory_mb"}
 
 
-def test_rows() -> None:
+def test_rows_have_the_times_of_each_size_count_and_rasterizer() -> None:
     rows = run_bench(
         ["cpu", "reference"], [(40, 30), (33, 17)], [50, 100], repeats=2, threads=1, memory=False
     )
@@ -54,7 +54,7 @@ def test_rows() -> None:
         assert row["peak_memory_mb"] is None
 
 
-def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
+def test_rasterizers_are_compared_with_the_first_in_steps_and_frames() -> None:
     first, second = run_bench(
         ["cpu", "reference"], [(40, 30)], [50], repeats=3, memory=False, scene="random"
     )
@@ -65,7 +65,7 @@ def test_turns_are_compared_with_the_first_and_whole_steps_are_made() -> None:
     assert min(first["fps"], second["fps"]) > 0
 
 
-def test_kernels_of_a_step_and_waits() -> None:
+def test_kernels_and_waits_of_a_step_on_a_cpu() -> None:
     """On a CPU the profiler sees torch's operators; nothing waits."""
     (row,) = run_bench(["cpu"], [(40, 30)], [50], repeats=1, memory=False, kernels=True)
     assert row["kernels_ms"]["_Render"] > 0
@@ -73,9 +73,8 @@ def test_kernels_of_a_step_and_waits() -> None:
     assert row["waits"] == row["waits_ms"] == {}
 
 
-def test_times_on_a_gpu_are_of_kernels_alone() -> None:
-    """Events as torch's profiler gives them: an operator's launch counts neither as a kernel nor as
-    a wait."""
+def test_times_on_a_gpu_are_those_of_kernels_alone() -> None:
+    """In the profiler's events, an operator's launch counts neither as a kernel nor as a wait."""
 
     def event(key: str, kind: DeviceType, count: int, cpu: float, gpu: float) -> FunctionEventAvg:
         average = FunctionEventAvg()
@@ -100,7 +99,7 @@ def test_times_on_a_gpu_are_of_kernels_alone() -> None:
     )
 
 
-def test_whole_steps_leave_the_scene_as_it_is() -> None:
+def test_whole_steps_do_not_change_the_scene() -> None:
     stepper = Stepper("cpu", Setting("trained", 40, 30, 50, threads=1))
     before = [
         tensor.detach().clone() for tensor in stepper.trainer.gaussians.values.tensors().values()
@@ -117,7 +116,7 @@ def test_whole_steps_leave_the_scene_as_it_is() -> None:
         assert torch.equal(tensor, old)
 
 
-def test_a_rasterizer_of_the_users_own(
+def test_a_users_rasterizer_is_timed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "twice.py").write_text(
@@ -164,7 +163,7 @@ def test_scene_is_seeded_and_seen(make: Callable[[int], Gaussians]) -> None:
 
 
 def longest_list(scene: Gaussians) -> float:
-    """Of all tiles, in units of the mean list; a Gaussian counts where its mean is."""
+    """The longest list of a tile over the mean one; a Gaussian counts in the tile of its mean."""
     camera = frontal_camera(500, 375)
     tile = (project(scene, camera).means.double() + 0.5).div(16).floor().long()  # [M, 2]
     inside = (tile >= 0).all(-1) & (tile[:, 0] < 500 // 16) & (tile[:, 1] < 375 // 16)
@@ -173,7 +172,7 @@ def longest_list(scene: Gaussians) -> float:
 
 
 def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
-    """1,054 entries a block at most, and 117 in the mean, in a trained courtyard."""
+    """A trained courtyard has 1,054 entries per block at most, and 117 on average."""
     assert longest_list(skewed_gaussians(50_000)) == pytest.approx(1054 / 117, rel=0.25)
     assert longest_list(trained_like_gaussians(50_000)) < 2
 
@@ -213,7 +212,7 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails() -> None:
         ),
     ],
 )
-def test_bad_input(arguments: list[str], cause: str) -> None:
+def test_bad_input_is_refused(arguments: list[str], cause: str) -> None:
     if arguments[1].startswith("gsplat") and torch.cuda.is_available():
         pytest.skip("there is a GPU")
     with pytest.raises(InputError, match=cause):

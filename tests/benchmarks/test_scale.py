@@ -1,5 +1,4 @@
-"""Verbs over an experiment of many trials: what they say is right; how long they take is printed,
-and fails nothing."""
+"""Verbs over an experiment of many trials: their output is right; their time is only printed."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_many_trials_are_read_and_averaged(tmp_path: Path) -> None:
-    """Ten thousand: `python -m tests.benchmarks.scale FOLDER 50 20 10`."""
+    """For ten thousand trials: `python -m tests.benchmarks.scale FOLDER 50 20 10`."""
     assert write_all(tmp_path, scenes=3, arms=4, seeds=5) == 60
     experiment = load_experiment(tmp_path, NAME)
     assert len(experiment.trials) == 60

@@ -1,4 +1,4 @@
-"""What counts as a wait for a device, and that a training step has one."""
+"""What counts as a wait for a device, and how many waits a training step has."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FREE = {
 
 
 @pytest.mark.parametrize("what", list(WAITING))
-def test_what_waits(what: str) -> None:
+def test_operations_that_wait_are_counted(what: str) -> None:
     work, expected = WAITING[what]
     with counting_waits(pretend=True) as counts:
         work()
@@ -45,19 +45,19 @@ def test_what_waits(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", list(FREE))
-def test_what_does_not(what: str) -> None:
+def test_operations_that_do_not_wait_are_not_counted(what: str) -> None:
     with counting_waits(pretend=True) as counts:
         FREE[what]()
     assert counts == {}
 
 
-def test_numbers_for_the_cpu_are_free_where_it_is_the_cpu() -> None:
+def test_python_numbers_for_the_cpu_do_not_wait() -> None:
     with counting_waits() as counts:
         torch.tensor([1.0])
     assert counts == {}
 
 
-def test_in_the_backward_pass_too() -> None:
+def test_waits_in_the_backward_pass_are_counted() -> None:
     class Reads(torch.autograd.Function):
         @staticmethod
         def forward(ctx, x):  # type: ignore[no-untyped-def]
@@ -84,9 +84,8 @@ def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("raster", ["triton", "reference"])
-def test_one_wait_in_a_training_step(raster: str) -> None:
-    """With Triton: its look at how much there is to composite. The reference shows that others
-    would be seen."""
+def test_a_training_step_with_triton_waits_once(raster: str) -> None:
+    """It reads how much there is to composite. The reference shows that more waits are counted."""
     pytest.importorskip("triton")
     environment = os.environ | {
         "TRITON_INTERPRET": "1",

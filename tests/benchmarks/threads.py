@@ -2,11 +2,12 @@
 
     python -m tests.benchmarks.threads [TRIAL WIDTH] ...
 
-A trial is a folder with a trained model; a training view of its own is drawn, ``WIDTH`` px wide.
-Without any: the scene of `gsbench bench`. Every shard is timed on one thread, by processor time,
-the fastest of some steps. Then the shards of a stage go to the threads in their order, each to the
-first that is free; torch's Adam is divided evenly, and all else is serial. What threads do to each
-other (memory, caches, the handing out) is not in it, so speedups are upper bounds.
+A trial is a folder with a trained model; one of its training views is drawn, ``WIDTH`` px wide.
+Without a trial, the scene of `gsbench bench` is drawn. Every shard is timed on one thread, by
+processor time; the fastest of some steps counts. Then the shards of a stage go to the threads in
+their order, each to the first thread that is free. torch's Adam is divided evenly, and all else is
+serial. Effects of threads on each other (memory, caches, scheduling) are left out, so speedups are
+upper bounds.
 """
 
 from __future__ import annotations
@@ -43,11 +44,10 @@ STEPS = 9
 
 
 def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
-    """A trial's model, and its first training view, ``width`` px wide, with noise for a
-    photograph."""
+    """A trial's model, and its first training view, ``width`` px wide, with noise as photograph."""
     values = TrialFolder(folder).configuration()
     steps = TrialSteps(Parts(values), Store(Path(values["runs"]) / STORE))
-    next(step for step in steps.steps() if step.stage == TRAIN)  # whose views are known by then
+    next(step for step in steps.steps() if step.stage == TRAIN)  # the views are known from here on
     camera = steps.views.scene.train[0].camera
     camera = camera.resized(width, round(camera.height * width / camera.width))
     image = np.random.default_rng(0).integers(
@@ -57,8 +57,10 @@ def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
 
 
 class Timed:
-    """A training of one thread; ``stages`` are the stages of the last step in order: name and ms of
-    each shard."""
+    """A training on one thread.
+
+    ``stages`` are the stages of the last step in order: the name, and the ms of each shard.
+    """
 
     def __init__(self, gaussians: Gaussians, scene: Scene) -> None:
         densifier = ADC(
@@ -95,7 +97,7 @@ class Timed:
 
 
 def makespan(times: Sequence[float], threads: int) -> float:
-    """When the last shard ends, where each goes to the first thread that is free."""
+    """The time until the last shard ends, if each goes to the first thread that is free."""
     free = [0.0] * threads
     for ms in times:
         heapq.heapreplace(free, free[0] + ms)

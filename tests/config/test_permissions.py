@@ -1,5 +1,4 @@
-"""Other people's runs folders and trainers: what they may run is what the one who types allows,
-every time."""
+"""Runs folders and trainers of strangers run only what the user allows in each command."""
 
 import json
 import sys
@@ -59,8 +58,7 @@ STRANGE_TRIALS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 def strange_runs(settings: dict[str, Any]) -> Path:
-    """A trial of somebody else's that failed, in no plan; its configuration allows itself
-    everything."""
+    """A stranger's failed trial that is in no plan; its configuration allows itself everything."""
     (trial,) = compose_trials(["name=x"])
     values = json.loads(json.dumps(trial.values)) | {
         "allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]
@@ -78,7 +76,9 @@ def strange_runs(settings: dict[str, Any]) -> Path:
     "words", [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
 )
 @pytest.mark.parametrize("case", STRANGE_TRIALS)
-def test_retry_runs_nothing_of_a_strange_folder_unasked(case, words, monkeypatch, refused):
+def test_retry_runs_nothing_of_a_strangers_folder_without_permission(
+    case, words, monkeypatch, refused
+):
     settings, said = STRANGE_TRIALS[case]
     strange_runs(settings)
     monkeypatch.setattr("gsbench.app.command.run_trials", no_trial)
@@ -87,7 +87,7 @@ def test_retry_runs_nothing_of_a_strange_folder_unasked(case, words, monkeypatch
 
 
 @pytest.mark.parametrize("case", ["a class", "a metric", "a program", "a program by another path"])
-def test_what_only_reads_runs_nothing_of_a_strange_folder(case):
+def test_verbs_that_only_read_run_nothing_of_a_strangers_folder(case):
     strange_runs(STRANGE_TRIALS[case][0])
     for words in (
         ["status"],
@@ -100,13 +100,13 @@ def test_what_only_reads_runs_nothing_of_a_strange_folder(case):
     assert not Path("exploded").exists()
 
 
-def test_a_configuration_that_was_read_allows_nothing():
+def test_permissions_in_a_trials_configuration_are_dropped():
     folder = strange_runs({})
     assert "bomb" in (folder / "config.yaml").read_text()
     assert TrialFolder(folder).configuration()["allow_targets"] == []
 
 
-def test_retry_does_what_it_is_allowed_to(monkeypatch):
+def test_retry_runs_what_its_command_allows(monkeypatch):
     strange_runs({"densify": {"_target_": "mine.Mine"}})
     began: list[Any] = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
@@ -114,9 +114,8 @@ def test_retry_does_what_it_is_allowed_to(monkeypatch):
     assert [trial.values["allow_targets"] for trial in began] == [["mine"]]
 
 
-def test_a_plan_allows_nothing_and_names_no_folder_of_modules(place, monkeypatch, refused):
-    """A stranger's plan says what is allowed, and a folder of the stranger's whose `mine`
-    explodes."""
+def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch, refused):
+    """A stranger's plan has a permission, and names a folder whose ``mine`` leaves a mark."""
     theirs = place / "theirs"
     theirs.mkdir()
     (theirs / "mine.py").write_text(f"open({str(place / 'exploded')!r}, 'w')\nclass Mine: ...\n")
@@ -140,9 +139,8 @@ def test_a_plan_allows_nothing_and_names_no_folder_of_modules(place, monkeypatch
     assert not (place / "exploded").exists()
 
 
-def test_a_plan_names_no_folder_of_packages_of_settings(place, monkeypatch):
-    """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not one in the folder
-    of the plan."""
+def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
+    """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not the plan's."""
     theirs = place / "theirs"
     for folder, line in (("theirs", f"open({str(place / 'exploded')!r}, 'w')\n"), (".", "")):
         (place / folder / "conf_of_mine").mkdir(parents=True)
@@ -190,7 +188,7 @@ PROGRAM = [
         ),
     ],
 )
-def test_every_program_and_variable_of_another_trainer_is_asked_for(words, missing):
+def test_every_program_and_variable_of_another_trainer_needs_permission(words, missing):
     with pytest.raises(InputError) as caught:
         compose_one([*PROGRAM, *words])
     assert f"add allow_targets=[{missing}] to the command" in str(caught.value)
@@ -207,8 +205,8 @@ def test_every_program_and_variable_of_another_trainer_is_asked_for(words, missi
 @pytest.mark.parametrize(
     "target", ["gsbench.external.exchange.External", "gsbench.pipeline.parts.External"]
 )
-def test_the_class_of_another_trainer_has_two_names(target):
-    """Permissions are asked for by these; by any other that leads to it, nothing is made."""
+def test_the_class_of_other_trainers_is_refused_under_further_names(target):
+    """Two names of the class ask for permissions; by any other name nothing is made."""
     with pytest.raises(InputError):
         build(
             "densify",
@@ -229,12 +227,12 @@ def test_harmless_variables_need_no_permission():
     compose_one([*PROGRAM, "+densify.environment.OMP_NUM_THREADS='4'", "allow_targets=[python]"])
 
 
-def test_a_version_command_cannot_hide_behind_what_is_known_later():
+def test_a_version_command_cannot_use_values_that_are_known_later():
     with pytest.raises(InputError, match=r"nothing is known as \{output\}"):
         compose_one([*PROGRAM, "densify.version_command=['{output}/x']", "allow_targets=[python]"])
 
 
-def test_retry_sends_nothing_to_a_tracker_that_a_strange_folder_names(monkeypatch, refused):
+def test_retry_sends_nothing_to_a_tracker_that_a_strangers_folder_names(monkeypatch, refused):
     address = "http://127.0.0.1:9"
     strange_runs({"tracking": {"uri": address}})
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)

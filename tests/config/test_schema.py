@@ -1,5 +1,4 @@
-"""Every file in ``conf`` composes, its classes can be built, and what is written there is what the
-code defaults to."""
+"""Every file in ``conf`` composes, and its classes can be built and check their options."""
 
 import dataclasses
 import json
@@ -36,7 +35,7 @@ def composed(*overrides: str) -> dict[str, Any]:
     return checked_values(config)
 
 
-# What the user of another program must say: its version, where it lies, and that it may run.
+# Settings that the user of another program must give: version, place and permission.
 PROGRAMS = {
     "external/program": [
         "densify.command=[mine,'{data}']",
@@ -128,7 +127,7 @@ def test_the_demo_downloads_little_and_declares_what_it_measures():
     asked = {
         (tuple(trial.values["eval"]["lpips"]), trial.values["eval"]["primary"]) for trial in trials
     }
-    # which needs no weights; LPIPS joins where its weights are
+    # FLIP needs no weights; LPIPS is measured where its weights are
     assert asked == {(("squeeze",), "flip")}
 
 
@@ -155,7 +154,7 @@ def test_experiments_have_the_size_of_the_paper():
         (["train.background=[0,0,2]"], "train.background"),
     ],
 )
-def test_rules_name_the_key(overrides, key):
+def test_errors_name_the_key(overrides, key):
     with pytest.raises(InputError, match=key):
         composed(*overrides)
 
@@ -175,12 +174,12 @@ def test_rules_name_the_key(overrides, key):
         (["eval.primary=flip", "eval.flip=false"], r"eval\.flip=false"),
     ],
 )
-def test_a_declared_metric_exists_and_is_measured(words, error):
+def test_a_declared_metric_must_exist_and_be_measured(words, error):
     with pytest.raises(InputError, match=error):
         composed(*words)
 
 
-def test_a_metric_of_ones_own_can_be_declared_if_it_says_what_is_better(tmp_path, monkeypatch):
+def test_a_users_metric_can_be_declared_if_it_has_a_direction(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     text = "class Known:\n    direction = 1\n    def measure(self, image, truth): return 1.0\n"
     text += "class Unknown(Known):\n    direction = 0\n"
@@ -209,7 +208,7 @@ def test_wrong_type_in_a_component_names_the_key():
 
 @pytest.mark.slow
 def test_every_component_of_gsbench_checks_its_own_options():
-    """`build` leaves it to them; what is wrong in every kind of option is a list of lists."""
+    """`build` leaves the checks to them. A list of lists is wrong for every kind of option."""
     for group, option in [
         (name, option) for name in ("init", "densify") for option in options(name)
     ]:
@@ -233,13 +232,13 @@ def test_hash_ignores_what_cannot_change_a_result():
         config_hash(composed("name=other", "seed=5", "threads=1", "tracking=none", "device=cpu"))
         == base
     )
-    # how a result will be read does not change it
+    # a declaration does not change a result
     assert config_hash(composed("eval.primary=psnr")) == base
     assert config_hash(composed("densify.volume_threshold=0.04")) != base
     assert config_hash(composed("scene.max_size=200")) != base
 
 
-def test_asking_for_more_metrics_is_another_result():
+def test_asking_for_more_metrics_changes_the_hash():
     words = ("eval.more=[gmsd]", "eval.fps=[640,480]", "eval.fps=[64,48]")
     assert len({config_hash(composed(*word)) for word in [(), *((word,) for word in words)]}) == 4
 
@@ -284,13 +283,13 @@ def test_hash_follows_the_source_of_a_users_metric(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["psnr", "lpips", "view", "Edges", "a-b"])
-def test_names_of_own_metrics_are_their_own(name):
+def test_a_users_metric_needs_a_plain_name_that_is_not_taken(name):
     with pytest.raises(InputError, match=rf"eval\.extra\.{name}: name your metric"):
         composed(f"eval.extra.{name}._target_=mine.X", "allow_targets=[mine]")
 
 
 def test_values_of_a_trial_have_the_types_of_json():
-    """OmegaConf 2.4 keeps tuples, and a record of a trial knows none."""
+    """OmegaConf 2.4 keeps tuples, which JSON does not have."""
     values = composed()
     assert json.loads(json.dumps(values)) == values
 
@@ -304,7 +303,7 @@ def test_an_own_metric_must_be_allowed_and_name_a_class():
         composed("eval.extra.edges=3")
 
 
-def test_no_training_needs_no_densifier():
+def test_a_run_without_training_requires_densify_none():
     with pytest.raises(InputError, match="add densify=none"):
         composed("train=none", "densify=adc")
     assert composed("train=none", "densify=none")["train"]["iterations"] == 0
@@ -313,7 +312,7 @@ def test_no_training_needs_no_densifier():
 
 
 @pytest.mark.parametrize("threads", ["4097", "1000000000000", "0"])
-def test_no_more_threads_than_a_system_starts(threads):
+def test_an_impossible_number_of_threads_is_refused(threads):
     with pytest.raises(
         InputError, match=r"threads must be a whole number in \[1, 4096\] or 'auto'"
     ):

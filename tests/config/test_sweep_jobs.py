@@ -1,5 +1,4 @@
-"""A job of a sweep has the configuration that its words give alone, whatever it shares with the
-others."""
+"""A job of a sweep has the configuration of its own words, whatever it shares with other jobs."""
 
 import pickle
 
@@ -53,7 +52,7 @@ def compositions(monkeypatch) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", list(SWEEPS))
 @pytest.mark.slow
-def test_every_job_is_what_its_words_say(name, compositions):
+def test_every_job_has_the_configuration_of_its_words(name, compositions):
     words, count = SWEEPS[name]
     trials = compose_trials(words, multirun=True)
     assert len(compositions) == count
@@ -66,7 +65,7 @@ def test_every_job_is_what_its_words_say(name, compositions):
 @pytest.mark.parametrize(
     "words", [["seed=0,-1"], ["train.iterations=5,-5"], ["seed=0,1", "scene.views=9,no"]]
 )
-def test_a_bad_value_is_refused_where_it_shares_a_composition(words):
+def test_a_bad_value_is_refused_in_a_shared_composition(words):
     with pytest.raises(InputError, match=f"{words[-1].partition('=')[0]} must be"):
         compose_trials(words, multirun=True)
 
@@ -75,7 +74,7 @@ def test_a_bad_value_is_refused_where_it_shares_a_composition(words):
     ("words", "values"),
     [
         (["a.b=1", "seed=2", "c=3", "d.e='4'"], {"a.b": 1, "seed": 2, "d.e": "4"}),
-        (["a.b={c:1}", "d.e=2"], {}),  # whose order Hydra keeps
+        (["a.b={c:1}", "d.e=2"], {}),  # a mapping, whose order matters
         (["+a.b.c=1", "a.b=2"], {}),
         (["a.b=1", "~a.b"], {}),
         (
@@ -92,10 +91,10 @@ def test_a_bad_value_is_refused_where_it_shares_a_composition(words):
         ),
     ],
 )
-def test_values_that_may_be_set_after_the_rest(words, values):
+def test_plain_values_are_those_that_may_be_set_after_composition(words, values):
     assert _plain_values(words) == values
 
 
-def test_a_trial_is_small_where_it_goes_to_another_process():
+def test_a_pickled_job_is_small():
     trials = compose_trials(["densify=adc,volumetric", "seed=0,1"], multirun=True)
     assert all(len(pickle.dumps(job_of(trial))) < 20_000 for trial in trials)

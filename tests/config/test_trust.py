@@ -1,5 +1,4 @@
-"""Nothing that a configuration or the current folder names is run unless the one who types allows
-it.
+"""Nothing that a configuration or the current folder names is run unless the user allows it.
 
 Every case tries to leave a mark: a module that writes a file when it is imported, or a call that
 makes a folder.
@@ -29,7 +28,7 @@ LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
 
 
 def calls(**settings: Any) -> dict[str, Any]:
-    """Settings with one of Hydra's own callbacks, and beside its name what a stranger adds."""
+    """Settings of one of Hydra's own callbacks, with a stranger's further ``settings``."""
     return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
 
 
@@ -231,7 +230,7 @@ MODES = {
 
 @pytest.mark.parametrize("mode", ["run", "dry run"])
 @pytest.mark.parametrize("case", STRANGE)
-def test_what_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
+def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     settings, said = STRANGE[case]
     assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
     assert not Path("exploded").exists()
@@ -241,7 +240,7 @@ def test_what_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "case", ["a callback", "made of a text", "a module of a package", "logging", "a launcher"]
 )
-def test_nor_where_somebody_only_asks(case, mode, capsys, monkeypatch):
+def test_queries_do_not_run_code_that_a_file_names(case, mode, capsys, monkeypatch):
     settings, said = STRANGE[case]
     assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
     assert not Path("exploded").exists()
@@ -263,7 +262,9 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep
 @pytest.mark.parametrize("place_of_words", ["params", "grids"])
 @pytest.mark.parametrize("launcher", ["gsbench", "basic"])
 @pytest.mark.parametrize("case", JOBS)
-def test_nor_what_only_the_jobs_of_a_sweep_say(case, launcher, place_of_words, capsys, monkeypatch):
+def test_code_that_only_jobs_of_a_sweep_name_is_not_run(
+    case, launcher, place_of_words, capsys, monkeypatch
+):
     words, said = JOBS[case]
     words = words | {"seed": "0,1"}
     node = {"params": words} if place_of_words == "params" else {"grids": [words]}
@@ -278,13 +279,13 @@ def test_nor_what_only_the_jobs_of_a_sweep_say(case, launcher, place_of_words, c
 @pytest.mark.parametrize(
     "variables", [{"PYTHONPATH": "/strange"}, {"OMP_NUM_THREADS": "2"}, "${launch.sbatch}"]
 )
-def test_a_file_sets_no_variable(variables, capsys, monkeypatch):
+def test_a_file_cannot_set_environment_variables(variables, capsys, monkeypatch):
     line = ask(experiment({"hydra": {"job": {"env_set": variables}}}), capsys, monkeypatch)
     assert "hydra.job.env_set can change what runs" in line
 
 
 @pytest.mark.parametrize("sweeper", ["gsbench", "basic"])
-def test_what_one_choice_of_a_sweep_brings_along_is_not_run(sweeper, capsys, monkeypatch):
+def test_code_from_a_single_choice_of_a_sweep_is_not_run(sweeper, capsys, monkeypatch):
     """Hydra configures the logging of a job before gsbench sees the job."""
     folder = Path("conf/scene")
     folder.mkdir(parents=True)
@@ -303,7 +304,7 @@ def test_what_one_choice_of_a_sweep_brings_along_is_not_run(sweeper, capsys, mon
 
 
 def test_a_launcher_in_a_strangers_file_is_not_run(capsys, monkeypatch):
-    """Not even in the place of an installed one."""
+    """The file may have the name of an installed launcher."""
     for group, target in (
         ("launcher", "hydra_plugins.bomb.Bomb"),
         ("sweeper", "hydra_plugins.bomb.Bomb"),
@@ -328,8 +329,8 @@ GSBENCH_WEIGHTS path
 """
 
 
-def test_only_variables_that_choose_threads_and_devices_are_free(monkeypatch):
-    """Of another trainer's environment; all others could start code."""
+def test_only_variables_that_choose_threads_and_devices_need_no_permission(monkeypatch):
+    """These are variables for another trainer. All others could start code."""
     assert foreign_variables({"OMP_NUM_THREADS": "2", "CUDA_VISIBLE_DEVICES": "1"}, []) == {}
     assert (
         list(foreign_variables(dict.fromkeys(VARIABLES.split(), "/strange"), []))
@@ -349,20 +350,20 @@ def test_only_variables_that_choose_threads_and_devices_are_free(monkeypatch):
     ],
 )
 @pytest.mark.parametrize("mode", MODES)
-def test_a_search_path_imports_nothing(word, said, mode, capsys, monkeypatch):
+def test_a_search_path_without_permission_imports_nothing(word, said, mode, capsys, monkeypatch):
     Path("conf").mkdir()
     assert said in ask([*MODES[mode], word], capsys, monkeypatch)
     assert not Path("exploded").exists()
 
 
-def test_nor_does_completion(monkeypatch):
+def test_completion_does_not_import_the_search_path(monkeypatch):
     line = "gsbench hydra.searchpath=[pkg://bombs] densify="
     monkeypatch.setenv("COMP_LINE", line)
     assert cli.run(["-sc", "query=bash"]) == 2
     assert not Path("exploded").exists()
 
 
-def test_a_search_path_that_was_allowed_is_read(place):
+def test_an_allowed_search_path_is_read(place):
     (place / "bombs" / "scene").mkdir()
     (place / "bombs" / "scene" / "own.yaml").write_text(
         "defaults: [courtyard, _self_]\nname: own\n"
@@ -371,7 +372,7 @@ def test_a_search_path_that_was_allowed_is_read(place):
     assert compose_trials(words)[0].values["scene"]["name"] == "own"
 
 
-# ---- whose permission, and what it means
+# ---- permissions and what they cover
 
 
 @pytest.mark.parametrize(
@@ -386,7 +387,7 @@ def test_a_search_path_that_was_allowed_is_read(place):
         "allow_targets=['']",
     ],
 )
-def test_permissions_are_typed_as_names(word):
+def test_permissions_must_be_a_list_of_names(word):
     with pytest.raises(InputError, match="a list of names"):
         typed_permissions([word])
 
@@ -399,7 +400,7 @@ def test_the_last_permission_counts():
     assert typed_permissions(["seed=1"]) == ()
 
 
-def test_what_is_typed_is_allowed_in_files_too(capsys):
+def test_a_typed_permission_also_covers_classes_in_files(capsys):
     run = experiment({"allow_targets": ["os"], "densify": {"_target_": "mine.Mine"}})
     (trial,) = compose_trials(["hydra.searchpath=[conf]", *run[2:], "allow_targets=[mine]"])
     assert trial.values["allow_targets"] == ["mine"]  # and not what the file says
@@ -414,13 +415,13 @@ def test_what_is_typed_is_allowed_in_files_too(capsys):
         ("mine.Popen", r"is subprocess\.Popen.*allow_targets=\[mine,subprocess\]"),
     ],
 )
-def test_trust_in_a_module_is_no_trust_in_what_it_imports(target, said):
+def test_permission_for_a_module_does_not_cover_its_imports(target, said):
     allow_modules(["mine"])
     with pytest.raises(InputError, match=said):
         build("densify", {"_target_": target, "name": "x"}, ["mine"])
 
 
-def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it():
+def test_permission_for_a_module_covers_gsbenchs_classes_in_it():
     allow_modules(["mine"])
     assert load_class("mine.ADC", "densify", ["mine"]).__module__.startswith("gsbench.")
     assert load_class("mine.Mine", "densify", ["mine"]).__name__ == "Mine"
@@ -436,7 +437,7 @@ def test_trust_in_a_module_extends_to_gsbenchs_classes_in_it():
         ({"size": 3}, "hydra.callbacks.x names no _target_"),
     ],
 )
-def test_callbacks_are_classes_of_the_allowed_module(settings, said, capsys, monkeypatch):
+def test_callbacks_must_be_classes_of_an_allowed_module(settings, said, capsys, monkeypatch):
     run = [*experiment({"hydra": {"callbacks": {"x": settings}}}), "allow_targets=[mine]"]
     assert said in ask(run, capsys, monkeypatch)
 
@@ -447,7 +448,7 @@ def test_an_allowed_callback_is_made(capsys, monkeypatch):
     assert "the trials began" in ask(run, capsys, monkeypatch)
 
 
-def test_only_allowed_modules_of_the_folder_are_found_and_behind_what_is_installed(place):
+def test_only_allowed_modules_of_the_folder_are_found_and_installed_ones_come_first(place):
     (place / "yaml.py").write_text(BOMB)
     (place / "json").mkdir()
     (place / "json" / "__init__.py").write_text(BOMB)
@@ -477,7 +478,7 @@ def test_looking_for_a_users_source_imports_nothing(place):
 
 
 @pytest.mark.parametrize("target", ["os.system", "gsbench_evil.X", "minefield.X", "", None])
-def test_prefixes_end_at_dots(target):
+def test_a_permission_covers_whole_names_only(target):
     with pytest.raises(InputError):
         check_target(target, "densify", ["mine", "mine.sub."])
 

@@ -1,5 +1,4 @@
-"""A value that YAML and a class both state is the same, unless it is said here that it shall
-differ."""
+"""A value that YAML and a class both state is the same, unless `DELIBERATE` lists it."""
 
 import dataclasses
 import importlib
@@ -13,7 +12,7 @@ from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.settings import option_fields
 from gsbench.system.install import conf_dir
 
-# they say which one of its group a file is
+# keys that tell the files of a group apart
 NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")
 # group/file: the keys whose values differ from the class's own; a file that is built on another has
 # the other's too
@@ -31,10 +30,10 @@ DELIBERATE = {
     "train/late2024": {"opacity"},
     "train/none": {"iterations"},
 }
-# Built on another file, and yet of a class whose defaults are its values.
+# Files that are built on another one, but have the defaults of a class of their own.
 OWN_CLASS = {"densify/edgeaware", "densify/gns"}
-# A shortened schedule, those of other authors (held to their code in tests/densify), and what
-# starts another program differ in most of what they have.
+# Files that differ in most keys: a shortened schedule, and the schedules of other authors, which
+# tests/densify compares with their code.
 WHOLE = {
     "train/quick",
     *(f"train/{name}" for name in ("fastgs", "improved_gs", "mrnf", "resgs", "taming")),
@@ -77,14 +76,13 @@ FILES = [
     path
     for group in ("densify", "eval", "init", "launch", "raster", "scene", "tracking", "train")
     for path in sorted(f"{group}/{file.stem}" for file in (conf_dir() / group).glob("*.yaml"))
-    # the others say where captures lie, and as what
+    # other scenes only say where a capture lies and of which kind it is
     if group != "scene" or path == "scene/courtyard"
 ]
 
 
 def stated(path: str) -> dict[str, Any]:
-    """The values that a file and those below it state, but for what is given, or comes from another
-    setting."""
+    """The values that a file and its bases state, except names and references to other settings."""
     values: dict[str, Any] = {}
     for file in (*reversed(list(bases(path))), path):
         values |= read(file)
@@ -105,7 +103,7 @@ def plain(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("path", [path for path in FILES if path not in WHOLE])
-def test_what_yaml_and_class_both_state_is_the_same(path):
+def test_yaml_values_equal_the_defaults_of_the_class(path):
     cls = class_of(path)
     if cls is None:  # a function, or a class without options
         return
@@ -127,7 +125,7 @@ def test_what_yaml_and_class_both_state_is_the_same(path):
     )
 
 
-def test_the_list_names_files_that_are_there():
+def test_the_lists_name_existing_files():
     assert DELIBERATE.keys() | WHOLE <= set(FILES)
     assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {
         "EvalConfig",

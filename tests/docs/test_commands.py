@@ -1,7 +1,6 @@
-"""Commands, settings and files that the documents name are there: verbs, their options, groups,
-choices and keys.
+"""Verbs, options, groups, choices, settings and files that the documents name exist.
 
-Read from the text, not run; values other than choices are checked where commands run.
+The text is read, and no command runs. Values other than choices are checked where commands run.
 """
 
 import contextlib
@@ -38,7 +37,7 @@ SPAN = re.compile(r"`([^`]+)`")
 COMMAND = re.compile(r"^ {4,}((?:[A-Z_]+=\S+ )*gsbench(?: .*)?)$", re.MULTILINE)
 SETTING = re.compile(r"^([+~]*)([a-z_][\w.]*)=(.*)$")
 FILE = re.compile(r"^[\w.-]+(/[\w.-]+)+\.(py|yaml|md|sh)$")
-# other names with a slash may be of other programs' files
+# Other names with a slash may be files of other programs.
 OUR_FILES = ("src/", "conf/", "docs/", "tests/")
 # a choice that is a name, and no placeholder, pattern or expression
 VERBATIM = re.compile(r"^[\w/]+$")
@@ -59,14 +58,13 @@ NO_SETTINGS = {"key", "stable", "grow_grad2d"}  # words of Hydra's grammar, of t
 
 @cache
 def keys_of(group: str) -> frozenset[str]:
-    """The settings of a group: those of its dataclass, of its files, and of the classes that these
-    name."""
+    """The settings of a group: those of its dataclass, its files, and the classes in the files."""
     known = {field.name for kind in CLASSES.get(group, ()) for field in dataclasses.fields(kind)}
     for file in (ROOT / "conf" / group).rglob("*.yaml"):
         content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
         known |= {str(key) for key in content}
         module, _, name = str(content.get("_target_", "")).rpartition(".")
-        if module and name != External.__name__:  # which stands there for a class of another room
+        if module and name != External.__name__:  # External is in `CLASSES`
             known |= set(
                 inspect.signature(getattr(importlib.import_module(module), name)).parameters
             )
@@ -81,8 +79,7 @@ def options_of(verb: str) -> frozenset[str]:
 
 
 def fault_of_setting(word: str) -> str:
-    """The reason why a word ``key=value`` can be no setting of gsbench's own; "" where it can, or
-    is no such word."""
+    """The reason why a word ``key=value`` is no setting of gsbench; "" for other words."""
     match = SETTING.match(word.strip("'\","))
     if match is None or match[2] in NO_SETTINGS:
         return ""
@@ -100,7 +97,7 @@ def fault_of_setting(word: str) -> str:
         missing = sorted(set(given) - choices)
         return f"{key} has no choice {', '.join(missing)}" if missing else ""
     if sign.startswith("+"):
-        return ""  # a setting that a class of the reader's own brings
+        return ""  # a setting of a reader's class
     if rest and group in GROUPS:
         return "" if rest.split(".")[0] in keys_of(group) else f"{group} has no setting {rest}"
     everywhere = TOP.union(*(keys_of(name) for name in GROUPS if name != "experiment"))
@@ -108,7 +105,7 @@ def fault_of_setting(word: str) -> str:
 
 
 def faults_of_command(command: str) -> Iterator[str]:
-    """The words of a command that gsbench would not know."""
+    """The reasons why words of a command are wrong."""
     words = command.partition("gsbench")[2].partition(" #")[0].split()
     words = words[: words.index("|")] if "|" in words else words
     verb = words[0] if words and re.fullmatch(r"[a-z]+", words[0]) else None
@@ -126,7 +123,7 @@ def faults_of_command(command: str) -> Iterator[str]:
 def faults_of(text: str) -> list[str]:
     """The faults of a document, each with its line."""
     text = FENCED.sub(lambda found: "\n" * found[0].count("\n"), text)
-    # a command goes on in a line
+    # a command may continue on the next line
     joined = re.sub(r"\\\n +", lambda found: " " * (len(found[0]) - 1) + "\0", text)
     found = [
         (match.start(1), match[1]) for match in (*COMMAND.finditer(joined), *SPAN.finditer(joined))
@@ -150,12 +147,12 @@ def faults_of(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
-def test_what_a_document_names_is_there(document):
+def test_commands_settings_and_files_in_a_document_exist(document):
     assert faults_of(document.read_text(encoding="utf-8")) == []
 
 
-def test_every_file_of_the_house_is_there():
-    """In the page on the code, files are named from ``src/gsbench``."""
+def test_files_in_the_architecture_document_exist():
+    """There, files may be named from ``src/gsbench``."""
     spans = SPAN.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
     named = [span for span in spans if FILE.match(span)]
     assert len(named) > 10

@@ -1,5 +1,4 @@
-"""The examples in docstrings are true, what users extend has one, and docstrings begin with a verb
-or a noun."""
+"""Docstrings begin with a verb or a noun, and their examples are true."""
 
 import ast
 import doctest
@@ -39,8 +38,7 @@ TITLED = (*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "src").rglob("*.yaml"))
 
 
 def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Line and text of a module's public docstrings: its own, and those of classes, functions and
-    methods."""
+    """Line and text of a module's public docstrings, also of its classes, functions and methods."""
     pending: list[ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef] = [tree]
     while pending:
         node = pending.pop()
@@ -57,8 +55,7 @@ def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def comments(text: str) -> Iterator[tuple[int, str]]:
-    """Line and text of the comments that have lines of their own; of a block only the first
-    line."""
+    """Line and text of comments on lines of their own; of a block, the first line only."""
     block = False
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.lstrip()
@@ -116,11 +113,11 @@ def test_unplain_words_are_found(source, lines):
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_examples(name, capsys):
+def test_examples_in_docstrings_are_true(name, capsys):
     result = doctest.testmod(importlib.import_module(name))
     assert result.failed == 0, capsys.readouterr().out
     written = len(PROMPT.findall(SOURCES[name].read_text(encoding="utf-8")))
-    # none stands where doctest does not look, such as in a decorated function
+    # No example is where doctest does not look, such as in a decorated function.
     assert result.attempted == written
 
 
@@ -132,7 +129,7 @@ def test_examples(name, capsys):
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_what_users_extend_has_an_example(extended, word):
+def test_classes_that_users_extend_have_an_example(extended, word):
     assert extended.__module__ in SOURCES
     assert word in (extended.__doc__ or "").partition("Examples:")[2]
 

@@ -20,12 +20,11 @@ from tests.conftest import ROOT
 pytestmark = pytest.mark.slow
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-FILE = re.compile(r"# (\w+\.py)\n")  # a block that starts so is a file of that name
+FILE = re.compile(r"# (\w+\.py)\n")  # the first line of a block that is a file of this name
 
 
 def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
-    """Write the blocks that are files into ``folder``, run the others there, and return their
-    variables."""
+    """Write the blocks that are files to ``folder``, run the others, and return their variables."""
     text = document.read_text(encoding="utf-8")
     variables: dict[str, Any] = {"__name__": "document"}
     for match in BLOCK.finditer(text):
@@ -41,8 +40,7 @@ def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Iterator[Path]:
-    """An empty working folder, from which modules can be imported; what was imported from it is
-    forgotten."""
+    """An empty working folder, whose modules can be imported and are forgotten afterwards."""
     for key in os.environ:
         if key.startswith(("GSBENCH_", "MLFLOW_")):
             monkeypatch.delenv(key)
@@ -58,7 +56,7 @@ def folder(tmp_path, monkeypatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
-def test_library(folder):
+def test_the_code_of_the_library_document_trains_and_resumes(folder):
     found = run_blocks(ROOT / "docs" / "library.md", folder)
     assert sum(found["losses"][-10:]) < 0.9 * sum(found["losses"][:10])
     assert len(found["trained"]) > len(found["initial"])
@@ -66,7 +64,7 @@ def test_library(folder):
         torch.testing.assert_close(found["again"].tensors()[name], tensor, rtol=0, atol=0)
 
 
-def test_densifier(folder, capsys):
+def test_the_densifier_of_its_document_runs(folder, capsys):
     found = run_blocks(ROOT / "docs" / "densifier.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     assert found["event"]["split_volume"] > 0
@@ -74,13 +72,13 @@ def test_densifier(folder, capsys):
     assert len(results) == 1
 
 
-def test_rasterizer(folder, capsys):
+def test_the_rasterizer_of_its_document_runs(folder, capsys):
     found = run_blocks(ROOT / "docs" / "rasterizer.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
 
 
-def test_metric(folder, capsys):
+def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
     found = run_blocks(ROOT / "docs" / "metric.md", folder)
     shown = capsys.readouterr()
     assert found["status"] == 0, shown.err
@@ -115,7 +113,7 @@ def test_metric(folder, capsys):
     )
 
 
-def test_initialiser(folder, capsys):
+def test_the_initialiser_of_its_document_runs(folder, capsys):
     """An initialiser from one file outside gsbench, through the real program."""
     found = run_blocks(ROOT / "docs" / "initialiser.md", folder)
     assert found["status"] == found["scan_status"] == 0, capsys.readouterr().err
@@ -127,8 +125,8 @@ def test_initialiser(folder, capsys):
     assert values["init_report"]["init"] == "shell"
 
 
-def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder):
-    """What its checklist asks of others."""
+def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
+    """It passes the checklist of the document."""
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
     from gsbench.gaussians.trainable import TrainableGaussians
@@ -144,7 +142,7 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder):
     import largest
 
     def rounds(state, first, last):
-        """Refinements ``first`` to ``last`` of a made-up training that goes on from ``state``."""
+        """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given."""
         densifier = largest.SplitLargest(
             start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
         )
@@ -186,7 +184,7 @@ def test_densifier_of_the_document_is_repeatable_and_resumes_to_the_bit(folder):
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
 
 
-def test_governed_class_of_the_document_ends_at_its_limit(folder):
+def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
     from gsbench.gaussians.trainable import TrainableGaussians
@@ -213,7 +211,7 @@ def test_governed_class_of_the_document_ends_at_its_limit(folder):
 @pytest.mark.parametrize(
     "document", ["README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
 )
-def test_links_between_documents_lead_somewhere(document):
+def test_links_between_documents_lead_to_existing_files(document):
     path = ROOT / document
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
         if "://" not in target:

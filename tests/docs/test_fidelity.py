@@ -1,4 +1,4 @@
-"""docs/fidelity.md says what the restatements of the arms measure."""
+"""docs/fidelity.md agrees with the differences that the tests of the arms measure."""
 
 import re
 
@@ -20,16 +20,15 @@ def test_every_arm_has_a_row_and_the_page_is_made_of_them():
 
 @pytest.mark.parametrize("arm", fidelity.ARMS)
 def test_the_largest_difference_is_no_larger_than_the_page_says(arm):
-    """Nor very much smaller: another processor rounds otherwise."""
+    """It is not much smaller, either; another processor rounds differently."""
     stated, found = float(fidelity.bounds_of(PAGE)[arm]), fidelity.measured(arm)
     assert found <= 10 * stated
     assert found >= stated / 1000
     assert stated <= 1e-6
 
 
-def test_a_difference_would_be_seen(monkeypatch):
-    """The measure is of the numbers themselves, and the tests behind it fail beyond their
-    tolerance."""
+def test_a_wrong_restatement_is_measured_and_refused(monkeypatch):
+    """A small error changes the measured difference, and a large one fails the tests."""
     from tests.densify import restatement
 
     correct = restatement.rotation

@@ -1,4 +1,4 @@
-"""The walks of docs/architecture.md lead where they say: all are made in a copy of gsbench."""
+"""The walks of docs/architecture.md work: a copy of gsbench gets all of their changes."""
 
 import json
 import os
@@ -23,7 +23,7 @@ TINY = """scene=courtyard scene.views=10 scene.width=64 scene.height=48 init=ran
 
 
 def edits(walk):
-    """The parts of a walk: (file, lines before, lines after)."""
+    """Yield the parts of a walk: (file, lines before, lines after)."""
     for part in walk.split("+++ ")[1:]:
         name, *lines = part.splitlines()
         before = [line[1:] for line in lines if not line.startswith("+")]
@@ -32,7 +32,7 @@ def edits(walk):
 
 
 @pytest.mark.parametrize("walk", WALKS.values(), ids=list(WALKS))
-def test_a_walk_names_what_is_there(walk):
+def test_a_walk_changes_lines_that_exist(walk):
     assert len(WALKS) == 5
     for name, before, _ in edits(walk):
         file = ROOT / name
@@ -41,7 +41,7 @@ def test_a_walk_names_what_is_there(walk):
 
 @pytest.fixture(scope="module")
 def walked(tmp_path_factory):
-    """A function that runs Python in a copy of gsbench in which all walks were made."""
+    """A function that runs Python in a copy of gsbench with the changes of all walks."""
     copy = tmp_path_factory.mktemp("walked")
     for folder in ("src", "conf"):
         shutil.copytree(ROOT / folder, copy / folder)
@@ -78,7 +78,7 @@ def test_the_new_densifier_prunes_before_it_grows(walked):
 
 
 @pytest.mark.slow
-def test_the_new_metric_is_measured_and_stands_in_tables(walked):
+def test_the_new_metric_is_measured_and_shown_in_tables(walked):
     assert 0 < walked.results["metrics"]["mae"] < 1
     shown = walked("-m", "gsbench", "tables", "walk", "--metrics", "mae").stdout
     assert "MAE ↓" in shown
@@ -98,7 +98,7 @@ def test_the_new_setting_is_checked_recorded_and_has_its_effect(walked):
 
 
 @pytest.mark.slow
-def test_the_new_loss_is_trained_with_and_makes_other_results(walked):
+def test_the_new_loss_is_trained_with_under_a_new_version_of_the_stage(walked):
     loss = (
         "import torch; from gsbench.train.loss import PhotometricLoss;"
         "one = torch.full((9, 9, 3), 0.5); print(float(PhotometricLoss(0.0)(one, one)[0]))"
@@ -108,6 +108,6 @@ def test_the_new_loss_is_trained_with_and_makes_other_results(walked):
 
 
 @pytest.mark.slow
-def test_the_new_column_stands_in_tables(walked):
+def test_the_new_column_is_shown_in_tables(walked):
     shown = walked("-m", "gsbench", "tables", "walk", "--metrics", "psnr,test_views").stdout
     assert "test views (views)" in shown

@@ -51,8 +51,10 @@ def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def finished_runs(environment, tmp_path_factory) -> Path:
-    """A runs folder with an experiment of four trials, trained once for all workers of the tests:
-    not to be changed."""
+    """A runs folder with an experiment of four trials, trained once for all workers of the tests.
+
+    Tests must not change it.
+    """
     runs = common_folder(tmp_path_factory) / "finished-runs"
     with FileLock(f"{runs}.lock"):
         if not (runs / "complete").exists():
@@ -89,8 +91,7 @@ def runs(finished_runs, tmp_path) -> Path:
 
 @pytest.fixture(scope="session")
 def environment(tmp_path_factory) -> dict[str, str]:
-    """The environment of the program: no weights, its own runs folder, the shared cache of compiled
-    kernels."""
+    """The environment of the program: its own runs folder, no weights, no settings of the user."""
     kept = {
         key: value
         for key, value in os.environ.items()
@@ -130,16 +131,19 @@ def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) ->
     return folder
 
 
-# What differs between two runs of the same trial: times, and where and when the files that it was
-# made of were written.
+# Keys that differ between two runs of the same trial: times, and the places and times of its input
+# files.
 CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
 def start(
     environment: dict[str, str], cwd: Path, runs: Path, *arguments: str, new_group: bool = False
 ) -> subprocess.Popen[str]:
-    """The program, started; with ``new_group``, as from a terminal: with what it starts it can be
-    sent Ctrl-C."""
+    """Start the program.
+
+    With ``new_group``, it and all that it starts are a group, which can be sent Ctrl-C as by a
+    terminal.
+    """
     return subprocess.Popen(
         [sys.executable, "-m", "gsbench.cli", *arguments],
         cwd=cwd,
@@ -153,8 +157,7 @@ def start(
 
 
 def results_of(runs: Path, name: str) -> dict[str, Any]:
-    """Everything that a sweep found out: results without times, and checksums of models, pictures
-    and tables."""
+    """The results of a sweep without times, with checksums of models, pictures and tables."""
     found: dict[str, Any] = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
         results = {
@@ -177,7 +180,7 @@ def results_of(runs: Path, name: str) -> dict[str, Any]:
 
 @pytest.fixture
 def undisturbed(finished_runs) -> dict[str, Any]:
-    """The finished trials of ``SWEEP``, which nobody disturbed."""
+    """The results of the trials of ``SWEEP`` from an undisturbed run."""
     return {
         trial: found
         for trial, found in results_of(finished_runs, FINISHED).items()

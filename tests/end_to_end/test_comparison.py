@@ -1,5 +1,4 @@
-"""What a comparison says of its arms, from real trials: gsbench's own, and one from a file
-outside."""
+"""The notes of a comparison on its arms, from real trials of gsbench's and a user's classes."""
 
 import pytest
 
@@ -40,7 +39,7 @@ OWN = [
 ]
 
 
-def test_arms_of_any_origin_are_told_apart_and_those_that_come_late_cost_the_declaration_its_place(
+def test_differences_of_arms_are_named_and_arms_added_later_are_reported(
     tmp_path, monkeypatch, capsys
 ):
     (tmp_path / "patient_arm.py").write_text(PATIENT)

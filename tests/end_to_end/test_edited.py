@@ -1,4 +1,4 @@
-"""gsbench itself is edited: no command returns the numbers that it gave before."""
+"""After an edit of gsbench itself, no command returns the numbers of the earlier code."""
 
 import json
 import shutil
@@ -23,14 +23,14 @@ QUICK = [
 ]
 
 
-def test_an_edited_loss_is_trained_with(gsbench, tmp_path):
+def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
     copy = tmp_path / "copy" / "src" / "gsbench"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(conf_dir(), tmp_path / "copy" / "conf")
     changes = {"PYTHONPATH": str(copy.parent), "GSBENCH_RUNS": str(tmp_path / "runs")}
 
     def train(*words):
-        # where kernels have to be compiled first
+        # The timeout leaves time to compile kernels.
         done = gsbench(*QUICK, *words, timeout=900, **changes)
         assert done.returncode == 0, done.stderr
         return done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""Renders and models of other programs, measured by our protocol and entered beside our arms."""
+"""Renders and models of other programs, measured by gsbench and entered beside its arms."""
 
 import csv
 import json
@@ -46,7 +46,7 @@ def trained(tmp_path_factory, environment) -> Path:
 
 @pytest.fixture
 def runs(trained, tmp_path) -> Path:
-    """A copy that the test may change."""
+    """A copy of the runs folder that the test may change."""
     return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
 
 
@@ -64,8 +64,7 @@ def views(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def better_renders(runs: Path, folder: Path, seed: int) -> Path:
-    """Renders nearer to the photographs than those of our arm, under the names that another program
-    gives."""
+    """Renders nearer to the photographs than those of the arm, with names of another program."""
     folder.mkdir()
     own = trial(runs, seed=seed)
     for file in (own / "renders").glob("*.png"):
@@ -76,7 +75,7 @@ def better_renders(runs: Path, folder: Path, seed: int) -> Path:
     return folder
 
 
-def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench, runs):
+def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbench, runs):
     own = trial(runs)
     for truth, settings in (
         (str(own), []),
@@ -111,7 +110,9 @@ def test_a_trials_own_renders_have_its_metrics_to_the_last_digit(gsbench, runs):
     assert "protocol standard-1" in shown.stdout
 
 
-def test_renders_stand_in_the_table_with_a_verdict(gsbench, runs, tmp_path, monkeypatch, capsys):
+def test_entered_renders_are_in_the_table_and_get_a_verdict(
+    gsbench, runs, tmp_path, monkeypatch, capsys
+):
     for seed in (0, 1):
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = gsbench(
@@ -153,7 +154,7 @@ def test_renders_stand_in_the_table_with_a_verdict(gsbench, runs, tmp_path, monk
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
     assert "by a training elsewhere, which left no record" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    (runs / "mlflow.db").unlink()  # a copy of a runs folder has the database of where it was
+    (runs / "mlflow.db").unlink()  # its addresses are those of the folder that was copied
     for words in (
         ["status", "small"],
         ["explain", "small:courtyard:psnr:theirs"],
@@ -166,9 +167,7 @@ def test_renders_stand_in_the_table_with_a_verdict(gsbench, runs, tmp_path, monk
         assert "renders" in capsys.readouterr().err
 
 
-def test_entered_twice_is_entered_once_and_a_place_is_taken_once(
-    runs, tmp_path, monkeypatch, capsys
-):
+def test_renders_are_entered_once_and_do_not_replace_others(runs, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     first, other = (
         better_renders(runs, tmp_path / "first", 0),
@@ -182,8 +181,8 @@ def test_entered_twice_is_entered_once_and_a_place_is_taken_once(
     assert "seed 0 of random-theirs on courtyard is taken" in capsys.readouterr().err
 
 
-def test_two_folders_and_no_trial_at_all(runs, tmp_path, monkeypatch, capsys):
-    """Without any scene: photographs in one folder, the renders of two methods in two others."""
+def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monkeypatch, capsys):
+    """Photographs are in one folder, the renders of two methods in two others."""
     truth = Path(shutil.copytree(trial(runs) / "ground_truth", tmp_path / "photographs"))
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "empty"))
     for arm, seed in (("ours", 0), ("theirs", 1)):
@@ -233,7 +232,7 @@ def test_two_folders_and_no_trial_at_all(runs, tmp_path, monkeypatch, capsys):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_requests_are_one_line(runs, tmp_path, monkeypatch, capsys, words, said):
+def test_bad_requests_are_refused_in_one_line(runs, tmp_path, monkeypatch, capsys, words, said):
     folders = {
         name: tmp_path / name.lower() for name in ("RENDERS", "PHOTOGRAPHS", "SMALLER", "FEWER")
     }
@@ -249,9 +248,8 @@ def test_bad_requests_are_one_line(runs, tmp_path, monkeypatch, capsys, words, s
     assert error.count("gsbench: ") == 1
 
 
-def test_somebodys_model(gsbench, runs, tmp_path):
-    """train=none init=ply: a PLY from anywhere, rendered here; our own gives our own numbers
-    back."""
+def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_path):
+    """With train=none and init=ply, a PLY is only rendered; a trial's own one gives its metrics."""
     model = tmp_path / "theirs.ply"
     shutil.copyfile(trial(runs) / "point_cloud.ply", model)
     scene = [word for word in SMALL if word.startswith(("scene", "eval"))]

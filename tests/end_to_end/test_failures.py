@@ -1,5 +1,4 @@
-"""The program where something fails: a full disk, a folder that cannot be written to, a trial that
-raises."""
+"""The program with a full disk, with a read-only folder, and with a trial that raises."""
 
 import json
 import os
@@ -16,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def small_disk(tmp_path) -> Iterator[Path]:
-    """A file system of three MiB; the test is skipped where this user may not mount one."""
+    """A file system of three MiB; skips if this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
@@ -30,7 +29,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
-def test_full_disk_ends_the_sweep_in_one_line_and_more_space_mends_it(
+def test_a_full_disk_ends_the_sweep_in_one_line_and_it_continues_with_more_space(
     gsbench, undisturbed, small_disk
 ):
     sweep = [word for word in SWEEP if word not in ("-m", "densify=adc,volumetric")]
@@ -53,15 +52,15 @@ def test_read_only_runs_folder_is_bad_input(gsbench, small_disk):
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     done = gsbench(*SMALL, GSBENCH_RUNS=str(small_disk))
     assert done.returncode == 2, done.stderr
-    *_, line = done.stderr.strip().splitlines()  # after what the models may need of the disk
+    *_, line = done.stderr.strip().splitlines()  # libraries may have written lines before
     assert line.startswith("gsbench:")
     assert "cannot be written to" in line
     assert "GSBENCH_RUNS" in line
     assert os.listdir(small_disk) == []
 
 
-def test_a_failed_trial_does_not_stop_the_others_and_retry_mends_it(gsbench, tmp_path):
-    """One densifier is the user's own and fails while a file is absent."""
+def test_a_failed_trial_does_not_stop_the_others_and_retry_completes_it(gsbench, tmp_path):
+    """One densifier is a user's class that fails while a file is absent."""
     (tmp_path / "mine.py").write_text(
         "from dataclasses import dataclass\nfrom pathlib import Path\nfrom gsbench.densify import "
         "ADC\n\n\n@dataclass\nclass Mine(ADC):\n    def begin(self, gaussians, context):\n        "

@@ -1,5 +1,4 @@
-"""A fresh machine: one command brings the data, and nothing of the paper's sweep is missing any
-more."""
+"""On a fresh machine, one command downloads all data of the paper's sweep."""
 
 import os
 import signal
@@ -31,7 +30,7 @@ def server(tmp_path) -> Iterator[Server]:
         yield running
 
 
-def test_fetch_then_table1_misses_nothing(gsbench, server, tmp_path):
+def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     one = gsbench("scene=garden")
     assert one.returncode == 2
     assert "`gsbench fetch mipnerf360 garden` brings what is missing" in one.stderr
@@ -53,7 +52,7 @@ def test_fetch_then_table1_misses_nothing(gsbench, server, tmp_path):
     assert (tmp_path / "data" / "tandt" / "truck" / "images" / "IMG_0001.JPG").is_file()
 
 
-def test_killed_and_started_again(server, tmp_path, environment, gsbench):
+def test_a_killed_fetch_continues(server, tmp_path, environment, gsbench):
     def slowly(_, __, body):
         time.sleep(0.05)
         return body

@@ -1,5 +1,4 @@
-"""Versions of a densifier, trained for real: the gate's exit codes, and the commit that bisect
-finds."""
+"""Real trainings of versions of a densifier: the gate's exit codes, and the commit of bisect."""
 
 import os
 import subprocess
@@ -58,7 +57,7 @@ def write_class(folder: Path, step: int, worse: bool) -> None:
     (folder / "mine.py").write_text(CLASS.format(step=step, worse=worse))
 
 
-def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench, tmp_path):
+def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_path):
     changes = {"GSBENCH_RUNS": str(tmp_path / "runs")}
 
     def do(*words):
@@ -70,7 +69,7 @@ def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench, tmp_path):
     same = do("gate", "good.zip", *WORDS)
     assert same.returncode == 0, same.stderr
     assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
-    # in the same runs folder: what was trained before is of another version
+    # in the same runs folder, with trials of another version
     write_class(tmp_path, 1, worse=True)
     worse = do("gate", "good.zip", *WORDS)
     assert worse.returncode == 1, worse.stdout + worse.stderr
@@ -84,7 +83,7 @@ def test_a_gate_passes_what_is_equal_and_stops_what_is_worse(gsbench, tmp_path):
     assert "the arms differ in iterations" in other.stderr
 
 
-def test_bisect_finds_the_commit_goes_on_where_it_was_and_leaves_the_checkout_alone(
+def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchanged(
     gsbench, tmp_path, monkeypatch
 ):
     for name, value in {"GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_NOSYSTEM": "1"}.items():

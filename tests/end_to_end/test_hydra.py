@@ -1,4 +1,4 @@
-"""gsbench as a Hydra app, through the real program: launchers of others, and callbacks."""
+"""gsbench as a Hydra app, through the real program: other launchers, and callbacks."""
 
 import json
 from importlib.util import find_spec
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 pytestmark = pytest.mark.slow
-SECONDS = 900  # a trial of three iterations on a machine that has much else to do
+SECONDS = 900  # a limit for a trial of three iterations on a busy machine
 
 TINY = [
     *(
@@ -69,7 +69,7 @@ def results_below(folder: Path) -> list[dict[str, float]]:
     return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
 
 
-def test_an_experiment_file_has_all_of_hydra(gsbench, tmp_path):
+def test_an_experiment_file_can_set_callbacks_and_a_sweep(gsbench, tmp_path):
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
@@ -99,7 +99,7 @@ def test_an_experiment_file_has_all_of_hydra(gsbench, tmp_path):
     ("package", "launcher"),
     [("hydra_joblib_launcher", "joblib"), ("hydra_submitit_launcher", "submitit_local")],
 )
-def test_another_launcher_runs_a_trial_a_job(gsbench, tmp_path, package, launcher):
+def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, launcher):
     if find_spec(f"hydra_plugins.{package}") is None:
         pytest.skip(f"needs {package.replace('_', '-')} (group dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]

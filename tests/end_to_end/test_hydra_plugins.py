@@ -1,5 +1,4 @@
-"""Plug-ins of others for Hydra, through the real program: sweepers that search, and Ray; and
-Hydra's own files.
+"""Other plug-ins for Hydra, through the real program: Optuna's sweeper, Ray, and Hydra's files.
 
 Two of them need older packages than gsbench's own search and tracker, so ``make
 test-hydra-plugins`` installs them into a folder of their own. Without it these tests are skipped.
@@ -61,7 +60,7 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
     assert found["best_value"] == pytest.approx(sign * statistics.fmean(psnr[best]))
 
 
-def test_what_a_sweeper_does_not_understand_is_one_line(gsbench, tmp_path):
+def test_settings_that_a_sweeper_does_not_understand_are_refused_in_one_line(gsbench, tmp_path):
     need("hydra_optuna_sweeper")
     for words in (["hydra.sweeper.params=3"], ["hydra.sweeper.direction=up", "seed=0,1"]):
         done = gsbench(
@@ -120,7 +119,7 @@ def ray_workers() -> list[psutil.Process]:
     return found
 
 
-def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
+def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
     cluster, environment, tmp_path, gsbench
 ):
     words = ["-m", *TINY, "name=x", "seed=0,1,2,3,4,5,6,7", "hydra/launcher=ray"]
@@ -151,7 +150,7 @@ def test_ray_runs_a_sweep_on_two_nodes_and_a_killed_worker_costs_nothing(
 # ---- Hydra's own files and logs
 
 
-def test_hydra_writes_its_files_where_it_is_told(gsbench, tmp_path):
+def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
     words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert done.returncode == 0, done.stderr

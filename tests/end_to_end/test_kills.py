@@ -1,5 +1,4 @@
-"""The program killed by signals, or run twice at once: it goes on, and ends as if nothing had
-happened."""
+"""The program, killed by signals or run twice at once, continues and ends as if undisturbed."""
 
 import json
 import os
@@ -42,7 +41,7 @@ def training_log_size(runs: Path) -> int:
     return bytes_written(runs, "store/train/.*.partial/metrics.jsonl")
 
 
-def test_killed_stopped_and_damaged_the_sweep_ends_as_undisturbed(
+def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
     environment, undisturbed, tmp_path
 ):
     runs = tmp_path / "runs"
@@ -133,7 +132,7 @@ def holders(runs: Path) -> dict[str, int]:
     return found
 
 
-def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(environment, tmp_path):
+def test_ctrl_c_stops_trials_in_other_processes_with_checkpoints(environment, tmp_path):
     """A terminal sends Ctrl-C to every process of the command."""
     runs = tmp_path / "runs"
     process = start(
@@ -148,13 +147,13 @@ def test_ctrl_c_stops_trials_in_processes_of_their_own_with_checkpoints(environm
     wait_for(runs, "store/train/.*.partial/checkpoint-*.pt", process)
 
 
-def test_one_killed_trial_harms_no_other_and_the_next_command_mends_it(environment, tmp_path):
+def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(environment, tmp_path):
     runs = tmp_path / "runs"
     process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
     deadline = time.monotonic() + 120
     killed, most = "", 0
     while process.poll() is None and time.monotonic() < deadline:
-        # its file outlives it
+        # the file of a killed process stays
         running = {trial: pid for trial, pid in holders(runs).items() if trial != killed}
         most = max(most, len(running))
         training = list(runs.glob("store/train/.*.partial/metrics.jsonl"))
@@ -182,7 +181,7 @@ TUNED = [
 
 
 def views(arm: Path) -> set[str]:
-    """The views that judge the trials of an arm."""
+    """The names of the views on which the trials of an arm are measured."""
     return {
         line.split(",")[0]
         for file in arm.glob("*/per_view.csv")
@@ -190,7 +189,7 @@ def views(arm: Path) -> set[str]:
     }
 
 
-def test_a_killed_tuning_goes_on_and_its_values_are_trained(gsbench, environment, tmp_path):
+def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environment, tmp_path):
     program = [sys.executable, "-m", "gsbench.cli", *TUNED]
     with subprocess.Popen(
         program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
@@ -231,8 +230,7 @@ def test_a_killed_tuning_goes_on_and_its_values_are_trained(gsbench, environment
 
 
 def page_of(runs: Path) -> list[str]:
-    """The page without the minute in which its claims were declared, and without what is measured
-    of a machine."""
+    """The lines of the page without the time of the declaration, and without times and memory."""
     lines = (runs / "check_it" / "claims.html").read_text().splitlines()
     assert sum(" were declared " in line for line in lines) == 1
     measured = (" were declared ", "seconds of training</th>", "memory (MB)</th>")
@@ -244,7 +242,7 @@ def count_done(runs: Path) -> int:
     return len(list(runs.glob("check_it/*/*/*/results.json")))
 
 
-def test_a_killed_check_goes_on_and_ends_with_the_same_page(tmp_path):
+def test_a_killed_check_continues_and_ends_with_the_same_page(tmp_path):
     words = dict(word.split("=", 1) for word in TINY)
     settings = {key: yaml.safe_load(value) for key, value in words.items()}
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}

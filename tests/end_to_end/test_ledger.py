@@ -1,4 +1,4 @@
-"""A ledger with real trainings: two ideas at once, a kill in the middle, and ideas of one's own."""
+"""A ledger with real trainings: two ideas at once, a kill in the middle, and a user's class."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_two_ideas_at_once_share_the_baseline(
     assert len(baselines) == 2  # that of the ledger, and that of the second idea
 
 
-def test_a_killed_try_goes_on_with_its_level(
+def test_a_killed_try_continues_with_its_level(
     gsbench: Run, environment: dict[str, str], tmp_path: Path
 ) -> None:
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
@@ -86,7 +86,7 @@ def test_a_killed_try_goes_on_with_its_level(
     assert len([one for one in entries if isinstance(one, Ended)]) == 1
 
 
-def test_edited_code_is_another_idea_and_broken_code_gives_its_place_back(
+def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(
     gsbench: Run, tmp_path: Path
 ) -> None:
     do(gsbench, tmp_path, *NEW, "seed=0,1")

@@ -1,5 +1,4 @@
-"""Masks in whole trials: not one bit of an ignored pixel enters one, an edited mask makes a new
-one."""
+"""Masks in whole trials: ignored pixels change nothing, and an edited mask makes a new trial."""
 
 import csv
 import hashlib
@@ -49,8 +48,7 @@ SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory) -> tuple[Path, Path]:
-    """A COLMAP folder with masks of a disc that wanders and of a margin, and the same with noise
-    below them."""
+    """A COLMAP folder with masks of a moving disc and a margin; the same with noise below them."""
     folder = tmp_path_factory.mktemp("masked")
     clean, noisy = folder / "clean", folder / "noisy"
     width, height = SIZE
@@ -100,7 +98,7 @@ def bits(folder: Path) -> dict[str, str]:
     ],
     ids=["sfm", "kornia", "smaller", "taming", "fastgs", "schedule"],
 )
-def test_not_one_bit_under_a_mask_enters_a_trial(captures, tmp_path, words):
+def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, words):
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
     clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
@@ -117,14 +115,14 @@ def test_not_one_bit_under_a_mask_enters_a_trial(captures, tmp_path, words):
 
 
 def _points(folder: Path) -> dict[str, str]:
-    """The digests of the cloud and the cameras that the trial began with."""
+    """The digests of the trial's initial cloud and cameras."""
     key = json.loads((folder / "results.json").read_text())["hashes"]["init"]
     model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
 
 
-def test_without_masks_the_noise_is_seen(captures, tmp_path):
-    """So the test above can fail."""
+def test_without_masks_the_noise_changes_the_trial(captures, tmp_path):
+    """This shows that the test above can fail."""
     clean, noisy = (trial(tmp_path, capture, *SIFT, "scene.masks=null") for capture in captures)
     digests = [
         hashlib.sha256((folder / "point_cloud.ply").read_bytes()).hexdigest()
@@ -135,7 +133,7 @@ def test_without_masks_the_noise_is_seen(captures, tmp_path):
     assert not (clean / "masks").exists()
 
 
-def test_an_edited_mask_makes_the_trial_anew_and_one_that_is_put_back_finds_it(
+def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     captures, tmp_path, capsys
 ):
     capture = tmp_path / "edited"
@@ -159,7 +157,7 @@ def test_an_edited_mask_makes_the_trial_anew_and_one_that_is_put_back_finds_it(
     assert json.loads((folder / "results.json").read_text())["hashes"] == first["hashes"]
 
 
-def test_bad_masks_end_in_one_line_before_any_work(captures, tmp_path, capfd):
+def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, capfd):
     capture = tmp_path / "bad"
     shutil.copytree(captures[0], capture)
     mask = sorted((capture / "masks").iterdir())[2]
@@ -203,8 +201,8 @@ def test_another_program_is_refused_with_masks(captures, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("make", [Sfm, SiftKornia, Dim])
-def test_no_keypoint_is_on_an_ignored_pixel(captures, tmp_path, make, request):
-    """Without `prepare`, so that there is something to be found below the masks."""
+def test_no_keypoint_lies_on_an_ignored_pixel(captures, tmp_path, make, request):
+    """Without `prepare`, there are features below the masks that could be found."""
     options = {"init": {"first_octave": 0, "max_num_features": 1500}, "net": {"max_keypoints": 500}}
     words = options["init" if make is Sfm else "net"] | {"two_view_tracks": True}
     if make is Dim:

@@ -1,8 +1,7 @@
-"""What leaves a capture as it is must leave its result: place, scale, rotation, names, formats,
-order.
+"""Changes that keep a capture's content must keep its result.
 
-A similarity may change a result as another seed does. Other names, or another format of the same
-values, may not change one bit.
+A similarity (place, scale, rotation) may change a result as another seed does. Other names, or
+another format of the same values, may not change one bit.
 """
 
 import json
@@ -55,8 +54,7 @@ Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory) -> Path:
-    """A COLMAP folder of the courtyard with exact cameras, and a cloud in the photographs'
-    colours."""
+    """A COLMAP folder of the courtyard with exact cameras and a coloured cloud."""
     folder = tmp_path_factory.mktemp("made") / "good"
     render_courtyard(folder, VIEWS, WIDTH, HEIGHT)
     cameras = courtyard_cameras(VIEWS, WIDTH, HEIGHT)
@@ -66,8 +64,7 @@ def good(tmp_path_factory) -> Path:
 
 
 def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [P, 3] of the ground, z = 0, and of a round wall, in the colours of a camera with them
-    in view."""
+    """Points [P, 3] of the ground and a round wall, and their colours [P, 3] in a photograph."""
     random = np.random.default_rng(0)
     angles, heights = random.uniform(0, 2 * np.pi, 1500), random.uniform(0, 6, 1500)
     wall = np.stack([7 * np.cos(angles), 7 * np.sin(angles), heights], axis=1)
@@ -105,7 +102,7 @@ def require_same_up_to_a_seed(trial: Path, original: list[Path]) -> None:
 
 
 def copy_of(good: Path, folder: Path, change: Change, text: bool = False) -> Path:
-    """A copy of the capture ``good`` whose photographs and model ``change`` has changed."""
+    """Copy the capture ``good``, and change the photographs and the model of the copy."""
     shutil.copytree(good / "images", folder / "images")
     model = pycolmap.Reconstruction(good / "sparse/0")
     change(folder, model)

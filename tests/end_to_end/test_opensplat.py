@@ -1,5 +1,4 @@
-"""OpenSplat as an arm, where it is installed: its model lies where the photographs were taken, and
-it grows."""
+"""OpenSplat as an arm, where it is installed: its model lies at the right place, and it grows."""
 
 import json
 import shutil
@@ -27,8 +26,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory) -> Path:
-    """The folder of a trial of OpenSplat on a small courtyard, with a schedule of growth as short
-    as the training."""
+    """The folder of a short trial of OpenSplat on a small courtyard, with a schedule of growth."""
     runs = tmp_path_factory.mktemp("runs")
     scene = [
         "scene.views=16",
@@ -63,9 +61,8 @@ def error(picture: np.ndarray, truth: np.ndarray) -> float:
     return float(np.square(picture.astype(float) - truth).mean())
 
 
-def test_its_renders_are_neither_turned_nor_shifted(trial):
-    """Each held-out photograph is nearer to its render than to the render mirrored, or moved by
-    some pixels."""
+def test_renders_of_opensplat_are_neither_mirrored_nor_shifted(trial):
+    """Each test photograph is nearer to its render than to a mirrored or shifted copy of it."""
     files = sorted((trial / "renders").glob("*.png"))
     assert len(files) == 2
     for file in files:
@@ -76,7 +73,7 @@ def test_its_renders_are_neither_turned_nor_shifted(trial):
             assert error(render, truth) < error(other, truth), file.name
 
 
-def test_it_grows_on_the_schedule_that_it_is_given(trial):
+def test_opensplat_grows_on_the_given_schedule(trial):
     results = json.loads((trial / "results.json").read_text())
     assert results["num_gaussians"] > results["num_init_points"]
     assert VERSION in results["trained_by"]["said"]

@@ -1,5 +1,4 @@
-"""Another program as an arm: it trains on what it is given, and what it leaves stands in the
-tables."""
+"""Another program as an arm: its inputs, the trials made of its results, and its failures."""
 
 import hashlib
 import json
@@ -72,8 +71,7 @@ def trainers(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory, environment, trainers) -> Path:
-    """A folder with a fetched scene, and a sweep over it of one arm of ours and two of other
-    programs."""
+    """A folder with a fetched scene, and a sweep of an arm of gsbench and two of other programs."""
     home = tmp_path_factory.mktemp("home")
     courtyard = home / "courtyard"
     render_courtyard(courtyard, views=12, width=96, height=72, seed=0)
@@ -141,7 +139,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         arm: next(line for line in table.splitlines() if f"| {arm} |" in line)
         for arm in ("adc", "cloud", "painter", "folder")
     }
-    assert "2.0" in rows["cloud"]  # thousand Gaussians: one a point
+    assert "2.0" in rows["cloud"]  # thousand Gaussians: one for each point
     # LPIPS; Gaussians of renders; their time
     assert [row.count("n/a") for row in rows.values()] == [1, 1, 2, 3]
     assert (
@@ -172,7 +170,9 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
     assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
 
 
-def test_its_model_is_one_as_any_other(home, monkeypatch, capsys, tmp_path):
+def test_the_model_of_another_program_can_be_viewed_and_exported(
+    home, monkeypatch, capsys, tmp_path
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     viewed = load_viewed(find_trial("three:garden:cloud:0", home / "runs"), torch.device("cpu"))
     assert len(viewed.gaussians) == 2000
@@ -183,7 +183,7 @@ def test_its_model_is_one_as_any_other(home, monkeypatch, capsys, tmp_path):
     assert "it has no model" in capsys.readouterr().err
 
 
-def test_what_is_recorded(home):
+def test_a_trial_of_another_program_has_a_full_record(home):
     model, renders = results(trial(home, "cloud")), results(trial(home, "painter"))
     assert (model["evaluated_from"], renders["evaluated_from"]) == ("model", "renders")
     assert model["trained_by"]["said"] == "painter 1.2.3"
@@ -198,9 +198,8 @@ def test_what_is_recorded(home):
 
 
 @pytest.mark.parametrize("arm", ["cloud", "painter"])
-def test_no_test_photograph_reaches_it(home, arm):
-    """The trainer walked everything beside and below its input, links followed, and told what it
-    found."""
+def test_no_test_photograph_reaches_another_program(home, arm):
+    """The trainer lists every file beside and below its input, and follows links."""
     log = (trial(home, arm) / "trainer.log").read_text()
     seen = dict(line.split()[1:] for line in log.splitlines() if line.startswith("saw "))
     held_out = {
@@ -226,7 +225,9 @@ def test_no_test_photograph_reaches_it(home, arm):
     assert "environment [] good" in log
 
 
-def test_done_is_done_and_another_version_is_another_result(home, trainers, monkeypatch, capsys):
+def test_a_finished_trial_is_not_repeated_and_another_version_is_another_trial(
+    home, trainers, monkeypatch, capsys
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
     words = [
@@ -243,7 +244,7 @@ def test_done_is_done_and_another_version_is_another_result(home, trainers, monk
         for path in (home / "runs" / "store").glob("*/*/manifest.json")
     }
     assert run(words) == 0
-    # the limit makes no other result
+    # the time limit is no part of the result's key
     assert run([*words, "name=again", "densify.time_limit_minutes=7"]) == 0
     assert {
         path: path.stat().st_mtime_ns
@@ -272,7 +273,7 @@ BAD_RENDERS = {
 
 
 @pytest.mark.parametrize(("arm", "expected"), [("cloud", BAD), ("painter", BAD_RENDERS)])
-def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
+def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
     trainers, tmp_path, monkeypatch, capsys, arm, expected
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
@@ -290,8 +291,8 @@ def test_bad_programs_end_in_a_line_each_and_lose_nothing_else(
         assert "observations 0" in Path(log[1]).read_text()
 
 
-def test_one_that_hangs_is_ended(trainers, tmp_path, monkeypatch, capsys):
-    """With its child, though both are deaf to SIGTERM."""
+def test_a_program_that_hangs_is_ended_with_its_child(trainers, tmp_path, monkeypatch, capsys):
+    """Both ignore SIGTERM."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     words = [
         "--config-dir",
@@ -316,8 +317,7 @@ def test_one_that_hangs_is_ended(trainers, tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """gsbench with a trainer that hangs, deaf to SIGTERM, and the trainer's and its child's process
-    ids."""
+    """gsbench with a trainer that hangs and ignores SIGTERM; ids of the trainer and its child."""
     words = [
         "--config-dir",
         str(trainers),
@@ -353,7 +353,7 @@ def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[
     "signum",
     [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
 )
-def test_it_ends_with_gsbench(hanging, signum):
+def test_another_program_ends_with_gsbench(hanging, signum):
     process, pids = hanging
     assert len(pids) == 2
     assert all(map(is_running, pids))
@@ -388,7 +388,9 @@ def test_it_ends_with_gsbench(hanging, signum):
     ],
     ids=lambda value: value[0] if isinstance(value, list) else None,
 )
-def test_bad_requests_are_one_line(gsbench, trainers, tmp_path, monkeypatch, capsys, words, said):
+def test_bad_requests_are_refused_in_one_line(
+    gsbench, trainers, tmp_path, monkeypatch, capsys, words, said
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     assert run(["--config-dir", str(trainers), *COURTYARD, "densify=cloud", *words]) == 2
     error = capsys.readouterr().err

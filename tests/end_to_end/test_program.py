@@ -1,5 +1,4 @@
-"""The program from outside: a sweep, its files and its table; bad input; and the installed
-wheel."""
+"""The program from outside: bad input, quick help, and the installed wheel."""
 
 import subprocess
 import sys
@@ -29,8 +28,8 @@ def test_truncated_photo_is_named(gsbench, tmp_path):
     assert "2.jpg" in done.stderr.strip().splitlines()[-1]
 
 
-def test_help_is_quick_to_load(gsbench):
-    """No torch, no MLflow: the modules say so, whatever the machine's speed."""
+def test_help_loads_no_large_library(gsbench):
+    """The list of loaded modules tells, whatever the machine's speed."""
     code = (
         "import sys, gsbench.cli as c; c.run(['--help']); "
         "sys.exit(any(m in sys.modules for m in ('torch', 'mlflow', 'numba')))"

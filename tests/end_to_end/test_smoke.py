@@ -1,5 +1,4 @@
-"""The program as a user runs it, one short test for each thing that it is used for: part of ``make
-test``."""
+"""One short test of the program for each of its uses; part of ``make test``."""
 
 import csv
 import json
@@ -101,7 +100,7 @@ def test_tables_and_report(gsbench, runs):
     assert "data:image/" in page
 
 
-def test_a_killed_trial_goes_on_to_the_same_bits(gsbench, runs, tmp_path):
+def test_a_killed_trial_continues_to_the_same_bits(gsbench, runs, tmp_path):
     (tmp_path / "mortal.py").write_text(MORTAL)
     own = [
         "densify=adc",
@@ -115,14 +114,14 @@ def test_a_killed_trial_goes_on_to_the_same_bits(gsbench, runs, tmp_path):
     assert not trials_of(runs, "killed")
     resumed = gsbench(*command, GSBENCH_RUNS=str(runs))
     assert resumed.returncode == 0, resumed.stderr
-    assert "iteration 120" in resumed.stderr  # the checkpoint that it goes on from
+    assert "iteration 120" in resumed.stderr  # the checkpoint from which it continues
     (trial,) = trials_of(runs, "killed").values()
     whole = trials_of(runs)["adc-0"]
     for name in ("point_cloud.ply", "per_view.csv", "renders/0000.png"):
         assert (trial / name).read_bytes() == (whole / name).read_bytes()
 
 
-def test_the_readmes_own_densifier_acts(gsbench, runs, tmp_path):
+def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
     (code,) = re.findall(
         r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
     )
@@ -232,8 +231,7 @@ def test_a_mirror_in_mlflow(gsbench, runs):
 
 @pytest.mark.skipif(os.name != "posix", reason="Slurm's commands are scripts of a shell here")
 def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
-    """``sbatch`` keeps the script; its command is then run as Slurm would run one task of the
-    array."""
+    """A stand-in for ``sbatch`` keeps the script, whose command is run as one task of the array."""
     bin_folder = tmp_path / "bin"
     bin_folder.mkdir()
     for name in ("sbatch", "srun", "squeue"):

@@ -1,5 +1,4 @@
-"""Splits in whole trials: not one bit of a held-out photograph enters a training, and a search
-never sees one."""
+"""Splits in whole trials: test photographs change no training, and no search with validation."""
 
 import csv
 import hashlib
@@ -38,8 +37,7 @@ TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory) -> tuple[Path, Path]:
-    """A COLMAP folder with points that all views made, and the same with noise in place of every
-    eighth photograph."""
+    """A COLMAP folder with points from all views; a copy with noise as every eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")
     clean, noisy = folder / "clean", folder / "noisy"
     render_courtyard(clean, views=12, width=192, height=144)
@@ -68,9 +66,8 @@ def bits(folder: Path) -> dict[str, str]:
     ("init", "choice"),
     [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")],
 )
-def test_not_one_bit_of_a_test_photograph_enters_a_trial(captures, tmp_path, init, choice):
-    """Poses aside, which are given here. Renders are equal too; what they are held against is
-    not."""
+def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path, init, choice):
+    """Poses are given here. Renders are equal, too, and only their photographs differ."""
     words = [f"init={init}", f"init.points_from={choice}"]
     words += (
         ["init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
@@ -88,8 +85,8 @@ def test_not_one_bit_of_a_test_photograph_enters_a_trial(captures, tmp_path, ini
         )
 
 
-def test_with_points_from_all_the_noise_is_seen(captures, tmp_path):
-    """So the test above can fail."""
+def test_with_points_from_all_photographs_the_noise_changes_the_trial(captures, tmp_path):
+    """This shows that the test above can fail."""
     words = [
         "init=sfm",
         "init.first_octave=0",
@@ -124,8 +121,7 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_p
 
 
 def test_a_search_with_validation_views_never_sees_a_test_view(captures, tmp_path):
-    """Not even with photographs replaced by noise does anything change, the fingerprint
-    included."""
+    """Noise in place of test photographs changes nothing, not even the fingerprint."""
     words = ["init=dataset", "densify=none", "scene.validation=true"]
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
     one, other = (json.loads((folder / "results.json").read_text()) for folder in (clean, noisy))

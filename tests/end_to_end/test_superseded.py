@@ -1,5 +1,4 @@
-"""What a densifier needs is edited and a seed is run: no table averages both versions, one command
-forgets the old."""
+"""After an edit of a densifier's helper, no table averages both versions of the code."""
 
 import json
 import shutil
@@ -34,14 +33,14 @@ OWN = [
 ]
 
 
-def test_an_edited_densifier_is_never_averaged_with_what_it_was(
+def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
     gsbench, tmp_path, monkeypatch, capsys
 ):
     runs = str(tmp_path / "runs")
     monkeypatch.setenv("GSBENCH_RUNS", runs)
 
     def train(*seeds):
-        """Trainings run in processes of their own, which import the file as it is."""
+        """Train in a new process, which imports the present files."""
         done = gsbench(
             "-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs
         )
@@ -49,7 +48,7 @@ def test_an_edited_densifier_is_never_averaged_with_what_it_was(
         return done.stderr
 
     def ask(*words, code=0):
-        """Verbs read files only, and run here."""
+        """Run a verb in this process, since verbs only read files."""
         assert run(list(words)) == code
         said = capsys.readouterr()
         return said.out + said.err

@@ -1,5 +1,4 @@
-"""A COLMAP scene written as transforms.json by other code, and read back: the same cameras, the
-same training."""
+"""A COLMAP scene that other code wrote as transforms.json has the same cameras and training."""
 
 import hashlib
 import json
@@ -41,8 +40,7 @@ QUICK = [
 
 
 def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write the model's cameras and points beside ``folder``/images as nerfstudio's documents
-    describe the format."""
+    """Write the model's cameras and points to ``folder`` as nerfstudio's documents describe."""
     frames: list[dict[str, Any]] = []
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
@@ -111,7 +109,7 @@ def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
     return found
 
 
-def test_the_training_is_that_of_the_colmap_scene(scene, tmp_path):
+def test_a_training_from_transforms_json_equals_that_from_colmap(scene, tmp_path):
     colmap = trial(tmp_path, "colmap", scene)
     read = trial(tmp_path, "transforms", scene)
     first, second = (json.loads((folder / "results.json").read_text()) for folder in (colmap, read))
@@ -129,7 +127,7 @@ def test_the_training_is_that_of_the_colmap_scene(scene, tmp_path):
         assert np.abs(pair[0] - pair[1]).mean() < 0.5  # levels
 
 
-def test_an_edited_file_makes_the_trial_anew(scene, tmp_path):
+def test_a_trial_is_trained_again_after_an_edit_of_transforms_json(scene, tmp_path):
     folder = tmp_path / "edited"
     shutil.copytree(scene, folder)
     words = ["densify=none", "train.iterations=3"]
@@ -144,7 +142,7 @@ def test_an_edited_file_makes_the_trial_anew(scene, tmp_path):
     assert hashlib.sha256((after / "point_cloud.ply").read_bytes()).hexdigest() != digest
 
 
-def test_without_points_the_file_says_which_initialiser(scene, tmp_path, capfd):
+def test_without_points_the_error_names_other_initialisers(scene, tmp_path, capfd):
     folder = tmp_path / "bare"
     shutil.copytree(scene, folder)
     document = json.loads((folder / "transforms.json").read_text())
@@ -161,7 +159,7 @@ def _scene(capture: Any, cache: Path) -> Scene:
     return load_scene(capture, capture.model, cache, max_size=300)
 
 
-def test_photographs_with_distortion_come_out_the_same(shared, tmp_path):
+def test_distorted_photographs_give_the_same_scene(shared, tmp_path):
     """Real photographs: COLMAP's SIMPLE_RADIAL as nerfstudio's OPENCV with k1."""
     source = shared / "data" / "herz_jesus_p25"
     folder = tmp_path / "church"

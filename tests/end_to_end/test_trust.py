@@ -1,5 +1,4 @@
-"""Whole trials in a folder that holds a module for every name that anything imports; none of them
-may be imported."""
+"""Whole trials in a folder with a module of every name that is imported: none may be loaded."""
 
 import importlib.metadata
 import os
@@ -19,8 +18,7 @@ BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\
 
 @pytest.fixture
 def capture(tmp_path) -> Path:
-    """A folder with bombs of all names of the standard library and of everything that is
-    installed."""
+    """A folder with modules that leave a mark, named like the standard and the installed ones."""
     folder, mark = tmp_path / "capture", tmp_path / "exploded"
     folder.mkdir()
     names = {
@@ -67,7 +65,7 @@ def gsbench(
 def test_no_module_of_the_current_folder_is_imported(capture):
     own = "from gsbench.densify import NoDensifier\nclass Own(NoDensifier):\n    pass\n"
     (capture / "own.py").write_text(own)
-    # what is installed comes before what lies here
+    # an installed yaml comes before the one in this folder
     allowed = ["densify._target_=own.Own", "allow_targets=[own,yaml]"]
     tracked = [word for word in TINY if word != "tracking=none"]
     for words in (
@@ -86,7 +84,7 @@ def test_no_module_of_the_current_folder_is_imported(capture):
     assert len(list((capture.parent / "runs" / "one").rglob("results.json"))) == 2
 
 
-def test_nor_by_a_process_of_its_own(capture):
+def test_an_isolated_process_imports_no_module_of_the_current_folder(capture):
     imports = "import posixpath; from gsbench.system.isolate import run_isolated"
     code = f"{imports}; print(run_isolated(posixpath.basename, 'a/b'))"
     done = gsbench(capture, start=("-P", "-c", code))
@@ -94,7 +92,7 @@ def test_nor_by_a_process_of_its_own(capture):
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 
-def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(capture):
+def test_python_m_gsbench_imports_no_module_of_the_current_folder(capture):
     code = "import runpy, sys; print(*sys.modules)"
     before = subprocess.run(
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
@@ -107,12 +105,12 @@ def test_nor_by_python_m_but_for_what_python_imports_before_it_comes_to_gsbench(
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 
-def test_nor_by_another_trainer_that_tells_its_version(capture):
-    """``python -c`` imports from where it runs, so its version is asked for in an empty folder."""
+def test_a_version_command_imports_no_module_of_the_current_folder(capture):
+    """``python -c`` imports from its folder, so the command runs in an empty one."""
     (capture.parent / "train.py").write_text(
         "import beside, sys; sys.exit('Error: trained ' + beside.WHAT)"
     )
-    # as many trainers have
+    # many trainers import modules that lie beside them
     (capture.parent / "beside.py").write_text("WHAT = 'with what lies beside it'")
     words = [
         "densify=external/program",

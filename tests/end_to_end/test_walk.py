@@ -1,8 +1,7 @@
-"""How a setting travels: a trial is composed, built and checked once, and V_th takes few doors from
-YAML to rule.
+"""The way of a setting from YAML to its use: few composings, few checks, few folders.
 
-The way is what the call stacks say at the moments when the value is composed, checked and used:
-from one to the next, up to the frame that they share and down again. A crossing is a step from one
+The way follows the call stacks at the moments when the value is composed, checked and used: from
+one stack to the next, up to the frame that they share and down again. A crossing is a step from one
 folder of gsbench to another.
 """
 
@@ -49,7 +48,7 @@ Frame = tuple[int, str]  # its identity while it lives, and its file below gsben
 
 
 def stack() -> list[Frame]:
-    """The living frames of gsbench, from the outermost in."""
+    """The present frames of gsbench, the outermost first."""
     frames = [(id(entry.frame), Path(entry.filename)) for entry in reversed(inspect.stack(0))]
     return [
         (number, path.relative_to(PACKAGE).as_posix())
@@ -59,7 +58,7 @@ def stack() -> list[Frame]:
 
 
 def way(stacks: list[list[Frame]]) -> list[str]:
-    """The files that one passes from the end of each stack to the end of the next."""
+    """The files on the way from the end of each stack to the end of the next."""
     passed = stacks[0][-1:]
     for here, there in itertools.pairwise(stacks):
         shared = sum(
@@ -73,7 +72,7 @@ def way(stacks: list[list[Frame]]) -> list[str]:
 
 
 def crossings(files: list[str]) -> int:
-    """How often a way from ``conf/`` over these files leaves a folder below gsbench."""
+    """The number of steps between folders on a way from ``conf/`` over these files."""
     folders = ["conf", *(file.partition("/")[0] for file in files)]
     return sum(one != other for one, other in itertools.pairwise(folders))
 
@@ -87,13 +86,12 @@ def test_a_way_is_counted_by_its_folders():
     assert crossings(way([outer, inner])) == 3  # conf, config, app, launch
 
 
-def test_from_the_yaml_to_the_split(tmp_path, monkeypatch):
+def test_a_setting_is_checked_twice_and_crosses_few_folders_from_yaml_to_use(tmp_path, monkeypatch):
     stacks: list[list[Frame]] = []
     calls: Counter[str] = Counter()
 
     def watch(owner, name, counts=lambda *given: True):
-        """Count the calls of ``owner.name`` whose arguments count, and note the stack at the
-        first."""
+        """Count the calls of ``owner.name`` that ``counts`` accepts; keep the first one's stack."""
         real = getattr(owner, name)
 
         def watched(*given, **named):

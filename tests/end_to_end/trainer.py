@@ -1,8 +1,8 @@
-"""A trainer of another program, as small as one can be: it knows nothing of gsbench.
+"""A minimal trainer that knows nothing of gsbench.
 
 It reads its COLMAP folder with pycolmap, makes a Gaussian of every point, in the colours that the
 training images have there, and writes a 3DGS PLY; or paints the points as seen by the test cameras.
-MODE says how it fails.
+The option ``--mode`` says how it fails.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ def project(
 
 
 def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) -> np.ndarray:
-    """The median colour of every point [P, 3] in [0, 1] over the training images that look at
-    it."""
+    """The median colour [P, 3] in [0, 1] of every point over the training images that show it."""
     seen = []
     for image in model.images.values():
         picture = np.asarray(Image.open(data / "images" / image.name)) / 255.0
@@ -74,7 +73,7 @@ def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) ->
 
 
 def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
-    """A 3DGS PLY of harmonics of degree 0, by hand."""
+    """Write a 3DGS PLY of harmonics of degree 0, without gsbench's code."""
     spacing = cKDTree(points).query(points, k=4)[0][:, 1:].mean(axis=1).clip(1e-4)
     table = np.zeros((len(points), len(COLUMNS)), "<f4")
     table[:, :3], table[:, 3:6], table[:, 6] = points, (colors - 0.5) / SH_DC, 2.0
@@ -91,7 +90,7 @@ def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -
 
 
 def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
-    """The points, far ones first, as squares of 3 px."""
+    """Draw the points, far ones first, as squares of 3 px."""
     for frame in json.loads((cameras / "transforms.json").read_text())["frames"]:
         # world to OpenCV camera
         pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
@@ -112,8 +111,7 @@ def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, m
 
 
 def confess(folder: Path) -> None:
-    """Print every file below ``folder`` that can be seen, and the pixels of those that are
-    pictures, as hashes."""
+    """Print every visible file below ``folder``, with a hash of the pixels of a picture."""
     for place, _, files in os.walk(folder, followlinks=True):
         for name in files:
             path = Path(place, name)

@@ -1,5 +1,4 @@
-"""Declaring the metric of a verdict: recorded before trials run, visible when changed, and nothing
-is computed anew."""
+"""Declaring the metric of a verdict: before trials run, visibly when changed, without computing."""
 
 import json
 import logging
@@ -41,7 +40,7 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(tmp_path, cap
     )
     declare([undeclared])
     assert read_declarations(tmp_path / "exp") == []
-    for trials in ([psnr, psnr], [psnr], [undeclared]):  # said again, or not said: it stands
+    for trials in ([psnr, psnr], [psnr], [undeclared]):  # repeated or left out, it stays declared
         declare(trials)
         assert [one.primary for one in read_declarations(tmp_path / "exp")] == ["psnr"]
     with caplog.at_level(logging.WARNING):
@@ -78,7 +77,7 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
     assert len(say((psnr, "densify=volumetric", "densify.volume_threshold=0.1"))[-1]) == 3
 
 
-def test_one_command_cannot_declare_two(tmp_path, refused):
+def test_one_command_cannot_declare_two_metrics(tmp_path, refused):
     trials = [composed(tmp_path, f"eval.primary={metric}") for metric in ("psnr", "ssim")]
     with pytest.raises(
         InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"
@@ -96,7 +95,7 @@ def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
         return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),))
 
     first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))
-    # it stands, with its time
+    # the first declaration stays, with its time
     assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first
     declared = [composed(tmp_path, "eval.primary=psnr")]
     declare(declared)
@@ -137,8 +136,8 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
         ["psnr"],
     )
 
-    # another name gets the same numbers from the store: they were there before, and are known to
-    # have been
+    # Another experiment gets the same numbers from the store: they were measured before its
+    # declaration.
     assert run([*words, "name=again", "eval.primary=ssim"]) == 0
     again = load_experiment(tmp_path, "again")
     found = active_declaration(again.folder, again.trials)

@@ -1,4 +1,4 @@
-"""How a job ended is told by the files of its trial; what it returned is not read."""
+"""The files of a trial say how its job ended; the result that the job returned is not read."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 def collected(folder: Path, failure: str | None = None) -> Outcome:
-    """How a job ended that left a result of its own, which nobody reads, and perhaps a failure."""
+    """The outcome of a job that left a pickled result, which is not read, and perhaps a failure."""
     trial = compose_one(["name=x"])
     if failure is not None:
         trial.folder.mkdir(parents=True)
@@ -31,13 +31,13 @@ def collected(folder: Path, failure: str | None = None) -> Outcome:
     return collect(job, trial.folder, [trial])
 
 
-def test_a_failed_job_is_told_by_the_trials_folder(folder):
+def test_a_failure_is_read_from_the_trials_folder(folder):
     outcome = collected(folder, json.dumps({"message": "no scene\nat all", "bad_input": True}))
     assert outcome.message == f"no scene; log: {folder / 'log'}"
     assert (outcome.status, outcome.bad_input) == ("failed", True)
 
 
-def test_a_job_that_left_nothing_is_told_by_its_log(folder):
+def test_the_end_of_a_job_without_files_is_read_from_its_log(folder):
     outcome = collected(folder)
     assert outcome.status == "failed"
     assert "ended without a result" in outcome.message
@@ -55,7 +55,7 @@ def test_one_trial_of_each_cloud_begins_first():
     ]
 
 
-def test_a_link_of_submitits_does_not_refuse_the_next_submission_and_any_other_does(tmp_path):
+def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     values = compose_one(["name=cluster", f"runs={tmp_path}"]).values
     folder = job_folder(values)
     script = folder / "2_submission.sh"

@@ -12,16 +12,16 @@ OWN = "densify._target_=mine.Patient"
     ("words", "said"),
     [
         (["densify=adc", OWN], ["densify.name=patient"]),
-        # the name of yet another one
+        # the name of another class of gsbench
         (["densify=adc", OWN, "densify.name=volumetric"], ["densify.name=patient"]),
         (["densify=adc", OWN, "densify.name=mine"], []),
         (["init=random", "init._target_=mine.Shell"], ["init.name=shell"]),
-        # ours by another class: settings tell
+        # another class of gsbench
         (["densify=adc", "densify._target_=gsbench.densify.AbsGS"], []),
         (["densify=adc"], []),
     ],
 )
-def test_a_class_of_ones_own_under_a_name_of_ours_is_told(words, said):
+def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(words, said):
     trials = [compose_one([*words, "allow_targets=[mine]", f"seed={seed}"]) for seed in (0, 1)]
     lines = borrowed_names(trials)
     assert len(lines) == len(said)

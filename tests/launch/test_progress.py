@@ -22,7 +22,7 @@ def begin(runs: Path, arm: str, seed: int) -> Path:
 
 @pytest.fixture
 def sweep(tmp_path) -> dict[tuple[str, int], Path]:
-    """A sweep: of adc all trials are done, of volumetric one is done, one failed, and one began."""
+    """A sweep: all trials of adc are done; of volumetric, one is done, one failed and one began."""
     folders = {(arm, seed): begin(tmp_path, arm, seed) for arm in ARMS for seed in SEEDS}
     # In the only seed that both have, adc is better; in the mean over all of its own trials it is
     # worse.
@@ -68,7 +68,7 @@ def test_states_speed_time_left_and_leader(sweep, tmp_path):
     assert "not a verdict" in frame.attrs["leader"]
 
 
-def test_a_trial_that_nobody_runs_waits(sweep):
+def test_a_trial_that_no_process_runs_counts_as_waiting(sweep):
     home = TrialFolder(sweep["adc", 0]).home
     progress = progress_of(home)
     assert progress.cells["a_init-volumetric", "a_scene"] == {
@@ -81,14 +81,16 @@ def test_a_trial_that_nobody_runs_waits(sweep):
     assert progress.speeds == {}
 
 
-def test_nobody_leads_before_all_arms_share_a_seed(tmp_path):
+def test_no_arm_leads_before_all_arms_share_a_seed(tmp_path):
     for arm in ARMS:
         begin(tmp_path, arm, 0)
     progress = progress_of(tmp_path / "swept")
     assert (progress.leader, progress.seconds_left) == ("", None)
 
 
-def test_the_table_stays_once_all_have_ended(sweep, tmp_path, monkeypatch, capsys):
+def test_watch_prints_the_table_and_ends_once_all_trials_have_ended(
+    sweep, tmp_path, monkeypatch, capsys
+):
     (sweep["volumetric", 2] / "failed.json").write_text(json.dumps({"message": "x"}))
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     assert run(["status", "swept", "--watch"]) == 1
@@ -99,7 +101,7 @@ def test_the_table_stays_once_all_have_ended(sweep, tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize("words", [["status", "--watch"], ["status", "nothing", "--watch"]])
-def test_what_cannot_be_watched_is_one_line(words, tmp_path, monkeypatch, refused):
+def test_watching_no_experiment_is_refused_in_one_line(words, tmp_path, monkeypatch, refused):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     refused(*words)
     with pytest.raises(InputError):

@@ -1,4 +1,4 @@
-"""Composition, plan, states and finished trials: what needs no training."""
+"""Composition, plan, states and finished trials, without trainings."""
 
 import errno
 import fcntl
@@ -57,8 +57,7 @@ def finish(
     unavailable: dict[str, str] | None = None,
     awaited: Sequence[str] = (),
 ) -> TrialRecord:
-    """Make the files of a finished trial, with one stage result in the store and one source
-    file."""
+    """Make the files of a finished trial, with one stage in the store and one source file."""
     folder = TrialFolder.of(values)
     folder.path.mkdir(parents=True, exist_ok=True)
     source = folder.runs.parent / "photos" / "a.jpg"
@@ -89,7 +88,7 @@ def finish(
 
 @cache
 def experiment(name: str) -> list[Trial]:
-    """Trial once: the paper's tables take seconds."""
+    """The trials of an experiment, composed once: the paper's tables take seconds."""
     return compose_trials([f"+experiment={name}"])
 
 
@@ -113,8 +112,7 @@ NEEDED = {  # what a YAML leaves to its user
         for name in ("brush", "fvdb", "lichtfeld", "nerfstudio", "opensplat")
     },
 }
-# where the name of a YAML is not that of its last part: captures of one's own are called after
-# their folder
+# Choices whose name is not that of their file: a user's captures are called after their folder.
 NAMES = {
     ("densify", "external/program"): "external",
     **{("scene", name): "somewhere" for name in ("blender", "colmap", "photos", "transforms")},
@@ -154,7 +152,7 @@ def test_paper_experiments_have_the_papers_trials_and_share_them():
         assert again.yaml.splitlines()[8:] == trial.yaml.splitlines()[8:]
 
 
-def test_grid_is_the_product_with_the_command_line_over_the_file():
+def test_a_grid_is_the_product_of_its_lists_and_typed_words_replace_the_files():
     trials = compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])
     assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
         ("adc", 5),
@@ -169,7 +167,7 @@ def test_grid_is_the_product_with_the_command_line_over_the_file():
     assert {t.values["train"]["iterations"] for t in trials} == {10}
 
 
-def test_name_seed_and_machine_are_in_no_hash_and_settings_are():
+def test_the_hash_covers_settings_but_not_name_seed_and_machine():
     hash_of = lambda *words: config_hash(trial_values(*words))  # noqa: E731
     assert hash_of() == hash_of(
         "name=other", "seed=9", "device=cpu", "threads=1", "launch=local", "tracking=none"
@@ -244,9 +242,7 @@ def test_options_of_the_command_line():
         parse(["--config-dir", "/nowhere"])
 
 
-def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     words = [
         "-m",
@@ -259,7 +255,7 @@ def test_a_folder_that_is_not_there_stops_a_sweep_before_its_first_trial(
         InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"
     ):
         launch(words)
-    assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # nothing to clean up after the mend
+    assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # no trial has begun
     assert launch([*words, "--dry-run"]) == 0
     assert "scene truck: the folder" in capsys.readouterr().out
 
@@ -384,7 +380,7 @@ def test_a_dry_run_says_what_has_changed(runs):
     )
 
 
-def test_metric_that_cannot_come_later_does_not_hinder():
+def test_a_trial_is_done_without_a_metric_that_stays_unavailable():
     values = trial_values()
     finish(
         values,
@@ -396,7 +392,7 @@ def test_metric_that_cannot_come_later_does_not_hinder():
     assert not why_not_done(values)
 
 
-def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do():
+def test_a_trial_is_done_until_the_weights_that_it_lacked_appear():
     values = trial_values()
     finish(values, unavailable={"lpips_vgg": "weights not found: vgg16.pth"}, awaited=["lpips_vgg"])
     assert not why_not_done(values, ["lpips_vgg", "flip"])
@@ -406,7 +402,7 @@ def test_weights_that_are_still_missing_do_not_hinder_and_new_ones_do():
 # ---- plan and states
 
 
-def test_what_is_awaited_is_not_read_from_the_prose_of_reasons():
+def test_awaited_metrics_are_not_inferred_from_the_texts_of_reasons():
     values = trial_values("seed=3")
     finish(
         values,
@@ -419,7 +415,7 @@ def test_what_is_awaited_is_not_read_from_the_prose_of_reasons():
     assert not why_not_done(values, ["lpips_vgg"])
 
 
-def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs):
+def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2,3"], multirun=True)
     add_to_plan(trials[:2])
     add_to_plan(trials)
@@ -444,7 +440,7 @@ def test_plan_keeps_what_was_asked_for_and_names_what_is_missing(runs):
     assert len(states_of_experiment(runs / "x")) == 3
 
 
-def test_damaged_plan_is_named_and_the_next_command_mends_it(runs, caplog):
+def test_a_damaged_plan_is_named_and_the_next_command_repairs_it(runs, caplog):
     (runs / "x").mkdir(parents=True)
     (runs / "x" / "plan.json").write_text("{")
     assert read_plan(runs / "x") == {}
@@ -592,7 +588,7 @@ def test_storage_errors_are_recognised(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
-def test_verbs_that_write_say_storage_errors_in_one_line(number, runs, monkeypatch, refused):
+def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkeypatch, refused):
     def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
@@ -613,7 +609,7 @@ def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
     assert "has no locks" in refused("status", "x", "--forget")
 
 
-def test_what_is_done_is_found_in_a_folder_that_may_not_be_written_to(runs, monkeypatch):
+def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):
     values = trial_values()
     finish(values)
     trials = [replace(_composed(), values=values)]

@@ -1,5 +1,4 @@
-"""The notebooks run from top to bottom, and each .ipynb is what its .py says, with small
-outputs."""
+"""The notebooks run from top to bottom, and each .ipynb agrees with its .py, with small outputs."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ def test_every_notebook_is_a_pair() -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_pair_is_equal_and_carries_small_outputs(path: Path) -> None:
+def test_both_files_of_a_notebook_agree_and_outputs_are_small(path: Path) -> None:
     jupytext = pytest.importorskip("jupytext", reason="needs jupytext (group dev)")
     nbformat = pytest.importorskip("nbformat", reason="needs nbformat (group dev)")
     source = jupytext.read(path)
@@ -79,6 +78,6 @@ def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         if "image/png" in output.get("data", {})
     ]
     assert pictures
-    keep = os.environ.get("KEEP_NOTEBOOKS")  # a folder: look at what came out
+    keep = os.environ.get("KEEP_NOTEBOOKS")  # a folder that keeps the outputs
     if keep:
         nbformat.write(notebook, Path(keep) / path.with_suffix(".ipynb").name)

@@ -1,4 +1,4 @@
-"""Where entered renders may stand."""
+"""The places at which renders may be entered."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_places_that_would_mix_or_damage_results_are_refused(
         find_destination(word, scene, seed, truth, tmp_path)
 
 
-def test_the_scene_may_be_named_again(tmp_path: Path) -> None:
+def test_the_scene_of_the_photographs_may_be_repeated(tmp_path: Path) -> None:
     wanted = Destination("table1", "courtyard", "sfm", "mine", 3)
     assert find_destination("table1:mine", "courtyard", 3, COURTYARD, tmp_path) == wanted
     assert find_destination("table1:mine", None, 3, COURTYARD, tmp_path) == wanted

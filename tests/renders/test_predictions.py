@@ -73,7 +73,7 @@ FORMS: dict[str, Callable[[Mapping[str, bytes], Path], Path]] = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_predictions_are_measured_as_they_are(
+def test_every_form_of_predictions_is_measured(
     form: str, members: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = FORMS[form](members, tmp_path / "predictions")
@@ -112,7 +112,7 @@ def test_strange_archives_are_refused(
     assert not list(tmp_path.rglob("evil.png"))
 
 
-def test_what_is_no_archive_of_predictions_is_refused(
+def test_files_that_are_no_archive_of_predictions_are_refused(
     members: dict[str, bytes],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -1,4 +1,4 @@
-"""The environment of the program, as the end-to-end tests have it."""
+"""The environment of the program, as in the end-to-end tests."""
 
 from __future__ import annotations
 

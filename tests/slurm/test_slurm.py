@@ -1,5 +1,4 @@
-"""A sweep in a real Slurm: out of time, requeued by hand, queued twice; it ends as an undisturbed
-one.
+"""A sweep in a real Slurm that runs out of time, is requeued and queued twice ends undisturbed.
 
 Needs a running Slurm: ``scripts/slurm_one_node.sh start`` sets one up on this machine.
 """
@@ -41,8 +40,7 @@ class Broken(ADC):
             raise RuntimeError("it is broken")
         return super().refine(step, gaussians, rng)
 """
-# seconds an iteration: with 300 of them a trial does not fit into Slurm's shortest time limit, a
-# minute
+# seconds per iteration: a trial of 300 does not fit into Slurm's shortest time limit, a minute
 PAUSE = 0.2
 SWEEP = [
     "--config-dir",
@@ -122,7 +120,7 @@ def queue() -> list[str]:
     return listing.stdout.split()
 
 
-def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(
+def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(
     place: Path, environment: dict[str, str]
 ) -> None:
     whole = start(place, environment, place / "whole", *SWEEP, "seed=0,1")
@@ -140,7 +138,7 @@ def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(
     queued = queue()
     assert len(queued) == 2
     time.sleep(3)
-    # as a preemption does: SIGTERM, then the queue
+    # like a preemption: SIGTERM, then back to the queue
     subprocess.run(["scontrol", "requeue", queued[0]], check=True)
     first.send_signal(signal.SIGINT)
     output, _ = first.communicate(timeout=120)
@@ -168,7 +166,7 @@ def test_sweep_runs_out_of_time_is_requeued_and_ends_as_undisturbed(
 def gsbench(
     place: Path, environment: dict[str, str], *words: str, pause: float = 0
 ) -> subprocess.CompletedProcess[str]:
-    """The program, to its end, with its own sayings on stdout and log lines on stderr."""
+    """Run the program to its end; its output is in stdout, its log lines in stderr."""
     variables = environment | {"GSBENCH_RUNS": str(place / "runs"), "PAUSE": str(pause)}
     command = [sys.executable, "-m", "gsbench.cli", *words]
     return subprocess.run(
@@ -177,7 +175,7 @@ def gsbench(
 
 
 def states(place: Path, environment: dict[str, str]) -> dict[str, str]:
-    """What ``gsbench status`` says of each arm."""
+    """The state of each arm by ``gsbench status``."""
     listing = json.loads(gsbench(place, environment, "status", "cluster", "--json").stdout)
     return {
         Path(trial["folder"]).parent.name.removeprefix("random-"): trial["state"]
@@ -192,7 +190,7 @@ def wait_for_states(place: Path, environment: dict[str, str], **wanted: str) -> 
         time.sleep(1)
 
 
-def test_submitted_and_left_status_and_retry_do_the_rest(
+def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(
     place: Path, environment: dict[str, str]
 ) -> None:
     (place / "broken").touch()
@@ -238,7 +236,7 @@ def test_submitted_and_left_status_and_retry_do_the_rest(
     assert not list(place.glob("runs/cluster/*/*/*/.submitted.json"))
 
 
-def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(
+def test_a_cancelled_job_is_missing_and_can_run_without_slurm(
     place: Path, environment: dict[str, str]
 ) -> None:
     later = [*CLUSTER, "launch.wait=false", "launch.sbatch={begin: now+1hour}"]
@@ -252,7 +250,7 @@ def test_job_that_was_cancelled_is_missing_and_can_be_run_elsewhere(
         f"Slurm job {job} has ended, log: "
         in gsbench(place, environment, "status", "cluster").stdout
     )
-    words = ["launch=serial", "allow_targets=[slow]"]  # which knows no launch.wait
+    words = ["launch=serial", "allow_targets=[slow]"]  # launch=serial has no launch.wait
     again = gsbench(place, environment, "retry", "cluster", *words)
     assert again.returncode == 0, again.stderr
     assert states(place, environment) == {"slow": "done"}

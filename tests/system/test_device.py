@@ -1,4 +1,4 @@
-"""What a choice of device brings along."""
+"""The choice of a device, its precision and its free memory."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from gsbench.system.device import free_bytes, select_device
 
 @pytest.fixture
 def rounding() -> Iterator[None]:
-    """TF32 allowed, as torch allows it to convolutions by default.
-
-    The process's settings come back afterwards.
-    """
+    """Allow TF32 within the test, as torch allows it to convolutions by default."""
     backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
     before = [backend.allow_tf32 for backend in backends]
     for backend in backends:
@@ -50,7 +47,9 @@ def test_a_device_is_chosen_or_refused(
         assert select_device(name) == torch.device(answer)
 
 
-def test_what_torch_has_reserved_and_does_not_use_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_that_torch_has_reserved_and_does_not_use_is_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 9999))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 50)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 20)
@@ -88,7 +87,7 @@ def test_a_gpu_that_another_program_holds_is_named(
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, gpus: int) -> None:
-    """Let torch seem to find so many GPUs."""
+    """Make torch report this number of GPUs."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1, 2))

@@ -1,4 +1,4 @@
-"""What is told of a checkout, and that git starts nothing that its own repository names."""
+"""The facts of a checkout, which git finds without starting programs that the repository names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository with one commit, in which a file was changed since; the current folder."""
+    """A repository with one commit as the current folder; ``run.sh`` beside it leaves a mark."""
     for name, value in {
         "GIT_CONFIG_GLOBAL": "/dev/null",
         "GIT_CONFIG_NOSYSTEM": "1",
@@ -40,13 +40,13 @@ def git(*words: str) -> str:
     ).stdout.strip()
 
 
-def test_commit_and_changes_are_told(repository: Path) -> None:
+def test_commit_and_changes_are_reported(repository: Path) -> None:
     assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": False}
     (repository / "a.txt").write_text("two")
     assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": True}
 
 
-def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(repository: Path) -> None:
+def test_an_untracked_folder_is_no_checkout(repository: Path) -> None:
     inner = repository / ".venv" / "site-packages"
     inner.mkdir(parents=True)
     (inner / "b.py").touch()
@@ -56,7 +56,7 @@ def test_a_folder_that_the_repository_does_not_follow_is_no_checkout(repository:
 @pytest.mark.parametrize(
     "setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"]
 )
-def test_git_starts_nothing_that_a_capture_names(
+def test_programs_in_a_repositorys_configuration_are_not_started(
     repository: Path, tmp_path: Path, setting: str
 ) -> None:
     name = setting.split(".")[1]
@@ -73,7 +73,7 @@ def test_git_starts_nothing_that_a_capture_names(
     assert not (tmp_path / "exploded").exists()
 
 
-def test_nor_hooks(repository: Path, tmp_path: Path) -> None:
+def test_hooks_of_a_repository_are_not_started(repository: Path, tmp_path: Path) -> None:
     hook = repository / ".git" / "hooks" / "post-index-change"
     hook.write_text(MARK.format(mark=tmp_path / "exploded"))
     hook.chmod(0o755)

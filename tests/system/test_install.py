@@ -63,7 +63,7 @@ def test_installed_from_a_folder_the_hint_names_the_folder(
     assert install_command("view") == f"pip install '{tmp_path if found else DISTRIBUTION}[view]'"
 
 
-def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:
+def test_no_text_tells_to_install_the_foreign_project_gsbench() -> None:
     foreign = re.compile(r"pip install [^`\n]*\bgsbench(?!-3dgs)(\[|['\"`\s]|$)", re.MULTILINE)
     assert foreign.search("pip install 'gsbench[view]'")
     assert not foreign.search("pip install 'gsbench-3dgs[view]'")
@@ -77,11 +77,8 @@ def test_no_text_sends_anyone_to_the_project_that_has_our_name() -> None:
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
-def test_the_image_is_built_by_commands_that_there_are() -> None:
-    """Docker builds what the README's two commands build.
-
-    Every ``make`` of the Dockerfile is a target.
-    """
+def test_the_dockerfile_calls_existing_make_targets() -> None:
+    """Docker builds what the README's two commands build."""
     targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
     assert {"demo", "test"} < set(targets)
     for target in targets:
@@ -89,8 +86,8 @@ def test_the_image_is_built_by_commands_that_there_are() -> None:
             ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False
         )
         assert done.returncode == 0, done.stderr
-    # whose names without a wildcard are of the root alone
+    # In .dockerignore, names without a wildcard match in the root only.
     ignored = (ROOT / ".dockerignore").read_text().split()
     assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(
         ignored
-    )  # nothing of this machine gets in
+    )  # so no local file gets into the image

@@ -18,7 +18,7 @@ from gsbench.errors import InputError
 from gsbench.system.isolate import CrashError, run_isolated
 from tests.processes import heed_interrupts
 
-PATIENCE = 120.0  # seconds within which what never comes is told from a slow machine
+PATIENCE = 120.0  # seconds; a slow machine needs fewer
 SOURCE = Path(gsbench.__file__).parents[1]
 
 FUNCTIONS = """

@@ -1,4 +1,4 @@
-"""Machine code that is kept on disk belongs to the sources that it was made of."""
+"""Compiled kernels on disk are used only with the sources that they were made from."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def _names(code: Any) -> Iterator[str]:
             yield from _names(constant)
 
 
-def test_the_kernels_are_where_they_are_looked_for() -> None:
+def test_modules_with_kernels_are_found() -> None:
     assert len(KERNEL_MODULES) >= 5
 
 
 @pytest.mark.parametrize("module", KERNEL_MODULES)
-def test_the_table_has_every_function_that_kernels_reach(module: str) -> None:
+def test_sources_include_every_function_that_kernels_call(module: str) -> None:
     loaded = importlib.import_module("gsbench." + module.removesuffix(".py").replace("/", "."))
     seen: set[int] = set()
     reached = [
@@ -95,11 +95,8 @@ def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -
     assert cache_folder.__wrapped__(package) == before
 
 
-def test_the_table_has_all_that_kernels_import() -> None:
-    """But for what sets the kernels' calls up.
-
-    Memory, threads, cameras as numbers, files and words.
-    """
+def test_sources_include_every_module_that_kernels_import() -> None:
+    """Modules that only prepare calls of kernels are exceptions."""
     known = {path.relative_to(PACKAGE).as_posix() for path in sources(PACKAGE)}
     around = {
         "logs.py",
@@ -117,7 +114,7 @@ def test_the_table_has_all_that_kernels_import() -> None:
             assert not strange, f"{name} imports {strange}"
 
 
-def test_the_base_is_the_folder_that_is_set_or_another_that_can_be_written(
+def test_the_cache_is_in_the_configured_folder_or_another_writable_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -48,7 +48,7 @@ def test_record_is_plain_text_and_full() -> None:
         ("Model : Raspberry Pi 5", "Raspberry Pi 5"),
     ],
 )
-def test_linux_names(
+def test_names_of_processors_on_linux(
     content: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "cpuinfo").write_text(content)
@@ -58,11 +58,11 @@ def test_linux_names(
 
 
 @pytest.mark.parametrize("system", ["linux", "darwin", "win32", "sunos"])
-def test_a_system_that_gives_no_name_is_named_all_the_same(
+def test_a_processor_without_a_name_is_called_by_its_architecture(
     system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "missing")
-    monkeypatch.setenv("PATH", str(tmp_path))  # no sysctl
+    monkeypatch.setenv("PATH", str(tmp_path))  # no program of the system
     monkeypatch.delenv("PROCESSOR_IDENTIFIER", raising=False)
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(platform, "processor", lambda: "")
@@ -80,7 +80,7 @@ def test_levels_follow_the_psabi() -> None:
     assert x86_level(v4 - {"sse4.2"}) == "x86-64-v1"
 
 
-def test_target_of_the_kernels_is_the_one_that_was_asked_for() -> None:
+def test_the_target_of_kernels_follows_numba_cpu_name() -> None:
     code = "from gsbench.system.machine import kernel_target; print(kernel_target())"
     changed = dict(os.environ) | {"NUMBA_CPU_NAME": "generic"}
     asked = subprocess.run(
@@ -94,7 +94,7 @@ def test_target_of_the_kernels_is_the_one_that_was_asked_for() -> None:
 @pytest.mark.parametrize(
     "variable", ["NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=-1", "NUMBA_DISABLE_JIT=x"]
 )
-def test_a_variable_that_numba_cannot_read_is_one_line(variable: str) -> None:
+def test_a_variable_that_numba_cannot_read_is_refused_in_one_line(variable: str) -> None:
     name, _, value = variable.partition("=")
     code = (
         "from gsbench.errors import InputError\n"

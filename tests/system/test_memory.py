@@ -22,7 +22,7 @@ def touch(megabytes: int) -> None:
     np.ones(megabytes * MIB, np.uint8).sum()
 
 
-def test_peak_holds_what_was_allocated_in_between() -> None:
+def test_the_peak_includes_memory_that_was_freed_again() -> None:
     before = peak_resident_mb()
     reset_peak_memory(CPU)
     touch(LARGE_MB)
@@ -30,14 +30,14 @@ def test_peak_holds_what_was_allocated_in_between() -> None:
 
 
 @pytest.mark.skipif(not memory.CLEAR_REFS.exists(), reason="only Linux starts the count anew")
-def test_peak_can_be_counted_anew() -> None:
+def test_the_peak_can_be_reset() -> None:
     touch(2 * LARGE_MB)
     high = peak_memory_mb(CPU)
     reset_peak_memory(CPU)
     assert peak_memory_mb(CPU) < high - LARGE_MB
 
 
-def test_systems_without_proc_use_what_they_have(
+def test_systems_without_proc_have_other_sources(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counted = peak_resident_mb()
@@ -50,8 +50,8 @@ def test_systems_without_proc_use_what_they_have(
     assert peak_resident_mb() == 3
 
 
-def test_the_pipeline_is_imported_where_there_is_no_resource_module() -> None:
-    """As on Windows, where psutil does without it."""
+def test_the_pipeline_can_be_imported_without_the_resource_module() -> None:
+    """Windows has no such module; psutil does without it."""
     code = (
         "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.keys, "
         "gsbench.bench"

@@ -1,4 +1,4 @@
-"""Slots for trials at once, and what each gets of the machine."""
+"""Slots for trials that run at once, and each trial's GPU and threads."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""No process outlives the function that started it, however it was started.
-
-Daemons included, on Linux.
-"""
+"""No process outlives the function that started it; on Linux this includes daemons."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ from tests.processes import heed_interrupts, is_running
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="daemons get away where nobody can adopt orphans"
 )
-PATIENCE = 60.0  # seconds within which what never comes is told from a slow machine
+PATIENCE = 60.0  # seconds; a slow machine needs fewer
 
 # A daemon as in Stevens: forked twice, in a session of its own, with an empty environment. It notes
 # its process id.
@@ -51,7 +48,7 @@ FORKS = "import os, time; [os.fork() for _ in range(4)]; time.sleep(600)"
 
 
 def is_gone(mark: Path) -> bool:
-    """Whether the process whose id stands in ``mark`` ends within our patience."""
+    """Return whether the process whose id is in the file ``mark`` ends within `PATIENCE`."""
     pid, deadline = int(mark.read_text()), time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         if not is_running(pid):

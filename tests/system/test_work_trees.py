@@ -1,4 +1,4 @@
-"""Work trees of a stranger's repository: nothing of his runs, and his checkout stays as it is."""
+"""Work trees of a stranger's repository: its programs do not run, its checkout does not change."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path: Path, git: Gi
     assert not ran.exists()
 
 
-def test_what_is_no_commit_or_comes_first_is_refused(tmp_path: Path, git: Git) -> None:
+def test_wrong_and_reversed_commits_are_refused(tmp_path: Path, git: Git) -> None:
     found = trees(tmp_path)
     for first, last, message in (
         ("nosuch", "HEAD", "rev-parse"),
@@ -99,7 +99,7 @@ def test_what_is_no_commit_or_comes_first_is_refused(tmp_path: Path, git: Git) -
         WorkTrees(tmp_path / "empty", tmp_path)
 
 
-def test_variables_of_another_repository_do_not_lead_away(
+def test_git_variables_of_a_hook_are_ignored(
     tmp_path: Path, git: Git, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "nowhere"))  # as in a hook

@@ -1,4 +1,4 @@
-"""A runs folder with a database, and a PostgreSQL server of our own."""
+"""A runs folder with a database, and a PostgreSQL server for one test."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ def runs(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def postgresql(tmp_path) -> Iterator[str]:
-    """The address of an empty database in a PostgreSQL server of our own; the test is skipped where
-    there is none."""
+    """The address of an empty database in a new PostgreSQL server; skips without PostgreSQL."""
     pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
     homes = (
         sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))

@@ -62,8 +62,7 @@ def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
 
 
 def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any]) -> bool:
-    """Mirror what is missing of an ended trial; False if nothing was missing. Raises what the
-    tracker raises."""
+    """Mirror an ended trial; False if nothing was missing. Raises any error of the tracker."""
     return mirror_ended(TrialFolder(folder), settings, values)
 
 

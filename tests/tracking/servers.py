@@ -14,15 +14,14 @@ BACKLOG = 64
 
 
 class Listener:
-    """A server on a port of its own that accepts every connection, and answers each after
-    ``seconds``, or never."""
+    """A server that accepts every connection, and answers each after ``seconds``; None: never."""
 
     def __init__(self, seconds: float | None = None) -> None:
         self.seconds = seconds
         self._socket = socket.create_server(("127.0.0.1", 0), backlog=BACKLOG)
         self.port: int = self._socket.getsockname()[1]
         self.connections: list[socket.socket] = []
-        self.threads = 1  # that were ever started here
+        self.threads = 1  # number of threads that were started here
         threading.Thread(target=self._accept, daemon=True).start()
 
     def __enter__(self) -> Listener:

@@ -1,4 +1,4 @@
-"""A tracker that a file of somebody else names gets nothing unless its address is typed."""
+"""A tracker that a stranger's file names gets nothing unless the user types its address."""
 
 import json
 
@@ -19,7 +19,9 @@ from tests.tracking.helpers import (
 )
 
 
-def test_the_address_is_the_configured_one_then_the_environments_then_ours(tmp_path, monkeypatch):
+def test_the_address_is_the_configured_one_else_the_environments_else_the_runs_folders(
+    tmp_path, monkeypatch
+):
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     assert tracker_uri(None, tmp_path) == default_uri(tmp_path) == f"sqlite:///{tmp_path}/mlflow.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
@@ -27,7 +29,7 @@ def test_the_address_is_the_configured_one_then_the_environments_then_ours(tmp_p
     assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
 
 
-def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch):
+def test_an_address_from_a_file_must_be_typed_or_in_the_environment(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
     assert untyped_address({"uri": None}) is None
     assert untyped_address({"uri": "http://a"}) == "http://a"
@@ -40,7 +42,7 @@ def test_an_address_counts_where_it_is_typed_or_of_the_environment(monkeypatch):
 
 @pytest.mark.parametrize("kind", ["sqlite", "http"])
 @pytest.mark.slow
-def test_sync_leaves_a_strange_tracker_alone(kind, tmp_path, monkeypatch, capfd):
+def test_sync_sends_nothing_to_a_tracker_that_was_not_typed(kind, tmp_path, monkeypatch, capfd):
     runs, target = tmp_path / "runs", tmp_path / "elsewhere" / "theirs.db"
     target.parent.mkdir()
     address = f"sqlite:///{target}" if kind == "sqlite" else f"http://127.0.0.1:{free_port()}"
@@ -80,7 +82,7 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     "place", ["http://127.0.0.1:{port}/api", "{outside}", "{runs}/mlartifacts/../../outside"]
 )
 @pytest.mark.slow
-def test_artifacts_go_nowhere_else_than_our_own_folder(place, tmp_path, monkeypatch, capfd):
+def test_artifacts_outside_the_runs_folder_are_refused(place, tmp_path, monkeypatch, capfd):
     runs, outside = tmp_path / "runs", tmp_path / "outside"
     outside.mkdir()
     values = trial_values(runs, name="theirs")
@@ -94,7 +96,7 @@ def test_artifacts_go_nowhere_else_than_our_own_folder(place, tmp_path, monkeypa
     assert not list(outside.iterdir())
 
 
-def test_no_link_among_the_artifacts_is_written_through(tmp_path):
+def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
     runs, private = tmp_path / "runs", tmp_path / "private"
     private.write_text("secret")
     values = trial_values(runs, name="theirs")

@@ -1,5 +1,4 @@
-"""Whatever a tracker does, and whenever: a trial that is complete ends with exit code 0, and one
-line says the rest."""
+"""A complete trial ends with exit code 0 and at most one warning, whatever its tracker does."""
 
 import json
 import os
@@ -37,8 +36,7 @@ from tests.tracking.helpers import (
 from tests.tracking.servers import Gate, Listener
 
 pytestmark = pytest.mark.slow
-# Not measured, only the limit within which a program that hangs for good is told from a slow
-# machine.
+# A limit for programs that hang; a slow machine needs less.
 SECONDS = 240
 PATIENCE = 4.0
 TINY = [
@@ -91,7 +89,7 @@ def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
 @pytest.mark.parametrize(
     "kind", ["refuses", "never answers", "answers after a minute", "hangs up", "postgresql"]
 )
-def test_a_bad_tracker_costs_a_trial_one_line(kind, runs):
+def test_a_trial_with_a_bad_tracker_is_complete_and_prints_one_line(kind, runs):
     with ExitStack() as stack:
         port = free_port()
         if kind in ("never answers", "postgresql"):
@@ -113,7 +111,7 @@ def test_a_bad_tracker_costs_a_trial_one_line(kind, runs):
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_nothing_is_left_of_a_trial_that_is_ended_while_its_tracker_hangs(signum, runs):
+def test_no_mirror_outlives_a_trial_that_is_ended_while_its_tracker_hangs(signum, runs):
     name = f"ended_by_{signum}"
     with Listener() as tracker:
         program = start(
@@ -182,7 +180,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 @pytest.fixture(params=["http", "postgresql"])
 def tracker(request, tmp_path_factory) -> Iterator[tuple[Gate, str]]:
-    """A tracker that works, behind a gate, and its address there."""
+    """A gate before a working tracker, and the address of the tracker through the gate."""
     with ExitStack() as stack:
         if request.param == "http":
             port = stack.enter_context(mlflow_server(tmp_path_factory.mktemp("server")))
@@ -198,15 +196,13 @@ def tracker(request, tmp_path_factory) -> Iterator[tuple[Gate, str]]:
         yield gate, uri
 
 
-def test_a_tracker_may_go_at_any_moment(tracker, tmp_path, monkeypatch):
-    """It is taken away early, late and in between; each time ``sync`` completes one run, with each
-    value once.
+def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_path, monkeypatch):
+    """The tracker is lost early, late and in between; ``sync`` completes one run, each value once.
 
-    A transaction that was cut off, of which the database never hears again, keeps nobody from its
-    rows for long.
+    The database is told to end a transaction that was cut off, which would lock its rows.
     """
     gate, uri = tracker
-    # may take longer than what follows
+    # made before, since it may take longer than the mirroring
     ensure_experiment(connect(uri, tmp_path), "tracked", tmp_path)
     seconds = SETTINGS["PGOPTIONS"].replace("60s", "3s")
     assert seconds != SETTINGS["PGOPTIONS"]
@@ -232,7 +228,7 @@ def test_a_tracker_may_go_at_any_moment(tracker, tmp_path, monkeypatch):
 
 
 def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
-    """Mirror a trial in a process of its own, which must end well; returns what it said."""
+    """Mirror a trial in a process of its own, which must succeed; returns its stderr."""
     words = mirror_command(runs, uri, seed, patience)
     done = subprocess.run(
         words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False

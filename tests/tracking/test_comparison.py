@@ -65,7 +65,7 @@ def unpacked(tag: str) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_the_files_alone_make_the_page_again(kind, tmp_path, request):
+def test_sync_makes_the_page_from_the_files(kind, tmp_path, request):
     uri = None if kind == "sqlite" else request.getfixturevalue("postgresql")
     folders = write_sweep(tmp_path / "runs")
     assert list(sync(folders, uri))[-1] == "8 trials mirrored now, 0 before"
@@ -86,7 +86,7 @@ def test_the_files_alone_make_the_page_again(kind, tmp_path, request):
     )
 
 
-def test_a_description_of_somebody_else_stays(runs):
+def test_a_users_description_is_kept(runs):
     write_sweep(runs, name="described")
     publish(runs / "described", None)
     client = connect(None, runs)
@@ -116,7 +116,7 @@ def test_other_versions_of_mlflow_get_the_plain_page(version):
 
 
 @pytest.mark.parametrize("limit", [500, 250])
-def test_a_server_that_refuses_long_parameters_gets_the_rest(limit, runs, monkeypatch):
+def test_a_server_that_refuses_long_parameters_gets_shortened_ones(limit, runs, monkeypatch):
     send = mlflow.MlflowClient.log_batch
 
     def strict(self, run_id, **sent):
@@ -136,7 +136,7 @@ def test_a_server_that_refuses_long_parameters_gets_the_rest(limit, runs, monkey
 
 
 @pytest.mark.slow
-def test_portrait_and_landscape_pictures_are_logged_as_they_are(runs):
+def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
     values = trial_values(runs, seed=2000)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)

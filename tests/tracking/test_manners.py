@@ -1,5 +1,4 @@
-"""What people who know MLflow look for: address, user, reasons of failures, files that are
-found."""
+"""What users of MLflow expect of a run: its address, user, reason of a failure, and files."""
 
 import getpass
 import json
@@ -46,7 +45,7 @@ def artifacts(client: Any, run: Any) -> set[str]:
     return {item.path for item in client.list_artifacts(run.info.run_id)}
 
 
-def test_a_trial_goes_where_the_environment_says(runs, tmp_path, monkeypatch):
+def test_a_trial_goes_to_the_tracker_in_the_environment(runs, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
     values = trial_values(tmp_path, seed=20)
     folder = begin_trial(values)
@@ -58,7 +57,7 @@ def test_a_trial_goes_where_the_environment_says(runs, tmp_path, monkeypatch):
     assert run.data.tags["mlflow.user"] == getpass.getuser()
 
 
-def test_a_failed_run_holds_its_reason_until_it_is_mended(runs):
+def test_a_failed_run_has_its_reason_until_the_trial_succeeds(runs):
     values = trial_values(runs, seed=22)
     folder = begin_trial(values)
     (folder / "log.txt").write_text("what happened\n")
@@ -87,8 +86,8 @@ def test_the_model_is_an_artifact_if_asked_for(runs):
     assert "point_cloud.ply" in artifacts(client, run)
 
 
-def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(runs, tmp_path):
-    """MLflow keeps absolute addresses, so that the old database would fill the old place."""
+def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
+    """MLflow keeps absolute addresses, so the copied database would write to the old folder."""
     mirrored(runs, seed=26)
     moved = tmp_path / "moved"
     shutil.copytree(runs, moved)
@@ -110,7 +109,7 @@ def test_the_mirror_of_a_moved_runs_folder_is_made_again_from_the_files(runs, tm
     assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
 
 
-def test_a_run_that_was_deleted_is_mirrored_anew(runs):
+def test_a_deleted_run_is_mirrored_again(runs):
     client, run = mirrored(runs, seed=28)
     client.delete_run(run.info.run_id)
     values = trial_values(runs, seed=28)

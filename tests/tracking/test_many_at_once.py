@@ -25,7 +25,7 @@ JOBS = 8
 
 
 def run_jobs(runs: Path, uri: str | None) -> None:
-    """Eight trials at once, in processes of their own, all new to the tracker."""
+    """Run eight trials at once, each in its own process, all new to the tracker."""
     commands = [mirror_command(runs, uri, seed) for seed in range(JOBS)]
     jobs = [
         subprocess.Popen(
@@ -39,8 +39,7 @@ def run_jobs(runs: Path, uri: str | None) -> None:
     ]
     outputs = [job.communicate(timeout=240)[0] for job in jobs]
     assert [job.returncode for job in jobs] == [0] * JOBS, outputs
-    # A loaded machine may be too slow for the last words of some; sync is what makes up for that,
-    # and nothing else is.
+    # A loaded machine may be too slow to send the last values of some; sync sends them.
     for seed in range(JOBS):
         values = trial_values(runs, seed)
         mirror_trial(options(uri), TrialFolder.of(values).path, values)

@@ -1,5 +1,4 @@
-"""The MLflow mirror: every metric arrives once and in the right experiment, and a bad tracker harms
-no trial."""
+"""The MLflow mirror: each metric arrives once in its experiment; a bad tracker harms no trial."""
 
 import json
 import logging
@@ -33,11 +32,11 @@ from tests.tracking.helpers import (
 )
 from tests.tracking.servers import Listener
 
-SECONDS = 240  # within which what never comes is told from a slow machine
+SECONDS = 240  # a limit for what never comes; a slow machine needs less
 
 
 @pytest.mark.slow
-def test_all_that_the_files_say_is_mirrored_once(runs):
+def test_everything_in_the_files_is_mirrored_once(runs):
     values = trial_values(runs, seed=1)
     folder = begin_trial(values)
     with following(options(), folder):
@@ -58,7 +57,7 @@ def test_all_that_the_files_say_is_mirrored_once(runs):
     }
 
 
-def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs):
+def test_a_crash_between_sending_and_recording_repeats_nothing(runs):
     values = trial_values(runs, seed=2)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
@@ -74,7 +73,7 @@ def test_a_crash_between_sending_and_noting_it_repeats_nothing(runs):
     assert len(history(client, run.info.run_id, "eval/psnr_dB")) == 1
 
 
-def test_results_that_changed_replace_the_run(runs):
+def test_changed_results_replace_the_run(runs):
     values = trial_values(runs, seed=3)
     folder = TrialFolder.of(values).path
     write_trial(folder, values)
@@ -87,7 +86,7 @@ def test_results_that_changed_replace_the_run(runs):
 
 
 def wait_for_run(folder: Path) -> None:
-    """Wait until the trial's run is there and noted."""
+    """Wait until the trial's folder records its run."""
     deadline = time.monotonic() + SECONDS
     while "token" not in (
         json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}
@@ -97,14 +96,14 @@ def wait_for_run(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_failed_and_a_stopped_trial_say_so_and_are_gone_on_with(runs):
+def test_runs_of_failed_and_stopped_trials_say_so_and_are_continued(runs):
     values = trial_values(runs, seed=4)
     folder = begin_trial(values)
     client = connect(None, runs)
     for error, status in ((KeyboardInterrupt(), "KILLED"), (RuntimeError("x"), "FAILED")):
         with pytest.raises(type(error)), following(options(), folder):  # noqa: PT012
             wait_for_run(folder)
-            if status == "FAILED":  # as a trial does before anyone beside it is told
+            if status == "FAILED":  # as a trial does before its error is raised
                 (folder / "failed.json").write_text(json.dumps({"message": "x"}))
             raise error
         run = run_of(client, 4)
@@ -171,13 +170,13 @@ def test_a_slow_tracker_is_not_waited_for(tmp_path, caplog):
     assert [record.getMessage().split(";")[0] for record in caplog.records] == [
         "tracking: MLflow is slow"
     ]
-    # no thread that the end of the interpreter could hit; one of before may have ended
+    # No thread is left that could hang at exit. An earlier one may have ended meanwhile.
     assert mine <= 0
     assert set(psutil.Process().children()) <= set(others)
 
 
 def test_one_process_mirrors_all_trials_of_a_sweep(runs):
-    """MLflow is loaded once, and nobody waits for it between trials."""
+    """MLflow is loaded once, and no trial waits for it."""
     others = set(psutil.Process().children())
     with Mirror() as mirror:
         for seed in (9, 10, 11):
@@ -195,7 +194,7 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs):
 
 
 @pytest.mark.slow
-def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(runs, caplog):
+def test_a_crash_of_the_mirror_is_reported_and_the_next_trial_gets_another_mirror(runs, caplog):
     for seed in (6, 7):
         values = trial_values(runs, seed)
         folder = begin_trial(values)
@@ -215,7 +214,7 @@ def test_a_mirror_that_crashes_is_said_and_the_next_trial_has_another(runs, capl
 
 @pytest.mark.slow
 def test_the_trials_process_loads_no_mlflow(runs):
-    """No part of it can then take the process down, and it takes no memory beside a training."""
+    """So MLflow cannot crash the process, and takes no memory beside a training."""
     values = trial_values(runs, seed=8)
     folder = begin_trial(values)
     code = (
@@ -235,8 +234,8 @@ def test_the_trials_process_loads_no_mlflow(runs):
 
 
 @pytest.mark.slow
-def test_a_database_is_whole_or_absent(tmp_path):
-    """Killed while it makes the tables, a process leaves nothing that stops the next one."""
+def test_a_killed_process_leaves_no_incomplete_database(tmp_path):
+    """A process that is killed while it makes the tables does not stop the next one."""
     code = (
         "import sys; from pathlib import Path; from gsbench.tracking import connect; "
         "connect(None, Path(sys.argv[1]))"
@@ -253,7 +252,7 @@ def test_a_database_is_whole_or_absent(tmp_path):
     assert (tmp_path / "mlflow.db").exists()
 
 
-def test_switched_off_means_no_mlflow(tmp_path):
+def test_mlflow_is_not_loaded_if_tracking_is_switched_off(tmp_path):
     code = (
         "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
         "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"

@@ -33,7 +33,7 @@ AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 
 
 def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
-    """A trial that was measured at iteration 50 too, with a picture."""
+    """A finished trial with a picture, which was also measured at iteration 50."""
     values = trial_values(runs, seed)
     folder = begin_trial(values)
     write_trial(folder, values)
@@ -48,15 +48,15 @@ def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
     return folder, values
 
 
-def test_mlflow_shows_a_curve_of_the_final_metrics_and_a_grid_of_the_test_pictures(runs):
+def test_mlflow_shows_curves_of_test_metrics_and_a_grid_of_test_pictures(runs):
     folder, values = finished_trial(runs, seed=1)
     mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 1)
     assert run.info.run_name == "a_densify · a_scene · s1"
     assert history(client, run.info.run_id, "eval/psnr_dB") == [(50, 15.0), (RECORDS, 20.0)]
-    assert run.data.metrics["eval/psnr_dB"] == 20.0  # what the tables show is the last
-    # by which the page knows that it has a grid to show
+    assert run.data.metrics["eval/psnr_dB"] == 20.0  # tables show the last value
+    # MLflow's page shows a grid of pictures if it finds this tag
     assert run.data.tags["mlflow.loggedImages"] == "True"
     names = [Path(item.path).name for item in client.list_artifacts(run.info.run_id, "images")]
     for kind in ("1 render", "2 photograph", "3 error"):
@@ -100,8 +100,8 @@ def test_the_summary_of_a_trial(tmp_path):
     }
 
 
-def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path, monkeypatch):
-    """With a stand-in for its client, which notes what it is told."""
+def test_weights_and_biases_gets_a_whole_trial_in_one_run(tmp_path, monkeypatch):
+    """A mock stands in for the client."""
     wandb = MagicMock()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     monkeypatch.setenv("WANDB_BASE_URL", "http://before")
@@ -136,7 +136,7 @@ def test_weights_and_biases_gets_all_of_a_trial_in_one_run(tmp_path, monkeypatch
     run.finish.assert_called_with(1)
 
 
-def test_experiments_open_as_machine_learning(runs):
+def test_experiments_have_the_kind_of_model_development(runs):
     client = connect(None, runs)
     tag = "mlflow.experimentKind"
     assert (
@@ -150,7 +150,7 @@ def test_experiments_open_as_machine_learning(runs):
     assert ensure_experiment(client, "plain", runs) == plain
     assert client.get_experiment(plain).tags[tag] == "custom_model_development"
     ensure_experiment(client, "chosen", runs)
-    assert client.get_experiment(chosen).tags[tag] == "regression"  # what somebody chose stays
+    assert client.get_experiment(chosen).tags[tag] == "regression"  # a user's choice is kept
 
 
 def test_a_tracker_whose_package_is_missing_is_refused_before_any_work(monkeypatch):
@@ -175,7 +175,7 @@ def test_tensorboard_shows_the_same_numbers_once(tmp_path):
         events = accumulator.EventAccumulator(str(there), size_guidance={"scalars": 0, "images": 0})
         return events.Reload()
 
-    for _ in range(2):  # after a crash between sending and noting it, too
+    for _ in range(2):  # the second time as after a crash between sending and recording
         assert mirror_trial(sink, folder, values)
         assert not mirror_trial(sink, folder, values)
         assert len(list(there.iterdir())) == 1

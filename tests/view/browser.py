@@ -33,7 +33,7 @@ FLAGS = [
     "--disable-component-update",
     "--remote-debugging-port=0",
 ]
-SECONDS = 300  # within which a page that stays as it is is told from a slow machine
+SECONDS = 300  # a limit for a page that never changes; a slow machine needs less
 SECONDS_BETWEEN_LOOKS = 0.5
 
 
@@ -75,7 +75,7 @@ class Browser:
         )
 
     def picture(self) -> np.ndarray:
-        """What the window shows now, [H, W, 3] in [0, 255]."""
+        """A screenshot of the window, [H, W, 3] in [0, 255]."""
         data = base64.b64decode(self.call("Page.captureScreenshot")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
@@ -90,7 +90,7 @@ class Browser:
                 return dict(answer["result"])
 
     def _page(self, profile: Path) -> str | None:
-        """The web socket's address of the page, once there is one."""
+        """The web socket address of the page; None if there is no page yet."""
         try:
             port = (profile / "DevToolsActivePort").read_text().split()[0]
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=20) as answer:

@@ -22,7 +22,7 @@ case "$*" in *"{works}"*) cp "$settings" "$previous";; *) echo "no device" >&2; 
 
 
 def stand_in(folder: Path, works: str) -> Path:
-    """An npx that writes its settings as the page if its words contain ``works``."""
+    """Write an npx that copies its settings to the page if its words contain ``works``."""
     folder.mkdir()
     (folder / "npx").write_text(NPX.replace("{works}", works))
     (folder / "npx").chmod(0o755)
@@ -64,7 +64,7 @@ def test_the_page_has_every_test_view(
 @pytest.mark.parametrize(
     ("works", "cause"), [("never", r"failed (no device)"), ("", "is not installed")]
 )
-def test_without_npx_the_command_to_type_is_said(
+def test_without_npx_the_error_names_the_command_to_type(
     works: str,
     cause: str,
     small_runs: Path,

@@ -1,4 +1,4 @@
-"""The viewer on finished trials: what it draws, and that its page comes and goes."""
+"""The viewer on finished trials: what it draws, and how its page starts and stops."""
 
 from __future__ import annotations
 
@@ -57,7 +57,9 @@ def test_drawing_a_test_view_gives_the_trials_own_render(
             np.testing.assert_array_equal(view.image, photograph)
 
 
-def test_the_large_are_shown_in_the_colour_of_their_cause(painters: list[TrialPainter]) -> None:
+def test_large_gaussians_are_shown_in_the_colour_of_their_cause(
+    painters: list[TrialPainter],
+) -> None:
     painter = painters[1]
     trial = painter.trial
     volumes = 4 / 3 * np.pi * trial.gaussians.scales.double().prod(-1).numpy()
@@ -111,7 +113,7 @@ def test_two_trials_and_their_photograph_share_one_camera(
         np.testing.assert_array_equal(shown, pane[12:, 2:])
 
 
-def test_a_page_that_sends_nonsense_ends_no_drawing(viewer: Viewer) -> None:
+def test_drawing_continues_after_a_page_sends_nonsense(viewer: Viewer) -> None:
     shown: list[np.ndarray] = []
     seen = {"wxyz": (0, 0, 0, 0), "position": (np.nan, 0, 0), "fov": 0.9, "aspect": 1e6}
     camera = SimpleNamespace(on_update=lambda _: None, **seen)
@@ -139,7 +141,9 @@ def test_page_shows_the_trials_in_a_browser(viewer: Viewer, tmp_path: Path) -> N
         browser.wait_until(lambda page: bool(page[150:, :800].std() > 20), "the trials")
 
 
-def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None:
+def test_a_wrong_address_of_a_trial_is_refused_with_the_right_ones(
+    small_runs: Path, tmp_path: Path
+) -> None:
     folder = find_trial("small:courtyard:adc", small_runs).path
     assert find_trial(str(folder), tmp_path).path == folder
     assert find_trial("small:courtyard:random-adc:0", small_runs).path == folder
@@ -156,7 +160,7 @@ def test_what_cannot_be_viewed_is_said(small_runs: Path, tmp_path: Path) -> None
         read_causes(folder / "lineage.npz", 1)
 
 
-def test_without_viser_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_viser_the_error_names_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=re.escape(install_command("view"))):
         servers.view(["a:b:c"], Path())
@@ -164,7 +168,7 @@ def test_without_viser_the_mend_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         servers.view(["a:b:c"] * 3, Path())
 
 
-def test_a_port_in_use_is_said() -> None:
+def test_a_port_in_use_is_refused() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -103,7 +103,7 @@ def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float
 
 @pytest.mark.parametrize("roll", [0.0, 0.4, math.pi])
 def test_page_stands_upright_where_the_photograph_was_taken(roll: float) -> None:
-    """The page's camera is made of its forward and upward directions, as look-at cameras are."""
+    """The page builds its camera from forward and upward directions, as look-at cameras do."""
     turn = Rotation.from_euler("YXZ", [0.7, -0.5, roll]).as_matrix()
     camera = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, turn.T, np.zeros(3))
     up = level_up(camera, np.array([0.0, -1.0, 0.0]))
@@ -128,7 +128,7 @@ def test_mean_up_points_up() -> None:
         *(("aspect", value) for value in (1e6, 0.0, math.nan)),
     ],
 )
-def test_what_is_no_camera_is_not_drawn(name: str, value: object) -> None:
+def test_impossible_cameras_of_a_page_are_refused(name: str, value: object) -> None:
     sound = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 0.9, "aspect": 1.6}
     page_camera(**sound, height=540, panes=1)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
@@ -183,7 +183,7 @@ def test_layers_choose_what_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
-def test_a_record_of_causes_that_is_damaged_is_one_line(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_record_of_causes_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "lineage.npz").write_bytes(content)
     with pytest.raises(InputError, match=r"lineage\.npz cannot be read"):
         read_causes(tmp_path / "lineage.npz", 1)

@@ -1,4 +1,4 @@
-"""Which requests the viewer answers: of its own page and of programs, and of no other page."""
+"""The viewer answers requests of its own page and of programs, and of no other page."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ UNWELCOME = [
 
 
 @pytest.mark.parametrize(("hosts", "origins"), WELCOME + UNWELCOME)
-def test_its_own_page_and_programs_are_welcome_and_no_other(hosts, origins) -> None:
+def test_only_the_own_page_and_programs_are_accepted(hosts, origins) -> None:
     assert is_own_page(hosts, origins) == ((hosts, origins) in WELCOME)
 
 
@@ -73,13 +73,13 @@ def answer(server: Any, hosts: list[str], origins: list[str], upgrade: bool) -> 
 
 
 @pytest.mark.parametrize("upgrade", [False, True], ids=["page", "connection"])
-def test_the_server_itself_answers_so(server: Any, upgrade: bool) -> None:
+def test_the_running_server_accepts_the_same_requests(server: Any, upgrade: bool) -> None:
     for headers in WELCOME + UNWELCOME:
         allowed = {101 if upgrade else 200} if headers in WELCOME else {400, 403}
         assert answer(server, *headers, upgrade) in allowed, headers
 
 
-def test_a_server_that_was_started_otherwise_is_not_trusted() -> None:
+def test_an_unguarded_server_is_refused() -> None:
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     with (
         pytest.raises(GsbenchError, match="cannot be kept from strange web pages"),

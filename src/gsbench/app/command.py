@@ -103,7 +103,7 @@ def run_trials(trials: Sequence[Trial]) -> int:
 def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     """Run ``task`` for a command line's trials: one, or many (``multirun``, an experiment).
 
-    Raises InputError, one line, for a wrong configuration.
+    Raises InputError with one line for a wrong configuration.
     """
     check_words(words)
     swept = [word for word in words if is_sweep(word)]
@@ -175,7 +175,7 @@ def other_sweeper(config: DictConfig) -> str:
 def words_without_sweeper(
     config: DictConfig, words: Sequence[str], name: str
 ) -> tuple[list[str], bool]:
-    """The words for a look at what another sweeper would run, and whether they are a sweep."""
+    """The words of a dry run of another sweeper, and whether they are a sweep."""
     kept = [
         word for word in words if not key_of(word).startswith(("hydra/sweeper", "hydra.sweeper."))
     ]
@@ -193,7 +193,7 @@ def words_without_sweeper(
 def prepare_other_sweeper(
     config: DictConfig, words: Sequence[str], task: TrialTask, name: str
 ) -> list[str]:
-    """Give the ``task`` what another sweeper asks for; returns the words for Hydra.
+    """Set the objective of the ``task`` for another sweeper; returns the words for Hydra.
 
     Raises InputError for a choice among the words that would run what is not allowed: Hydra reads a
     job's logging before the job can be checked.
@@ -282,7 +282,7 @@ def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: b
 
 
 def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
-    """Print the trials with their states, and the folders that they will miss; run none."""
+    """Print the trials with their states, and the folders that are missing; run none."""
     if not need_no_check(trials):
         check_parts(trials, on_this_machine=False)
     lines = describe_plan(trials, trials[0].values["launch"]["parallel"])
@@ -291,7 +291,7 @@ def list_trials(trials: Sequence[Trial]) -> list[Outcome]:
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:
-    """Refuse a sweep's settings without a sweep, unmapped parameters, and a second launcher."""
+    """Refuse a sweep's settings without a sweep, params that are no mapping, and two launchers."""
     sweeper = config.hydra.sweeper
     params = sweeper.get("params")
     if not multirun and config.hydra.mode is None and (params or sweeper.get("grids")):
@@ -381,9 +381,8 @@ def run_sweep(
 def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
     """Run the trials in the looks that the sequential test plans.
 
-    Decided pairs of arms get no further trials.
-
-    Raises InputError for a sweep that cannot be tested so.
+    Decided pairs of arms get no further trials. Raises InputError for a sweep that cannot be tested
+    in this way.
     """
     stopping = plan_sweep(trials)
     if sweep.task.look_only:
@@ -446,8 +445,8 @@ def words_of_grids(
 ) -> list[list[str]]:
     """The words of each grid: its own, the shared ``params``, and those ``given`` for it.
 
-    If two set one key, the later counts. Trials are in the order of the grids; the shared settings
-    vary fastest.
+    If two words set one key, the later one counts. Trials are in the order of the grids; the shared
+    settings vary fastest.
     """
     listed = set(map(bare_key, itertools.chain(*grids)))
     jobs = []

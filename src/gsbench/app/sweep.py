@@ -1,4 +1,4 @@
-"""A sweep that Hydra has started, and the task that runs a trial: for searches and grids.
+"""The task that Hydra runs for each job, and a sweep that Hydra has started.
 
 Hydra's task function is `TrialTask`. gsbench's own sweeper hands all trials to it as one batch.
 Another launcher calls it for each job, perhaps in another process. Another sweeper proposes the
@@ -45,8 +45,8 @@ class Objective:
     """The value that another sweeper gets for a job: the mean of a metric over the job's seeds.
 
     ``sign`` says what the sweeper looks for: the largest value (1) or the least (-1). A metric
-    whose better direction is the other one is negated. ``seeds`` are the words of the seeds, none
-    for the job's own seed.
+    whose better direction is the other one is negated. ``seeds`` are the words of the seeds; if
+    empty, the job's own seed is used.
     """
 
     sign: int
@@ -108,11 +108,10 @@ class TrialTask:
         )
 
     def __call__(self, config: DictConfig) -> float | None:
-        """Run one job.
+        """Run one job; returns its value for another sweeper, else None.
 
-        Called by Hydra or by another launcher, perhaps in another process; raises if it failed.
-
-        Returns the job's value for another sweeper, else None.
+        Hydra or another launcher calls it, perhaps in another process. Raises InputError or
+        GsbenchError if a trial of a sweep's job failed.
         """
         # Paths of the command line start where it was given, also with hydra.job.chdir and on a
         # node of a cluster.
@@ -120,8 +119,8 @@ class TrialTask:
             os.chdir(self.folder)
         allow_modules(self.allowed, self.folder)
         hydra: Any = HydraConfig.instance().cfg
-        # Checked again: the files that this job chooses may set other things of Hydra than the
-        # checked ones.
+        # Checked again, because the files that this job chooses may set other settings of Hydra
+        # than those that were checked.
         compose.check_permitted(hydra, self.allowed)
         has_log = bool(hydra.hydra.job_logging.get("root"))
         set_up_logging(hydra.hydra.verbose, has_log)
@@ -140,7 +139,7 @@ class TrialTask:
             return None
         # A job of a sweep: its launcher passes on what is raised.
         outcomes = self.handle(trials)
-        if self.objective:  # nobody else collects them
+        if self.objective:  # another sweeper does not collect them
             self.trials += trials
             self.outcomes += outcomes
         for outcome in outcomes:
@@ -167,7 +166,7 @@ class Sweep:
     config: DictConfig
     task: TrialTask
     context: HydraContext
-    launcher: Launcher | None = None  # None: gsbench's own, in the hands of another sweeper
+    launcher: Launcher | None = None  # None: gsbench's own, called by another sweeper
 
     @classmethod
     def begin(cls, context: HydraContext, task: TaskFunction, config: DictConfig) -> Self:
@@ -249,7 +248,7 @@ def _returned(
     outcomes: Mapping[Path, Outcome],
     objective: Objective,
 ) -> JobReturn:
-    """What a launcher returns to another sweeper for a job."""
+    """The value or the error of a job, as a launcher returns it to another sweeper."""
     returned = JobReturn(overrides=job)
     try:
         for outcome in (outcomes[trial.folder] for trial in trials):

@@ -59,7 +59,7 @@ DEFAULT_POINTS = 20
 SEED = "seed"
 # groups that say how all arms are run and judged
 NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")
-# settings that a point's trials have different values of
+# settings that have their own values in the trials of a point
 REPLACED = (SEED, "name", "scene.validation", "eval.primary")
 DIGITS = 4  # significant digits of a value, so that people can type it
 
@@ -68,9 +68,8 @@ DIGITS = 4  # significant digits of a value, so that people can type it
 class TuneSettings:
     """Settings of a tuning.
 
-    ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out.
-
-    ``seed`` lists the seeds of a point's trials. The sweep may have none of them.
+    ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out. ``seed``
+    lists the seeds of a point's trials. The sweep may have none of them.
     """
 
     points: NonNegativeInt = DEFAULT_POINTS
@@ -135,10 +134,7 @@ class ArmSearch:
         return None if record is None else record.metrics.get(self.record.metric)
 
     def judge(self, proposal: Proposal, trials: Sequence[Trial]) -> SearchPoint:
-        """Judge a point by the mean of its trials.
-
-        It has failed if one of them lacks the metric.
-        """
+        """Judge a point by the mean of its trials; it failed if one of them lacks the metric."""
         from optuna.trial import TrialState
 
         values = [value for trial in trials if (value := self.value_of(trial)) is not None]
@@ -189,8 +185,8 @@ def tuned_jobs(
 def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
     """Propose, train and judge the points of all arms side by side.
 
-    A dry run judges only points whose trials are done already; it returns False at the first that
-    is not.
+    A dry run judges only points whose trials are done already, and returns False at the first other
+    point.
     """
     while True:
         points: list[tuple[ArmSearch, Proposal, list[list[str]]]] = []
@@ -414,7 +410,7 @@ def _own_values(
 
 
 def _is_in(value: Any, searched: Any) -> bool:
-    """Return whether ``searched`` contains a value that rounding to `DIGITS` does not change."""
+    """Return whether ``value`` lies in ``searched`` and rounding to `DIGITS` does not change it."""
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)

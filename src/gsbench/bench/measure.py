@@ -1,7 +1,4 @@
-"""Comparison of rasterizers.
-
-Training steps in parts, whole training steps, and frames as in a viewer.
-"""
+"""Timing of rasterizers: training steps in parts, whole training steps, frames as in a viewer."""
 
 import itertools
 import statistics
@@ -112,7 +109,7 @@ class Stepper:
     def steps_per_second(self) -> float:
         """The speed of whole training steps.
 
-        View, render, loss, backward, statistics, Adam, losses read at times.
+        A step has view, render, loss, backward pass, statistics and Adam. Losses are read at times.
         """
         steps = STEPS_AT_ONCE[self.device.type]
         begin = self._now()
@@ -177,7 +174,8 @@ def per_step(
 def device_of(raster: str) -> torch.device:
     """The device for timing ``raster``.
 
-    A GPU if it needs one, or if it is a user's class and there is a GPU.
+    It is a GPU if ``raster`` needs one, or if it is a user's class and there is a GPU. Raises
+    InputError if it needs one and there is none.
     """
     if "." in raster:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -1,7 +1,4 @@
-"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model.
-
-It has a camera for them, too.
-"""
+"""Scenes for timing: synthetic Gaussians, the same on every machine, or a trained model."""
 
 import math
 from pathlib import Path
@@ -24,9 +21,8 @@ FIRST_DEPTH, DEPTH_RATIO = 2.0, 12.0  # trained-like scene: least depth, and lar
 MEDIAN_SIGMA = 1.6 / (FOCAL * 500)
 SIGMA_EXPONENT = 0.4  # sigma is proportional to count^-0.4: many Gaussians are smaller
 SIGMA_SPREAD = 0.7  # standard deviation of log sigma
-# Skewed scene; for comparison, a trained courtyard has 117 entries per block on average, and at
-# most 1,054.
-# number; share of Gaussians; standard deviation of x/z and y/z
+# Skewed scene: number of spots, share of Gaussians in them, standard deviation of x/z and y/z. For
+# comparison, a trained courtyard has 117 entries per block on average, and at most 1,054.
 SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05
 BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # random scene: depth of its centre, and side
 NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, approximately
@@ -36,8 +32,8 @@ INITIAL_OPACITY = 0.1  # 3DGS
 def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
     """Make ``count`` Gaussians like those of a trained model.
 
-    Many small and flat, few large, with varied opacities. They fill the view of `frontal_camera`
-    and a margin around it.
+    Many are small and flat, a few are large, and opacities vary. They fill the view of
+    `frontal_camera` and a margin around it.
     """
     generator = _generator(count, seed)
     depth = FIRST_DEPTH * (torch.rand(count, generator=generator) * math.log(DEPTH_RATIO)).exp()
@@ -60,8 +56,8 @@ def trained_like_gaussians(count: int, seed: int = SEED) -> Gaussians:
 def random_gaussians(count: int, seed: int = SEED) -> Gaussians:
     """Make ``count`` Gaussians like those at the start of a training.
 
-    Faint spheres of equal size in a box in front of `frontal_camera`. Their size is the distance to
-    their neighbours.
+    They are faint spheres of equal size in a box in front of `frontal_camera`. Their size is the
+    distance to their neighbours.
     """
     generator = _generator(count, seed)
     means = BOX_SIDE * (torch.rand(count, 3, generator=generator) - 0.5)
@@ -103,7 +99,7 @@ def make_scene(
 ) -> tuple[Gaussians, Scene]:
     """Make Gaussians and a scene of noise images for them.
 
-    They are from the model ``ply``, or of a ``kind`` in `SCENES`.
+    The Gaussians are those of the model ``ply``, else ``count`` of a ``kind`` in `SCENES`.
     """
     if ply is not None:
         gaussians = read_ply(ply)
@@ -127,7 +123,7 @@ def frontal_camera(width: int, height: int) -> Camera:
 def camera_before(scene: Gaussians, width: int, height: int) -> Camera:
     """A camera that looks along z at the middle of ``scene``.
 
-    It stands at twice the median distance of the Gaussians.
+    Its distance from there is twice the median distance of the Gaussians.
     """
     center: Tensor = scene.means.median(0).values  # [3]
     distance = (scene.means - center).norm(dim=-1).median().item()

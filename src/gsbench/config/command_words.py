@@ -1,4 +1,4 @@
-"""The words of a command line, checked before Hydra composes anything: wrong ones are refused."""
+"""Parse and check the words of a command line, before Hydra composes anything."""
 
 import re
 import shlex
@@ -33,7 +33,7 @@ OPTIONS = (
     "--help",
     "--version",
 )
-# of Hydra: they replace the main configuration
+# Hydra's options that replace the main configuration
 MAIN_CONFIG_OPTIONS = ("--config-name", "-cn", "--config-path", "-cp")
 # Settings that are texts, by the last part of their keys.
 TEXTS = (
@@ -55,7 +55,10 @@ KEY = re.compile(r"[+~]*\w+([./]\w+)*")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
-    """The overrides, whether lists expand (``-m``), and whether trials are only listed."""
+    """Return the overrides, whether lists expand (``-m``), and whether trials are only listed.
+
+    Raises InputError for an unknown option.
+    """
     overrides: list[str] = []
     folders: list[Path] = []
     multirun = dry_run = False
@@ -117,7 +120,7 @@ def check_words(words: Sequence[str]) -> None:
         )
     for word in words:
         override, key = parse_word(word), key_of(word)
-        # the rest about them is checked after composition (config/trust.py)
+        # Hydra's own settings are otherwise checked after composition (config/trust.py).
         if key.startswith(("hydra.", "hydra/")):
             if override.is_sweep_override():
                 raise InputError(
@@ -141,7 +144,7 @@ def check_text(word: str) -> None:
     """Raise InputError for a text that Hydra would read as a number and write differently.
 
     ``name=1_1`` would become 11, and ``name=1e3`` 1000.0, so results would land in a folder that
-    nobody named.
+    the user did not name.
     """
     key, _, values = word.partition("=")
     for text in map(str.strip, values.split(",")):
@@ -159,7 +162,10 @@ def check_text(word: str) -> None:
 
 
 def check_removal(override: Override) -> None:
-    """Raise InputError for removing anything but an option of a class, which may have others."""
+    """Raise InputError unless the removed setting is an option of a component.
+
+    A user's class may lack options that the chosen file sets.
+    """
     group, dot, _ = bare_key(override.get_key_element()).partition(".")
     if not dot or group not in (*COMPONENTS, "raster"):
         raise InputError(
@@ -168,7 +174,7 @@ def check_removal(override: Override) -> None:
 
 
 def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
-    """The names that a command line allows by ``allow_targets=[…]``; the last one counts."""
+    """The names that a command line allows by ``allow_targets=[…]``; the last such word counts."""
     allowed: tuple[str, ...] = ()
     for word in words:
         override = parse_word(word)
@@ -215,7 +221,7 @@ def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
 
 @cache
 def parse_word(word: str) -> Override:
-    """A word as Hydra reads it. Raises InputError unless it is a ``key=value``."""
+    """Parse a word as Hydra does. Raises InputError unless it is ``key=value`` or ``~key``."""
     if "=" not in word and not word.startswith("~"):
         raise InputError(f"{word!r} is not a setting like key=value")
     open_at_once = accumulate(((letter in "[{(") - (letter in "]})") for letter in word), initial=0)
@@ -248,7 +254,7 @@ def bare_key(key: str) -> str:
 
 
 def value_text(value: object) -> str:
-    """A plain value as a word's value."""
+    """The text of a plain value in a word, such as ``null``, ``true`` or ``[1,2]``."""
     if isinstance(value, list):
         return f"[{','.join(map(value_text, value))}]"
     return (
@@ -269,7 +275,7 @@ def hint_for(word: str) -> str:
 
 
 def _quoted(word: str) -> str:
-    """A hint to quote the word's value, for characters that mean something to Hydra."""
+    """A hint to quote the word's value, whose characters mean something to Hydra."""
     key, _, value = word.partition("=")
     if not KEY.fullmatch(key):
         return ""
@@ -287,7 +293,7 @@ def _quoted(word: str) -> str:
 
 
 def check_single(words: Sequence[str], advice: str) -> None:
-    """`check_words`, and raise InputError with ``advice`` for a word with several values."""
+    """Run `check_words`, and raise InputError with ``advice`` for a word with several values."""
     check_words(words)
     if swept := [word for word in words if is_sweep(word)]:
         raise InputError(f"{swept[0]} lists several values: {advice}")
@@ -299,7 +305,7 @@ def is_sweep(word: str) -> bool:
 
 
 def check_sweep(override: Override) -> None:
-    """Raise InputError for a sweep without a list of values, or with one for equal trials."""
+    """Raise InputError for an interval, and for a list whose values would give equal trials."""
     if not override.is_discrete_sweep():
         key = bare_key(override.get_key_element())
         raise InputError(
@@ -312,7 +318,8 @@ def check_sweep(override: Override) -> None:
 def grid_points(overrides: Sequence[Override]) -> list[list[str]]:
     """The words of every point of the grid that ``overrides`` span.
 
-    If two set one key, the later counts.
+    If two overrides set one key, the later one counts. Raises InputError for an interval, and for
+    a list that is empty or has more than `MAX_POINTS` values.
     """
     choices: dict[str, list[str]] = {}
     for override in overrides:

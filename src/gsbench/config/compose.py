@@ -1,6 +1,6 @@
-"""Hydra's part: the configuration of a command line, checked, and the trials it describes.
+"""Compose and check the configuration of a command line with Hydra, and make its trials.
 
-Also gsbench as an app of Hydra's, and Hydra's errors in one line.
+Also runs gsbench as a Hydra app, and rewrites Hydra's errors as one line.
 """
 
 import copy
@@ -57,8 +57,8 @@ CONFIG_NAME = "config"  # conf/config.yaml
 VERSION_BASE: dict[str, Any] = (
     {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
 )
-# From Hydra 1.4 on: within this context it instantiates the named classes only (``mine.*``: all of
-# a module).
+# Within this context, Hydra 1.4 and later instantiates only the named classes (``mine.*``: all of a
+# module).
 WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
     hydra.utils, "execution_whitelist", lambda names: nullcontext()
 )
@@ -100,7 +100,7 @@ def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfi
     """Compose the configuration of ``words`` with Hydra's node, and check what it may run.
 
     Words that list several values are left out. From here on Python finds the modules that
-    ``words`` allow in the folder ``modules`` (default: the current one). Raises InputError, one
+    ``words`` allow in the folder ``modules`` (default: the current one). Raises InputError with one
     line. Call it within `hydra_ready`.
     """
     # The order matters: Hydra imports packages of the search path while it composes, so they are
@@ -145,7 +145,7 @@ def check_files(folders: Sequence[Path]) -> None:
 def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
     """The number of values in a YAML node after each alias is replaced by what it names.
 
-    ``sizes`` are those known.
+    ``sizes`` keeps the numbers that are known, by the id of the node.
     """
     if id(node) not in sizes:
         sizes[id(node)] = 1  # counts where an alias stands for a mapping or list that contains it
@@ -159,7 +159,7 @@ def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
 def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfig:
     """Refuse a configuration that would run what is not ``allowed``, and set ``allow_targets``.
 
-    Setting it discards what a file says of ``allow_targets``.
+    This discards any ``allow_targets`` from a file.
     """
     check_permitted(config, allowed)
     with read_write(config), open_dict(config):
@@ -168,7 +168,7 @@ def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfi
 
 
 def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
-    """`check_composed`, with Hydra's nodes as the installed packages write them."""
+    """Run `check_composed` against Hydra's nodes as the installed packages write them."""
     choices = config.hydra.runtime.choices if "hydra" in config else {}
     words = [
         f"{group}={choice}"
@@ -182,9 +182,8 @@ def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
 def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
     """Hydra's node for the choices ``words``, from installed packages only.
 
-    Choices from a user's folder are left out.
-
-    It also has what gsbench's own ``conf/config.yaml`` sets.
+    It includes what gsbench's own ``conf/config.yaml`` sets. Choices from a user's folder are left
+    out.
     """
     with hydra_ready():
         try:
@@ -192,7 +191,7 @@ def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
         except (HydraException, OmegaConfBaseException):
             if len(words) < 2:
                 return installed_nodes(())
-            # One by one: a choice that no package has must not take the others along.
+            # One by one, so that a choice that no package has does not drop the others.
             nodes: dict[str, Any] = {}
             for word in words:
                 own = installed_nodes((word,))
@@ -254,7 +253,7 @@ READS_HYDRA = re.compile(r"\$\{\s*hydra\b")
 def compose_jobs(
     loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
 ) -> list[Trial]:
-    """The trials of ``jobs``, lists of their words; ``sweep`` is the whole configuration.
+    """Compose the trials of ``jobs``, each a list of words; ``sweep`` is the whole configuration.
 
     ``first`` is the number of the first job, for ``${hydra:job.num}``.
     """
@@ -286,7 +285,7 @@ def compose_jobs(
                 with read_write(composed), open_dict(composed):
                     composed.hydra.job.num, composed.hydra.job.id = number, f"job_id_for_{number}"
                     HydraConfig.instance().set_config(composed)
-                    composed.pop("hydra")  # large, and no trial reads it but by ${hydra:…}
+                    composed.pop("hydra")  # large, and trials read it only by ${hydra:…}
             settings = repr(OmegaConf.to_container(composed, resolve=False))
             trials.append(resolve_trial(composed, overrides))
         reads_hydra = READS_HYDRA.search(settings)
@@ -354,7 +353,7 @@ def _key_and_value(word: str) -> tuple[str, Any]:
 def hydra_ready() -> Iterator[None]:
     """Initialise Hydra with gsbench's configuration folder within the block."""
     register_schemas()
-    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of ours
+    if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of this kind
         yield
         return
     try:
@@ -367,12 +366,10 @@ def hydra_ready() -> Iterator[None]:
 def run_main(
     task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
 ) -> None:
-    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``.
+    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what it raises.
 
-    Raises what ``task`` raises.
-
-    Hydra may instantiate its own callbacks, and of the checked ``config`` the allowed ones and the
-    chosen plug-ins.
+    Hydra may instantiate its own callbacks, the plug-ins that the checked ``config`` chooses, and
+    the classes that it allows.
     """
     names = (
         []
@@ -397,7 +394,7 @@ def run_main(
 
 
 def plugins_of(config: DictConfig) -> dict[str, Any]:
-    """The nodes of a configuration of which Hydra makes the launcher and the sweeper."""
+    """The nodes of a configuration from which Hydra makes the launcher and the sweeper."""
     return {
         key: OmegaConf.to_container(config.hydra[key], resolve=False)
         for key in ("launcher", "sweeper")
@@ -405,7 +402,7 @@ def plugins_of(config: DictConfig) -> dict[str, Any]:
 
 
 class _WithoutHydrasLine:
-    """Standard error without Hydra's line before it raises a job's error, which gsbench prints."""
+    """Standard error without Hydra's line about a job's error, which gsbench prints itself."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -438,7 +435,8 @@ Errors = type[Exception] | tuple[type[Exception], ...]
 def explained(overrides: Sequence[str], errors: Errors = Exception) -> Iterator[None]:
     """Raise the block's ``errors`` as InputError: one line in terms of the words ``overrides``.
 
-    The default is any error, since while Hydra composes all errors come from the user's input.
+    By default these are all errors, since any error while Hydra composes comes from the user's
+    input.
     """
     try:
         yield

@@ -135,7 +135,7 @@ class LaunchConfig:
 
 @dataclass
 class Config:
-    """The root.
+    """The root of the configuration.
 
     ``init`` and ``densify`` take any keys, because a user's own class has its own options.
     """
@@ -169,7 +169,7 @@ COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 def register_schemas() -> None:
     """Register the schemas with Hydra.
 
-    Those of groups go under ``schema/``, so that they are no choices.
+    Schemas of groups go under ``schema/``, so that Hydra does not offer them as choices.
     """
     store = ConfigStore.instance()
     store.store(name="config_schema", node=_names_and_defaults(Config))
@@ -179,7 +179,7 @@ def register_schemas() -> None:
 
 @cache
 def _names_and_defaults(schema: type) -> type:
-    """An untyped dataclass for Hydra with the fields of ``schema``: `checked_values` checks."""
+    """A dataclass for Hydra with the fields of ``schema``, untyped: `checked_values` checks."""
     fields: list[tuple[str, Any, Any]] = []
     for entry in dataclasses.fields(schema):
         factory: Any = entry.default_factory
@@ -192,10 +192,10 @@ def _names_and_defaults(schema: type) -> type:
 
 
 def checked_values(config: DictConfig) -> dict[str, Any]:
-    """The resolved values of a configuration without Hydra's node, converted (``1e3``), checked.
+    """Resolve, convert (``1e3``) and check a configuration; returns its values.
 
-    The classes that ``init`` and ``densify`` name check their options themselves, when they are
-    made. Raises InputError naming the key.
+    Hydra's node is left out. The classes that ``init`` and ``densify`` name check their options
+    themselves, when they are made. Raises InputError naming the key.
     """
     values = plain(config)
     # also options of components, which their classes check later
@@ -265,9 +265,10 @@ def check_external(values: Mapping[str, Any]) -> None:
 
 
 def plain(values: Any) -> Any:
-    """Settings as plain Python values of JSON's types; OmegaConf 2.4 keeps tuples.
+    """Settings as plain Python values of JSON's types.
 
-    A configuration is resolved, without Hydra's node.
+    A configuration is resolved, and Hydra's node left out. Tuples, which OmegaConf 2.4 keeps,
+    become lists.
     """
     if isinstance(values, DictConfig):
         own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])

@@ -102,7 +102,7 @@ RESOLVERS = ("hydra", "now", "oc.env", "oc.select", "python_version")
 # Hydra 1.4's own values, whose resolvers join the words of a job. With arguments they would call
 # other resolvers.
 HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirname:}")
-# not imported for the check, which may take seconds
+# Classes of this form are not imported for the check, since an import may take seconds.
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")
 # Settings that a sweep in a file may not vary: its jobs are composed after the check of the whole
 # configuration.
@@ -163,7 +163,7 @@ def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
             f"{group}.{TARGET}={target} cannot be imported: {module_name} has no "
             f"{name}{did_you_mean(name, dir(module))}"
         )
-    # A name that an allowed module merely imports (`mine.Popen`) is somebody else's code.
+    # A name that an allowed module merely imports (`mine.Popen`) is the code of another module.
     defined_as = f"{getattr(cls, '__module__', None)}.{getattr(cls, '__qualname__', name)}"
     if isinstance(cls, type) and not is_allowed(defined_as, (PACKAGE, *allowed)):
         advice = permission_advice([defined_as.split(".")[0]], allowed)
@@ -207,7 +207,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
 
 
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
-    """The packages of gsbench whose classes may stand at a place without permission."""
+    """The packages of gsbench whose classes a setting at ``place`` may name without permission."""
     if len(place) == 1 and place[0] in COMPONENTS:
         own = f"{PACKAGE}.{place[0]}"
         return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
@@ -242,7 +242,7 @@ def check_composed(
 
 
 def _differing(given: Any, installed: Any) -> Any:
-    """The part of ``given`` that differs from ``installed``: entries of mappings, else all."""
+    """The part of ``given`` that differs from ``installed``: entries of a mapping, or all."""
     if not isinstance(given, dict) or not isinstance(installed, dict):
         return given
     differing = {
@@ -304,7 +304,7 @@ def _check_place(place: tuple[str, ...], target: Any, allowed: Sequence[str]) ->
 def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
     """Refuse Hydra's own settings that would start code.
 
-    Of `MADE_NODES`, ``hydra`` has what no package wrote.
+    In ``hydra``, `MADE_NODES` hold only what no installed package wrote.
     """
     # A variable can name a file that Python, a library or a program loads, and no list of harmless
     # ones is complete.
@@ -334,7 +334,10 @@ def _check_hydra(hydra: Mapping[str, Any], allowed: Sequence[str]) -> None:
 
 
 def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[str]) -> None:
-    """Refuse a ``text`` of no package that a plug-in or logger could take for code or a file."""
+    """Refuse a ``text`` that a plug-in or logger could take for code or a file.
+
+    Call it only for a text that no installed package wrote.
+    """
     is_logging = node.endswith("_logging")
     if key in CLASS_KEYS:
         if not is_allowed(text, allowed):
@@ -349,7 +352,7 @@ def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[st
         or text in FREE_TEXTS
     ):
         return
-    # logging imports what stands behind ext://, in any text.
+    # In any text, logging imports the name after ext://.
     if (
         "://" in text
         or not text.isprintable()
@@ -364,7 +367,7 @@ def _check_text(where: str, node: str, key: str, text: str, allowed: Sequence[st
 def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
     """Import the callback classes that ``hydra.callbacks`` names.
 
-    Raises InputError for what is no such class.
+    Raises InputError for anything else.
     """
     from hydra.experimental.callback import Callback
 
@@ -383,9 +386,9 @@ def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
 
 
 def is_external(densify: Mapping[str, Any]) -> bool:
-    """Return whether these settings are another program's.
+    """Return whether these settings make another program the trainer.
 
-    The class is built under the names `EXTERNAL` only.
+    They do if their class has one of the import paths `EXTERNAL`.
     """
     return densify.get(TARGET) in EXTERNAL
 
@@ -413,7 +416,7 @@ def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
 
 
 def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:
-    """The ``variables`` that may not be set: not free, not allowed, nor at this value already."""
+    """The ``variables`` that may not be set: neither free nor allowed nor at this value already."""
     return {
         name: value
         for name, value in variables.items()

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 def run_batch(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the trials that are not done by their launcher, and return the outcomes of all."""
+    """Run the unfinished trials by their launcher, and return the outcomes of all."""
     launcher = trials[0].values["launch"]["name"]
     with storage_errors(checked_runs_folder(trials[0].values["runs"])), stop_on_signals():
         # A wrong folder of weights is an error even if all trials are done.
@@ -75,7 +75,7 @@ def _begin(trials: Sequence[Trial], unfinished: Sequence[Trial]) -> None:
 
 
 def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]:
-    """The outcomes of finished trials, and the unfinished ones, each folder once."""
+    """The outcomes of finished trials, and the unfinished trials; each folder counts once."""
     outcomes: list[Outcome] = []
     unfinished: list[Trial] = []
     for folder, trial in {trial.folder: trial for trial in trials}.items():
@@ -167,7 +167,7 @@ def check_trackers(trials: Sequence[Trial]) -> None:
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:
-    """A line for each class of the user's whose name in tables is that of a class of gsbench."""
+    """A line for each user's class whose name in tables is that of a class of gsbench."""
     lines = []
     for group in ("densify", "init"):
         parts = [trial.values[group] for trial in trials]

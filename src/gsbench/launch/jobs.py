@@ -96,7 +96,7 @@ def outcome_of_error(folder: Path, error: Exception) -> Outcome:
 
 
 def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
-    """Run the trials.
+    """Run the trials in this process, one after the other.
 
     A trial that another process is running comes last, so that two sweeps share the work.
     """
@@ -120,7 +120,7 @@ def run_one(trial: Trial, mirror: Mirror, wait: bool) -> Outcome:
     """
     mirror.follow(trial.folder, trial.values["tracking"])
     try:
-        # here, because a sweep that is done needs no torch
+        # imported here, because a finished sweep needs no torch
         from gsbench.pipeline.trial import run_trial
 
         return outcome_of_results(trial.folder, run_trial(trial, wait))
@@ -167,7 +167,7 @@ class TrialJob:
                     slot = stack.enter_context(
                         take_slot(TrialFolder.of(self.values).runs, launch["parallel"])
                     )
-                    # else its number counts the GPUs of the parent
+                    # A number as in cuda:1 counts the GPUs that the parent sees.
                     if not names_one_gpu(self.values["device"]):
                         assign_gpu(slot, self.visible_gpus)
                 assign_threads(self.values["threads"], launch["parallel"])
@@ -215,7 +215,7 @@ def job_folder(values: dict[str, Any]) -> Path:
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
     require_no_links(runs, folder)
-    # submitit leaves a link to each job script. Nobody reads it again, and `require_no_links` below
+    # submitit leaves a link to each job script. It is not read again, and `require_no_links` below
     # would refuse it.
     for link in folder.glob(".submission_file_*.sh"):
         if link.is_symlink():
@@ -228,9 +228,9 @@ def job_folder(values: dict[str, Any]) -> Path:
 def _run(
     trials: Sequence[Trial], executor: Executor, parallel: int, mirror: Mirror
 ) -> list[Outcome]:
-    """Run at most ``parallel`` processes at once.
+    """Run the trials in at most ``parallel`` processes at once.
 
-    If this process is stopped it stops them; if killed, they go on.
+    If this process is stopped, it stops them; if it is killed, they go on.
     """
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
     try:
@@ -276,7 +276,7 @@ def collect(job: Job[Outcome], folder: Path, trials: Sequence[Trial]) -> Outcome
     values = next(trial.values for trial in trials if trial.folder == folder)
     files, log_file = TrialFolder(folder), job.paths.stderr
     record = files.sound_record()
-    # the trial has just ended, so they are still unavailable
+    # The trial has just ended, so the metrics that it lacked are still unavailable.
     unavailable = () if record is None else record.awaited
     reason = files.why_not_done(values, lambda options: unavailable)
     if record is not None and not reason:
@@ -312,7 +312,7 @@ CHECKS_UNTIL_LOST = 2
 
 
 def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the trials in Slurm; await those that an earlier command submitted.
+    """Run the trials in Slurm; those in its queue from an earlier command are not submitted again.
 
     Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of
     status "queued".
@@ -373,7 +373,7 @@ def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
 
 
 def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
-    """The job of each trial by its folder: one in the queue, or a task of a new array job."""
+    """The job of each trial by its folder: its job in the queue, else a task of a new array job."""
     import submitit
 
     folders = [trial.folder for trial in trials]

@@ -104,7 +104,7 @@ def _names(folders: Sequence[Path]) -> dict[Path, Name]:
 
 
 def _kinds(name: Name) -> tuple[Name, ...]:
-    """The trials that tell how long one takes, the most similar ones first."""
+    """The keys of trials that tell how long one takes: its arm and scene, its arm, all."""
     return name, (name[0], ""), ("", "")
 
 

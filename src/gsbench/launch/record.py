@@ -56,7 +56,7 @@ def _checked_folder(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PlanFile(Record):
-    """``plan.json``; ``trials`` are by their folders within the experiment."""
+    """The file ``plan.json``: the trials by their folders within the experiment."""
 
     trials: dict[Annotated[str, AfterValidator(_checked_folder)], PlannedTrial]
 
@@ -64,8 +64,8 @@ class PlanFile(Record):
 def add_to_plan(trials: Sequence[Trial]) -> None:
     """Add the trials to the plans of their experiments.
 
-    A trial without overrides, which was read from its own record, is not added: as a plan they
-    would mean the defaults.
+    A trial without overrides was read from its own record. It is not added, because in a plan no
+    overrides mean the defaults.
     """
     by_home: dict[Path, dict[Path, PlannedTrial]] = {}
     for trial in trials:
@@ -195,7 +195,7 @@ def declare(trials: Sequence[Trial]) -> None:
 
 
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
-    """Add a claims file's, sweep's or round's questions to the experiment's record.
+    """Add the questions of a claims file, a sweep or a round of votes to the experiment's record.
 
     Returns the recorded declaration: if the latest one of its kind is equal, that one with its
     earlier time.

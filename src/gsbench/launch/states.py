@@ -1,8 +1,6 @@
 """The states of trials, from their folders and from Slurm's queue, and the listing of a dry run.
 
-Loads no torch.
-
-A file in a trial's folder names its Slurm job.
+A file in a trial's folder names its Slurm job. Loads no torch.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from gsbench.words import counted, readable_time
 
 @dataclass(frozen=True)
 class TrialState:
-    """A trial's state, since when it has it (Unix time), and a note.
+    """A trial's state, the time at which it began (Unix time), and a note.
 
     A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no
     longer the present code; a failed one if a trial of later code has the same settings.
@@ -60,7 +58,7 @@ def states_of_experiment(home: Path) -> list[TrialState]:
 
 
 def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
-    """The states; failed trials are superseded if one of the same settings got further.
+    """Mark failed and stopped trials as superseded if one with the same settings got further.
 
     Such trials differ only in the code of a user's class, which was repaired in between.
     """
@@ -228,7 +226,7 @@ def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "runn
 
 
 def read_queue(users: Iterable[str]) -> Queue | None:
-    """The jobs and array tasks of ``users`` by id; None without an answer of Slurm."""
+    """The jobs and array tasks of ``users`` by id; None if Slurm does not answer."""
     command = [
         "squeue",
         f"--user={','.join(sorted(users))}",
@@ -262,7 +260,7 @@ class FinishedTrials:
 
     def __init__(self, runs: Path) -> None:
         self._folders: dict[str, list[Path]] = defaultdict(list)
-        # for an iteration, by `_similarities`
+        # seconds per iteration, by `_similarities`
         self._seconds: dict[str, list[float]] = defaultdict(list)
         for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
             files = TrialFolder(path.parent)
@@ -286,9 +284,8 @@ class FinishedTrials:
     def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
         """Seconds for the trial with ``values``, and the number of trials that this rests on.
 
-        These have the same scene at the same size, the same rasterizer and, if possible, the same
-        densifier. Times are taken per iteration. Without such trials there is no estimate, ``(0,
-        0)``.
+        These trials have the same scene at the same size, the same rasterizer and, if possible, the
+        same densifier. Times are taken per iteration. Returns ``(0, 0)`` without such trials.
         """
         for similarity in _similarities(values):
             if seconds := self._seconds.get(similarity):
@@ -297,7 +294,10 @@ class FinishedTrials:
 
 
 def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
-    """The facts that trials of similar times share: scene, rasterizer and densifier, or two."""
+    """Hashes of scene, rasterizer and densifier, and of scene and rasterizer.
+
+    Trials that share one of them take similar times.
+    """
     shared = [settings["scene"], settings["raster"]["name"]]
     return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
 

@@ -105,7 +105,7 @@ def measure_renders(options: argparse.Namespace, runs: Path) -> None:
 def _measure(
     options: argparse.Namespace, renders: Path, photographs: Path | None, runs: Path
 ) -> None:
-    """Measure the pictures in ``renders``; ``photographs`` serve if the command names none."""
+    """Measure the pictures in ``renders``; ``photographs`` are used if the command names none."""
     if options.truth is not None:
         truth = _reference_images(options, runs)
     elif photographs is not None:
@@ -354,7 +354,7 @@ def find_destination(
 def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
     """Raise `InputError` if the experiment tests the scene on other photographs."""
     for trial in _trials(runs / destination.experiment, destination.scene):
-        # Numbers of other photographs, or of another size, are no answer to the same question.
+        # Values of other photographs, or of another size, cannot be compared with the trial's.
         conditions = trial.conditions
         size = "x".join(map(str, truth.resolution))
         if conditions["data"] != truth.data or conditions["resolution"] != size:

@@ -27,7 +27,7 @@ DAMAGE = (tarfile.TarError, zipfile.BadZipFile, EOFError, OSError, ValueError, R
 
 @contextmanager
 def opened_renders(place: Path) -> Iterator[tuple[Path, Path | None]]:
-    """The folders of renders and, from nerfbaselines, of photographs; an archive is unpacked.
+    """Yield the folders of renders and, from nerfbaselines, of photographs; unpacks an archive.
 
     Raises InputError if ``place`` is neither a folder nor such an archive.
     """
@@ -93,7 +93,7 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
 
 
 def _home(archive: Path, names: Sequence[str]) -> str:
-    """The folder in the archive that has both, with a slash at its end; "" for the archive."""
+    """The folder in the archive that has both, with a slash at its end; "" for its top level."""
     both = sorted(_parents(names, RENDERED) & _parents(names, PHOTOGRAPHS))
     if len(both) != 1:
         raise InputError(
@@ -104,7 +104,7 @@ def _home(archive: Path, names: Sequence[str]) -> str:
 
 
 def _parents(names: Sequence[str], folder: str) -> set[str]:
-    """The folders, with a slash at their ends, that have a folder of this name."""
+    """The folders that contain a ``folder`` of this name, with a slash at their ends."""
     starts = (f"/{name}".partition(f"/{folder}/") for name in names)
     return {f"{start}/".lstrip("/") for start, found, _ in starts if found}
 

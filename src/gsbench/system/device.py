@@ -44,11 +44,10 @@ def select_device(name: str, setting: str = "device") -> torch.device:
 
 
 def disable_tf32() -> None:
-    """Make GPUs compute float32 without rounding to TF32 in the whole process.
+    """Make GPUs compute float32 without rounding to TF32, in the whole process and in all passes.
 
-    Also in backward passes. By default torch lets cuDNN's convolutions round to TF32, which has 10
-    bits. SSIM subtracts nearly equal moments: with TF32 its map had errors of up to 350, and its
-    gradient was noise.
+    By default torch lets cuDNN's convolutions round to TF32, which has 10 bits. SSIM subtracts
+    nearly equal moments: with TF32 its map had errors of up to 350, and its gradient was noise.
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False

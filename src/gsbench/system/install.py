@@ -1,7 +1,4 @@
-"""The installation of gsbench.
-
-Its folder, the command that installs extras, and its state in git.
-"""
+"""The installation of gsbench: its folder, how to install extras, and its state in git."""
 
 import json
 import os
@@ -22,7 +19,7 @@ DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" 
 def install_command(extra: str = "") -> str:
     """The shell command that installs gsbench with an extra such as ``view``.
 
-    It installs from where gsbench came from.
+    It installs from the same place as gsbench itself: a checkout, a folder or the package index.
     """
     extras = f"[{extra}]" if extra else ""
     root = checkout()
@@ -32,10 +29,7 @@ def install_command(extra: str = "") -> str:
 
 
 def installed_from() -> Path | None:
-    """The folder that pip installed gsbench from, by pip's record (PEP 610).
-
-    It is None for a package index.
-    """
+    """The folder that pip installed gsbench from, by pip's record (PEP 610), or None."""
     try:
         record = distribution(DISTRIBUTION).read_text("direct_url.json")
     except PackageNotFoundError:
@@ -46,10 +40,7 @@ def installed_from() -> Path | None:
 
 
 def checkout() -> Path | None:
-    """The folder of the source checkout that gsbench runs from.
-
-    It is None if it was installed as a wheel.
-    """
+    """The folder of the source checkout that gsbench runs from; None for an installed wheel."""
     root = Path(__file__).resolve().parents[3]
     return (
         root
@@ -92,8 +83,8 @@ SAFE_SETTINGS = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protoc
 def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
     """The ``commit`` of the checkout that contains ``folder``, and whether it is ``edited``.
 
-    It is None if that is unknown. Empty if there is no checkout, or if git does not track the file
-    ``tracked``.
+    ``edited`` is None if that is unknown. Returns {} if there is no checkout, or if git does not
+    track the file ``tracked``.
     """
     commit = _git(folder, "rev-parse", "HEAD") if _git(folder, "ls-files", "--", tracked) else None
     if not commit:
@@ -108,10 +99,7 @@ def checkout_of(folder: Path, tracked: str) -> dict[str, Any]:
 
 @cache
 def own_checkout() -> dict[str, Any]:
-    """The commit of gsbench's own checkout, and whether tracked files had changed.
-
-    Empty if it is no checkout.
-    """
+    """`checkout_of` for gsbench's own code; {} if it does not run from a checkout."""
     return checkout_of(Path(__file__).parent, Path(__file__).name)
 
 
@@ -136,7 +124,7 @@ class WorkTrees:
     """
 
     def __init__(self, folder: Path, place: Path) -> None:
-        # of the folder, within the work tree
+        # the path of the folder within its work tree
         self.prefix = run_git(folder, "rev-parse", "--show-prefix")
         self._folder, self._place = folder, place
         objects = run_git(folder, "rev-parse", "--path-format=absolute", "--git-path", "objects")
@@ -149,7 +137,7 @@ class WorkTrees:
     def commits(self, first: str, last: str) -> list[tuple[str, str, str]]:
         """List (hash, date, subject) of the commits from ``first`` to ``last``.
 
-        Those inside merges are left out. Raises InputError if one of them is not a commit, or if
+        Commits inside merges are left out. Raises InputError if one of them is not a commit, or if
         ``first`` does not come before ``last``.
         """
         names = [
@@ -180,8 +168,8 @@ class WorkTrees:
 def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> str:
     """Run git in ``folder`` and return its output.
 
-    It has `SAFE_SETTINGS`, and is without `REPOSITORY_VARIABLES`. Raises InputError with git's
-    message if it fails.
+    git gets `SAFE_SETTINGS` and no `REPOSITORY_VARIABLES`. Raises InputError with git's message if
+    it fails.
     """
     environment = {
         key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES

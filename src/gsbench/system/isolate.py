@@ -67,10 +67,7 @@ def continue_in_child() -> bool:
 
 
 def end_descendants() -> None:
-    """Kill all descendants of this process.
-
-    It repeats this, since they may start others meanwhile.
-    """
+    """Kill all descendants of this process, again and again, since they may start others."""
     # not at the top: the import takes longer than many of the functions that run here
     import psutil
 
@@ -145,10 +142,10 @@ def run_isolated(
 ) -> T:
     """Return ``function(*args)``, computed in a fresh child process.
 
-    ``function`` must be a top-level function of a module other than ``__main__``. It, its arguments
-    and its result are pickled. ``what`` names the work in errors ("undistortion"). The output of
-    the child, also of native libraries, is appended to the file ``log``; without ``log`` it is
-    dropped on success.
+    ``function`` must be a top-level function of a module other than ``__main__``. The function, its
+    arguments and its result are pickled. ``what`` names the work in errors ("undistortion"). The
+    output of the child, also of native libraries, is appended to the file ``log``; without ``log``
+    it is dropped on success.
 
     An exception of the function is raised again here, with the child's traceback as a note. A crash
     of the process raises `CrashError`, whose message ends with the last error lines of the output.
@@ -176,10 +173,7 @@ POLL_SECONDS = 0.25
 
 
 class ProgressFile:
-    """A `Progress` that appends to a file, from which the parent process reads.
-
-    Its short writes are atomic.
-    """
+    """A `Progress` that appends short lines to a file, from which the parent process reads."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -196,10 +190,7 @@ def run_with_progress(
     what: str,
     log: Path | None = None,
 ) -> T:
-    """Return ``function(job, progress)``, computed in a fresh process (`run_isolated`).
-
-    Its progress is forwarded.
-    """
+    """Return ``function(job, progress)``, computed by `run_isolated`; its progress is forwarded."""
     with tempfile.TemporaryDirectory(prefix="gsbench-progress-") as folder:
         channel = ProgressFile(Path(folder, "progress.txt"))
         channel.path.touch()
@@ -232,8 +223,8 @@ def _listen(path: Path, progress: Progress, ended: threading.Event) -> None:
 def python_command(module: str, name: str, *arguments: str) -> list[str]:
     """The command of a fresh interpreter that calls ``name`` of ``module``.
 
-    It has the same module search path. The function has no parameters; ``arguments`` are in
-    ``sys.argv[2:]``.
+    The interpreter has the module search path of this process. The function has no parameters;
+    ``arguments`` are in ``sys.argv[2:]``.
     """
     search_path = json.dumps([sys.path, allowed_modules()])
     # -P: a stranger's capture in the current folder may have a json.py, which must not be imported.
@@ -248,10 +239,7 @@ def python_command(module: str, name: str, *arguments: str) -> list[str]:
 
 
 def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
-    """Start the child, wait for it and return its exit code.
-
-    On any exception here, also Ctrl-C, end it.
-    """
+    """Start the child, wait for it and return its exit code; end it on any exception, as Ctrl-C."""
     command = python_command("gsbench.system.isolate", "_child", str(call), str(result))
     # In its own session, the child does not receive Ctrl-C. The parent does and ends it: one
     # traceback, not two. Nothing is written to the pipe at stdin. When it closes, the child ends,
@@ -279,7 +267,7 @@ def _run_child(call: Path, result: Path, output: BinaryIO) -> int:
 def _end_group(leader: int) -> None:
     """Kill programs that the child left running in its session, the process group ``leader``."""
     if hasattr(os, "killpg"):
-        # none is left (macOS: only zombies are)
+        # raised if no process is left (on macOS: only zombies)
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(leader, signal.SIGKILL)
 
@@ -287,7 +275,7 @@ def _end_group(leader: int) -> None:
 def _child() -> None:
     """The main function of the child.
 
-    Its arguments are the paths of the pickled call and of the result to write.
+    The arguments of the process are the paths of the pickled call and of the result to write.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if not continue_in_child():
@@ -301,7 +289,7 @@ def _child() -> None:
     result.write_bytes(pickle.dumps(outcome))
     sys.stdout.flush()
     sys.stderr.flush()
-    # without unloading native libraries, which may crash then; the result is already written
+    # Native libraries are not unloaded, because they may crash then. The result is already written.
     os._exit(0)
 
 
@@ -315,10 +303,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def describe_exit(code: int) -> str:
-    """Describe the unexpected end of a process by its exit code.
-
-    "crashed (SIGSEGV)", "ended early (exit code 1)".
-    """
+    """Describe the unexpected end of a process by its exit code: ``crashed (SIGSEGV)``."""
     if code < 0:
         try:
             name = signal.Signals(-code).name

@@ -1,7 +1,4 @@
-"""Compilation of kernels by numba.
-
-Options, the cache on disk, and the message to the user during compilation.
-"""
+"""Compilation of kernels by numba: options, the cache on disk, and a message to the user."""
 
 import functools
 import hashlib
@@ -78,11 +75,11 @@ def cache_folder(package: Path = PACKAGE) -> Path:
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call.
 
-    Without the GIL, without Python's division checks, cached on disk. Reference counts are off, too
-    (``_nrt``): numba would update them atomically at each inlined call. So a kernel must not
-    allocate memory; the caller owns all arrays.
+    The kernel runs without the GIL and without Python's division checks, and is cached on disk.
+    Reference counts are off, too (``_nrt``): numba would update them atomically at each inlined
+    call. So a kernel must not allocate memory; the caller owns all arrays.
     """
-    # read when the decorator runs; other users of numba in this process keep theirs
+    # The decorator reads this setting. Other users of numba in this process keep their own.
     previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:

@@ -84,10 +84,7 @@ def is_held(path: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class LockHolder(Record):
-    """Record of a lock's holder about itself.
-
-    Host, process, Slurm job, start (Unix time) and work.
-    """
+    """A lock's holder: its host, process and Slurm job, since when (Unix time), and its work."""
 
     host: str
     pid: int
@@ -104,10 +101,7 @@ class LockHolder(Record):
 
 
 def read_holder(path: Path) -> LockHolder | None:
-    """Read what the holder of the lock ``path`` wrote about itself.
-
-    It is None if that is not readable.
-    """
+    """Read what the holder of the lock ``path`` wrote about itself; None if it is not readable."""
     return read_if_sound(_holder_file(path), LockHolder)
 
 

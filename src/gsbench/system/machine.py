@@ -36,11 +36,10 @@ NUMBA_MINIMA = {"NUMBA_NUM_THREADS": 1, "NUMBA_DISABLE_JIT": 0}
 
 
 def describe_machine(device: torch.device) -> dict[str, str]:
-    """Describe this machine for results.
+    """Describe this machine for results: ``cpu``, ``architecture`` and three more keys.
 
-    ``cpu``, ``architecture``, ``kernels``, ``torch``, ``device``. ``kernels`` is the processor type
-    that kernels are compiled for, with its instruction set; ``torch`` is the instruction set that
-    torch uses; ``device`` is the name of the GPU, or "cpu".
+    ``kernels`` is the processor type that kernels are compiled for, with its instruction set;
+    ``torch`` is the instruction set that torch uses; ``device`` is the name of the GPU, or "cpu".
     """
     import torch
 
@@ -77,7 +76,7 @@ def _linux_name() -> str:
     named = next((entries[key] for key in CPU_NAME_KEYS if key in entries), "")
     if named or "CPU part" not in entries:
         return named
-    # no name on 64-bit ARM
+    # 64-bit ARM has only numbers there.
     return f"ARM implementer {entries.get('CPU implementer', '?')} part {entries['CPU part']}"
 
 
@@ -115,9 +114,9 @@ def numba_target() -> tuple[str, str]:
 
 
 def kernel_target() -> str:
-    """The target of numba, this processor or ``NUMBA_CPU_NAME``.
+    """The LLVM name of the processor that numba compiles for and, on x86-64, its level.
 
-    Its LLVM name and, on x86-64, its level.
+    That is this processor, or the one in ``NUMBA_CPU_NAME``.
     """
     name, features = numba_target()
     if platform.machine().lower() not in ("x86_64", "amd64"):

@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 def available_threads(parallel: int = 1) -> int:
     """The number of CPU threads for one of ``parallel`` trials.
 
-    That of Slurm, else an equal share of the cores.
+    It is the number that Slurm gives a task, else an equal share of the cores.
     """
     slurm = os.environ.get("SLURM_CPUS_PER_TASK", "")
     if slurm.isdigit() and int(slurm) > 0:
@@ -63,7 +63,8 @@ def available_threads(parallel: int = 1) -> int:
 def trials_at_once(max_gaussians: int | None, device: str) -> int:
     """A good number of trials at once.
 
-    The number of GPUs, if they train, else by cores and memory.
+    It is 1 for one GPU by its number, the number of GPUs for training on GPUs, else what cores and
+    memory allow.
     """
     if names_one_gpu(device):
         return 1
@@ -77,9 +78,9 @@ def trials_at_once(max_gaussians: int | None, device: str) -> int:
 
 @contextmanager
 def take_slot(runs: Path, count: int) -> Iterator[int]:
-    """Hold the first free one of ``count`` slots of this machine.
+    """Hold the first free one of ``count`` slots of this machine, and yield its number.
 
-    A limit for trials of all commands together.
+    The slots limit the trials of all commands together. Waits until one is free.
     """
     folder = runs / ".slots" / socket.gethostname()
     folder.mkdir(parents=True, exist_ok=True)
@@ -96,7 +97,7 @@ def take_slot(runs: Path, count: int) -> Iterator[int]:
 
 
 def assign_gpu(slot: int, visible: str | None) -> None:
-    """Let this process see one GPU, by its slot, of those that the parent saw.
+    """Let this process see one of the GPUs that its parent saw (``visible``), chosen by ``slot``.
 
     Call it before importing torch.
     """
@@ -112,10 +113,7 @@ def assign_gpu(slot: int, visible: str | None) -> None:
 
 
 def names_one_gpu(device: str) -> bool:
-    """Return whether ``device`` names a GPU by its number, such as cuda:1.
-
-    All trials then use it.
-    """
+    """Return whether ``device`` names a GPU by its number, as cuda:1; all trials then use it."""
     return device.startswith("cuda:")
 
 
@@ -125,10 +123,7 @@ def installed_gpus() -> list[str]:
 
 
 def nvidia_smi(query: str) -> list[str]:
-    """The answers of ``nvidia-smi`` to ``--query-gpu=QUERY``, one for each GPU.
-
-    It is [] without a driver.
-    """
+    """The answers of ``nvidia-smi --query-gpu=QUERY``, one for each GPU; [] without a driver."""
     try:
         listing = subprocess.run(
             ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
@@ -176,7 +171,7 @@ def reset_peak_memory(device: torch.device) -> None:
 def peak_memory_mb(device: torch.device) -> float:
     """Peak memory since `reset_peak_memory`, MiB.
 
-    Torch's allocations on a GPU, else this process's resident memory.
+    On a GPU it is that of torch's allocations, else this process's resident memory.
     """
     if device.type == "cuda":
         import torch
@@ -200,10 +195,7 @@ def peak_resident_mb() -> float:
 
 
 def peak_child_mb() -> float:
-    """The largest peak resident memory of an ended child of this process, MiB.
-
-    It is 0 if the platform does not report it.
-    """
+    """The largest peak resident memory of an ended child of this process, MiB; 0 if not known."""
     return 0.0 if resource is None else _max_resident_mb(resource.RUSAGE_CHILDREN)
 
 

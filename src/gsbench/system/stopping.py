@@ -46,7 +46,7 @@ def requested() -> bool:
 def stop_on_signals(signals: Sequence[int] = SIGNALS) -> Iterator[None]:
     """Raise `Stopped` in the main thread if a signal comes within the block.
 
-    Restore the earlier handlers after it.
+    The earlier handlers are restored after it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -92,7 +92,7 @@ def reinstall_handlers() -> None:
 def deferred() -> Iterator[None]:
     """Defer a first signal within the block: it sets `requested` and raises `Stopped` at the end.
 
-    A second stops.
+    A second signal raises `Stopped` at once.
     """
     reinstall_handlers()
     _State.deferring += 1

@@ -33,7 +33,7 @@ MAX_TAG = 5000  # characters of an experiment's tag in older versions of MLflow
 TRIED = ("3.17.",)  # versions of MLflow whose page was seen to show the views
 COLUMNS = ("scene", "init", "densify", "seed")  # tags of a run
 ARM = "arm"  # the parameter by which runs are grouped
-VERDICT = "- Verdict, "  # how the notes begin that belong above the table
+VERDICT = "- Verdict, "  # the beginning of notes that belong above the table
 NO_VERDICT = "No verdict: it needs a declared metric (eval.primary), two arms and two seeds."
 OWN_NOTE = "`gsbench report"  # in a description that `publish` wrote
 CHART_HEIGHT = 250  # px
@@ -62,7 +62,7 @@ def publish(home: Path, uri: str | None) -> str:
 def _set(client: MlflowClient, experiment_id: str, tags: dict[str, str]) -> None:
     present = client.get_experiment(experiment_id).tags
     note = present.get(NOTE)
-    if note and OWN_NOTE not in note:  # somebody wrote a description
+    if note and OWN_NOTE not in note:  # a user wrote the description
         tags = {VIEW: tags[VIEW]}
     for key, value in tags.items():
         if len(value) <= MAX_TAG and present.get(key) != value:

@@ -6,8 +6,8 @@ crashes the process, after a trial that was complete. A process can be killed.
 
 `Mirror` starts the process, and at the end waits for it a bounded time. `follow` is the main
 function of the process. It gets the folders to follow on stdin, and reads everything else from
-files. Its exit code says how it ended, and the last line on its stderr says why. `sync` mirrors
-once, trials that have ended.
+files. Its exit code says how it ended, and the last line on its stderr says why. `sync` mirrors,
+once, the trials that have ended.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class MirrorError(Exception):
 
 
 class Mirror:
-    """Mirrors the trials that begin within a ``with`` block, by one process; none if ``idle``.
+    """Mirrors the trials that begin within a ``with`` block, by one process; ``idle``: none.
 
     At the end of the block, it waits a bounded time for the tracker. Errors of the tracker are
     never raised: one line in the log says what is missing.
@@ -154,9 +154,7 @@ SECONDS_AFTER_PARENT = 10.0
 
 
 class TrackerRun:
-    """The tracker's run of the trial in ``folder``, new or continued.
-
-    It is locked until it is closed.
+    """The tracker's run of the trial in ``folder``, new or continued, locked until it is closed.
 
     ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError
     if another process mirrors the trial, and any error of the tracker.
@@ -197,7 +195,7 @@ class TrackerRun:
         self._note()
 
     def end(self) -> None:
-        """Log the rest; close the run by the trial's files: failed, done, or otherwise killed."""
+        """Log the rest, and close the run as the trial's files say: failed, done, else killed."""
         if self.is_complete:
             return
         # the run shows earlier results, which new ones have replaced
@@ -245,8 +243,8 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             yield f"left out: {error}"
             continue
         options = values["tracking"] | ({"uri": uri} if uri else {})
-        # The runs folder may be somebody else's: it must not make us send files or passwords to an
-        # address of theirs.
+        # The runs folder may be a stranger's. It must not make gsbench send files or passwords to
+        # the stranger's address.
         if address := untyped_address(options, uri):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "
@@ -269,7 +267,7 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
 
 
 def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> bool:
-    """Mirror an ended trial; returns False if the tracker lacked nothing.
+    """Mirror an ended trial; returns False if the tracker lacks nothing.
 
     Raises the errors of `TrackerRun`.
     """
@@ -287,7 +285,7 @@ def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> M
     return MirrorError(f"{sink_of(options).name} does not take {folder.label} ({reason})")
 
 
-# by experiment and tracker: a trial there
+# for each experiment and tracker, a trial and its settings ``tracking``
 Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
 
 
@@ -393,7 +391,7 @@ class _FollowedTrial:
     def _has_ended_since(self) -> bool:
         """Return whether the trial has ended since it was added.
 
-        Older result files are of an earlier run.
+        Result files that are older are of an earlier run.
         """
         for name in (RESULTS, FAILED):
             with suppress(OSError):

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 VARIABLE = "MLFLOW_TRACKING_URI"
 LOCK = ".mlflow.lock"  # in the runs folder: one process at a time makes tables and experiments
-# else its page opens in the view for chat models
+# Without this tag, the experiment's page opens in the view for chat models.
 KIND = {"mlflow.experimentKind": "custom_model_development"}
-# Environment against printing, telemetry and hanging for minutes.
+# Environment variables against printing, telemetry and waits of minutes.
 SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",
@@ -124,8 +124,8 @@ def require_own_artifacts(client: MlflowClient, address: str, runs: Path) -> Non
 
     if client.tracking_uri != default_uri(runs):
         return
-    # The runs folder may be somebody else's, and its database name a server that would get files
-    # and our password.
+    # The runs folder may be a stranger's, and its database may name a server that would get files
+    # and the user's password.
     place = Path(local_file_uri_to_path(address))
     if not place.is_relative_to(runs / ARTIFACTS) or ".." in place.parts:
         raise InputError(

@@ -61,7 +61,7 @@ def picture_key(view: str, kind: str) -> str:
 def arm_name(densify: str, init: str) -> str:
     """The name of an arm.
 
-    What is compared most often comes first, since trackers cut long names at their end.
+    The densifier is compared most often. It comes first, since trackers cut long names at the end.
     """
     return f"{densify} · {init}"
 
@@ -85,7 +85,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a trial in a tracker, in Markdown (``note``) and in numbers."""
+    """The parts of a finished trial that a tracker shows; ``note`` is in Markdown."""
 
     note: str
     scalars: Sequence[Scalar]
@@ -158,7 +158,7 @@ class Sink(Protocol):
     def log(self, scalars: Sequence[Scalar]) -> None:
         """Log numbers.
 
-        Some may be repetitions: a process may be killed between sending and noting that.
+        Some may have been sent before, by a process that was killed before it could record that.
         """
 
     def complete(self, summary: Summary) -> None:
@@ -325,7 +325,7 @@ def _read_picture(path: Path) -> Array:
 def _seconds(record: Mapping[str, float]) -> float:
     """The training time of a record.
 
-    Without one, a function of its iteration, so that each reading gives the same.
+    For a record without a time it is computed from the iteration, so that each reading agrees.
     """
     return float(record.get("seconds", record["step"] / 1000))
 
@@ -334,7 +334,7 @@ def _seconds(record: Mapping[str, float]) -> float:
 
 
 class TensorBoardSink:
-    """The event files of one trial. They cannot be edited, so a continued trial is written anew."""
+    """The event files of one trial. They cannot be edited, so a continued trial starts anew."""
 
     name, state_file = "TensorBoard", "tensorboard.json"
 
@@ -383,7 +383,7 @@ class TensorBoardSink:
 
 # ---- Weights & Biases: ``tracking.uri`` is its server, else WANDB_BASE_URL and WANDB_MODE decide
 
-# our own axis: W&B's step must only grow, and the two files of curves are read one after the other
+# gsbench's axis: W&B's step must only grow, and two files of curves are read one after the other
 STEP = "iteration"
 
 

@@ -39,7 +39,7 @@ def write_page(trial: TrialResult, out: Path) -> None:
     Raises GsbenchError with the command to type if npx is missing or fails; then model and settings
     lie beside ``out``.
     """
-    # first of all: whatever is wrong with the trial is said before anything is downloaded
+    # First, so that an error in the trial is raised before anything is downloaded.
     settings = page_settings(trial)
     npx = shutil.which("npx")
     if npx is None:
@@ -96,9 +96,9 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
 
 
 def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The path through the cameras and back, shown until somebody takes the mouse."""
+    """The path through the cameras and back, shown until the user takes the mouse."""
     stops = [*cameras, cameras[0]]
-    # of each key the numbers of all stops, one after another
+    # for each key, the numbers of all stops one after another
     values = {key: np.ravel([stop[key] for stop in stops]).tolist() for key in cameras[0]}
     times = [SECONDS_PER_VIEW * k for k in range(len(stops))]
     return {
@@ -129,9 +129,9 @@ EFFECTS: dict[str, dict[str, Any]] = {  # all are off; the viewer wants their va
 def _camera(
     view: View, points: NDArray[np.floating], normalization: Normalization
 ) -> dict[str, Any]:
-    """The place of a test view, the point that it looks at, and its longer angle in degrees.
+    """The place of a test view, its target, and the field of view of its longer side in degrees.
 
-    The point lies at the median depth of the initial ``points`` [P, 3] before the camera. The
+    The target lies at the median depth of the initial ``points`` [P, 3] before the camera. The
     viewer turns models by half a turn about z, since its y points up.
     """
     camera = view.camera

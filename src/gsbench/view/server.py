@@ -278,7 +278,7 @@ def mean_up(views: Sequence[View]) -> NDArray[np.float64]:
 
 
 def level_up(camera: Camera, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The direction nearest to ``up`` that keeps the picture of ``camera`` upright, a unit [3].
+    """The unit vector [3] nearest to ``up`` that keeps the picture of ``camera`` upright.
 
     A page rotates around its upward direction. Around the camera's own one, the horizon would tilt.
     """

@@ -194,7 +194,7 @@ class Layers:
 
 
 class TrialPainter:
-    """Draws one trial from any camera, and from several threads at once, as its rasterizer can."""
+    """Draws one trial from any camera; several threads may draw at once, as with its rasterizer."""
 
     def __init__(self, trial: ViewedTrial, rasterizer: Rasterizer) -> None:
         self.trial, self.rasterizer = trial, rasterizer
