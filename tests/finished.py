@@ -51,6 +51,5 @@ def search_record(points: list[dict[str, Any]]) -> dict[str, Any]:
         "scenes": ["courtyard"],
         "ranges": {},
         "log": [],
-        "as_it_is": False,
         "points": points,
     }

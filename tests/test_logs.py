@@ -47,12 +47,7 @@ def test_all_characters_that_control_a_terminal_are_escaped_and_no_others(text: 
     assert not [
         c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t"
     ]
-    assert not [
-        c
-        for c in shown
-        if unicodedata.bidirectional(c)
-        in ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-    ]
+    assert not [c for c in shown if unicodedata.bidirectional(c) in TURNING]
     assert printable(shown) == shown
     if all(c.isprintable() or c in "\n\t" for c in text) and not set(text) & set(
         "\u061c\u200e\u200f"

@@ -244,11 +244,11 @@ def _named(place: tuple[Any, ...]) -> str:
 def _fault_of_leaf(item: Any) -> str:
     kind = type(item)
     if kind is str:
-        return "a text with half a character" if SURROGATE.search(item) else ""
+        return "a text with a lone surrogate (half a character)" if SURROGATE.search(item) else ""
     if kind is float:
         return "" if math.isfinite(item) else f"{item}, which is not a finite number"
     if kind is int:
-        return "" if -LARGEST_INT < item < LARGEST_INT else "an integer beyond all bounds"
+        return "" if -LARGEST_INT < item < LARGEST_INT else "an integer of more than 64 bits"
     return "" if kind is bool or item is None else f"of type {kind.__name__}"
 
 

@@ -153,7 +153,6 @@ def test_each_arm_gets_the_same_points_on_validation_views_and_the_sweep_gets_th
 
 @pytest.mark.parametrize("stops", [3, 9])  # in the search, and in the sweep
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_killed_tuning_continues_and_chooses_the_same_values(
     stops, sweep, runs, tmp_path, monkeypatch
 ):

@@ -228,7 +228,7 @@ def test_harmless_variables_need_no_permission():
 
 
 def test_a_version_command_cannot_use_values_that_are_known_later():
-    with pytest.raises(InputError, match=r"nothing is known as \{output\}"):
+    with pytest.raises(InputError, match=r"unknown placeholder \{output\}"):
         compose_one([*PROGRAM, "densify.version_command=['{output}/x']", "allow_targets=[python]"])
 
 

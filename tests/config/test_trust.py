@@ -48,7 +48,7 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {
         "is not a class for hydra.callbacks.x",
     ),
     "a class of gsbench in a strange place": (
-        calls(_target_="gsbench.logs._QuietFileHandler", filename="exploded"),
+        calls(_target_="gsbench.logs._QuietHandler", filename="exploded"),
         "is not a class for hydra.callbacks.x",
     ),
     "a copy for a callback": ({"hydra": {"callbacks": {"x": "${densify}"}}}, "write the settings"),

@@ -47,10 +47,10 @@ def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
     text = loss.read_text()
     assert text.count("PhotometricLoss(options.ssim_weight,") == 1
     loss.write_text(text + "# a comment\n")
-    assert "was done" in train()
+    assert "already done" in train()
     loss.write_text(text.replace("(options.ssim_weight,", "(0.95,"))
     assert "will be checked: the code of gsbench changed in: train" in train("--dry-run")
-    assert "was done" not in train()
+    assert "already done" not in train()
     second = results()
     assert second["metrics"]["psnr"] != first["metrics"]["psnr"]
     assert second["hashes"]["init"] == first["hashes"]["init"]

@@ -171,7 +171,7 @@ def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(environ
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
     assert len(results_of(runs, "local")) == 3
-    assert output.count("was done") == 2
+    assert output.count("already done") == 2
 
 
 TUNED = [

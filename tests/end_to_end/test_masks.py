@@ -148,7 +148,7 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     Image.fromarray(pixels).save(mask)
     capsys.readouterr()
     trial(tmp_path / "runs", capture, *words)
-    assert "was done" not in capsys.readouterr().err
+    assert "already done" not in capsys.readouterr().err
     second = json.loads((folder / "results.json").read_text())
     assert first["hashes"]["train"] != second["hashes"]["train"]
     assert first["hashes"]["config"] == second["hashes"]["config"]

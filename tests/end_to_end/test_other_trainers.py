@@ -373,7 +373,7 @@ def test_another_program_ends_with_gsbench(hanging, signum):
             ["densify.options.python=no-such-program", "allow_targets=[no-such-program,PAINTER]"],
             "no program 'no-such-program'",
         ),
-        (["densify.command='{python} {date}'"], "nothing is known as {date}; did you mean data?"),
+        (["densify.command='{python} {date}'"], "unknown placeholder {date}; did you mean data?"),
         (["densify.command='{python} x'"], "has no {data}"),
         (["densify.version=???"], "densify.version is not set"),
         (["densify.options.mode=???"], "densify.options.mode is not set"),

@@ -96,7 +96,7 @@ def test_a_command_is_split_and_its_placeholders_are_filled_once() -> None:
     for command, said in (("", "x is empty"), ("'a", "cannot be split")):
         with pytest.raises(InputError, match=said):
             split_command(command, "x")
-    with pytest.raises(InputError, match=r"x: nothing is known as \{tset\}; did you mean test\?"):
+    with pytest.raises(InputError, match=r"x: unknown placeholder \{tset\}; did you mean test\?"):
         fill_placeholders("{tset}", {"test": 1}, "x")
 
 

@@ -52,7 +52,7 @@ NAN = float("nan")
         ("images.bin", lambda data: replaced(data, 44, "<d", NAN), "has no pose that can be used"),
         ("cameras.bin", lambda data: replaced(data, 32, "<d", -300.0), "is damaged"),
         ("cameras.bin", lambda data: replaced(data, 16, "<Q", 0), "is damaged"),
-        ("points3D.bin", lambda data: replaced(data, 16, "<d", NAN), "lies nowhere"),
+        ("points3D.bin", lambda data: replaced(data, 16, "<d", NAN), "has no finite position"),
         ("points3D.bin", lambda data: replaced(data, 0, "<Q", 2**60), "truncated or damaged"),
         ("images.bin", lambda data: replaced(data, 0, "<Q", 2**60), "truncated or damaged"),
         ("cameras.bin", lambda data: data[:-3], "truncated or damaged"),

@@ -197,6 +197,9 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
     ]
     assert found == pytest.approx(expected, abs=1e-5)
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["unavailable"]["fps"] == "another program's renders are known, not its model"
+    assert (
+        metrics["unavailable"]["fps"]
+        == "only the renders of the other program are known, not its model"
+    )
     assert len(list((folder / "renders").iterdir())) == 2
     assert told == [("views", 1, 2), ("views", 2, 2)]

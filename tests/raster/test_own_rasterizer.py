@@ -85,7 +85,7 @@ def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> N
     )
     assert len(recorded["source"]["untiled"]) == 64
 
-    assert "was done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
+    assert "already done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
     with (folder / "untiled.py").open("a") as stream:
         stream.write("# another version\n")
     changed = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")

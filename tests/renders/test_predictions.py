@@ -133,5 +133,5 @@ def test_files_that_are_no_archive_of_predictions_are_refused(
         assert message in capsys.readouterr().err
     monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", 1000)
     big = as_zip(members, tmp_path / "big")
-    with pytest.raises(InputError, match="and 1 kB are the most"), opened_renders(big):
+    with pytest.raises(InputError, match="more than the limit of 1 kB"), opened_renders(big):
         pass

@@ -168,9 +168,13 @@ def sound_model() -> list[tuple[str, tuple]]:
     [
         (None, 0, None, ""),
         *(
-            (place, 0, number, f"{kind} {number} is there twice, or has no number")
+            (place, 0, number, f"{kind} {number}{fault}")
             for place, kind in ((1, "camera"), (3, "image"), (5, "point"))
-            for number in (0, LARGEST[kind] + 1, -1)
+            for number, fault in (
+                (0, " appears twice"),
+                (LARGEST[kind] + 1, f": the number must be from 0 to {LARGEST[kind]}"),
+                (-1, ": the number must be from 0"),
+            )
         ),
         (0, 2, 0, "camera 0 is damaged"),
         (0, 3, 0, "camera 0 is damaged"),
@@ -183,7 +187,7 @@ def sound_model() -> list[tuple[str, tuple]]:
         (2, 2, 7, "image 0 names camera 7, which the model lacks"),
         (2, 3, "", "image 0 has no name of its own"),
         (3, 3, "a.png", "has no name of its own"),
-        (4, 1, (0.0, np.nan, 0), "point 0 lies nowhere"),
+        (4, 1, (0.0, np.nan, 0), "point 0 has no finite position"),
         (5, 2, [(LARGEST["image"], 3)], "2D point 3 of image"),
         (5, 2, [(LARGEST["image"], -1)], "2D point -1 of image"),
         (5, 2, [(9, 0)], "2D point 0 of image 9"),
@@ -271,8 +275,8 @@ def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(
         ("images", "1 0 0 0 0 0 0 5 1 a.png\n1 2 -1", "image 1 .* has no pose"),
         ("images", "1 1 0 0 0 0 0 nan 1 a.png\n1 2 -1", "image 1 .* has no pose"),
         ("images", "1 1 0 0 0 0 0 5 2 a.png\n1 2 -1", "names camera 2"),
-        ("points3D", "1 0 0 nan 0 0 0 0.1", "point 1 lies nowhere"),
-        ("points3D", "1 nan 0 5 0 0 0 0.1", "point 1 lies nowhere"),
+        ("points3D", "1 0 0 nan 0 0 0 0.1", "point 1 has no finite position"),
+        ("points3D", "1 nan 0 5 0 0 0 0.1", "point 1 has no finite position"),
         ("points3D", "1 0 0 5 0 0 0 x", "truncated or damaged"),
         ("points3D", "1 0 0 5 0 0 0 0.1 1 1", "2D point 1 of image 1"),
         ("points3D", "1 0 0 5 0 0 0 0.1 2 0", "2D point 0 of image 2"),

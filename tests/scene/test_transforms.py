@@ -116,9 +116,22 @@ def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path: Path) 
     for name, camera in one.items():
         np.testing.assert_allclose(camera.rotation, other[name].rotation, atol=1e-9)
         np.testing.assert_allclose(camera.translation, other[name].translation, atol=1e-9)
-    cloud = read_cloud(moved.model)  # type: ignore[arg-type]
-    np.testing.assert_allclose(cloud.points, points, atol=1e-9)
-    assert cloud.colors.tolist() == [[10, 20, k] for k in range(5)]
+    for capture in (moved, capture_of(in_blenders_files(folder), tmp_path / "three")):
+        cloud = read_cloud(capture.model)  # type: ignore[arg-type]
+        np.testing.assert_allclose(cloud.points, points, atol=1e-9)
+        assert cloud.colors.tolist() == [[10, 20, k] for k in range(5)]
+
+
+def in_blenders_files(folder: Path) -> Path:
+    """The same folder with a file of training views, and one of test views without a transform."""
+    document = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    test = {"file_path": "images/test.png", "transform_matrix": looking_at_origin(EYES[0]).tolist()}
+    (folder / "images" / "test.png").write_bytes((folder / "images" / "0.png").read_bytes())
+    left_out = ("applied_transform", "applied_scale", "ply_file_path")
+    without = {key: value for key, value in document.items() if key not in left_out}
+    (folder / "transforms_test.json").write_text(json.dumps(without | {"frames": [test]}))
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -386,6 +399,14 @@ def test_known_keys_without_effect_are_ignored_without_a_warning(
     assert not caplog.text
 
 
+def test_black_transparent_is_refused_where_transparent_pixels_become_white(tmp_path: Path) -> None:
+    folder = write(tmp_path / "in", black_transparent=True)
+    assert CaptureSource(SceneConfig(name="t", kind="transforms", path=str(folder))).step
+    white = SceneConfig(name="t", kind="transforms", path=str(folder), transparent="white")
+    with pytest.raises(InputError, match=r"black_transparent: .*save the files so"):
+        _ = CaptureSource(white).step
+
+
 def test_unknown_keys_are_named_in_one_line(tmp_path: Path, caplog) -> None:
     read_transforms(write(tmp_path / "in", in_each_frame(lens="wide"), exporter="x", fl_X=3.0))
     (record,) = caplog.records
@@ -412,7 +433,7 @@ def test_nerfstudios_lists_of_filenames_are_the_split(
     assert (capture.train_names, capture.test_names) == (names(train), names(test))
     assert not caplog.text
     assert len(capture_of(folder, tmp_path / "other").image_names) == 6
-    assert "a split of its own, which scene.split=list takes" in caplog.text
+    assert "its own split: scene.split=list uses it" in caplog.text
 
 
 @pytest.mark.parametrize("written", ["images/4.JPG", "images/4", "IMAGES/4.PNG", "images\\4.jpeg"])

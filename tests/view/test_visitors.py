@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import types
 from collections.abc import Iterator
 from typing import Any
 
@@ -82,7 +81,7 @@ def test_the_running_server_accepts_the_same_requests(server: Any, upgrade: bool
 def test_an_unguarded_server_is_refused() -> None:
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     with (
-        pytest.raises(GsbenchError, match="cannot be kept from strange web pages"),
+        pytest.raises(GsbenchError, match="other web pages could reach the viewer"),
         refuse_other_pages(),
     ):
-        types.SimpleNamespace()
+        pass  # a server that starts here would not be guarded

@@ -294,8 +294,8 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
 def _check_size(size: int) -> None:
     if size > MAX_TOTAL_BYTES:
         raise InputError(
-            f"its files are {readable_bytes(size)}, and {readable_bytes(MAX_TOTAL_BYTES)} are the "
-            "most"
+            f"its files are {readable_bytes(size)}, more than the limit of "
+            f"{readable_bytes(MAX_TOTAL_BYTES)}"
         )
 
 

@@ -72,7 +72,7 @@ def fill_placeholders(text: str, values: Mapping[str, object], key: str) -> str:
         if name not in values:
             names = ", ".join(f"{{{known}}}" for known in values)
             raise InputError(
-                f"{key}: nothing is known as {{{name}}}{did_you_mean(name, values)} (there are "
+                f"{key}: unknown placeholder {{{name}}}{did_you_mean(name, values)} (there are "
                 f"{names})"
             )
         return str(values[name])

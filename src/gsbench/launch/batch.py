@@ -83,7 +83,7 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
             unfinished.append(trial)
         else:
             outcomes.append(outcome_of_results(folder, trial.files.record()))
-            log.info("%s: was done  %s", outcomes[-1].label, outcomes[-1].message)
+            log.info("%s: already done  %s", outcomes[-1].label, outcomes[-1].message)
     return outcomes, unfinished
 
 

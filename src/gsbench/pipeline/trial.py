@@ -153,7 +153,7 @@ def run_trial(trial: Trial, wait: bool = True) -> TrialRecord:
         folder.path.mkdir(parents=True, exist_ok=True)
         with hold(folder.lock, folder.label, wait), log_to(folder.path / layout.LOG):
             if not folder.why_not_done(trial.values):
-                log.info("%s: was done", folder.label)
+                log.info("%s: already done", folder.label)
                 return folder.record()
             remove_temporaries(folder.path)
             return _run(trial, folder)
@@ -234,7 +234,7 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         (folder.path / layout.BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
-    log.info("%s: %s%s%s", folder.label, metrics, size, "  (was done)" if was_done else "")
+    log.info("%s: %s%s%s", folder.label, metrics, size, "  (already done)" if was_done else "")
     if results.learnt_nothing:
         log.warning("%s: %s", folder.label, results.learnt_nothing)
     return results

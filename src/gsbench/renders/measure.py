@@ -248,7 +248,9 @@ def reference_images_of(trial: TrialResult) -> ReferenceImages:
     """The reference images of a finished trial, as its own evaluation names and orders them."""
     photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
     if trial.record.resolution is None or "data" not in trial.record.hashes:
-        raise InputError(f"{trial.label} does not say what it was tested on: run this trial again")
+        raise InputError(
+            f"{trial.label} has no record of the size or hash of its test views: run it again"
+        )
     what = f"the test views of {trial.label}"
     return ReferenceImages(
         photographs,

@@ -88,7 +88,9 @@ def _wanted(archive: Path, sizes: dict[str, int]) -> dict[str, str]:
     total = sum(sizes[name] for name in wanted)
     if total > MAX_TOTAL_BYTES:
         most = readable_bytes(MAX_TOTAL_BYTES)
-        raise InputError(f"{archive} unpacks to {readable_bytes(total)}, and {most} are the most")
+        raise InputError(
+            f"{archive} unpacks to {readable_bytes(total)}, more than the limit of {most}"
+        )
     return wanted
 
 

@@ -305,7 +305,7 @@ class ModelChecks:
         self, point_id: int, position: Sequence[float], track: Iterable[Sequence[int]]
     ) -> None:
         if not all(map(math.isfinite, position)):
-            raise InputError(f"point {point_id} lies nowhere ({_listed(position)})")
+            raise InputError(f"point {point_id} has no finite position ({_listed(position)})")
         _check_id(point_id, self._points, "point", MAX_POINT_ID)
         self._points.add(point_id)
         for image_id, index in track:
@@ -334,5 +334,7 @@ def _listed(numbers: Sequence[float]) -> str:
 
 
 def _check_id(number: int, earlier: Collection[int], what: str, largest: int) -> None:
-    if number in earlier or not 0 <= number <= largest:
-        raise InputError(f"{what} {number} is there twice, or has no number")
+    if number in earlier:
+        raise InputError(f"{what} {number} appears twice")
+    if not 0 <= number <= largest:
+        raise InputError(f"{what} {number}: the number must be from 0 to {largest}")

@@ -127,7 +127,7 @@ def read_transforms(
             "scene.masks"
         )
     if transforms.split is not None and not split.asks_the_capture and not split.by_lists:
-        log.warning("%s has a split of its own, which scene.split=list takes", transforms.files[0])
+        log.warning("%s has its own split: scene.split=list uses it", transforms.files[0])
     capture = _make_capture(
         name,
         root,

@@ -34,6 +34,7 @@ from gsbench.parsing import (
     without_byte_order_mark,
 )
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size, list_images, match_names
+from gsbench.scene.options import Backdrop
 from gsbench.scene.transforms_keys import check_keys
 from gsbench.scene.types import Array, CameraModel
 from gsbench.words import some_of
@@ -113,15 +114,15 @@ class Transforms:
     """Converted content of a folder's files: cameras by image name, their split, and their points.
 
     ``split`` are the names for training and for testing, or None if one file holds all images.
-    ``points`` is a PLY file; ``applied.undo`` converts its coordinates to those of the cameras.
-    ``has_mask_paths`` says that at least one image names a mask.
+    ``points`` is a PLY file; ``applied_to_points.undo`` converts its coordinates to those of the
+    cameras. ``has_mask_paths`` says that at least one image names a mask.
     """
 
     files: tuple[Path, ...]
     images: dict[str, PosedCamera]
     split: tuple[list[str], list[str]] | None
     points: Path | None
-    applied: AppliedTransform
+    applied_to_points: AppliedTransform
     has_mask_paths: bool
 
     @property
@@ -165,14 +166,17 @@ def find_files(folder: Path) -> dict[str, Path]:
     return files
 
 
-def read_transforms(folder: Path) -> Transforms:
-    """Read the cameras in ``folder``; raises InputError for a file that cannot be understood."""
+def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
+    """Read the cameras in ``folder``; raises InputError for a file that cannot be understood.
+
+    ``backdrop`` is the colour under transparent pixels.
+    """
     files = find_files(folder)
-    records = {split: _read_record(path) for split, path in files.items()}
+    records = {split: _read_record(path, backdrop) for split, path in files.items()}
     find = _FileFinder(folder)
     images: dict[str, PosedCamera] = {}
     names: dict[str, list[str]] = {split: [] for split in files}
-    points, applied = None, AppliedTransform()
+    points, applied_to_points = None, AppliedTransform()
     for split, record in records.items():
         path, missing = files[split], []
         applied = _applied_transform(path, record)
@@ -190,6 +194,7 @@ def read_transforms(folder: Path) -> Transforms:
             log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
         if record.ply_file_path is not None:
             points = folder / _relative_path(path, record.ply_file_path)
+            applied_to_points = applied
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
     own_lists = _named_split(files[""], records[""], images) if "" in files else None
@@ -199,7 +204,7 @@ def read_transforms(folder: Path) -> Transforms:
         dict(sorted(images.items())),
         own_lists if held_out is None else (sorted(names["train"]), held_out),
         points,
-        applied,
+        applied_to_points,
         any(frame.mask_path for record in records.values() for frame in record.frames),
     )
 
@@ -214,14 +219,16 @@ def _relative_path(path: Path, written: str) -> PurePosixPath:
     return relative
 
 
-def _read_record(path: Path) -> TransformsRecord:
+def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     content = read_bytes(resolved(path))
     try:
         content = without_byte_order_mark(content)
     except InputError as error:
         raise DamagedError(path, f"cannot be read: {error}") from error
     record = parse_typed(content, TransformsRecord, path)
-    check_keys(path, from_json(content), names_of(TransformsRecord), names_of(FrameRecord))
+    check_keys(
+        path, from_json(content), names_of(TransformsRecord), names_of(FrameRecord), backdrop
+    )
     return record
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.errors import InputError
+from gsbench.scene.options import Backdrop
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
@@ -31,7 +32,7 @@ DEPTH = (
     "depth_unit_scale_factor",
 )
 OTHER_DATA = ("enable_ray_loading", "normal_file_path", "envmap")
-# `black_transparent` makes black pixels transparent, and these are blended over black.
+# `black_transparent` makes black pixels transparent: harmless where these are blended over black.
 TRAINING = ("importance_sampling", "n_extra_learnable_dims", "black_transparent")
 NOTES = (
     "sharpness",
@@ -64,25 +65,34 @@ REFUSED = {
     "white_transparent": "it makes white pixels transparent: save the files so",
     "time": "a scene that moves cannot be trained as one that stands still",
 }
+BLACK_BECOMES_WHITE = {
+    "black_transparent": "it makes black pixels transparent, which scene.transparent=white "
+    "makes white: save the files so"
+}
 
 
 def check_keys(
-    path: Path, document: Any, file_keys: Collection[str], frame_keys: Collection[str]
+    path: Path,
+    document: Any,
+    file_keys: Collection[str],
+    frame_keys: Collection[str],
+    backdrop: Backdrop,
 ) -> None:
     """Check the keys of a file that gsbench does not use.
 
-    ``file_keys`` are the used keys of the file, ``frame_keys`` those of a frame. Raises InputError
-    for a key of `REFUSED` whose value has an effect (`says_something`). Logs one line that names
-    unknown keys.
+    ``file_keys`` are the used keys of the file, ``frame_keys`` those of a frame; ``backdrop`` is
+    the colour under transparent pixels. Raises InputError for a key of `REFUSED` whose value has an
+    effect (`says_something`). Logs one line that names unknown keys.
     """
+    refused = REFUSED if backdrop == "black" else REFUSED | BLACK_BECOMES_WHITE
     unknown: set[str] = set()
     records = [("", document, file_keys)]
     for number, frame in enumerate(document["frames"]):
         records.append((f" (frame {number})", frame, frame_keys))
     for place, record, used in records:
         for key, value in record.items():
-            if key in REFUSED and says_something(key, value):
-                raise InputError(f"{path}: {key}{place}: {REFUSED[key]}")
+            if key in refused and says_something(key, value):
+                raise InputError(f"{path}: {key}{place}: {refused[key]}")
             if key not in used and key not in HARMLESS and key not in REFUSED:
                 unknown.add(key)
     if unknown:

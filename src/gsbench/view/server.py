@@ -353,5 +353,5 @@ def refuse_other_pages() -> Iterator[None]:
         yield
     if not started:
         raise GsbenchError(
-            "this version of viser cannot be kept from strange web pages: install viser 1.1"
+            "other web pages could reach the viewer in this version of viser: install viser 1.1"
         )

@@ -54,7 +54,7 @@ class MappingResult:
             return ()
         counts = ", ".join(f"{strategy} {count}" for strategy, count in self.tried)
         return (
-            f"cameras come from the way {self.strategy!r}, since COLMAP's defaults placed too few "
+            f"cameras come from the strategy {self.strategy!r}: COLMAP's defaults placed too few "
             f"(images: {counts})",
         )
 

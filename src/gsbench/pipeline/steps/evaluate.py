@@ -151,7 +151,7 @@ def _build_from_renders(views: Views, trained: Step, parts: Parts) -> Callable[[
                 report("views", done, len(scene.test))
         unknown = {}
         if parts.eval.fps is not None:
-            unknown["fps"] = "another program's renders are known, not its model"
+            unknown["fps"] = "only the renders of the other program are known, not its model"
         _write_metrics(folder, evaluator, per_view, scene, unknown)
 
     return build

@@ -105,7 +105,8 @@ class CaptureSource:
 
     @cached_property
     def _transforms(self) -> Transforms:
-        return read_transforms_files(existing_folder(self.name, str(self.options.path)))
+        folder = existing_folder(self.name, str(self.options.path))
+        return read_transforms_files(folder, self.options.transparent)
 
 
 def _courtyard_step(options: SceneConfig) -> Step:
@@ -130,7 +131,7 @@ def _transforms_step(transforms: Transforms) -> Step:
         if transforms.points is not None:
             points, colors = read_points(transforms.points)
             grey = np.full(points.shape, GREY, dtype=np.uint8)
-            cloud = transforms.applied.undo(points), grey if colors is None else colors
+            cloud = transforms.applied_to_points.undo(points), grey if colors is None else colors
         write_frames(target / SPARSE_FOLDERS[0], transforms.images, cloud=cloud)
 
     return step_of(CAPTURE, inputs, build)
