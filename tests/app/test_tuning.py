@@ -29,7 +29,7 @@ from hydra_plugins.gsbench import TUNE
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
 
-pytest.importorskip("optuna", reason="needs Optuna (extra search)")
+optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
 
 FILE = """\
 # @package _global_
@@ -273,7 +273,14 @@ def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(sweep, runs, capsy
 
 def test_an_interval_searches_one_arm(runs, monkeypatch):
     """A search is the tuning of one arm: its best is trained with the seeds of the command."""
-    fake = Fake()
+    fake, sampler_settings = Fake(), {}
+    sampler = optuna.samplers.TPESampler
+
+    def make_sampler(**settings):
+        sampler_settings.update(settings)
+        return sampler(**settings)
+
+    monkeypatch.setattr(optuna.samplers, "TPESampler", make_sampler)
     monkeypatch.setattr("gsbench.app.command.run_batch", fake)
     words = [
         "-m",
@@ -289,6 +296,8 @@ def test_an_interval_searches_one_arm(runs, monkeypatch):
     ]
     assert cli.run([*words, *searched]) == 0
     assert fake.batches == [2, 1, 2]
+    # Points that run together must know of each other, or the sampler may choose one twice.
+    assert sampler_settings == {"seed": 0, "constant_liar": True}
     part = search_summary(runs / "fair-tune-random-volumetric")
     assert part is not None
     assert "no test view was looked at" in part[0]

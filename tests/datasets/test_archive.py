@@ -7,6 +7,7 @@ import io
 import os
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 from gsbench.datasets.archive import (
     DamagedMemberError,
     extract,
+    is_complete,
     open_archive,
     open_archive_at,
     wanted_members,
@@ -105,6 +107,25 @@ def test_damaged_bytes_of_a_member_are_detected(compression: int, tmp_path: Path
             assert (tmp_path / "a.jpg").read_bytes() == content
             (tmp_path / "a.jpg").unlink()
     assert not (tmp_path / "a.jpg").exists()
+
+
+def test_a_file_is_complete_by_its_size_and_checksum(tmp_path: Path) -> None:
+    file = tmp_path / "a.jpg"
+    checksum = zlib.crc32(b"content")
+    assert not is_complete(file, 7, checksum)
+    for content, complete in ((b"content", True), (b"contenu", False), (b"content2", False)):
+        file.write_bytes(content)
+        assert is_complete(file, 7, checksum) is complete
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_as_an_archive_is_refused_and_not_awaited(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x.zip")
+    with (
+        pytest.raises(InputError, match=r"x\.zip"),
+        open_archive_at(str(tmp_path / "x.zip"), PATIENT),
+    ):
+        pass
 
 
 @pytest.fixture

@@ -92,11 +92,11 @@ def failing() -> Any:
         (endless, r"eval\.extra\.own raised RecursionError .*test_own_metric\.py"),
         (
             lambda: 10**400,
-            r"eval\.extra\.own must return a number for each view, got a too large one",
+            r"eval\.extra\.own must return a number for each view, got one that is too large",
         ),
         (
             lambda: 10**5000,
-            r"eval\.extra\.own must return a number for each view, got a too large one",
+            r"eval\.extra\.own must return a number for each view, got one that is too large",
         ),
     ],
 )

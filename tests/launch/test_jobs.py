@@ -1,6 +1,7 @@
 """The files of a trial say how its job ended; the result that the job returned is not read."""
 
 import json
+import logging
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
+from gsbench.launch import jobs
 from gsbench.launch.jobs import Outcome, clouds_first, collect, job_folder
 
 
@@ -68,3 +70,28 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     (folder / "2_0_0_log.out").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match=r"2_0_0_log\.out is a link"):
         job_folder(values)
+
+
+def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
+    folder, monkeypatch, caplog
+):
+    """The first job wrote a result, the second is listed once more and then missing twice."""
+    caplog.set_level(logging.INFO, "gsbench")
+    queues = iter([{"7_1"}, None, set(), {"7_1"}, set(), set()])
+    monkeypatch.setattr(jobs, "read_queue", lambda users: next(queues))
+    monkeypatch.setattr(jobs, "SECONDS_BETWEEN_POLLS", 0)
+    monkeypatch.setattr(jobs, "SECONDS_BETWEEN_QUEUE_CHECKS", -1)
+    trials = [compose_one(["name=x", f"seed={seed}"]) for seed in (0, 1)]
+    waiting = {}
+    for number, trial in enumerate(trials):
+        paths = SimpleNamespace(
+            result_pickle=folder / f"{number}.pkl", stderr=folder / f"{number}.log"
+        )
+        waiting[trial.folder] = SimpleNamespace(job_id=f"7_{number}", paths=paths)
+    (folder / "0.pkl").write_bytes(b"")
+    outcomes = jobs._wait(waiting, trials)
+    assert [outcome.folder for outcome in outcomes] == [trial.folder for trial in trials]
+    assert list(queues) == []
+    said = [record.getMessage() for record in caplog.records]
+    assert ["seed 0" in said[0], "seed 1" in said[1]] == [True, True]
+    assert [line.endswith(f"({k} of 2)") for k, line in enumerate(said, 1)] == [True, True]

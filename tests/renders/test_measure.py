@@ -7,7 +7,13 @@ from pathlib import Path
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.renders.measure import Destination, ReferenceImages, find_destination
+from gsbench.renders.measure import (
+    Destination,
+    ReferenceImages,
+    check_destination,
+    find_destination,
+)
+from tests.analysis.synthetic import Plan, write_runs
 
 COURTYARD = ReferenceImages(
     {}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm"
@@ -39,3 +45,24 @@ def test_the_scene_of_the_photographs_may_be_repeated(tmp_path: Path) -> None:
     assert find_destination("table1:mine", "courtyard", 3, COURTYARD, tmp_path) == wanted
     assert find_destination("table1:mine", None, 3, COURTYARD, tmp_path) == wanted
     assert find_destination("table1:mine", "garden", 3, FOLDER, tmp_path).scene == "garden"
+
+
+@pytest.mark.parametrize(
+    ("data", "resolution", "refused"),
+    [
+        ("data-garden", (400, 300), False),
+        ("data-garden", (400, 301), True),
+        ("data-stump", (400, 300), True),
+    ],
+)
+def test_renders_of_other_photographs_than_the_experiments_are_refused(
+    data: str, resolution: tuple[int, int], refused: bool, tmp_path: Path
+) -> None:
+    write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
+    truth = ReferenceImages({}, "the pictures in a folder", data, resolution, {})
+    destination = Destination("exp", "garden", "sfm", "mine", 0)
+    if refused:
+        with pytest.raises(InputError, match="tests garden on other photographs"):
+            check_destination(destination, truth, tmp_path)
+    else:
+        check_destination(destination, truth, tmp_path)

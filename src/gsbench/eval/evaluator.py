@@ -295,7 +295,7 @@ class Evaluator:
             return float(value)
         except OverflowError:
             raise InputError(
-                f"eval.extra.{key} must return a number for each view, got a too large one"
+                f"eval.extra.{key} must return a number for each view, got one that is too large"
             ) from None
 
     def _leave_out(self, key: str, error: UnavailableError) -> None:
