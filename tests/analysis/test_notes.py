@@ -1,5 +1,4 @@
-"""Notes on what trials have in common, word for word, for made-up trials whose numbers are
-known."""
+"""Notes on what trials have in common, word for word, for made-up trials."""
 
 import json
 from dataclasses import replace

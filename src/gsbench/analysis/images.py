@@ -158,7 +158,7 @@ def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     """
     first, second, truth = read_compared(*pair, view)
     errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
-    nearer = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)  # [H, W], 1: the second is
+    nearer = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)  # [H, W], above 0: the second is
     gain = nearer[..., None]  # [H, W, 1]
     white, blue, red = (
         np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43))

@@ -37,8 +37,10 @@ FEW = 1.2
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """One scene of a verdict: its mean paired difference, with a test adjusted for all scenes of
-    all questions."""
+    """One scene of a verdict: its mean paired difference, with a test.
+
+    The test is adjusted for all scenes of all questions.
+    """
 
     scene: str
     mean: float

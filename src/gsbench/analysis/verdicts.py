@@ -345,7 +345,7 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
     """The statement about scenes like these in words; "" with too few scenes.
 
     For example ``scenes like these: undecided; it helps in 7 of 8 (sign test p 0.070, …)``.
-    ``words`` has the word for each outcome, ``what`` the words for a gain.
+    ``words`` has other words for outcomes, ``what`` the words for a gain.
     """
     like = verdict.like_these
     if like is None:
