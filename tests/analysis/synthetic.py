@@ -134,9 +134,9 @@ def write_trial(
     config_hash: str = "c0ffee00",
     **settings: Any,
 ) -> Path:
-    """Write one trial folder: results, per-view metrics, events, curves and a configuration.
+    """Write a trial's folder: results, per-view metrics, events, curves, and a configuration.
 
-    ``settings`` are further settings, as ``group__key``.
+    ``settings`` (``group__key=value``) are added to the configuration.
     """
     path = trial_folder(runs, data, config_hash)
     path.mkdir(parents=True)
@@ -172,9 +172,10 @@ def write_arms(
     experiment: str = "exp",
     **settings: Any,
 ) -> list[Path]:
-    """Write trials of arms, each with its densifier's settings; all get ``group__key``.
+    """Write trials of arms whose results are noise.
 
-    Their results are noise.
+    ``arms`` has the densifier's settings of each arm; ``settings`` (``group__key=value``) are
+    for all.
     """
     rng = np.random.default_rng(0)
     paths = []
@@ -200,8 +201,8 @@ TEXTURED = slice(80, 160)  # columns of the ground truth that hold grass; the ot
 def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
     """Write ground truth that is smooth on the left and grassy on the right, and renders.
 
-    "adc" blurs the grass more than "volumetric". In the upper left corner "volumetric" is off by 20
-    levels, where "adc" is right.
+    "adc" blurs the grass more than "volumetric". In the upper left corner "volumetric" is off
+    by 20 levels, where "adc" is right.
     """
     noise = np.random.default_rng(data["seed"])
     for folder in ("renders", "ground_truth"):
@@ -241,7 +242,7 @@ def write_point_cloud(path: Path, data: dict[str, Any]) -> None:
 
 
 def events(data: dict[str, Any]) -> list[dict[str, int]]:
-    """Refinements every 100 iterations, with a volume split where the densifier has one."""
+    """Refinements every 100 iterations; only "volumetric" splits by volume."""
     volume = 4 if data["densify"] == "volumetric" else 0
     counts = {"cloned": 20, "split_gradient": 12, "split_volume": volume, "pruned_opacity": 7}
     return [{"step": step, **counts} for step in range(600, data["iterations"] + 1, 100)]

@@ -1,4 +1,4 @@
-"""A user's metric that is added to an experiment later: earlier trials count as without it."""
+"""A user's own metric that is added later: for older trials its setting counts as unset."""
 
 from pathlib import Path
 

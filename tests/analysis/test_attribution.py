@@ -1,4 +1,4 @@
-"""The ingredients in which two arms differ, named wherever the arms are compared."""
+"""The differences between two arms are named wherever the arms are compared."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SCHEDULE |= {
 
 
 def config(name: str, **changes: Any) -> dict[str, Any]:
-    """A shipped densifier as a trial records it."""
+    """The settings of a shipped densifier as a trial records them, with ``changes``."""
     own = {
         f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v)
         for key, v in shipped_arms()[name].items()
@@ -51,7 +51,7 @@ def config(name: str, **changes: Any) -> dict[str, Any]:
 
 
 def densifier(name: str, **changes: Any) -> dict[str, Any]:
-    """The settings of a shipped densifier, without their prefix."""
+    """The same settings without the prefix ``densify.``."""
     prefix = "densify."
     return {
         key.removeprefix(prefix): v
@@ -111,7 +111,7 @@ def test_every_shipped_class_lists_how_it_departs_from_adc() -> None:
     assert {settings["_target_"] for settings in shipped_arms().values()} == set(departures())
 
 
-def test_settings_that_only_name_or_place_a_trial_are_no_ingredient() -> None:
+def test_settings_that_only_name_or_place_a_trial_are_no_ingredients() -> None:
     other = config("adc") | {
         "densify.name": "adc-2",
         "eval.primary": "psnr",
@@ -176,7 +176,7 @@ def test_a_comparison_of_several_ingredients_is_reported(tmp_path: Path) -> None
     assert sentence(trials, "adc", "longaxis") in notes
 
 
-def test_a_comparison_of_one_ingredient_is_not_commented(tmp_path: Path) -> None:
+def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path: Path) -> None:
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
     assert sentence(trials, "adc", "volumetric") == ""
     assert not any(

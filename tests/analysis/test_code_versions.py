@@ -1,4 +1,4 @@
-"""Cells never mix two versions of the code, and superseded trials are named."""
+"""Table cells never mix versions of the code, and superseded trials are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Declared metrics: how verdicts are adjusted, and what is reported on late declarations."""
+"""Declared metrics: which tests are adjusted together, and what is said of late declarations."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family() ->
     assert first.outcome(1, None) == "undecided"
 
 
-# --- what readers are told
+# --- what report and table say
 
 
 def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path) -> None:
@@ -342,10 +342,10 @@ WHOLE = planned([0, 1, 2])
     ],
 )
 @pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
-def test_trials_that_were_added_after_results_cost_the_metric_its_place(
+def test_a_metric_whose_trials_were_added_after_results_is_adjusted_with_all_others(
     tmp_path: Path, trials: dict[str, list[int]], words: str, recorded: bool
 ) -> None:
-    """Whether a later command wrote its additions down, or trials were brought in past it."""
+    """A later command recorded the additions, or the trials came without a record."""
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
     (one,) = judged(experiment)

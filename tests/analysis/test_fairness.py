@@ -1,4 +1,4 @@
-"""The fairness sheet, generated from records and files, without any omission."""
+"""The fairness sheet has everything that records and files say about two arms."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The data frame of an experiment: one row a trial, as the result files have it."""
+"""The data frame of an experiment: one row per trial, with the values of the result files."""
 
 import io
 import json

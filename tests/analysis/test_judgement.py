@@ -1,4 +1,4 @@
-"""`pair` and `judge` on trials in files: what is paired or named, and what decides an outcome."""
+"""`pair` and `judge` on trials in files: pairs, trials that are left out, and outcomes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 
 
 def named(trials: tuple[TrialResult, ...], seeds: tuple[int, ...] = (0, 1, 2)) -> Question:
-    """The question about these trials by their folders."""
+    """The question that names these trials by their folders."""
     keys = {(trial.scene, trial.densify): trial.key for trial in trials}
     scenes = {scene: (keys[scene, "adc"], keys[scene, "volumetric"]) for scene, _ in keys}
     return replace(PSNR, scenes=scenes, seeds=seeds, name="claim")

@@ -1,4 +1,4 @@
-"""Machines and initial clouds may differ between trials, and notes always report it."""
+"""Trials of several machines or initial clouds are averaged and compared, always with a note."""
 
 from collections.abc import Callable
 from pathlib import Path

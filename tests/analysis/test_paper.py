@@ -1,4 +1,4 @@
-"""The paper as data: its numbers against its own text, and the classing of cells."""
+"""The paper as data: its numbers agree with its text, and measured cells are marked by them."""
 
 import re
 
@@ -195,7 +195,7 @@ def test_an_experiment_without_the_papers_arms_is_refused(make_experiment):
     assert build_table(experiment).rows
 
 
-def test_the_verb_prints_and_writes(tmp_path, capsys):
+def test_the_tables_verb_prints_and_writes_files(tmp_path, capsys):
     runs = tmp_path / "runs"
     write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     assert tables(["table1"], runs) == 0
@@ -236,7 +236,7 @@ def test_the_table_of_differences_quotes_the_papers_setup(make_experiment):
         assert "The paper on hardware: it trained on one NVIDIA RTX 2080." in written
 
 
-def test_the_papers_own_set_up_has_the_papers_layout(tmp_path, capsys):
+def test_an_experiment_with_the_suffix_own_has_the_papers_layout(tmp_path, capsys):
     write_runs(tmp_path, Plan(experiment="table1_own", inits=("dim_paper",), scenes=("garden",)))
     assert tables(["table1_own"], tmp_path) == 0
     out = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The report: one page without other files, accessible, with the verdict first."""
+"""The report: one page that needs no other file, with the verdict first, usable by everybody."""
 
 import base64
 import io
@@ -100,7 +100,7 @@ class Elements(HTMLParser):
         return [attrs for name, attrs in self.found if name == tag]
 
 
-def test_the_page_is_well_formed_and_needs_nothing_else(page):
+def test_the_page_is_well_formed_and_needs_no_other_file(page):
     elements = Elements(page)
     assert elements.open == []
     for tag, attribute in (("img", "src"), ("link", "href"), ("script", "src"), ("iframe", "src")):
@@ -230,7 +230,7 @@ def test_volumes_are_those_of_the_ellipsoids(experiment):
 
 
 def test_logged_histograms_are_shares_of_all_trials_together():
-    """Ten Gaussians of one trial and thirty of another; the second alone has an iteration 8."""
+    """Ten Gaussians of one trial and thirty of another; only the second has an iteration 8."""
     edges = [-4.0, -3.0, -1.0, 0.0]
     rows = [
         [Histogram(step=4, log10_edges=edges, counts=[4, 0, 6])],
@@ -354,9 +354,10 @@ def test_each_line_has_a_colour_and_dashes_of_its_own():
     [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)],
 )
 def test_an_axis_has_round_ticks_within_its_range(values, log):
-    """The range extends a little beyond the values.
+    """The range goes a little beyond the values.
 
-    A logarithmic axis without two decades names its ends and its middle.
+    A logarithmic axis that does not contain two decades has ticks at its ends and in the
+    middle.
     """
     axis = Axis(values, log, 100.0, 300.0)
     places = [axis.to_px(tick) for tick in axis.ticks]
@@ -395,7 +396,7 @@ def test_an_axis_has_round_ticks_within_its_range(values, log):
         ((1, 1e6), True, [1, 100, 1e4, 1e6], ["1", "100", "10k", "1M"]),
     ],
 )
-def test_ticks_of_an_axis(values, log, ticks, labels):
+def test_ticks_are_at_round_values_with_matching_labels(values, log, ticks, labels):
     axis = Axis(values, log, 0.0, 100.0)
     assert axis.ticks == pytest.approx(ticks)
     assert [axis.label(tick) for tick in axis.ticks] == labels
@@ -461,7 +462,7 @@ def test_a_chart_with_nothing_to_draw_is_an_empty_string():
     assert forest_plot("t", [], "x", 1) == ""
 
 
-def test_the_verb_writes_the_file(runs, tmp_path, capsys):
+def test_the_report_verb_writes_the_file(runs, tmp_path, capsys):
     assert report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Statistics and planning against scipy, textbooks, hand-counted cases and simulated sweeps."""
+"""Statistics and planning against SciPy, textbooks, cases counted by hand, and simulations."""
 
 from __future__ import annotations
 
@@ -191,10 +191,7 @@ def test_scenes_like_these_are_judged_by_the_sign_test() -> None:
 
 
 def test_the_interval_of_the_median_is_exact() -> None:
-    """The outermost of eight values miss the median with probability 2 / 2^8.
-
-    Six values suffice for 5 %, but not for 1 %.
-    """
+    """The ends of eight values miss the median with probability 2 / 2^8; six reach 5 %, not 1 %."""
     values = np.arange(8.0)
     assert median_interval(values, 0.05) == Interval(0.0, 7.0)
     assert median_interval(values, 0.3) == Interval(2.0, 5.0) or median_interval(
@@ -340,7 +337,7 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
 
 
 @pytest.mark.parametrize("like_these", [False, True])
-def test_designs_that_are_needed_just_suffice(like_these: bool) -> None:
+def test_planned_designs_have_the_fewest_seeds_that_suffice(like_these: bool) -> None:
     designs = designs_needed(0.35, KNOWN, like_these)
     assert designs
     for one in designs:
@@ -352,13 +349,13 @@ def test_designs_that_are_needed_just_suffice(like_these: bool) -> None:
 
 
 def test_seeds_do_not_replace_scenes() -> None:
-    """If scenes differ by more than the effect, no number of seeds decides on scenes like these."""
+    """If scenes differ by more than the effect, no number of seeds shows scenes like these."""
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
     assert designs_needed(0.5, scattered, like_these=True) == []
     assert designs_needed(0.5, scattered, like_these=False)[0] == Design(1, 3)
 
 
-def test_questions_without_an_answer_are_refused() -> None:
+def test_impossible_plans_are_refused() -> None:
     one_scene = estimate_components([np.array([0.0, 2.0])])
     with pytest.raises(InputError, match="two"):
         designs_needed(1.0, one_scene, like_these=True)

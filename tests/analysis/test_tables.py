@@ -44,10 +44,7 @@ def one_trial(
     settings: dict | None = None,
     **values: object,
 ) -> Path:
-    """Write a trial of one scene.
-
-    In ``values``, ``psnr`` is a metric, and ``_iterations`` a key of results.json.
-    """
+    """A trial of one scene; ``psnr=…`` gives a metric, ``_iterations=…`` a key of results.json."""
     metrics = {key: value for key, value in values.items() if not key.startswith("_")}
     plan = Plan()
     views = {key: np.array([value]) for key, value in metrics.items()}
@@ -212,7 +209,11 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
         ({"max_gaussians": 50_000, "cap": "soft"}, (3, 0), True),  # one budget for both
         # a time limit may have stopped its growth
         ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),
-        ({"max_gaussians": None, "cap": None}, (None, 0), False),  # no count of what was refused
+        (
+            {"max_gaussians": None, "cap": None},
+            (None, 0),
+            False,
+        ),  # unknown whether the cap blocked any
         # a governor steers growth even if it refuses nothing
         ({"max_gaussians": 1000, "cap": "governor"}, (0, 0), False),
     ],
@@ -241,7 +242,7 @@ def test_the_mean_of_scenes_gives_each_the_same_weight(tmp_path):
         assert table.rows[-1].entries[0].text == f"{mean:.2f} ± {std:.2f}"
 
 
-def test_costs_are_averaged_by_both_rules(make_experiment, tmp_path):
+def test_changes_of_costs_are_given_of_totals_and_as_the_mean_of_ratios(make_experiment, tmp_path):
     for scene, adc, volumetric in (("a", 1_000_000, 2_000_000), ("b", 3_000_000, 3_000_000)):
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=adc)
         one_trial(
@@ -403,7 +404,7 @@ def test_latex_has_as_many_cells_as_columns(make_experiment):
     } == {width}
 
 
-def test_results_written_by_hand_are_plain_json(make_experiment):
+def test_results_files_are_plain_json(make_experiment):
     trial = make_experiment().trials[0]
     assert json.loads((trial.path / "results.json").read_text())["metrics"] == trial.metrics
 

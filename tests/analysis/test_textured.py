@@ -33,7 +33,7 @@ def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
     counts[:, 50:] = 0
     (trial.path / MASKS).mkdir()
     Image.fromarray(counts).save(trial.path / MASKS / "view000.png")
-    # of the left half, its last ten columns
+    # the last ten columns of the left half
     assert textured_error(trial) == pytest.approx(4.0, abs=0.2)
     for picture in (trial.path / "renders").iterdir():
         picture.unlink()

@@ -37,9 +37,9 @@ FEW = 1.2
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """One scene of a verdict: its mean paired difference, with a test.
+    """The mean paired difference of one scene.
 
-    The test is adjusted for all scenes of all questions.
+    Its test is adjusted for all scenes of all questions.
     """
 
     scene: str

@@ -179,7 +179,7 @@ def _shared_ledger(home: Path) -> bytes:
 
 
 def without_private_words(words: Sequence[str]) -> list[str]:
-    """Settings as words, without those of the user's folders and servers; paths have no folders."""
+    """Settings as words, without the user's folders and servers; of paths, only the names."""
     shared = []
     for word in words:
         group = re.split(r"[./=]", word.lstrip("+~"), maxsplit=1)[0]

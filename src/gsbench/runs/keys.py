@@ -400,7 +400,7 @@ def has_changed_since_import(name: str) -> bool:
 
 
 def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
-    """The user's modules imported since ``before`` but not ``named``: their edits change no key."""
+    """The user's modules imported since ``before`` but not ``named``; no key has their code."""
     tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {
         *named,
         PACKAGE.name,

@@ -324,7 +324,7 @@ class TrialFolder:
         return sorted((self.path / kind).glob("*.png"))
 
     def _unchanged(self, name: str) -> bytes:
-        """The content of a file that is as it was when it was written.
+        """The content of a file, as it was written.
 
         Raises FileNotFoundError, and DamagedError if it cannot be read or was changed
         later.

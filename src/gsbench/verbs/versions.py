@@ -159,8 +159,7 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
 
 @dataclass
 class CommitSearch:
-    """A search through ``commits``, the first of which is good, with one declaration for all its
-    steps."""
+    """A search through ``commits`` with one declaration for all steps; the first commit is good."""
 
     # an experiment without trials for the declaration; each commit's trials are in one of its own
     home: Path
