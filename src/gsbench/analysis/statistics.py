@@ -458,7 +458,7 @@ def power_of_mean(deviation: float, design: Design, difference: float) -> float:
 
 @cache
 def _thresholds(design: Design) -> NDArray[np.float64]:
-    """The least significant means [DESIGN_DRAWS], in true standard errors.
+    """The smallest means [DESIGN_DRAWS] that are significant, in true standard errors.
 
     Each belongs to one draw of simulated variances of the scenes.
     """
@@ -480,11 +480,12 @@ def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None
 
 
 def designs_needed(difference: float, components: Components, like_these: bool) -> list[Design]:
-    """The designs that see ``difference`` with a power of `POWER`: by number of scenes.
+    """The designs that see ``difference`` with a power of `POWER`, one per number of scenes.
 
-    Each has the fewest seeds for its number of scenes. A number of scenes is left out if it
-    needs more than ``MAX_SEEDS`` seeds, or no fewer seeds than fewer scenes do. A statement
-    about scenes like these starts at ``MIN_SCENES``.
+    Each has the fewest seeds. A number of scenes is left out if it needs more than
+    ``MAX_SEEDS`` seeds, or no fewer seeds than fewer scenes do. A statement about scenes like
+    these starts at ``MIN_SCENES``. Raises InputError for a difference of 0 or one that is not
+    finite.
     """
     if difference == 0 or not math.isfinite(difference):
         raise InputError(

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def load_rounds(home: Path) -> list[RoundVerdict]:
-    """The verdicts of all rounds in ``home``, oldest first; a damaged round is only warned of."""
+    """The verdicts of all rounds in ``home``, oldest first; a damaged round gives a warning."""
     verdicts = []
     for folder in (home / VOTES).glob("*/"):
         try:
