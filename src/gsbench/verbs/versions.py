@@ -96,9 +96,8 @@ def _baseline(
 ) -> dict[str, list[TrialResult]]:
     """The archive's trials of each scene.
 
-    If it has several arms there, only the one with the name of the new trial's arm counts.
-    Raises InputError for a scene that the archive lacks, and if several arms or settings are
-    left.
+    If one of its arms there has the name of the new trial's arm, only that one counts. Raises
+    InputError for a scene that the archive lacks, and if several arms or settings are left.
     """
     baseline = {}
     for scene, new in by_scene.items():
