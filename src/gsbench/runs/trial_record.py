@@ -215,7 +215,7 @@ class TrialRecord(Record):
 
     @property
     def remark(self) -> str:
-        """Why the results of a finished trial may surprise, in one line; "" if nothing is known."""
+        """The reason why a finished trial's results may surprise, in one line; "" without one."""
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
@@ -375,7 +375,7 @@ class Building(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class MadeOf(Record):
-    """What a trial's results were made of: configuration, versions, and files with their stamps.
+    """The inputs of a trial's results: configuration, versions, and files with their stamps.
 
     ``settings`` is the configuration, ``config`` its hash, ``results`` the hash of the rest of
     ``results.json``. ``sources`` are the user's files, ``folders`` their folders with times of
