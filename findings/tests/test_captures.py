@@ -1,5 +1,4 @@
-"""``scripts/captures.py`` on captures of made cameras: which points are kept, what is asked of
-gsbench, what stays."""
+"""``scripts/captures.py`` on made-up captures: kept points, commands, and files that stay."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ COUNT = 6300  # above the most that are kept
 
 
 def write_capture(folder: Path, points: int = COUNT, model: bool = True) -> np.ndarray:
-    """Three photographs' names, and a model of as many points [P, 3], which are returned."""
+    """Write a capture with a photograph and a model of random points [P, 3]; return the points."""
     positions = np.random.default_rng(1).normal(size=(points, 3))
     (folder / "images").mkdir(parents=True)
     (folder / "images" / "0.png").touch()
@@ -39,12 +38,14 @@ def write_model(folder: Path, positions: np.ndarray) -> None:
 
 
 def points_of(capture: Path) -> np.ndarray:
-    """The positions [P, 3], in the order of their rows."""
+    """The positions [P, 3] of a capture's points, sorted."""
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
     return np.unique([point.xyz for point in model.points3D.values()], axis=0)
 
 
-def test_a_thin_cloud_with_the_same_cameras_and_photographs(tmp_path: Path) -> None:
+def test_a_prepared_capture_has_fewer_points_and_the_same_cameras_and_photographs(
+    tmp_path: Path,
+) -> None:
     given = write_capture(tmp_path / "data" / "fox")
     few = write_capture(tmp_path / "data" / "bonsai", points=10)
     for name in ("out", "again"):
@@ -61,7 +62,7 @@ def test_a_thin_cloud_with_the_same_cameras_and_photographs(tmp_path: Path) -> N
     assert len(points_of(tmp_path / "data" / "fox")) == COUNT, "the capture itself stays as it is"
 
 
-def test_what_is_there_stays_and_what_is_not_is_said(
+def test_prepared_captures_are_kept_and_missing_ones_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_capture(tmp_path / "data" / "fox", points=20)
@@ -76,11 +77,8 @@ def test_what_is_there_stays_and_what_is_not_is_said(
     assert len(lines) == len(captures.CAPTURES)
 
 
-def test_a_run_that_was_killed_is_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A capture counts as ready when all of it is there; the photographs behind the link stay in
-    any case."""
+def test_a_killed_run_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A capture counts as ready only if it is complete; the linked photographs never change."""
     write_capture(tmp_path / "data" / "fox", points=20)
 
     def killed(self: pycolmap.Reconstruction, folder: Path) -> None:
@@ -101,8 +99,10 @@ def test_a_run_that_was_killed_is_gone_on_with(
 def test_a_capture_without_a_model_gets_the_estimated_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The two commands are understood by gsbench, and the entry that the second names is where the
-    first writes."""
+    """gsbench understands both commands.
+
+    The second one exports the trial that the first one ran.
+    """
     write_capture(tmp_path / "data" / "monstree", model=False)
     asked: list[str] = []
 

@@ -1,4 +1,4 @@
-"""The findings say what the archives say, and what they name is there."""
+"""The findings agree with the archives, and the files that they name exist."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ SETTINGS = {
 PAGE = tables.README.read_text(encoding="utf-8")
 
 
-def test_the_tables_are_made_again_from_the_archives() -> None:
+def test_the_tables_follow_from_the_archives() -> None:
     assert tables.TABLES.read_text(encoding="utf-8") == tables.all_tables()
     assert tables.with_answers(PAGE) == PAGE
     assert "nan" not in tables.all_tables()
 
 
-def test_every_figure_of_the_page_stands_in_a_table() -> None:
+def test_every_figure_of_the_page_is_in_a_table() -> None:
     known = set(FIGURE.findall(tables.TABLES.read_text(encoding="utf-8")))
     known |= {figure.lstrip("+−") for figure in known} | SETTINGS
     prose = re.sub(r"<!-- verdicts -->.*?<!-- end -->", "", PAGE, flags=re.DOTALL)
@@ -56,7 +56,7 @@ def test_every_figure_of_the_page_stands_in_a_table() -> None:
     assert [figure for figure in FIGURE.findall(prose) if figure not in known] == []
 
 
-def test_what_the_page_says_of_seeds_is_so() -> None:
+def test_the_pages_statements_on_seeds_are_true() -> None:
     def of(
         name: str, arm: str, scene: str, split: str = "interpolation", **kept: object
     ) -> tuple[float, float]:
@@ -81,7 +81,7 @@ def test_what_the_page_says_of_seeds_is_so() -> None:
     assert not any(one.verdict.late for one in tables.verdicts("volume").values())
 
 
-def test_what_the_page_names_is_there() -> None:
+def test_files_that_the_page_names_exist() -> None:
     for name in re.findall(r"\]\(((?!http)[^)#]+)\)", PAGE):
         assert (FINDINGS / name).exists(), name
     for name in re.findall(r"findings/(?:claims|archives|scripts)/\w+\.\w+", PAGE):

@@ -134,8 +134,10 @@ def write_trial(
     config_hash: str = "c0ffee00",
     **settings: Any,
 ) -> Path:
-    """Write one trial folder: results, per-view metrics, events, curves and a configuration with
-    ``settings``."""
+    """Write a trial's folder: results, per-view metrics, events, curves, and a configuration.
+
+    ``settings`` (``group__key=value``) are added to the configuration.
+    """
     path = trial_folder(runs, data, config_hash)
     path.mkdir(parents=True)
     names = [f"view{k:03d}" for k in range(len(next(iter(views.values()))))]
@@ -170,8 +172,11 @@ def write_arms(
     experiment: str = "exp",
     **settings: Any,
 ) -> list[Path]:
-    """Trials of arms with the densifier's settings given for each, and ``group__key`` for all;
-    results are noise."""
+    """Write trials of arms whose results are noise.
+
+    ``arms`` has the densifier's settings of each arm; ``settings`` (``group__key=value``) are
+    for all.
+    """
     rng = np.random.default_rng(0)
     paths = []
     for (name, densify), scene, seed in itertools.product(arms.items(), scenes, seeds):
@@ -194,10 +199,10 @@ TEXTURED = slice(80, 160)  # columns of the ground truth that hold grass; the ot
 
 
 def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
-    """Ground truth that is smooth on the left and grassy on the right; "adc" blurs the grass more
-    than "volumetric".
+    """Write ground truth that is smooth on the left and grassy on the right, and renders.
 
-    In the upper left corner "volumetric" is off by 20 levels, where "adc" is right.
+    "adc" blurs the grass more than "volumetric". In the upper left corner "volumetric" is off
+    by 20 levels, where "adc" is right.
     """
     noise = np.random.default_rng(data["seed"])
     for folder in ("renders", "ground_truth"):
@@ -219,8 +224,7 @@ def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
 
 
 def write_point_cloud(path: Path, data: dict[str, Any]) -> None:
-    """A PLY with log-normal scales, smaller for "volumetric"; and histograms logged during its
-    training."""
+    """Write a PLY with log-normal scales, smaller for "volumetric", and logged histograms."""
     rng = np.random.default_rng(data["seed"])
     fields = ["x", "y", "z", "opacity", *(f"scale_{k}" for k in range(3))]
     vertices = np.zeros(2000, dtype=[(name, "f4") for name in fields])
@@ -238,7 +242,7 @@ def write_point_cloud(path: Path, data: dict[str, Any]) -> None:
 
 
 def events(data: dict[str, Any]) -> list[dict[str, int]]:
-    """Refinements every 100 iterations, with a volume split where the densifier has one."""
+    """Refinements every 100 iterations; only "volumetric" splits by volume."""
     volume = 4 if data["densify"] == "volumetric" else 0
     counts = {"cloned": 20, "split_gradient": 12, "split_volume": volume, "pruned_opacity": 7}
     return [{"step": step, **counts} for step in range(600, data["iterations"] + 1, 100)]

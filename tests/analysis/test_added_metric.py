@@ -1,5 +1,4 @@
-"""A metric of one's own that is added to an experiment with trials: what these lack counts as
-unset."""
+"""A user's own metric that is added later: for older trials its setting counts as unset."""
 
 from pathlib import Path
 
@@ -25,7 +24,7 @@ def runs(tmp_path) -> Path:
     return tmp_path
 
 
-def test_tables_show_both_and_choose_either(runs):
+def test_tables_show_trials_with_and_without_the_metric(runs):
     experiment = load_experiment(runs, "exp")
     table = build_table(experiment)
     assert table.row_headings == ("scene", "init", "densify", KEY)
@@ -37,11 +36,11 @@ def test_tables_show_both_and_choose_either(runs):
     assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
 
 
-def test_the_report_is_written(runs):
+def test_the_report_names_the_added_metric(runs):
     assert "mine.Mae" in build_report(load_experiment(runs, "exp"))
 
 
-def test_a_null_and_no_key_are_one_setting(tmp_path):
+def test_a_null_setting_equals_a_missing_key(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
     one_trial(tmp_path, 1, "bbbbbbbb", {"eval__extra": None}, psnr=28.0)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])

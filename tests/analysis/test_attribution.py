@@ -1,4 +1,4 @@
-"""What differs between two arms, said wherever they are compared."""
+"""The differences between two arms are named wherever the arms are compared."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SCHEDULE |= {
 
 
 def config(name: str, **changes: Any) -> dict[str, Any]:
-    """A shipped densifier as a trial records it."""
+    """The settings of a shipped densifier as a trial records them, with ``changes``."""
     own = {
         f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v)
         for key, v in shipped_arms()[name].items()
@@ -51,7 +51,7 @@ def config(name: str, **changes: Any) -> dict[str, Any]:
 
 
 def densifier(name: str, **changes: Any) -> dict[str, Any]:
-    """The same as the settings of the group alone."""
+    """The same settings without the prefix ``densify.``."""
     prefix = "densify."
     return {
         key.removeprefix(prefix): v
@@ -101,17 +101,17 @@ def test_settings_of_the_first_configuration_come_first() -> None:
         ("adc", "adc", ()),
     ],
 )
-def test_arms_of_gsbench_differ_in_what_their_files_say(
+def test_shipped_arms_differ_in_the_ingredients_that_their_files_list(
     first: str, second: str, expected: tuple[str, ...]
 ) -> None:
     assert ingredients(config(first), config(second)) == expected
 
 
-def test_every_shipped_class_says_in_what_it_departs_from_adc() -> None:
+def test_every_shipped_class_lists_how_it_departs_from_adc() -> None:
     assert {settings["_target_"] for settings in shipped_arms().values()} == set(departures())
 
 
-def test_settings_that_only_name_or_place_a_trial_are_no_ingredient() -> None:
+def test_settings_that_only_name_or_place_a_trial_are_no_ingredients() -> None:
     other = config("adc") | {
         "densify.name": "adc-2",
         "eval.primary": "psnr",
@@ -147,8 +147,8 @@ def test_changes_outside_the_densifier_are_ingredients() -> None:
     assert set(ingredients(sfm, dim)) == {"initial cloud", "cameras"}
 
 
-def test_a_class_of_ones_own_is_one_ingredient_and_its_settings_belong_to_it() -> None:
-    """And of two versions of one class with settings of its own, each setting is one."""
+def test_a_users_class_with_its_settings_is_one_ingredient() -> None:
+    """Between two versions of one such class, each setting is an ingredient."""
     own = config("adc") | {"densify._target_": "mine.Patient", "densify.patience": 3}
     assert ingredients(config("adc"), own) == ("rule mine.Patient",)
     assert ingredients(config("adc"), own | {"densify.interval": 50}) == (
@@ -162,7 +162,7 @@ def test_a_class_of_ones_own_is_one_ingredient_and_its_settings_belong_to_it() -
     assert ingredients(config("longaxis"), own)[0] == "rule mine.Patient"
 
 
-def test_a_mixed_comparison_is_said(tmp_path: Path) -> None:
+def test_a_comparison_of_several_ingredients_is_reported(tmp_path: Path) -> None:
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     assert sentence(trials, "adc", "longaxis") == (
         "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
@@ -176,7 +176,7 @@ def test_a_mixed_comparison_is_said(tmp_path: Path) -> None:
     assert sentence(trials, "adc", "longaxis") in notes
 
 
-def test_a_comparison_of_one_ingredient_is_not_commented(tmp_path: Path) -> None:
+def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path: Path) -> None:
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
     assert sentence(trials, "adc", "volumetric") == ""
     assert not any(
@@ -184,7 +184,7 @@ def test_a_comparison_of_one_ingredient_is_not_commented(tmp_path: Path) -> None
     )
 
 
-def test_what_a_command_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
+def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
     changes = {"gradient_threshold": 0.0016, "max_gaussians": 9, "cap": "governor", "stop": 77}
     arms = {name: densifier(name, **changes) for name in ("adc", "longaxis")}
     assert sentence(trials_of(tmp_path, arms), "adc", "longaxis") == (
@@ -192,7 +192,7 @@ def test_what_a_command_changed_in_all_arms_is_no_difference(tmp_path: Path) -> 
     )
 
 
-def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:
+def test_trials_without_recorded_settings_are_reported(tmp_path: Path) -> None:
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")}):
         if "longaxis" in path.parent.name:
             (path / "config.yaml").unlink()
@@ -201,7 +201,7 @@ def test_trials_without_a_record_are_said_to_have_none(tmp_path: Path) -> None:
     )
 
 
-def test_what_another_program_did_is_many_ingredients_at_once(tmp_path: Path) -> None:
+def test_another_program_counts_as_many_ingredients(tmp_path: Path) -> None:
     program = {"_target_": "gsbench.densify.External", "command": "train"}
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "3dgs": program, "brush": program})
     assert sentence(trials, "adc", "3dgs") == (
@@ -212,7 +212,7 @@ def test_what_another_program_did_is_many_ingredients_at_once(tmp_path: Path) ->
     )
 
 
-def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:
+def test_a_training_elsewhere_has_unknown_ingredients(tmp_path: Path) -> None:
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "theirs": densifier("adc")}):
         if path.parent.name == "sfm-theirs":
             data = json.loads((path / "results.json").read_text())
@@ -222,7 +222,7 @@ def test_what_was_trained_elsewhere_is_not_known(tmp_path: Path) -> None:
     assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."
 
 
-def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> None:
+def test_points_of_a_search_are_not_compared(tmp_path: Path) -> None:
     trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     (tmp_path / "exp" / "tuning.json").write_text("{}")
     assert not any(
@@ -233,7 +233,7 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path: Path) -> N
 # --- controls
 
 
-def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
+def test_arms_are_compared_with_their_controls(tmp_path: Path) -> None:
     arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
     trials = trials_of(
         tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"}
@@ -253,7 +253,7 @@ def test_controls_are_held_against_their_arms(tmp_path: Path) -> None:
     ]
 
 
-def test_naming_a_control_makes_no_other_trial() -> None:
+def test_naming_a_control_does_not_change_the_configuration_hash() -> None:
     with_control = {
         "eval": {"lpips": [], "controls": {"longaxis": "absgrad"}},
         "densify": {"name": "adc"},
@@ -289,7 +289,7 @@ def test_experiments_list_the_control_of_every_mixed_arm() -> None:
     assert checked >= 2
 
 
-def test_the_pair_that_stands_for_two_arms_is_as_alike_as_there_is() -> None:
+def test_representatives_share_scene_and_seed_if_possible() -> None:
     arms = Arm("sfm", "a"), Arm("sfm", "b")
     generator = random.Random(0)
     for _ in range(200):

@@ -1,4 +1,4 @@
-"""Cells never mix two versions of the code, and what is superseded is named."""
+"""Table cells never mix versions of the code, and superseded trials are named."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_class_that_only_one_arm_has_is_no_difference(tmp_path: Path) -> None:
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
 
 
-def test_a_moved_scene_is_no_other_version(tmp_path: Path) -> None:
+def test_a_scene_in_another_folder_is_no_other_version(tmp_path: Path) -> None:
     one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene__path": "/here"}, psnr=27.0, _code=code(NEW))
     one_trial(tmp_path, 1, "bbbbbbbb", MINE | {"scene__path": "/there"}, psnr=28.0, _code=code(NEW))
     assert (
@@ -108,7 +108,7 @@ def test_a_room_that_one_arm_alone_uses_is_no_difference(tmp_path: Path) -> None
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
 
 
-def test_a_number_names_its_commit_and_what_was_edited(tmp_path: Path) -> None:
+def test_explain_names_the_commit_and_the_edited_rooms(tmp_path: Path) -> None:
     made = of_gsbench(train="released", eval="a" * 16) | {"commit": "0123abcd", "edited": True}
     one_trial(tmp_path, 0, psnr=27.0, _code=made)
     said = explain_cell("exp:garden:psnr:adc", tmp_path)
@@ -122,13 +122,15 @@ def test_a_number_names_its_commit_and_what_was_edited(tmp_path: Path) -> None:
 
 
 def superseded(runs: Path, present: dict[str, str] | None = None) -> dict[str, str]:
-    """Reasons by the seed of the trial."""
+    """The reasons why trials are superseded, by their seeds."""
     trials = read_experiment(runs / "exp").trials
     found = find_superseded(trials, lambda target, trial: (present or {}).get(target))
     return {path.name.partition("-")[2]: reason for path, reason in found.items()}
 
 
-def test_without_the_file_the_version_that_finished_last_is_the_present_one(tmp_path: Path) -> None:
+def test_without_the_module_the_version_that_finished_last_is_the_present_one(
+    tmp_path: Path,
+) -> None:
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
     assert superseded(tmp_path) == {
@@ -136,7 +138,7 @@ def test_without_the_file_the_version_that_finished_last_is_the_present_one(tmp_
     }
 
 
-def test_the_file_decides_which_version_is_the_present_one(tmp_path: Path) -> None:
+def test_the_module_decides_which_version_is_the_present_one(tmp_path: Path) -> None:
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
     assert superseded(tmp_path, {"mine.Patient": OLD}) == {

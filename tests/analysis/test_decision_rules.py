@@ -52,5 +52,5 @@ def test_the_simulator_has_the_test_and_the_levels_of_the_judge() -> None:
 
 
 @pytest.mark.parametrize("kind", ["normal", "one scene in eight stands out"])
-def test_the_table_of_untruths_is_that_of_the_judge(kind: str) -> None:
+def test_the_simulator_finds_the_error_rates_of_the_judge(kind: str) -> None:
     assert rates(KINDS[kind], 1.0, 20, fast=True) == rates(KINDS[kind], 1.0, 20)

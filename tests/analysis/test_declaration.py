@@ -1,5 +1,4 @@
-"""A verdict whose metric was fixed before: what is adjusted for what, and what is said of late
-declarations."""
+"""Declared metrics: which tests are adjusted together, and what is said of late declarations."""
 
 from __future__ import annotations
 
@@ -85,7 +84,7 @@ def test_a_verdict_in_words_has_its_numbers(tmp_path: Path) -> None:
 # --- families
 
 
-def test_of_one_pair_the_declared_metric_is_tested_as_it_is_and_the_others_by_holm(
+def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(
     tmp_path: Path,
 ) -> None:
     (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
@@ -106,7 +105,7 @@ def test_of_one_pair_the_declared_metric_is_tested_as_it_is_and_the_others_by_ho
         running = max(running, min(1.0, factor * alone(verdict)))
         expected.append(running)
     assert [verdict.p for verdict in ordered] == pytest.approx(expected)
-    assert ordered[0].outcome == "supported"  # a clear effect is found among the secondary, too
+    assert ordered[0].outcome == "supported"  # a clear effect is found in a secondary metric, too
 
 
 def alone(verdict: Verdict) -> float:
@@ -129,7 +128,7 @@ def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_
     assert all(one.family == 9 for arms in found for one in arms.verdicts[1:])
 
 
-def test_a_verdict_that_only_a_single_test_would_give_is_none_in_a_family() -> None:
+def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family() -> None:
     rng = np.random.default_rng(3)
     noise = [rng.normal(0, 0.1, (1, 3)) for _ in range(9)]
     weak = np.array([[0.9, 1.0, 1.3]])
@@ -141,7 +140,7 @@ def test_a_verdict_that_only_a_single_test_would_give_is_none_in_a_family() -> N
     assert first.outcome(1, None) == "undecided"
 
 
-# --- what readers are told
+# --- what report and table say
 
 
 def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path) -> None:
@@ -160,7 +159,7 @@ def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path)
     assert "No metric was declared" not in page
 
 
-def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(
+def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(
     tmp_path: Path,
 ) -> None:
     write_runs(tmp_path, Plan(effect=CLEAR, views=3))
@@ -179,7 +178,7 @@ def test_where_nothing_was_declared_that_is_said_and_all_metrics_are_one_family(
     assert not any("declared" in note for note in build_table(experiment).notes)
 
 
-def test_tables_carry_the_verdict_on_the_declared_metric_whichever_trials_they_show(
+def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(
     tmp_path: Path,
 ) -> None:
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR)
@@ -194,7 +193,7 @@ def test_tables_carry_the_verdict_on_the_declared_metric_whichever_trials_they_s
     assert [note for note in part.notes if note.startswith("Verdict")] == whole
 
 
-def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_place(
+def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_it(
     tmp_path: Path,
 ) -> None:
     experiment = declared_experiment(tmp_path, ("lpips_alex", EARLY), effect=CLEAR)
@@ -215,7 +214,9 @@ def test_a_declared_metric_without_weights_is_undecided_and_no_other_takes_its_p
 # --- when it was declared
 
 
-def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_path: Path) -> None:
+def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
+    tmp_path: Path,
+) -> None:
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", LATE), effect=CLEAR, views=3)
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
@@ -226,7 +227,7 @@ def test_a_declaration_after_results_is_said_and_gives_no_place_of_its_own(tmp_p
     assert "declared beforehand." not in page
 
 
-def test_what_is_declared_again_stands_from_the_first_time() -> None:
+def test_a_repeated_declaration_counts_from_its_first_time() -> None:
     psnr, later, flip = (
         Declaration(time=time, questions=(Question(metric=metric, sign=0),))
         for metric, time in (("psnr", EARLY), ("psnr", LATE), ("flip", LATE))
@@ -237,7 +238,7 @@ def test_what_is_declared_again_stands_from_the_first_time() -> None:
     assert latest_declaration([psnr, flip, later]) is later
 
 
-def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) -> None:
+def test_a_replaced_declaration_is_reported(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("psnr", EARLY), ("flip", LATE))
     found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
@@ -248,11 +249,10 @@ def test_a_declaration_that_took_the_place_of_another_is_said(tmp_path: Path) ->
     )
 
 
-def test_what_was_measured_before_counts_also_where_results_were_written_later(
+def test_the_time_of_measuring_counts_not_that_of_writing_results(
     tmp_path: Path,
 ) -> None:
-    """The store gives an experiment of another name the same numbers within seconds: ``measured``
-    is when they came."""
+    """The store gives another experiment the same numbers at once, with their ``measured``."""
     paths = write_runs(tmp_path, Plan())
     declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
     after = calendar.timegm(time.strptime("2030-06-02T00:00:00Z", STAMP))
@@ -269,7 +269,7 @@ def test_what_was_measured_before_counts_also_where_results_were_written_later(
     assert not found.beforehand
 
 
-def test_trials_remember_a_declaration_whose_record_is_gone(tmp_path: Path) -> None:
+def test_a_declaration_is_read_from_trials_if_its_record_is_gone(tmp_path: Path) -> None:
     path = write_runs(tmp_path, Plan())[0]
     data = json.loads((path / "results.json").read_text())
     (path / "results.json").write_text(
@@ -305,7 +305,7 @@ def planned(
     }
 
 
-def test_declared_trials_keep_the_metrics_place(tmp_path: Path) -> None:
+def test_a_metric_declared_with_all_trials_is_declared_beforehand(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2])))
     found = active_declaration(experiment.folder, experiment.trials)
@@ -342,10 +342,10 @@ WHOLE = planned([0, 1, 2])
     ],
 )
 @pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
-def test_trials_that_were_added_after_results_cost_the_metric_its_place(
+def test_a_metric_whose_trials_were_added_after_results_is_adjusted_with_all_others(
     tmp_path: Path, trials: dict[str, list[int]], words: str, recorded: bool
 ) -> None:
-    """Whether a later command wrote its additions down, or trials were brought in past it."""
+    """A later command recorded the additions, or the trials came without a record."""
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
     (one,) = judged(experiment)
@@ -362,7 +362,7 @@ def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
     assert "All metrics of all pairs of arms are one family, 4 tests adjusted by Holm." in page
 
 
-def test_declared_trials_that_are_missing_are_said(tmp_path: Path) -> None:
+def test_declared_trials_that_are_missing_are_counted(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
     found = active_declaration(experiment.folder, experiment.trials)
@@ -373,10 +373,10 @@ def test_declared_trials_that_are_missing_are_said(tmp_path: Path) -> None:
     )
 
 
-def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added(
+def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(
     tmp_path: Path,
 ) -> None:
-    """The trials repeat that the metric was declared, and not with which trials."""
+    """Results repeat the declared metric and its time, but not the declared trials."""
     for path in write_runs(tmp_path, Plan(effect=CLEAR)):
         data = json.loads((path / "results.json").read_text())
         measured = EARLY if path.name.endswith(("seed0", "seed1")) else "2021-01-01T00:00:00Z"
@@ -392,8 +392,7 @@ def test_a_record_that_was_deleted_and_written_anew_does_not_hide_what_was_added
     assert not found.beforehand
 
 
-def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> None:
-    """A record may declare a metric alone."""
+def test_a_record_may_name_no_trials_and_a_damaged_record_declares_nothing(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("psnr", EARLY))
     found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
@@ -404,7 +403,7 @@ def test_records_without_trials_and_damaged_ones_are_read(tmp_path: Path) -> Non
         assert active_declaration(experiment.folder, experiment.trials) is None
 
 
-def test_every_declaration_is_a_line_of_one_kind_and_reads_back(tmp_path: Path) -> None:
+def test_declarations_are_read_back_as_they_were_written(tmp_path: Path) -> None:
     arms = Arm("sfm", "adc"), Arm("sfm", "volumetric", (("densify.max_gaussians", "30000"),))
     keys = ("garden/sfm-adc/3fa9c1d2", "garden/sfm-volumetric/aaaaaaaa")
     asked = Question(
@@ -426,7 +425,7 @@ def test_every_declaration_is_a_line_of_one_kind_and_reads_back(tmp_path: Path) 
     assert str(arms[1]) == "sfm-volumetric max_gaussians=30000"
 
 
-def test_a_sweep_in_looks_has_one_verdict_and_it_is_that_of_the_looks(tmp_path: Path) -> None:
+def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     scenes = {
         scene: (f"{scene}/sfm-adc/c0ffee00", f"{scene}/sfm-volumetric/c0ffee00")

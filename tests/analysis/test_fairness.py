@@ -1,5 +1,4 @@
-"""The fairness sheet: generated from records and files, and nothing that was recorded is missing
-from it."""
+"""The fairness sheet has everything that records and files say about two arms."""
 
 import json
 import re
@@ -47,7 +46,7 @@ def paths(tmp_path) -> list[Path]:
     return write_arms(tmp_path, {name: densifier(name) for name in ("adc", "longaxis")})
 
 
-def test_settings_schedules_and_what_was_measured_stand_side_by_side(tmp_path, paths):
+def test_the_sheet_has_settings_schedules_and_measurements_side_by_side(tmp_path, paths):
     change(
         paths,
         "longaxis",
@@ -112,13 +111,13 @@ def test_long_values_are_cut():
     ]
 
 
-def test_the_notes_say_the_ingredients_and_the_tuning(tmp_path, paths):
+def test_the_notes_name_the_ingredients_and_the_tuning(tmp_path, paths):
     notes = sheet(tmp_path).notes
     assert notes[0] == "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
     assert f"Tuning. {NOTHING}" in notes
 
 
-def test_an_arm_of_ones_own_has_its_class_and_version(tmp_path):
+def test_a_users_own_arm_has_its_class_and_version(tmp_path):
     own = {"_target_": "largest.SplitLargest", "start": 50, "share": 0.1}
     found = write_arms(tmp_path, {"adc": densifier("adc"), "largest": own})
     change(
@@ -150,7 +149,7 @@ def test_trials_without_any_record_still_have_a_sheet(tmp_path, paths):
 # --- tuning
 
 
-def test_values_that_were_tried_here_are_said(tmp_path):
+def test_settings_that_vary_among_the_arms_are_listed_as_tuning(tmp_path):
     arms = {
         f"volumetric-{v}": densifier("volumetric", volume_threshold=v) for v in (0.01, 0.03, 0.1)
     }
@@ -204,10 +203,10 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     assert tuning() == ["Tuning. sfm-volumetric: the search vth found nothing."]
 
 
-# --- where it stands
+# --- where it is shown
 
 
-def test_the_sheet_stands_before_the_verdicts_numbers_in_the_report(tmp_path, paths):
+def test_the_report_shows_the_sheet_before_the_numbers_of_the_verdict(tmp_path, paths):
     page = build_report(load_experiment(tmp_path, "exp"))
     assert (
         page.index('<h2 id="h-verdict"')

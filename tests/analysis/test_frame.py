@@ -1,4 +1,4 @@
-"""The data frame of an experiment: one row a trial, as the result files have it."""
+"""The data frame of an experiment: one row per trial, with the values of the result files."""
 
 import io
 import json
@@ -18,7 +18,7 @@ from tests.analysis.test_tables import one_trial
 Make = Callable[..., Experiment]
 
 
-def test_a_row_is_a_trial_as_its_file_says(make_experiment):
+def test_each_row_has_the_values_of_one_trials_file(make_experiment):
     experiment = make_experiment()
     frame = to_frame(experiment)
     assert len(frame) == len(experiment.trials) == 12
@@ -44,7 +44,7 @@ def test_a_row_is_a_trial_as_its_file_says(make_experiment):
     assert frame["num_gaussians"].dtype == frame["seed"].dtype == pd.Int64Dtype()
 
 
-def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment):
+def test_groups_of_the_frame_average_to_the_cells_of_the_table(make_experiment):
     experiment = make_experiment()
     means = to_frame(experiment).groupby(["scene", "densify"])["psnr"].agg(["mean", "std"])
     values = [
@@ -56,7 +56,7 @@ def test_groups_of_the_frame_are_the_cells_of_the_table(make_experiment):
     assert means.loc[("garden", "adc"), "std"] == pytest.approx(statistics.stdev(values), abs=1e-12)
 
 
-def test_what_is_missing_is_missing_and_what_was_swept_has_a_column(tmp_path):
+def test_a_missing_value_is_na_and_a_swept_setting_has_a_column(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, flip=0.1, _num_init_points=None)
     one_trial(tmp_path, 0, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0, own=3.0)
     frame = to_frame(load_experiment(tmp_path, "exp"))

@@ -1,5 +1,4 @@
-"""`pair` and `judge` on trials in files: what is paired, what is named, what each outcome rests
-on."""
+"""`pair` and `judge` on trials in files: pairs, trials that are left out, and outcomes."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 
 
 def named(trials: tuple[TrialResult, ...], seeds: tuple[int, ...] = (0, 1, 2)) -> Question:
-    """The question about these trials by their folders."""
+    """The question that names these trials by their folders."""
     keys = {(trial.scene, trial.densify): trial.key for trial in trials}
     scenes = {scene: (keys[scene, "adc"], keys[scene, "volumetric"]) for scene, _ in keys}
     return replace(PSNR, scenes=scenes, seeds=seeds, name="claim")
@@ -40,7 +39,7 @@ def test_pairs_share_scene_and_seed(make_experiment: Callable[..., Experiment]) 
     assert pair(trials, named(trials)).differences.tolist() == found.differences.tolist()
 
 
-def test_what_has_no_partner_is_named_and_scenes_keep_the_seeds_that_all_have(
+def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = [
@@ -55,7 +54,7 @@ def test_what_has_no_partner_is_named_and_scenes_keep_the_seeds_that_all_have(
     assert len(found.trials) == 8
 
 
-def test_of_planned_seeds_none_beyond_the_first_that_is_missing_counts(
+def test_planned_seeds_after_the_first_missing_one_do_not_count(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = make_experiment().trials
@@ -96,7 +95,9 @@ def test_budgets_may_differ_if_the_question_names_its_trials(
     assert not pair(trials, PSNR).rows
 
 
-def test_ratios_are_taken_of_logarithms(make_experiment: Callable[..., Experiment]) -> None:
+def test_relative_differences_are_means_of_logarithms(
+    make_experiment: Callable[..., Experiment],
+) -> None:
     trials = make_experiment().trials
     question = replace(named(trials), metric="gaussians", relative=True, least=0.1)
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(question,)))
@@ -111,7 +112,7 @@ def test_ratios_are_taken_of_logarithms(make_experiment: Callable[..., Experimen
 
 
 @pytest.mark.parametrize("densify", ["adc", "volumetric"])
-def test_of_nothing_no_ratio_is_taken(
+def test_no_ratio_is_taken_of_a_value_of_zero(
     make_experiment: Callable[..., Experiment], densify: str
 ) -> None:
     trials = make_experiment(scenes=("garden",)).trials
@@ -125,7 +126,7 @@ def test_of_nothing_no_ratio_is_taken(
     assert "garden seed 1: PSNR (dB) is 0, and a ratio needs numbers above 0" in found.left_out
 
 
-def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(
+def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = make_experiment(effect={"psnr": 3.0}).trials
@@ -141,7 +142,7 @@ def test_a_look_waits_for_every_scene_and_stops_where_it_is_decided(
     assert judge(later, declared)[0].interval == whole.interval
 
 
-def test_trials_that_were_measured_before_the_question_cost_it_its_place(
+def test_trials_measured_before_the_question_divide_its_error_rate(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     trials = make_experiment(effect={"psnr": 3.0}).trials
@@ -195,16 +196,16 @@ def rows(before: list[list[float]], after: list[list[float]]) -> Pairs:
     return Pairs(tuple(scene_pairs(place, noise, 0.0) for place, noise in enumerate(both)))
 
 
-def test_a_training_that_failed_is_found() -> None:
+def test_an_outlying_training_is_found() -> None:
     good = [[20.0, 20.1, 19.9, 20.05]] * 2
     found = find_outlying(rows(good, [[20.5, 20.6, 10.0, 20.4], [20.5, 20.4, 20.6, 20.5]]))
     assert [trial.path for trial in found] == [Path("0/b2")]
     assert find_outlying(rows(good, good)) == []
-    # of two nobody knows which one failed
+    # of two trials, it is not known which one failed
     assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []
 
 
-def test_a_verdict_that_hangs_on_one_training_is_undecided(
+def test_a_verdict_that_depends_on_one_training_is_undecided(
     make_experiment: Callable[..., Experiment],
 ) -> None:
     """Without the training that failed the mean has the other sign."""
@@ -256,10 +257,10 @@ def test_scenes_of_all_questions_are_one_family_and_a_single_scene_has_the_quest
     ]
 
 
-# --- which arms are held against which
+# --- which arms are compared
 
 
-def test_comparisons_worth_making() -> None:
+def test_arms_are_compared_with_the_baseline_of_the_same_initialiser() -> None:
     arms = [Arm("dim", "adc"), Arm("dim", "volumetric"), ADC, VOLUMETRIC]
     assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[2], arms[3])]
     three = [Arm(init, "x") for init in "abc"]
@@ -268,7 +269,7 @@ def test_comparisons_worth_making() -> None:
     assert choose_pairs([ADC]) == []
 
 
-def test_variants_are_held_against_the_baselines_own() -> None:
+def test_variants_are_compared_with_the_baseline_of_the_same_settings() -> None:
     arms = [
         Arm("sfm", name, (("cap", str(cap)),)) for name in ("adc", "volumetric") for cap in (1, 2)
     ]

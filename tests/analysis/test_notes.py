@@ -1,5 +1,4 @@
-"""Notes on what trials have in common, word for word, for made-up trials whose numbers are
-known."""
+"""Notes below tables, word for word, for made-up trials with known numbers."""
 
 import json
 from dataclasses import replace
@@ -31,7 +30,7 @@ def with_record(trial: TrialResult, **values: object) -> TrialResult:
     [
         ({"garden": (100, 128)}, "28 % more"),
         ({"garden": (100, 60)}, "40 % fewer"),
-        ({"garden": (100, 200), "stump": (300, 200)}, ""),  # as many in all
+        ({"garden": (100, 200), "stump": (300, 200)}, ""),  # equal totals
         ({"garden": (100, 100), "stump": (300, 400)}, "25 % more"),
         # over the scenes where all counts are known
         ({"garden": (100, 150), "stump": (0, 400)}, "50 % more"),
@@ -39,7 +38,7 @@ def with_record(trial: TrialResult, **values: object) -> TrialResult:
         ({"garden": (1000, 979)}, "2 % fewer"),
     ],
 )
-def test_unlike_counts_are_said_over_the_scenes_that_both_have(tmp_path, counts, said):
+def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path, counts, said):
     made = trials_of(tmp_path, scenes=list(counts))
     trials = [
         with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"])
@@ -51,7 +50,7 @@ def test_unlike_counts_are_said_over_the_scenes_that_both_have(tmp_path, counts,
     assert counts_sentence(trials, ADC, Arm("sfm", "mcmc")) == ""
 
 
-def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_several(tmp_path):
+def test_each_way_of_holding_views_out_is_stated_with_scenes_if_there_are_several(tmp_path):
     made = trials_of(tmp_path, seeds=(0, 1))
     alike = [
         with_record(trial, held_out="every 8th image", test_views=6, train_views=42)
@@ -71,7 +70,7 @@ def test_ways_of_holding_views_out_are_said_with_their_scenes_where_there_are_se
     assert held_out_notes([with_record(trial, held_out="") for trial in made]) == []
 
 
-def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path):
+def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_path):
     for path in write_runs(
         tmp_path, Plan(inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",))
     ):
@@ -96,7 +95,7 @@ def test_whose_views_made_the_points_is_said_once_for_each_initialiser(tmp_path)
 @pytest.mark.parametrize(
     ("lost", "rest"), [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")]
 )
-def test_of_what_is_left_out_three_are_named_and_all_are_counted(tmp_path, lost, rest):
+def test_up_to_three_left_out_trials_are_named_and_all_are_counted(tmp_path, lost, rest):
     paths = write_runs(tmp_path, Plan())
     for path in paths[:lost]:
         (path / "results.json").unlink()

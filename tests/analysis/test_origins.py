@@ -1,4 +1,4 @@
-"""Machines and initial clouds: averaged over, compared across, and always said."""
+"""Trials of several machines or initial clouds are averaged and compared, always with a note."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -45,13 +45,13 @@ def test_trials_of_several_machines_are_averaged_and_the_table_says_so(tmp_path)
     assert "machine   Ryzen (znver3, torch AVX2)" in explain_cell("exp:garden:psnr:adc", tmp_path)
 
 
-def test_one_machine_or_none_recorded_is_no_note(tmp_path):
+def test_one_kind_of_machine_or_none_recorded_gives_no_note(tmp_path):
     one_trial(tmp_path, 0, psnr=27.0, _machine=XEON)
     one_trial(tmp_path, 1, psnr=27.0)
     assert not any("machine" in note for note in notes_of(tmp_path))
 
 
-def test_one_initialiser_that_gave_two_clouds_is_noted(tmp_path):
+def test_two_clouds_of_one_initialiser_are_noted(tmp_path):
     for seed, densify, cloud in ((0, "adc", A), (1, "adc", B), (0, "volumetric", A)):
         one_trial(tmp_path, seed, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
     assert (

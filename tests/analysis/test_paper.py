@@ -1,4 +1,4 @@
-"""The paper as data: its numbers against its own text, and the classing of cells."""
+"""The paper as data: its numbers agree with its text, and measured cells are marked by them."""
 
 import re
 
@@ -35,7 +35,7 @@ def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
 
 
 @pytest.mark.shared
-def test_the_data_are_those_of_the_printed_tables(shared):
+def test_the_numbers_are_those_of_the_printed_tables(shared):
     """Every number of the tables in the paper's text, row by row, with its printed digits."""
     paper, text = load_paper(), (shared / "paper.md").read_text()
     rows = [
@@ -62,7 +62,7 @@ def test_the_data_are_those_of_the_printed_tables(shared):
         ] == row[1:]
 
 
-def test_what_the_paper_contradicts_follows_from_its_numbers():
+def test_the_papers_contradictions_follow_from_its_numbers():
     paper = load_paper()
     table1, table2 = (paper.tables[name] for name in ("table1", "table2"))
     text = "\n".join(paper.contradictions)
@@ -110,7 +110,7 @@ def test_what_the_paper_contradicts_follows_from_its_numbers():
     assert set(paper.scenes("table1")) - set(paper.scenes("table2")) == {"train"}
 
 
-def test_a_printed_number_stands_for_its_rounding_range():
+def test_a_printed_number_has_the_range_that_rounds_to_it():
     assert PrintedNumber("0.27").range == pytest.approx((0.265, 0.275))
     assert PrintedNumber("0.270").range == pytest.approx((0.2695, 0.2705))
 
@@ -129,7 +129,7 @@ def test_a_printed_number_stands_for_its_rounding_range():
         (cell(0.130, 0.00056, 2), INTERVAL),
     ],
 )
-def test_agreement(measured, expected):
+def test_a_measured_cell_is_marked_by_its_agreement_with_the_printed_number(measured, expected):
     assert agreement(measured, PrintedNumber("0.12")) == expected
 
 
@@ -164,7 +164,7 @@ def test_scenes_that_the_paper_lacks_come_last(make_experiment):
     ]
 
 
-def test_table1_names_a_stand_in_for_the_papers_initialiser(make_experiment):
+def test_table1_names_the_initialiser_that_replaces_the_papers(make_experiment):
     experiment = make_experiment(experiment="table1", inits=("sfm",), scenes=("garden",))
     _, difference = paper_tables(experiment, "table1")
     assert any("from sfm replace the paper's DIM" in note for note in difference.notes)
@@ -195,7 +195,7 @@ def test_an_experiment_without_the_papers_arms_is_refused(make_experiment):
     assert build_table(experiment).rows
 
 
-def test_the_verb_prints_and_writes(tmp_path, capsys):
+def test_the_tables_verb_prints_and_writes_files(tmp_path, capsys):
     runs = tmp_path / "runs"
     write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     assert tables(["table1"], runs) == 0
@@ -228,7 +228,7 @@ def test_the_verb_names_bad_options_and_left_out_trials(tmp_path, capsys):
     assert load_experiment(tmp_path, "exp").trials
 
 
-def test_below_the_differences_stands_what_the_paper_says_of_its_setup(make_experiment):
+def test_the_table_of_differences_quotes_the_papers_setup(make_experiment):
     _, difference = paper_tables(
         make_experiment(experiment="table1", inits=("dim",), scenes=("garden",)), "table1"
     )
@@ -236,7 +236,7 @@ def test_below_the_differences_stands_what_the_paper_says_of_its_setup(make_expe
         assert "The paper on hardware: it trained on one NVIDIA RTX 2080." in written
 
 
-def test_the_papers_own_set_up_has_the_papers_layout(tmp_path, capsys):
+def test_an_experiment_with_the_suffix_own_has_the_papers_layout(tmp_path, capsys):
     write_runs(tmp_path, Plan(experiment="table1_own", inits=("dim_paper",), scenes=("garden",)))
     assert tables(["table1_own"], tmp_path) == 0
     out = capsys.readouterr().out
@@ -265,13 +265,13 @@ def test_every_paper_names_its_source_and_has_sane_numbers(name):
 
 
 @pytest.mark.parametrize("name", published_names())
-def test_scenes_and_methods_are_called_as_gsbench_calls_them(name):
+def test_scenes_and_methods_of_papers_have_the_names_of_gsbench(name):
     paper = load_published(name)
     assert all((conf_dir() / "scene" / f"{scene}.yaml").is_file() for scene, _ in paper.printed)
     assert (conf_dir() / "densify" / f"{paper.densify}.yaml").is_file()
 
 
-def test_ours_stand_beside_the_printed_numbers(tmp_path, capsys):
+def test_measured_values_are_shown_beside_the_printed_numbers(tmp_path, capsys):
     for seed, psnr in enumerate((27.41, 27.41, 27.41)):
         one_trial(tmp_path, seed, psnr=psnr, ssim=0.9, lpips_vgg_raw=0.2)
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
@@ -288,7 +288,7 @@ def test_ours_stand_beside_the_printed_numbers(tmp_path, capsys):
     assert "### Difference from 3dgs" in capsys.readouterr().out
 
 
-def test_what_cannot_be_compared_is_said(tmp_path):
+def test_trials_that_cannot_be_compared_with_a_paper_are_refused(tmp_path):
     one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
     with pytest.raises(InputError, match="no trial here is of one of them"):
         published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")

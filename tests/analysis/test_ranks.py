@@ -1,5 +1,4 @@
-"""Arms ranked over scenes: the published critical values, Friedman's test, groups, and what is left
-out."""
+"""Arms ranked over scenes: critical values, Friedman's test, groups, and what is left out."""
 
 import re
 from collections.abc import Callable
@@ -40,8 +39,7 @@ def test_the_critical_values_are_those_of_demsar(arms, q):
 
 
 def test_the_example_of_demsar():
-    """Demšar 2006, section 3.2.2: four classifiers on 14 data sets have the critical difference
-    1.25."""
+    """Demšar 2006, section 3.2.2: four classifiers on 14 data sets, critical difference 1.25."""
     assert critical_difference(4, 14) == pytest.approx(1.25, abs=0.005)
 
 
@@ -115,7 +113,7 @@ def test_equal_arms_do_not_differ(make_experiment):
     assert ranking.groups == [(0, 2)]
 
 
-def test_report_and_site_have_the_picture(seven, tmp_path):
+def test_report_and_site_have_the_plot_of_ranks(seven, tmp_path):
     write_archive(seven, tmp_path / "exp.zip")
     assert run(["site", str(tmp_path / "exp.zip"), "--out", str(tmp_path / "site")]) == 0
     for page in (build_report(seven), (tmp_path / "site" / "index.html").read_text()):

@@ -1,5 +1,4 @@
-"""The report: it stands alone, says the verdict first, needs neither mouse nor eyes, and shows the
-right places."""
+"""The report: one page that needs no other file, with the verdict first, usable by everybody."""
 
 import base64
 import io
@@ -43,8 +42,7 @@ ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Path:
-    """Two scenes with pictures, in which "volumetric" has a clearly better LPIPS and nothing else
-    differs."""
+    """Two scenes with pictures, in which "volumetric" differs only by a clearly better LPIPS."""
     folder = tmp_path_factory.mktemp("runs")
     write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1))
     return folder
@@ -102,7 +100,7 @@ class Elements(HTMLParser):
         return [attrs for name, attrs in self.found if name == tag]
 
 
-def test_the_page_is_well_formed_and_needs_nothing_else(page):
+def test_the_page_is_well_formed_and_needs_no_other_file(page):
     elements = Elements(page)
     assert elements.open == []
     for tag, attribute in (("img", "src"), ("link", "href"), ("script", "src"), ("iframe", "src")):
@@ -112,7 +110,7 @@ def test_the_page_is_well_formed_and_needs_nothing_else(page):
     assert not re.search(r"url\(|@import|https?://|fetch\(|XMLHttp", page)
 
 
-def test_it_can_be_read_without_eyes_and_used_without_a_mouse(page):
+def test_the_page_suits_screen_readers_and_keyboards(page):
     elements = Elements(page)
     assert elements.all("html") == [{"lang": "en"}]
     assert all(attrs.get("alt") for attrs in elements.all("img"))
@@ -139,7 +137,7 @@ def test_the_verdict_comes_first(page):
     assert "LPIPS Alex" not in verdicts  # not run: no row
 
 
-def test_what_a_verdict_does_not_say_stands_beside_it(page):
+def test_unequal_counts_and_training_times_are_stated_beside_the_verdict(page):
     """The arms have other counts, and equal trials other times."""
     headline = re.search(r'<div class="verdict"><p><strong>([^<]*)</strong>', page)
     assert headline is not None
@@ -168,8 +166,8 @@ def test_texture_energy_is_the_squared_gradient():
     assert texture_energy(np.full((9, 9, 3), 7, dtype=np.uint8)).max() == 0
 
 
-def test_whole_views_are_the_worst_the_median_and_the_best(experiment):
-    """Of a scene with three views, each picked by another gain."""
+def test_the_views_with_the_least_median_and_largest_gain_are_shown(experiment):
+    """The scene has three views, so each is chosen, in the order of gains."""
     trials = [trial for trial in experiment.trials if trial.scene == "garden"]
     first, second = (
         next(t.path for t in trials if (t.arm, t.seed) == (arm, 0)) for arm in (ADC, VOLUMETRIC)
@@ -192,7 +190,7 @@ def test_whole_views_are_the_worst_the_median_and_the_best(experiment):
     assert len(both) == 3
 
 
-def test_of_one_or_two_views_each_is_shown_once(tmp_path):
+def test_one_or_two_views_are_each_shown_once(tmp_path):
     for count, named in (
         (1, ["the only view"]),
         (2, ["the view with the least gain", "the view with the largest gain"]),
@@ -232,7 +230,7 @@ def test_volumes_are_those_of_the_ellipsoids(experiment):
 
 
 def test_logged_histograms_are_shares_of_all_trials_together():
-    """Ten Gaussians of one trial and thirty of another; the second alone has an iteration 8."""
+    """Ten Gaussians of one trial and thirty of another; only the second has an iteration 8."""
     edges = [-4.0, -3.0, -1.0, 0.0]
     rows = [
         [Histogram(step=4, log10_edges=edges, counts=[4, 0, 6])],
@@ -251,7 +249,7 @@ def test_logged_histograms_are_shares_of_all_trials_together():
     assert np.array(found[8]) == pytest.approx(np.array([[10**-2.0, 1.0]]))
 
 
-def test_the_share_above_the_threshold_is_said(experiment, page):
+def test_the_share_of_volumes_above_the_threshold_is_stated(experiment, page):
     found = [
         10 ** log10_volumes(t.path / "point_cloud.ply")
         for t in experiment.trials
@@ -260,7 +258,7 @@ def test_the_share_above_the_threshold_is_said(experiment, page):
     assert f"sfm-adc: {np.mean(np.concatenate(found) > 0.03):.2%} of volumes exceed 0.03." in page
 
 
-def test_growth_and_pruning_by_cause_are_a_table(page):
+def test_growth_and_pruning_by_cause_are_shown_in_a_table(page):
     events = page.split("<caption>Gaussians by cause, mean of a trial</caption>")[1].split(
         "</table>"
     )[0]
@@ -324,7 +322,7 @@ def test_a_line_chart_puts_values_where_they_belong():
     assert y0 == y2 > y1  # up is smaller in SVG
 
 
-def test_charts_have_their_margins():
+def test_charts_have_fixed_margins():
     figure = ElementTree.fromstring(line_chart("t", [("a", [(0, 0), (10, 10)])], "x", "y"))
     assert next(figure.iter("svg")).attrib["viewBox"] == "0 0 380 250"
     x, y = 58 + 304 * 10 / 10.4, 206 - 180 * 10 / 10.4
@@ -356,8 +354,11 @@ def test_each_line_has_a_colour_and_dashes_of_its_own():
     [(2, 5), (3, 3), (0.3, 40), (1e-9, 1e9), (0.011, 0.012), (7000, 30000), (99.5, 101), (1, 1e6)],
 )
 def test_an_axis_has_round_ticks_within_its_range(values, log):
-    """Its range goes a little beyond the values; on a logarithmic one of no two decades, ends and
-    middle are named."""
+    """The range goes a little beyond the values.
+
+    A logarithmic axis that does not contain two decades has ticks at its ends and in the
+    middle.
+    """
     axis = Axis(values, log, 100.0, 300.0)
     places = [axis.to_px(tick) for tick in axis.ticks]
     assert 2 <= len(places) <= 12
@@ -395,7 +396,7 @@ def test_an_axis_has_round_ticks_within_its_range(values, log):
         ((1, 1e6), True, [1, 100, 1e4, 1e6], ["1", "100", "10k", "1M"]),
     ],
 )
-def test_ticks_of_an_axis(values, log, ticks, labels):
+def test_ticks_are_at_round_values_with_matching_labels(values, log, ticks, labels):
     axis = Axis(values, log, 0.0, 100.0)
     assert axis.ticks == pytest.approx(ticks)
     assert [axis.label(tick) for tick in axis.ticks] == labels
@@ -455,20 +456,20 @@ def test_the_threshold_of_a_chart_is_the_one_that_all_arms_have_in_scene_units(
     assert _threshold(load_experiment(tmp_path / "b", "exp").trials) == own
 
 
-def test_nothing_to_draw_is_an_empty_string():
+def test_a_chart_with_nothing_to_draw_is_an_empty_string():
     assert line_chart("t", [("a", [])], "x", "y") == ""
     assert line_chart("t", [("a", [(0, 1), (1, 0)])], "x", "y", log=True) == ""
     assert forest_plot("t", [], "x", 1) == ""
 
 
-def test_the_verb_writes_the_file(runs, tmp_path, capsys):
+def test_the_report_verb_writes_the_file(runs, tmp_path, capsys):
     assert report(["exp", "--out", str(tmp_path / "sub" / "r.html")], runs) == 0
     assert (tmp_path / "sub" / "r.html").read_text().startswith("<!doctype html>")
     assert str(tmp_path / "sub" / "r.html") in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "sub").iterdir()] == ["r.html"]
 
 
-def test_one_trial_of_each_arm_is_no_verdict(tmp_path):
+def test_one_trial_of_each_arm_gives_no_verdict(tmp_path):
     write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",), effect={"psnr": 9.0}))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert ">garden</text>" in page
@@ -477,7 +478,7 @@ def test_one_trial_of_each_arm_is_no_verdict(tmp_path):
     assert "▲ better" not in page
 
 
-def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path):
+def test_a_report_on_a_table_of_the_paper_compares_with_its_numbers(tmp_path):
     write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
     page = build_report(load_experiment(tmp_path, "table1"))
     assert "Table 1, difference from the printed values" in page
@@ -486,9 +487,11 @@ def test_a_report_on_a_table_of_the_paper_has_its_numbers_beside(tmp_path):
     )
 
 
-def test_costs_stand_under_the_verdict(page):
-    """20,010 and 26,010 Gaussians on the average, 51.025 and 66.025 s; seeds 0 to 2 add as many
-    seconds."""
+def test_costs_are_listed_under_the_verdict(page):
+    """Means: 20,010 and 26,010 Gaussians; 51.025 and 66.025 s.
+
+    Seeds 0 to 2 add as many seconds.
+    """
     costs = page.split('aria-label="Cost">')[1].split("</ul>")[0]
     assert "<li>Gaussians +30.0% as a ratio of totals, +30.0% as the mean of 2 scenes</li>" in costs
     assert (
@@ -535,7 +538,7 @@ def test_swept_settings_become_arms_of_their_own(tmp_path):
     assert "sfm-volumetric max_gaussians=10000 against sfm-adc max_gaussians=10000" in page
 
 
-def test_arms_that_never_differed_are_called_equal_and_not_undecided(tmp_path):
+def test_arms_that_never_differ_are_called_equal_and_not_undecided(tmp_path):
     write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
     page = build_report(load_experiment(tmp_path, "exp"))
     assert "equal in every metric" in page
@@ -562,7 +565,7 @@ def test_no_scene_is_named_where_none_is_decided(tmp_path):
     assert by_scene_lines(judged.verdicts) == []
 
 
-def test_points_of_a_search_are_not_held_against_each_other(tmp_path):
+def test_points_of_a_search_are_not_compared(tmp_path):
     write_runs(tmp_path, Plan())
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))
     points = [{"value": 27.5, "settings": {"densify.volume_threshold": 0.6841}}]
@@ -574,8 +577,8 @@ def test_points_of_a_search_are_not_held_against_each_other(tmp_path):
     assert "densify.volume_threshold = 0.6841 (point 1)" in page
 
 
-def test_a_forest_has_a_scale_whatever_its_range():
-    """A range of -.09 to .09 had zero as its one tick."""
+def test_a_forest_plot_has_at_least_two_grid_lines_for_any_range():
+    """A range of -0.09 to 0.09 once had only one tick, at zero."""
     for reach in (0.0886, 0.09, 0.11, 1.0, 3.3, 940.0):
         chart = forest_plot(
             "t", [ForestRow("a", 0.1 * reach, Interval(-reach, reach))], "difference", 1

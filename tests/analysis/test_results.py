@@ -1,4 +1,4 @@
-"""Reading result files: what is sound is read, everything else is named and left out."""
+"""Reading result files: sound trials are read, all others are named and left out."""
 
 import json
 import subprocess
@@ -37,7 +37,7 @@ def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
     ) * 2
 
 
-def test_hydra_and_report_files_beside_the_trials_do_not_disturb(tmp_path):
+def test_hydra_and_report_files_beside_the_trials_are_ignored(tmp_path):
     write_runs(tmp_path, Plan())
     (tmp_path / "exp" / ".hydra").mkdir()
     (tmp_path / "exp" / "report.html").write_text("")
@@ -134,7 +134,7 @@ def test_views_must_average_to_the_metrics_of_their_trial(tmp_path):
         read_views(trial)
 
 
-def test_json_lines_end_at_a_damaged_line(tmp_path):
+def test_reading_json_lines_stops_at_a_damaged_line(tmp_path):
     (tmp_path / "m.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
     assert read_rows(tmp_path / "m.jsonl") == [{"step": 1}, {"step": 2}]
     assert read_rows(tmp_path / "absent.jsonl") == []

@@ -1,5 +1,4 @@
-"""The statistics and planning against scipy, textbooks, hand-counted cases, and simulated
-sweeps."""
+"""Statistics and planning against SciPy, textbooks, cases counted by hand, and simulations."""
 
 from __future__ import annotations
 
@@ -42,9 +41,11 @@ def test_the_test_of_one_scene_is_the_paired_t_test() -> None:
     assert t_test(np.array([[0.3]])) is None
 
 
-def test_scenes_weigh_alike_and_each_has_a_variance_of_its_own() -> None:
-    """By hand: variances 1 and 2 of three pairs each; three fifths of Satterthwaite's
-    2 (1 + 2)^2 / (1 + 4) degrees, but at least the 2 of one scene."""
+def test_scenes_have_equal_weights_and_their_own_variances() -> None:
+    """By hand: variances 1 and 2 of three pairs each.
+
+    Satterthwaite's degrees are 2 (1 + 2)^2 / (1 + 4); three fifths of them count, but at least 2.
+    """
     rows = np.array([[1.0, 2.0, 3.0], [3 - 2**0.5, 3.0, 3 + 2**0.5]])
     found = t_test(rows)
     assert found is not None
@@ -68,7 +69,7 @@ def test_the_error_is_that_of_welch() -> None:
     assert found.degrees == pytest.approx(max(4.0, 5 / 7 * welch.df))
 
 
-def test_of_single_pairs_the_spread_of_scenes_stands_for_that_of_trainings() -> None:
+def test_with_single_pairs_the_spread_of_scenes_replaces_that_of_trainings() -> None:
     values = np.array([[0.3], [0.1], [0.5]])
     found = t_test(values)
     assert found is not None
@@ -85,11 +86,13 @@ def test_two_pairs_suffice_for_a_test() -> None:
 @pytest.mark.parametrize(
     ("low", "high", "known"), [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)]
 )
-def test_an_interval_that_ends_at_zero_holds_it(low: float, high: float, known: bool) -> None:
+def test_an_interval_that_ends_at_zero_does_not_exclude_it(
+    low: float, high: float, known: bool
+) -> None:
     assert Interval(low, high).excludes_zero() == Interval(-high, -low).excludes_zero() == known
 
 
-def test_trainings_that_do_not_differ_are_sure() -> None:
+def test_without_spread_p_is_zero_or_for_no_difference_one() -> None:
     same = t_test(np.full((2, 3), 0.2))
     assert same is not None
     assert (same.p, same.interval()) == (0.0, Interval(same.mean, same.mean))
@@ -114,7 +117,7 @@ def test_holm_is_step_down_and_monotone() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_an_interval_leaves_zero_out_exactly_where_p_is_below_5_percent(seed: int) -> None:
+def test_an_interval_excludes_zero_exactly_if_p_is_below_5_percent(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size, scenes, seeds = (int(n) for n in rng.integers((1, 1, 2), (25, 9, 5)))
     for one in answer_family(
@@ -142,15 +145,13 @@ def test_an_interval_leaves_zero_out_exactly_where_p_is_below_5_percent(seed: in
         ((0.1, 2.0), 0, "undecided"),
     ],
 )
-def test_the_interval_alone_makes_the_outcome(
+def test_the_interval_alone_decides_the_outcome(
     interval: tuple[float, float], sign: int, expected: str
 ) -> None:
     assert outcome_of(Interval(*interval), sign, 0.5) == expected
 
 
-def test_what_is_too_small_is_told_at_an_equal_part_of_the_error_rate() -> None:
-    """A member whose sign is sure at Holm's rate, and whose size is so only at a member's equal
-    part."""
+def test_too_small_is_decided_at_an_equal_share_of_the_error_rate() -> None:
     clear, other = np.array([[0.30, 0.31, 0.29]]), np.array([[0.0, 5.0, -4.0]])
     one = answer_family([clear, other])[0]
     assert (one.rate, one.equal_rate) == (pytest.approx(ALPHA / 2), ALPHA / 2)
@@ -161,7 +162,7 @@ def test_what_is_too_small_is_told_at_an_equal_part_of_the_error_rate() -> None:
 # --- scenes like these
 
 
-def test_scenes_like_these_are_asked_by_the_sign_test() -> None:
+def test_scenes_like_these_are_judged_by_the_sign_test() -> None:
     means = np.array([-0.044, 0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007])
     found = judge_like_these(means, 1, 0.005)
     assert found is not None
@@ -190,8 +191,7 @@ def test_scenes_like_these_are_asked_by_the_sign_test() -> None:
 
 
 def test_the_interval_of_the_median_is_exact() -> None:
-    """Of eight values the outermost hold the median but for 2 / 2^8; of six 5 % is reached, 1 %
-    not."""
+    """The ends of eight values miss the median with probability 2 / 2^8; six reach 5 %, not 1 %."""
     values = np.arange(8.0)
     assert median_interval(values, 0.05) == Interval(0.0, 7.0)
     assert median_interval(values, 0.3) == Interval(2.0, 5.0) or median_interval(
@@ -231,7 +231,7 @@ def test_all_looks_together_err_in_at_most_5_percent_also_with_a_noisy_scene(
     assert np.mean(false) < 0.05 + 3 * (0.05 * 0.95 / len(sweeps)) ** 0.5
 
 
-def test_levels_and_plans_of_looks() -> None:
+def test_levels_of_looks_and_numbers_of_seeds_at_looks() -> None:
     assert look_levels(3, (4,), 0.05) == (0.05,)
     # too little to spend for any of the simulated sequences
     assert look_levels(1, (2, 3), 1e-6)[0] == 0.0
@@ -242,7 +242,7 @@ def test_levels_and_plans_of_looks() -> None:
     assert plan_looks(14) == (*range(2, 13), 14)
 
 
-# --- untruths, of simulated checks; scripts/untruths.py has the large table
+# --- false outcomes of simulated checks; scripts/untruths.py has the large table
 
 
 CHECKS = 300
@@ -257,14 +257,14 @@ LIMIT = 0.05 + 3 * (0.05 * 0.95 / CHECKS) ** 0.5  # three standard errors above 
         pytest.param("a training in ten fails, either arm", marks=pytest.mark.slow),
     ],
 )
-def test_no_word_is_untrue_in_more_than_5_percent(kind: str) -> None:
+def test_no_outcome_is_false_in_more_than_5_percent(kind: str) -> None:
     for effect in (0.0, 0.5, 1.0, 2.0):
         found = rates(KINDS[kind], effect, CHECKS)
         assert max(found.untrue.values()) < LIMIT, (effect, found)
         assert found.like_these < LIMIT, (effect, found)
 
 
-def test_a_noisy_scene_with_few_seeds_does_not_make_verdicts() -> None:
+def test_a_noisy_scene_with_few_seeds_causes_no_false_verdicts() -> None:
     found = rates(KINDS["2, 10 and 10 pairs, the small scene noisy"], 0.0, CHECKS)
     assert max(found.untrue.values()) < LIMIT
 
@@ -315,7 +315,7 @@ def test_components_of_equal_scenes_by_hand() -> None:
     assert (found.scenes, found.trials) == (2, 4)
 
 
-def test_scenes_that_do_not_differ_have_no_variance_of_their_own() -> None:
+def test_equal_scenes_have_no_variance_between_them() -> None:
     assert estimate_components([np.array([0.0, 2.0]), np.array([0.0, 2.0])]).between == 0.0
     assert estimate_components([np.array([0.0, 2.0])]).between is None
     with pytest.raises(InputError, match="two seeds"):
@@ -323,7 +323,7 @@ def test_scenes_that_do_not_differ_have_no_variance_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("like_asked", [False, True])
-def test_power_is_the_share_of_simulated_sweeps_that_see_it(like_asked: bool) -> None:
+def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_asked: bool) -> None:
     rng = np.random.default_rng(1)
     design, effect, sweeps = Design(8, 3), 0.35, 4000
     scenes = rng.normal(0, KNOWN.between or 0.0, (sweeps, design.scenes, 1)) if like_asked else 0.0
@@ -337,7 +337,7 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_it(like_asked: bool) ->
 
 
 @pytest.mark.parametrize("like_these", [False, True])
-def test_designs_that_are_needed_just_suffice(like_these: bool) -> None:
+def test_planned_designs_have_the_fewest_seeds_that_suffice(like_these: bool) -> None:
     designs = designs_needed(0.35, KNOWN, like_these)
     assert designs
     for one in designs:
@@ -349,14 +349,13 @@ def test_designs_that_are_needed_just_suffice(like_these: bool) -> None:
 
 
 def test_seeds_do_not_replace_scenes() -> None:
-    """Where scenes differ by more than the effect, no number of seeds speaks of scenes like
-    these."""
+    """If scenes differ by more than the effect, no number of seeds shows scenes like these."""
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
     assert designs_needed(0.5, scattered, like_these=True) == []
     assert designs_needed(0.5, scattered, like_these=False)[0] == Design(1, 3)
 
 
-def test_questions_without_an_answer_are_refused() -> None:
+def test_impossible_plans_are_refused() -> None:
     one_scene = estimate_components([np.array([0.0, 2.0])])
     with pytest.raises(InputError, match="two"):
         designs_needed(1.0, one_scene, like_these=True)

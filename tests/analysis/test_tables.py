@@ -44,8 +44,7 @@ def one_trial(
     settings: dict | None = None,
     **values: object,
 ) -> Path:
-    """A trial of one scene with metrics given in ``values`` (psnr=…), or other keys of results.json
-    (_iterations=…)."""
+    """A trial of one scene; ``psnr=…`` gives a metric, ``_iterations=…`` a key of results.json."""
     metrics = {key: value for key, value in values.items() if not key.startswith("_")}
     plan = Plan()
     views = {key: np.array([value]) for key, value in metrics.items()}
@@ -93,7 +92,7 @@ def test_bold_is_by_scene_not_by_table(make_experiment):
     assert bold == {(s, "sfm", "volumetric") for s in ("courtyard", "garden", "mean of 2 scenes")}
 
 
-def test_no_mean_is_shown_where_no_scene_has_every_arm(tmp_path):
+def test_no_mean_is_shown_if_no_scene_has_every_arm(tmp_path):
     paths = write_runs(tmp_path, Plan())
     for path in [*paths[0:3], *paths[9:]]:  # courtyard has volumetric alone, garden adc
         shutil.rmtree(path)
@@ -129,7 +128,7 @@ def test_an_unavailable_metric_is_na_with_its_reason(make_experiment):
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_where_another_lpips_alone_was_asked_for_it_has_the_column(there, tmp_path):
+def test_the_only_lpips_that_was_asked_for_has_a_column(there, tmp_path):
     measured = {"lpips_squeeze": 0.1} if there else {}
     one_trial(tmp_path, 0, settings={"eval__lpips": ["squeeze"]}, psnr=27.0, **measured)
     keys = [quantity.key for quantity in choose_quantities(load_experiment(tmp_path, "exp").trials)]
@@ -203,15 +202,19 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
 @pytest.mark.parametrize(
     ("second_budget", "blocked", "compared"),
     [
-        # neither cap acted: both grew as they liked
+        # neither cap acted, so none limited the growth
         ({"max_gaussians": None, "cap": None}, (0, 0), True),
         ({"max_gaussians": None, "cap": None}, (3, 0), False),
         ({"max_gaussians": 1000, "cap": "hard"}, (0, 3), False),
         ({"max_gaussians": 50_000, "cap": "soft"}, (3, 0), True),  # one budget for both
-        # who knows what it would have become
+        # a time limit may have stopped its growth
         ({"max_gaussians": None, "cap": None, "seconds": 60}, (0, 0), False),
-        ({"max_gaussians": None, "cap": None}, (None, 0), False),  # no count of what was refused
-        # it steers also where it refuses nothing
+        (
+            {"max_gaussians": None, "cap": None},
+            (None, 0),
+            False,
+        ),  # unknown whether the cap blocked any
+        # a governor steers growth even if it refuses nothing
         ({"max_gaussians": 1000, "cap": "governor"}, (0, 0), False),
     ],
 )
@@ -226,7 +229,7 @@ def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
     assert ("garden: not compared, no best marked: budget differ." in table.notes) is not compared
 
 
-def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path):
+def test_the_mean_of_scenes_gives_each_the_same_weight(tmp_path):
     for scene, psnrs in (("a", (20.0, 22.0)), ("b", (30.0, 31.0))):
         for seed, psnr in enumerate(psnrs):
             one_trial(tmp_path, seed, psnr=psnr, _scene=scene)
@@ -239,7 +242,7 @@ def test_the_mean_of_scenes_weighs_scenes_alike(tmp_path):
         assert table.rows[-1].entries[0].text == f"{mean:.2f} ± {std:.2f}"
 
 
-def test_costs_are_averaged_by_both_rules(make_experiment, tmp_path):
+def test_changes_of_costs_are_given_of_totals_and_as_the_mean_of_ratios(make_experiment, tmp_path):
     for scene, adc, volumetric in (("a", 1_000_000, 2_000_000), ("b", 3_000_000, 3_000_000)):
         one_trial(tmp_path, 0, psnr=20.0, _scene=scene, _num_gaussians=adc)
         one_trial(
@@ -300,7 +303,7 @@ def test_rows_are_in_the_order_of_numbers_then_of_text(tmp_path):
     assert [row.labels for row in table.rows] == [("9",), ("10",), ("100",), ("None",)]
 
 
-def test_markdown(make_experiment):
+def test_markdown_has_a_line_for_each_row_and_equal_numbers_of_cells(make_experiment):
     text = to_markdown(build_table(make_experiment(), rows=["scene"], columns=["densify"]))
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert lines[0].startswith("| scene | PSNR (dB) ↑ adc | PSNR (dB) ↑ volumetric |")
@@ -401,7 +404,7 @@ def test_latex_has_as_many_cells_as_columns(make_experiment):
     } == {width}
 
 
-def test_results_written_by_hand_are_plain_json(make_experiment):
+def test_results_files_are_plain_json(make_experiment):
     trial = make_experiment().trials[0]
     assert json.loads((trial.path / "results.json").read_text())["metrics"] == trial.metrics
 

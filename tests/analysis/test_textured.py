@@ -13,9 +13,11 @@ from gsbench.runs.layout import FROM_PIXELS, MASKS
 from tests.analysis.synthetic import Plan, write_runs
 
 
-def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path):
-    """Steps grow from left to right, so texture does; the render is off by the tenth of a column's
-    number."""
+def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
+    """Texture grows from left to right, as steps do.
+
+    The render is off by a tenth of the column's number.
+    """
     write_runs(
         tmp_path, Plan(scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True)
     )
@@ -31,7 +33,7 @@ def test_it_is_the_mean_error_where_the_fifth_of_most_texture_lies(tmp_path):
     counts[:, 50:] = 0
     (trial.path / MASKS).mkdir()
     Image.fromarray(counts).save(trial.path / MASKS / "view000.png")
-    # of the left half, its last ten columns
+    # the last ten columns of the left half
     assert textured_error(trial) == pytest.approx(4.0, abs=0.2)
     for picture in (trial.path / "renders").iterdir():
         picture.unlink()

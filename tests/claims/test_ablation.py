@@ -1,5 +1,4 @@
-"""Switches of densifiers: which are on, which runs they make, and verdicts from result files with
-known gains."""
+"""Switches of densifiers: which are on, which runs they make, and verdicts on known gains."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
@@ -41,7 +40,7 @@ def on(*names: str) -> Run:
     return frozenset(names)
 
 
-def test_what_acts_within_another_is_trained_only_where_that_is_on():
+def test_a_switch_within_another_is_trained_only_where_the_other_is_on():
     runs = runs_to_train(NESTED)
     assert runs == [
         on("rule", "shrink", "once"),
@@ -51,13 +50,13 @@ def test_what_acts_within_another_is_trained_only_where_that_is_on():
         on(),
     ]
     assert effective_run(on("shrink", "once"), NESTED) == on()
-    alone = {"shrink": NESTED["shrink"]}  # where the rule is not asked about it stays as it is: on
+    alone = {"shrink": NESTED["shrink"]}  # the rule is no switch here, so it stays on
     assert runs_to_train(alone) == [on("shrink"), on()]
     assert off_settings(on("rule"), NESTED) == {"of": 1, "b": 2}
     assert off_settings(on("rule", "shrink", "once"), NESTED) == {}
 
 
-def test_switches_within_each_other_are_refused():
+def test_switches_that_depend_on_each_other_are_refused():
     circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
     with pytest.raises(InputError, match="circle"):
         runs_to_train(circle)
@@ -78,7 +77,7 @@ def test_switches_within_each_other_are_refused():
     "arm", [name for name in options("densify") if name != "none" and "/" not in name]
 )
 def test_every_declared_switch_of_every_arm_makes_another_densifier(arm):
-    """Its settings are those of the class, allowed there, and act on the arm as configured."""
+    """The settings of a switch are allowed for the class, and they change the arm as configured."""
     values = compose_one([f"densify={arm}"]).values["densify"]
     own = type(build("densify", values, [])).SWITCHES
     found = declared_switches(own, values)
@@ -88,7 +87,7 @@ def test_every_declared_switch_of_every_arm_makes_another_densifier(arm):
     assert all(switch.within in {"", *own} for switch in own.values())
 
 
-def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on():
+def test_the_volumetric_class_declares_three_switches_and_only_those_that_are_on_count():
     once = compose_one(["densify=volumetric_once"]).values["densify"]
     assert list(declared_switches(Volumetric.SWITCHES, once)) == [
         "volume_rule",
@@ -103,7 +102,7 @@ def test_the_paper_rule_has_the_three_that_matter_and_only_those_that_are_on():
     assert set().union(*(switch.off for switch in Volumetric.SWITCHES.values())) <= set(defaults)
 
 
-def test_a_yaml_declares_switches_that_are_no_part_of_a_result():
+def test_switches_in_a_yaml_file_do_not_change_the_configuration_hash():
     values: dict[str, Any] = {
         "grow": 1,
         "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}},
@@ -120,7 +119,7 @@ def test_a_yaml_declares_switches_that_are_no_part_of_a_result():
             declared_switches({}, {"switches": wrong})
 
 
-def test_a_name_that_is_no_switch_is_named_with_the_nearest():
+def test_an_unknown_switch_is_refused_with_the_nearest_name():
     with pytest.raises(InputError, match="did you mean shrink"):
         choose_switches(NESTED, ["shrnk"], "x")
     with pytest.raises(InputError, match="declares no switch"):
@@ -131,8 +130,10 @@ def test_a_name_that_is_no_switch_is_named_with_the_nearest():
 def write_ablation(
     runs: Path, gains: Mapping[str, float], seeds: int = 3
 ) -> dict[Run, dict[str, str]]:
-    """Trials in which each part of `NESTED` adds its gain in PSNR, where it acts; their folders by
-    run and scene."""
+    """Write trials in which each part of `NESTED` that acts adds its gain in PSNR.
+
+    Returns their folders by run and scene.
+    """
     keys = {}
     for number, chosen in enumerate(runs_to_train(NESTED)):
         for seed in range(seeds):
@@ -148,7 +149,7 @@ def write_ablation(
     return keys
 
 
-def test_each_combination_is_judged_against_all_parts(tmp_path):
+def test_each_combination_is_judged_against_the_run_with_all_parts(tmp_path):
     keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": 0.0})
     verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
     found = {str(one.question.arm): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
@@ -194,13 +195,13 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_words_are_refused_in_a_line(runs, words, message, refused):
+def test_bad_words_of_ablate_are_refused_in_one_line(runs, words, message, refused):
     assert message in refused("ablate", *(word for word in TINY if word != "densify=none"), *words)
     assert not (runs).exists()
 
 
 @pytest.mark.slow
-def test_the_verb_trains_each_run_once_and_judges_it(runs, said):
+def test_ablate_trains_each_run_once_and_judges_it(runs, said):
     words = [
         *(word for word in TINY if word != "densify=none"),
         "densify=adc",

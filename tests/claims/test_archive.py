@@ -1,5 +1,4 @@
-"""Archives of results: what comes back, what is never in them, and damage of every kind named in
-one line."""
+"""Archives of results: what they keep, what they never hold, and one line for every damage."""
 
 import json
 import zipfile
@@ -41,7 +40,7 @@ def rewrite(file: Path, change: Callable[[dict[str, bytes]], None]) -> None:
             archive.writestr(name, data)
 
 
-def test_results_settings_and_views_come_back(tmp_path):
+def test_results_settings_and_views_are_read_back(tmp_path):
     file = export(tmp_path)
     there = load_experiment(tmp_path / "runs", "exp")
     back = unpack_archive(file, tmp_path / "other")
@@ -55,7 +54,7 @@ def test_results_settings_and_views_come_back(tmp_path):
     ).read_text()
 
 
-def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path):
+def test_an_archive_is_small_and_equal_results_give_equal_archives(tmp_path):
     file = export(tmp_path, MANY)
     assert file.stat().st_size < 300_000
     before = file.read_bytes()
@@ -63,7 +62,7 @@ def test_an_archive_is_small_and_the_same_results_make_the_same(tmp_path):
     assert file.read_bytes() == before
 
 
-def test_no_pixels_and_no_paths_of_the_machine(tmp_path):
+def test_an_archive_has_no_pixels_no_paths_and_no_passwords(tmp_path):
     runs = tmp_path / "runs"
     (path, *_) = write_runs(runs, Plan(pictures=True, views=2))
     config = yaml.safe_load((path / "config.yaml").read_text())
@@ -95,9 +94,8 @@ def test_no_pixels_and_no_paths_of_the_machine(tmp_path):
     )
 
 
-def test_it_is_an_ro_crate(tmp_path):
-    """The rules of RO-Crate 1.2, sections 3 (root data entity), 4 (data entities) and 2
-    (packaging)."""
+def test_an_archive_is_an_ro_crate(tmp_path):
+    """RO-Crate 1.2, sections 2 (packaging), 3 (root data entity) and 4 (data entities)."""
     file = export(tmp_path)
     content = members(file)
     crate = json.loads(content["ro-crate-metadata.json"])
@@ -141,7 +139,7 @@ def drop(name: str) -> Callable[[Path], None]:
 
 
 def resigned(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
-    """An edit by somebody who wrote the new checksum down, too."""
+    """An edit by somebody who also updates the checksum."""
     import hashlib
 
     def change(content: dict[str, bytes]) -> None:
@@ -204,7 +202,7 @@ def flip_a_bit(file: Path) -> None:
         ),
     ],
 )
-def test_damage_of_every_kind_is_one_line_and_leaves_nothing(tmp_path, damage, message):
+def test_every_kind_of_damage_is_refused_in_one_line_and_leaves_no_files(tmp_path, damage, message):
     file = export(tmp_path)
     damage(file)
     with pytest.raises(InputError) as raised:

@@ -1,5 +1,4 @@
-"""A check from its file to its page: what is asked, what is run at each look, and that again
-nothing is."""
+"""A check from its file to its page: questions, runs at each look, and repeated checks."""
 
 import json
 import shutil
@@ -49,7 +48,7 @@ def check_of(tmp_path: Path, **changes: Any) -> Check:
 
 
 class FakeRunner:
-    """Writes made-up results in the place of trained ones; ``fails`` names a seed that fails."""
+    """Writes made-up results instead of training; ``fails`` names a seed that fails."""
 
     def __init__(self, noise: float, fails: int | None = None) -> None:
         self.noise, self.fails = noise, fails
@@ -77,7 +76,7 @@ class FakeRunner:
 
 
 def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
-    """Go through the looks; what is done is not run again."""
+    """Go through the looks; trials that are done are not run again."""
 
     def run(planned: Sequence[KeyAndSeed]) -> None:
         trials = check.to_run(planned)
@@ -90,7 +89,7 @@ def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
     return check.verdicts(run_looks(check.declaration, check.judged, run))
 
 
-def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path):
+def test_a_clear_effect_ends_at_the_first_look_and_a_repeated_check_runs_nothing(tmp_path):
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001)
     first = looked(check, runner)
     assert [verdict.word for verdict in first] == ["supported"]
@@ -100,19 +99,19 @@ def test_a_clear_effect_ends_at_the_first_look_and_again_nothing_is_run(tmp_path
     assert [one.verdict.interval for one in again] == [one.verdict.interval for one in first]
 
 
-def test_seeds_are_added_look_by_look_up_to_the_most(tmp_path):
+def test_seeds_are_added_look_by_look_up_to_the_largest_number(tmp_path):
     runner = FakeRunner(noise=2.0)
     (verdict,) = looked(check_of(tmp_path), runner)
     assert verdict.word == "undecided"
     assert runner.batches == [4, 2, 2]
 
 
-def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path):
+def test_a_claim_waits_for_a_failed_seed_and_is_decided_once_it_succeeds(tmp_path):
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001, fails=1)
     (verdict,) = looked(check, runner)
     assert (verdict.word, runner.batches) == ("undecided", [4])
     assert "the next look waits for them; failed: " in verdict.reason
-    assert verdict.reason.endswith("no room")  # once for both arms, of which the reason is the same
+    assert verdict.reason.endswith("no room")  # once, since both arms failed for the same reason
     runner.fails = None
     for failed in list(tmp_path.rglob("failed.json")):
         shutil.rmtree(failed.parent)
@@ -120,7 +119,7 @@ def test_a_failed_seed_makes_its_claim_wait_and_its_return_decides(tmp_path):
     assert (verdict.word, runner.batches) == ("supported", [4, 2])
 
 
-def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path):
+def test_scenes_that_cannot_be_tested_are_named_and_not_run(tmp_path):
     file = parse_claims(content() | {"scenes": {"courtyard": None, "garden": None}})
     check = prepare(
         file, tmp_path, lambda trials: ["no data"] * (trials[0].values["scene"]["name"] == "garden")
@@ -132,11 +131,11 @@ def test_what_is_missing_here_is_named_and_nothing_is_run_for_it(tmp_path):
     nothing = prepare(file, tmp_path / "b", lambda trials: ["no data"])
     assert looked(nothing, FakeRunner(0.1))[0].reason == "courtyard, garden: no data"
     assert "not testable here  lpips: courtyard, garden: no data" in describe(nothing)
-    # what can be tested here is a part of it
+    # the hash depends on what can be tested here
     assert nothing.declaration.hash != check.declaration.hash
 
 
-def test_settings_that_do_not_compose_name_their_place(tmp_path):
+def test_settings_that_do_not_compose_are_refused_with_claim_scene_and_arm(tmp_path):
     for bad, message in (
         (
             changed("arms", "adc", to={"densify": "adcc"}),
@@ -151,7 +150,7 @@ def test_settings_that_do_not_compose_name_their_place(tmp_path):
             prepare(parse_claims(bad), tmp_path, lambda trials: [])
 
 
-def test_another_seed_is_another_folder_and_the_same_settings(tmp_path):
+def test_another_seed_has_another_folder_and_the_same_settings(tmp_path):
     trial = next(iter(check_of(tmp_path).first_trials.values()))
     other = with_seed(trial, 7)
     assert yaml.safe_load(other.yaml)["seed"] == other.values["seed"] == 7
@@ -162,7 +161,7 @@ def test_another_seed_is_another_folder_and_the_same_settings(tmp_path):
     assert "seed=7" in other.overrides
 
 
-def test_the_page_says_all(tmp_path):
+def test_the_page_has_verdicts_looks_and_declarations(tmp_path):
     check = check_of(tmp_path, says="it is <better> | by far")
     verdicts = looked(check, FakeRunner(noise=0.001))
     older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
@@ -184,8 +183,10 @@ def test_the_page_says_all(tmp_path):
 def judged(
     outcome: Any, mean: float = 0.0, error: float = 0.0, direction: str = "higher", **more: Any
 ) -> ClaimVerdict:
-    """A verdict on a claim with a least effect of 0.3, whose interval is the mean if the error is
-    0."""
+    """A verdict on a claim with a least effect of 0.3.
+
+    With an ``error`` of 0, its interval is the mean.
+    """
     file = parse_claims(content(direction=direction))
     answer = Answer(mean, StudentT(mean, error, 1e6), 0.05, 0.05, 0.05)
     question = file.question(file.claims[0], {})
@@ -239,7 +240,7 @@ def test_each_verdict_has_its_reason(one, reason):
     assert one.word == ("not testable here" if reason == "no data" else one.verdict.outcome)
 
 
-def test_numbers_and_late_trials_on_the_page():
+def test_the_page_shows_short_numbers_and_late_trials():
     assert [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)] == [
         "1,000",
         "-1,000",
@@ -250,7 +251,7 @@ def test_numbers_and_late_trials_on_the_page():
     assert _late_words(judged("undecided", late=2)).startswith("2 trials had been measured before")
 
 
-def test_the_verb_on_made_up_trials_and_on_their_archive(
+def test_check_judges_made_up_trials_and_their_archive_alike(
     runs, tmp_path, monkeypatch, capsys, said, refused
 ):
     runner = FakeRunner(noise=0.001)
@@ -298,7 +299,7 @@ def test_the_verb_on_made_up_trials_and_on_their_archive(
 
 
 @pytest.mark.slow
-def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
+def test_check_declares_before_it_runs_trials_and_repeats_its_page(
     runs, tmp_path, monkeypatch, capsys, said
 ):
     words = dict(word.split("=", 1) for word in TINY)
@@ -355,7 +356,7 @@ def test_the_verb_runs_real_trials_declares_first_and_ends_with_the_same_page(
 
 @pytest.mark.parametrize("key", ["allow_targets", "+allow_targets"])
 def test_a_file_of_claims_allows_no_code(tmp_path, key, monkeypatch):
-    """A stranger's claims may name a class; only the one who types may let it run."""
+    """A stranger's claims may name a class; only the user who types the command may allow it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "stranger.py").write_text(
         "from gsbench.densify import ADC\n\n\nclass Mine(ADC):\n    pass\n"

@@ -1,5 +1,4 @@
-"""Files of claims: those that ship, and every kind of bad input as one line that names the place
-and the mend."""
+"""Files of claims: those that ship, and one line for every kind of bad input."""
 
 import copy
 import dataclasses
@@ -39,7 +38,7 @@ GOOD: dict[str, Any] = {
 
 
 def changed(*path: Any, to: Any) -> dict[str, Any]:
-    """The good file with another value somewhere."""
+    """The good file with one value changed."""
     content = copy.deepcopy(GOOD)
     place: Any = content
     for key in path[:-1]:
@@ -71,7 +70,7 @@ def test_the_files_that_ship_are_sound(path):
     assert any(claim.not_testable for claim in file.claims)
 
 
-def test_words_of_a_trial_are_those_of_a_command_line():
+def test_settings_of_a_trial_are_words_of_a_command_line():
     file = parse_claims(
         changed("claims", 0, "budget", to={"densify.max_gaussians": 15000, "densify.cap": None})
     )
@@ -87,7 +86,7 @@ def test_words_of_a_trial_are_those_of_a_command_line():
     assert file.words(file.claims[0], "courtyard", "volumetric")[2] == "scene=courtyard"
 
 
-def test_the_nearer_setting_counts():
+def test_settings_of_a_claim_override_those_of_arms_and_of_the_file():
     content = changed("settings", to={"densify.max_gaussians": 1, "scene.max_size": 160})
     content["arms"]["adc"] = {"densify": "adc", "densify.max_gaussians": 2}
     content["claims"][0]["budget"] = {"densify.max_gaussians": 3}
@@ -105,7 +104,7 @@ def test_the_direction_of_a_claim_is_the_sign_of_its_question():
     assert [sign(direction) for direction in ("higher", "same", "lower")] == [1, 0, -1]
 
 
-def test_the_question_has_what_decides_and_no_words():
+def test_the_question_does_not_depend_on_the_wording_of_the_claim():
     file = parse_claims(GOOD)
     keys = ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")
     question = file.question(file.claims[0], {"courtyard": keys})
@@ -121,7 +120,7 @@ def test_the_question_has_what_decides_and_no_words():
     assert other.question(other.claims[0], {"courtyard": keys}) == question
 
 
-def test_effects_are_differences_or_parts():
+def test_the_least_effect_is_a_difference_or_a_percentage():
     absolute = parse_claims(GOOD).claims[0].effect
     relative = parse_claims(changed("claims", 0, "least", to="10%")).claims[0].effect
     assert (absolute.size, str(absolute)) == (0.005, "0.005")
@@ -227,13 +226,13 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
 @pytest.mark.parametrize(
     ("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD]
 )
-def test_bad_input_is_one_line(content, message):
+def test_bad_input_is_refused_in_one_line(content, message):
     with pytest.raises(InputError, match=message) as caught:
         parse_claims(content())
     assert "\n" not in str(caught.value)
 
 
-def test_a_metric_of_ones_own_needs_its_class():
+def test_a_users_own_metric_needs_its_class():
     content = changed("claims", 0, "metric", to="sharpness")
     with pytest.raises(InputError, match=r"eval\.extra\.sharpness"):
         parse_claims(content)
@@ -250,7 +249,7 @@ def test_the_file_that_the_document_shows_is_sound():
     assert [claim.id for claim in file.claims] == ["quality"]
 
 
-def test_files_that_cannot_be_read_say_so(tmp_path):
+def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_claims(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="cannot be read"):

@@ -1,5 +1,4 @@
-"""The gate on made-up trials: what passes, what is worse, what is not decided, and what is
-refused."""
+"""The gate on made-up trials: results of the new version, and refused questions."""
 
 from __future__ import annotations
 
@@ -94,7 +93,7 @@ def gate(
         (0.0, 1.0, PASSED, "equal to the last bit in all 4 pairs of trials", 2),
     ],
 )
-def test_results(
+def test_the_gate_passes_fails_or_stays_undecided_by_effect_and_noise(
     tmp_path: Path, effect: float, noise: float, result: str, words: str, seeds: int
 ) -> None:
     verdict, most = gate(tmp_path, effect, noise)
@@ -102,7 +101,7 @@ def test_results(
     assert words in describe(verdict)
 
 
-def test_what_is_shown_not_to_be_worse_passes_though_it_may_be_better(tmp_path: Path) -> None:
+def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_path: Path) -> None:
     verdict, most = gate(tmp_path, 0.3, 0.02, asked(least="0.35"))
     assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
     assert "not worse by 0.35 in PSNR" in describe(verdict)
@@ -120,7 +119,7 @@ def test_what_is_shown_not_to_be_worse_passes_though_it_may_be_better(tmp_path: 
         (1, -0.2, NOT_DECIDED),
     ],
 )
-def test_a_loss_of_the_least_that_matters_is_not_excluded_by_itself(
+def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(
     sign: int, mean: float, result: str
 ) -> None:
     question = replace(asked().questions[0], sign=sign)
@@ -129,7 +128,7 @@ def test_a_loss_of_the_least_that_matters_is_not_excluded_by_itself(
     assert result_of(undecided) == result
 
 
-def test_a_look_waits_for_every_scene_also_where_the_first_is_equal(tmp_path: Path) -> None:
+def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path: Path) -> None:
     old = trials(tmp_path, 0, 0.1)
     (verdict,) = Gate(
         asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]
@@ -208,7 +207,7 @@ def test_questions_that_cannot_be_judged_are_refused() -> None:
         (["exp.zip", "launch.wait=false"], "launch.wait"),
     ],
 )
-def test_bad_input_of_the_verb(
+def test_bad_input_of_gate_is_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -227,7 +226,7 @@ def test_bad_input_of_the_verb(
 @pytest.mark.parametrize(
     ("effect", "code", "words"), [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")]
 )
-def test_the_verb_ends_with_the_result_of_its_gate(
+def test_the_exit_code_of_gate_is_its_result(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -264,7 +263,7 @@ def test_the_verb_ends_with_the_result_of_its_gate(
 
 
 @pytest.mark.parametrize("worse", range(1, 13))
-def test_bisecting_finds_each_commit_within_its_steps(worse: int) -> None:
+def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse: int) -> None:
     asked_for: list[int] = []
 
     def result(commit: int) -> str:
@@ -275,7 +274,7 @@ def test_bisecting_finds_each_commit_within_its_steps(worse: int) -> None:
     assert len(asked_for) == len(set(asked_for)) <= most_steps(12) - SPARE
 
 
-def test_bisecting_passes_over_what_is_not_decided_or_does_not_train() -> None:
+def test_bisecting_skips_commits_that_are_undecided_or_do_not_train() -> None:
     assert first_worse(12, lambda commit: PASSED) is None
     answers = {6: NOT_DECIDED, 7: None}
     assert first_worse(
@@ -292,5 +291,5 @@ def test_bisecting_passes_over_what_is_not_decided_or_does_not_train() -> None:
 
     assert first_worse(12, never) == (0, 12)
     assert len(asked_for) <= most_steps(12)
-    # costs no step
+    # a commit that does not train costs no step
     assert first_worse(12, lambda commit: WORSE if commit == 12 else None) == (0, 12)

@@ -1,5 +1,4 @@
-"""The page of a check: what it says of scenes like these, of machines and clouds, and of
-initialisers."""
+"""The page of a check on scenes like these, machines, clouds and initialisers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,7 +43,7 @@ def page_of(trials: Sequence[TrialResult]) -> Page:
 
 
 @pytest.mark.parametrize("scenes", ["abcde", "abcdef"])
-def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(tmp_path, scenes):
+def test_from_six_scenes_on_the_page_has_a_statement_about_scenes_like_these(tmp_path, scenes):
     page = page_of(made(tmp_path, tuple(scenes)))
     assert page.sections[0].verdict.word == "supported"
     assert ("scenes like these: supported; it is higher in 6 of 6" in to_text(page)) == (
@@ -54,7 +53,7 @@ def test_from_six_scenes_on_scenes_like_these_are_asked_beside_the_verdict(tmp_p
     assert f"The paper: {SIZE}." in to_text(page)
 
 
-def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path):
+def test_the_page_notes_different_machines_and_clouds(tmp_path):
     trials = made(tmp_path, ("room",), seeds=2)
 
     def lines(cpus):
@@ -80,7 +79,7 @@ def test_the_page_says_where_machines_and_clouds_of_its_trials_differ(tmp_path):
     assert not any(words in line for line in plain for words in ("machine", "clouds"))
 
 
-def test_where_scenes_differ_in_the_initialiser_a_sheet_stands_for_each(tmp_path):
+def test_each_initialiser_has_a_fairness_sheet_of_its_own(tmp_path):
     trials = [
         replace(
             one,

@@ -1,5 +1,4 @@
-"""The mean of many studies: Student's t over them, refused where protocols are unlike; archives as
-studies."""
+"""The mean of many studies by Student's t, refusals, and archives as studies."""
 
 import json
 from dataclasses import replace
@@ -33,7 +32,7 @@ STUDIES = [
 ]
 
 
-def test_studies_are_the_units():
+def test_the_mean_is_tested_with_studies_as_units():
     found, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     interval = expected.confidence_interval()
     assert found.test is not None
@@ -45,8 +44,8 @@ def test_studies_are_the_units():
     assert found.prediction.high - found.test.mean == pytest.approx(half)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say():
-    """Errors of two or three seeds' making, which random-effects methods would take as known."""
+def test_intervals_contain_the_truth_as_often_as_they_claim():
+    """Studies of two or three seeds, whose errors random-effects methods would take as known."""
     rng, held = np.random.default_rng(0), 0
     for _ in range(600):
         effects = rng.normal(1.0, 0.3, 5) + rng.normal(0, rng.uniform(0.1, 0.5, 5))
@@ -56,7 +55,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert held / 600 > 0.95 - 3 * (0.05 * 0.95 / 600) ** 0.5
 
 
-def test_no_mean_where_protocols_differ():
+def test_studies_of_different_protocols_have_no_mean():
     studies = [Study("a", 1.0, None, "paper-1"), Study("b", 1.1, None, "standard-1")]
     found = pool(studies)
     assert found.test is None
@@ -69,14 +68,14 @@ def test_no_mean_where_protocols_differ():
     assert alike.mean == pytest.approx(1.0)
 
 
-def test_one_study_is_no_pool_and_two_of_one_name_are_refused():
+def test_one_study_has_no_mean_and_a_study_given_twice_is_refused():
     assert pool(STUDIES[:1]).test is None
     assert pool([]).test is None
     with pytest.raises(InputError, match="twice"):
         pool([STUDIES[0], STUDIES[0]])
 
 
-def test_a_mean_says_where_a_further_study_would_lie():
+def test_the_mean_is_described_with_the_prediction_for_a_further_study():
     pooled, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     mean, spread = np.mean(EFFECTS), np.std(EFFECTS, ddof=1)
     own, reach = expected.confidence_interval(), stats.t.ppf(0.975, 3) * spread * 1.25**0.5
@@ -104,7 +103,7 @@ def archive(
     budget: dict[str, Any] | None = None,
     **plan: Any,
 ) -> Path:
-    """A lab's archive, in which volumetric gains 1 dB."""
+    """Write the archive of a laboratory in which "volumetric" gains 1 dB."""
     runs = tmp_path / f"runs_{name}_{seed}"
     paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
     for number, path in enumerate(paths):
@@ -113,7 +112,7 @@ def archive(
             protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
         )
         results["budget"] = budget or results["budget"]
-        # no two trainings take one and the same time
+        # no two trainings take exactly the same time
         results["seconds"]["train"] += seed + number / 1000
         (path / "results.json").write_text(json.dumps(results))
     file = tmp_path / f"{name}.zip"
@@ -121,7 +120,7 @@ def archive(
     return file
 
 
-def test_an_archive_is_a_study_of_its_pairs(tmp_path):
+def test_an_archive_is_a_study_of_its_paired_differences(tmp_path):
     file = archive(tmp_path, "lab")
     ((study,), _, _) = read_studies(file, WANTED, "lab")
     trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
@@ -143,7 +142,7 @@ def test_an_archive_is_a_study_of_its_pairs(tmp_path):
     assert study.name == "lab"
 
 
-def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path):
+def test_initialisers_on_different_scenes_are_one_study(tmp_path):
     both = archive(tmp_path, "both", inits=("sfm", "dataset"))
     assert [study.name for study in read_studies(both, WANTED, "both")[0]] == [
         "both (dataset)",
@@ -163,7 +162,7 @@ def test_where_each_scene_has_one_initialiser_they_are_one_study(tmp_path):
 
 
 def test_trials_of_archives_can_be_chosen(tmp_path, said):
-    """As where one archive holds two initialisers, or two splits, under one name."""
+    """One archive may have two initialisers, or two splits, under one name."""
     files = [
         str(archive(tmp_path, name, seed, inits=("sfm", "random")))
         for seed, name in enumerate("ab")
@@ -176,7 +175,7 @@ def test_trials_of_archives_can_be_chosen(tmp_path, said):
     assert run(["pool", *files, "--arm", "volumetric", "--where", "init=none"]) == 2
 
 
-def test_unlike_budgets_are_named(tmp_path, capsys):
+def test_different_budgets_are_named(tmp_path, capsys):
     steered = archive(tmp_path, "steered", budget={"max_gaussians": 20_000, "cap": "governor"})
     growing = archive(tmp_path, "growing", seed=1, budget={"max_gaussians": None, "cap": None})
     assert run(["pool", str(steered), str(growing), "--arm", "volumetric"]) == 0
@@ -184,7 +183,7 @@ def test_unlike_budgets_are_named(tmp_path, capsys):
     assert sentence in capsys.readouterr().out
 
 
-def test_three_labs_make_a_mean(tmp_path, said):
+def test_three_archives_have_a_mean(tmp_path, said):
     files = [str(archive(tmp_path, f"lab{k}", k)) for k in range(3)]
     out = said("pool", *files, "--arm", "volumetric")
     assert "| lab0 | +" in out
@@ -193,7 +192,7 @@ def test_three_labs_make_a_mean(tmp_path, said):
 
 
 def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
-    """Between archives and within one: every study is shown, and none is lost."""
+    """The protocols differ between archives or within one; every study is shown."""
     files = [
         str(archive(tmp_path, "a", 0)),
         str(archive(tmp_path, "b", 1, "both")),
@@ -207,7 +206,7 @@ def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
     assert "b (standard-1): not asked for" in out
 
 
-def test_bad_sources_are_a_line_each_and_the_others_are_pooled(tmp_path, capsys, refused):
+def test_each_bad_source_has_one_line_and_the_others_are_pooled(tmp_path, capsys, refused):
     good = [archive(tmp_path, "good", 0), archive(tmp_path, "fine", 1)]
     cut = archive(tmp_path, "cut", 2)
     cut.write_bytes(cut.read_bytes()[:-500])
@@ -236,7 +235,7 @@ def test_bad_sources_are_a_line_each_and_the_others_are_pooled(tmp_path, capsys,
     refused("pool", cut, "--arm", "volumetric")
 
 
-def test_labs_that_name_their_files_alike_are_told_apart(tmp_path, said):
+def test_archives_with_the_same_file_name_are_distinguished(tmp_path, said):
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)

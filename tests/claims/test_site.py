@@ -1,5 +1,4 @@
-"""The site from archives: what its pages say, that strangers' words stay words, and that its tables
-sort."""
+"""The site from archives: content of its pages, escaped texts of strangers, sorted tables."""
 
 import json
 import re
@@ -57,7 +56,7 @@ class Elements(HTMLParser):
         self.text += data
 
 
-def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp_path):
+def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
     files = [
         archive(tmp_path, Plan(), claim="sharper"),
         archive(tmp_path, Plan(experiment="other", effect={"psnr": 2})),
@@ -86,7 +85,7 @@ def test_the_first_page_has_arms_scenes_claims_and_links_that_lead_somewhere(tmp
     assert "https://" not in page
 
 
-def test_a_table_of_many_metrics_becomes_one_of_each(tmp_path):
+def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
     write_runs(tmp_path, Plan())
     table = build_table(
         load_experiment(tmp_path, "exp"), columns=("scene",), metrics=("psnr", "ssim", "flip")
@@ -109,11 +108,11 @@ def test_a_table_of_many_metrics_becomes_one_of_each(tmp_path):
         ("…", set(), "experiment"),
     ],
 )
-def test_a_key_is_plain_and_not_taken(name, taken, key):
+def test_the_key_of_an_experiment_is_plain_and_not_taken(name, taken, key):
     assert _unique_key(name, taken) == key
 
 
-def test_pictures_are_there_where_the_archive_has_them(tmp_path):
+def test_the_report_has_pictures_if_the_archive_has_them(tmp_path):
     file = archive(tmp_path, Plan(seeds=(0,), scenes=("courtyard",), pictures=True), pictures=True)
     site(tmp_path, file)
     # whole views
@@ -138,7 +137,7 @@ def test_an_archive_of_too_many_bytes_is_neither_written_nor_read(tmp_path, monk
         write_archive(load_experiment(tmp_path / "runs-exp", "exp"), tmp_path / "again.zip")
 
 
-def test_words_of_a_stranger_stay_words(tmp_path):
+def test_html_in_texts_of_a_stranger_is_escaped(tmp_path):
     def spoil(content):
         for name in ("results.jsonl", "configurations.jsonl", "declared.jsonl"):
             lines = [json.loads(line) for line in content[name].splitlines()]
@@ -175,7 +174,7 @@ def test_words_of_a_stranger_stay_words(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["index", "Con Trol%20#x", "é<>".replace("<>", "")])
-def test_names_of_experiments_lead_to_no_other_file(tmp_path, name):
+def test_names_of_experiments_become_plain_names_of_files(tmp_path, name):
     one, other = archive(tmp_path, Plan(experiment=name)), tmp_path / "again.zip"
     other.write_bytes(one.read_bytes())
     site(tmp_path, one, other)
@@ -184,7 +183,7 @@ def test_names_of_experiments_lead_to_no_other_file(tmp_path, name):
     assert all(re.fullmatch(r"[a-z0-9_-]+\.html", report) for report in reports)
 
 
-def test_damaged_archives_are_left_out_and_nothing_at_all_is_refused(tmp_path, capsys, refused):
+def test_damaged_archives_are_left_out_and_a_site_without_any_is_refused(tmp_path, capsys, refused):
     good, bad = archive(tmp_path, Plan()), tmp_path / "bad.zip"
     bad.write_bytes(good.read_bytes()[:100])
     out = str(tmp_path / "site")
@@ -207,7 +206,7 @@ def test_damaged_archives_are_left_out_and_nothing_at_all_is_refused(tmp_path, c
         "pictures/a.png",
     ],
 )
-def test_a_picture_that_leads_elsewhere_is_refused(tmp_path, name):
+def test_a_picture_with_a_path_outside_its_trial_is_refused(tmp_path, name):
     import hashlib
 
     def add(content):
@@ -229,7 +228,7 @@ def test_a_picture_that_leads_elsewhere_is_refused(tmp_path, name):
 
 
 @pytest.mark.slow
-def test_a_click_on_a_heading_sorts(tmp_path):
+def test_a_click_on_a_heading_sorts_the_table(tmp_path):
     archives = [
         archive(tmp_path, Plan(experiment=name, seeds=range(k + 1))) for k, name in enumerate("cab")
     ]

@@ -1,5 +1,4 @@
-"""Looks: which trials each needs, in which order, and that a question whose trials failed gets no
-more."""
+"""Looks: the trials that each look needs, their order, and questions whose trials failed."""
 
 from dataclasses import replace
 
@@ -31,7 +30,7 @@ def verdict(final: bool) -> Verdict:
     return Verdict(BOTH, asked_quantity("psnr"), Pairs(()), final=final)
 
 
-def test_trials_come_seed_by_seed_and_each_once():
+def test_trials_of_a_look_are_ordered_by_seed_and_each_is_listed_once():
     assert trials_of_look(DECLARATION, [0], 2) == [("a", 7), ("b", 7), ("a", 5), ("b", 5)]
     assert trials_of_look(DECLARATION, [1], 9) == [("a", 5), ("c", 5), ("a", 7), ("c", 7)]
     both = trials_of_look(DECLARATION, [0, 1], 1)
@@ -45,7 +44,7 @@ def test_trials_come_seed_by_seed_and_each_once():
     [
         ([(True, True)], []),  # decided before: nothing is run
         ([(False, True), (True, True)], [4]),
-        # no pair is there after the first look: both wait for what failed
+        # no pair after the first look: both questions wait for failed trials
         ([(False, False)] * 3, [6]),
     ],
 )
@@ -59,7 +58,7 @@ def test_looks_end_when_nothing_can_be_decided(finals, looked):
     assert [one.final for one in verdicts] == list(finals[min(len(looked), len(finals) - 1)])
 
 
-def test_a_pair_is_told_in_a_sentence():
+def test_the_verdict_on_a_pair_is_one_sentence():
     assert headline(verdict(False)) == "sfm-new against sfm-adc: no verdict yet, trials are missing"
     assert headline(replace(verdict(True), untestable="no scene")).endswith(
         "no verdict yet, no scene"

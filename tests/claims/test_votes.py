@@ -1,5 +1,4 @@
-"""Votes: a page that tells nothing, a whole round in a browser by keyboard, and a verdict by exact
-tests."""
+"""Votes: a blind page, a whole round in a browser by keyboard, and exact verdicts."""
 
 import itertools
 import json
@@ -68,7 +67,7 @@ def made(runs, tmp_path) -> Callable[..., RoundKey]:
 
 
 def prefers(arm: str) -> Chooser:
-    """Votes of a person who always prefers ``arm``, and sees through traps."""
+    """The votes of a person who always prefers ``arm`` and passes every trap."""
     return lambda showing: next(
         (side for side in SHARP if getattr(showing, side) in (arm, "photograph")), "same"
     )
@@ -128,7 +127,7 @@ def made_up(
 # ---- the page
 
 
-def test_the_page_tells_nothing_of_arms(made, tmp_path):
+def test_the_page_does_not_reveal_arms(made, tmp_path):
     key = made("--people", "2")
     text = (tmp_path / "page" / "index.html").read_text()
     for word in ("sfm", "volumetric", "courtyard", "garden", "view0", key.salt, "blurred"):
@@ -145,7 +144,7 @@ def test_the_page_tells_nothing_of_arms(made, tmp_path):
     assert not set(map(key.commitment, key.showings)) & set(map(again.commitment, again.showings))
 
 
-def test_each_showing_has_the_pictures_that_its_key_says(made, runs, tmp_path):
+def test_each_showing_has_the_pictures_that_its_key_names(made, runs, tmp_path):
     page = tmp_path / "page"
     key = made()
     text = (page / "index.html").read_text()
@@ -204,7 +203,7 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
             assert key.showings.index(showing) > key.showings.index(first)
 
 
-def test_more_pairs_than_views_are_said(made, capsys):
+def test_a_lack_of_views_or_people_is_reported(made, capsys):
     key = made("--people", "9", pairs="40")
     out = capsys.readouterr().out
     assert len(key.pairs) == 14
@@ -215,7 +214,7 @@ def test_more_pairs_than_views_are_said(made, capsys):
     assert "decide nothing: that needs 6 people" in capsys.readouterr().out
 
 
-def test_it_is_declared_and_leaves_other_declarations_alone(made, runs, tmp_path):
+def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path):
     key = made("--people", "7")
     declared = [one for one in read_declarations(runs / "exp") if one.vote_round == key.round]
     assert [(one.kind, one.votes, len(one.questions)) for one in declared] == [("votes", 84, 1)]
@@ -244,13 +243,15 @@ def test_it_is_declared_and_leaves_other_declarations_alone(made, runs, tmp_path
         (["look", "exp"], "invalid choice"),
     ],
 )
-def test_bad_input_is_one_line(runs, words, message, tmp_path, monkeypatch, refused):
+def test_bad_input_of_vote_is_refused_in_one_line(
+    runs, words, message, tmp_path, monkeypatch, refused
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     assert message in refused("vote", *words)
 
 
-def test_without_pictures_there_is_no_page(tmp_path):
+def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
     write_runs(tmp_path, Plan(experiment="bare"))
     trials = load_experiment(tmp_path, "bare").trials
     arms = choose_arms(sorted({trial.arm for trial in trials}), ())
@@ -262,7 +263,7 @@ def test_without_pictures_there_is_no_page(tmp_path):
 # ---- files of votes
 
 
-def test_files_that_do_not_fit_are_refused(made, tmp_path, refused):
+def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, refused):
     key = made("--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
@@ -286,7 +287,7 @@ def test_files_that_do_not_fit_are_refused(made, tmp_path, refused):
     )
 
 
-def test_a_changed_key_judges_nothing(made, runs, tmp_path, refused):
+def test_a_changed_key_is_refused(made, runs, tmp_path, refused):
     key = made()
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
@@ -299,7 +300,7 @@ def test_a_changed_key_judges_nothing(made, runs, tmp_path, refused):
     file.write_text(text)
 
 
-def test_names_of_strangers_stay_words(made, runs, tmp_path):
+def test_html_in_names_of_people_is_escaped(made, runs, tmp_path):
     key = made("--people", "1")
     careless = ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>")
     assert run(["vote", "judge", "exp", saved(tmp_path, careless)]) == 0
@@ -328,7 +329,7 @@ def test_the_report_shows_where_people_and_lpips_disagree(made, runs, tmp_path):
 
 
 @pytest.mark.parametrize("agree", range(10))
-def test_people_are_the_units_of_an_exact_test(agree):
+def test_people_are_the_units_of_an_exact_sign_test(agree):
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5)
     ballots = [ballot(key, n, prefers("sfm-b" if n < agree else "sfm-a")) for n in range(9)]
     (pair,) = judge_round(key, ballots).pairs
@@ -341,7 +342,7 @@ def test_people_are_the_units_of_an_exact_test(agree):
     assert pair.scenes is None
 
 
-def test_scenes_are_the_units_of_the_other_statement():
+def test_scenes_are_the_units_of_another_exact_sign_test():
     key = made_up(["sfm-a", "sfm-b"], scenes=7, views=3)
 
     def choose(showing):
@@ -354,7 +355,7 @@ def test_scenes_are_the_units_of_the_other_statement():
     assert pair.scenes.p == pytest.approx(binomtest(6, 7).pvalue)
 
 
-def test_traps_latecomers_and_early_looks():
+def test_votes_with_failed_traps_or_after_the_declared_people_are_left_out():
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5, people=6)
     good = [ballot(key, n, prefers("sfm-b"), minute=10 + n) for n in range(5)]
     blind = ballot(key, 8, lambda showing: "same", minute=1, name="Ann")
@@ -371,14 +372,14 @@ def test_traps_latecomers_and_early_looks():
     assert blind.label not in judge_round(allowed, [replace(blind, round=allowed.round)]).left_out
 
 
-def test_who_answers_by_side_is_inconsistent():
+def test_a_person_who_always_answers_left_is_inconsistent():
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5, traps=0)
     verdict = judge_round(key, [ballot(key, 1, lambda showing: "left")])
     assert (verdict.consistent, verdict.left) == (0.0, 1.0)
     assert judge_round(key, []).pairs == ()
 
 
-def test_more_arms_share_the_error_rate():
+def test_several_arms_share_the_error_rate_and_are_ranked():
     key = made_up(["sfm-a", "sfm-b", "sfm-c"], scenes=2, views=2)
     order = ["sfm-a", "sfm-c", "sfm-b", "photograph"]
 
@@ -400,7 +401,7 @@ def test_more_arms_share_the_error_rate():
     assert all(interval.low <= chance <= interval.high for _, chance, interval in verdict.ranking)
 
 
-def test_the_ranking_is_the_maximum_of_its_likelihood():
+def test_the_ranking_maximises_its_likelihood():
     rng = np.random.default_rng(3)
     wins = rng.integers(0, 20, (4, 5, 5)).astype(float)
     for counts, chances in zip(wins, bradley_terry(wins), strict=True):
@@ -416,7 +417,7 @@ def test_the_ranking_is_the_maximum_of_its_likelihood():
 @pytest.mark.parametrize(
     "name", ["everybody guesses", "people differ", "scenes differ", "people and scenes differ"]
 )
-def test_without_an_effect_few_rounds_state_one(name):
+def test_without_an_effect_at_most_5_percent_of_rounds_state_one(name):
     untruths = script("vote_untruths")
     people, scenes, both, votes = untruths.rates(untruths.KINDS[name], 0.0, 300)[1::2]
     # The error rate is 5 %; of 300 rounds, 8.8 % lie three standard errors above it.
@@ -425,7 +426,7 @@ def test_without_an_effect_few_rounds_state_one(name):
         assert votes > 0.3  # of a test that takes all votes as independent
 
 
-def test_intervals_of_a_ranking_hold_the_truth():
+def test_intervals_of_a_ranking_contain_the_truth():
     assert script("vote_untruths").ranking_misses(9, 9, 30) < 0.1
 
 

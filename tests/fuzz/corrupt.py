@@ -1,6 +1,6 @@
-"""Ways in which files come to harm.
+"""Random damage to the bytes of files.
 
-Cut, flipped, doubled, filled with NaN, infinities, zeros or huge counts.
+Files are cut, flipped, doubled, or filled with NaN, infinities, zeros or huge counts.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _remove(data: bytes, rng: Random) -> bytes:
 
 
 def _word(data: bytes, rng: Random) -> bytes:
-    """Another word for one of a text file's."""
+    """Replace one word of a text file."""
     words = data.split(b" ")
     words[rng.randrange(len(words))] = rng.choice(WORDS)
     return b" ".join(words)

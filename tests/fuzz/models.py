@@ -1,10 +1,11 @@
-"""Damaged models, PLY files, pictures and archives, read one by one.
+"""Read damaged models, PLY files, pictures and archives one by one.
 
-A program, so that a crash is seen as one.
+It is a program of its own, so that a crash ends only this program.
 
     python -m tests.fuzz.models FOLDER FIRST COUNT
 
-prints how many cases were refused and how many were read, and the case that ended in anything else.
+It prints how many cases were refused and how many were read. A case with any other end stops it;
+its number is in ``FOLDER/current``.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ MEMBERS = {
 
 
 def write_originals(folder: Path) -> None:
-    """A small model with points and tracks in both formats, and a PLY file."""
+    """Write a small model in both formats, a PLY file, pictures and archives."""
     import pycolmap
 
     options = pycolmap.SyntheticDatasetOptions()
@@ -67,7 +68,7 @@ def write_originals(folder: Path) -> None:
 
 
 def run_case(originals: Path, work: Path, case: int) -> bool:
-    """Whether a damaged file was refused (True) or read as something that makes sense (False)."""
+    """Return whether a damaged file was refused; otherwise it was read as sensible values."""
     rng = Random(case)
     kind = KINDS[case % len(KINDS)]
     if kind == "ply":
@@ -118,7 +119,7 @@ def _check_gaussians(path: Path) -> None:
 def _check_picture(path: Path) -> None:
     width, height = image_size(path)
     assert exif_orientation(path) >= 0
-    if width * height < 1 << 24:  # else it would take long, and is as good
+    if width * height < 1 << 24:  # a larger one would take long and show nothing more
         picture = read_image(path)
         assert picture.shape == (height, width, 3)
         assert picture.dtype == np.uint8

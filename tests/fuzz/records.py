@@ -1,11 +1,12 @@
-"""Damaged files of a runs folder, one after the other.
+"""Damage the files of a runs folder, one after the other, and read them.
 
-Run as a program, so that a crash or a hang is seen as one.
+It is a program of its own, so that a crash or a hang ends only this program.
 
     python -m tests.fuzz.records FOLDER FIRST COUNT [FILE]
 
-damages the files of a small experiment, or FILE alone, reads them as the verbs do, and prints how
-many cases were noticed and how many were read, and the case that ended in anything else.
+It damages the files of a small experiment, or FILE alone, and reads them as the verbs do. It prints
+how many cases were noticed and how many were read as sound. A case with any other end stops it; its
+number is in ``FOLDER/current``.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ STRANGE: tuple[str, ...] = (
 
 
 def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str, Any]:
-    """A configuration as a trial writes it, as far as anyone reads it."""
+    """A configuration as a trial writes it, with the settings that readers use."""
     return {
         "name": EXPERIMENT,
         "seed": seed,
@@ -129,7 +130,7 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
 
 
 def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:
-    """A trial with every file that its readers look for."""
+    """Write a trial with every file that its readers look for."""
     values = values_of(runs, densify, seed, threshold)
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
@@ -167,7 +168,7 @@ def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) ->
 
 
 def write_original(runs: Path) -> dict[str, Path]:
-    """A small experiment; its files by name, those that are damaged in turn."""
+    """Write a small experiment; return the files that are damaged in turn, by name."""
     home = runs / EXPERIMENT
     done, *_ = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)]
     variant = write_trial(runs, "volumetric", 0, 0.5)
@@ -231,7 +232,7 @@ def write_original(runs: Path) -> dict[str, Path]:
 
 
 def damage(path: Path, sound: bytes, rng: Random) -> str:
-    """Damage the file; what was done in one word."""
+    """Damage the file; return the kind of damage in one word."""
     kind = rng.choice(("shape",) * 6 + ("bytes",) * 3 + ("place",))
     if kind == "bytes":
         path.write_bytes(corrupt(sound, rng))
@@ -260,7 +261,7 @@ def _misshapen(sound: bytes, rng: Random) -> bytes:
     at = rng.randrange(len(lines))
     try:
         tree = json.loads(lines[at])
-    except ValueError:  # the table of views
+    except ValueError:  # per_view.csv is not JSON
         return rng.choice(STRANGE).encode().join(sound.split(b",", rng.randint(1, 3)))
     marks: dict[str, str] = {}
     for _ in range(rng.choice((1, 1, 2))):
@@ -290,9 +291,9 @@ def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
 
 
 def look(runs: Path, places: dict[str, Path]) -> int:
-    """Read everything as the verbs do; how much was refused or left out.
+    """Read everything as the verbs do; return how much was refused or left out.
 
-    Raises what is no InputError.
+    Raises any error that is not an InputError.
     """
     home = runs / EXPERIMENT
     refused = 0
@@ -349,7 +350,7 @@ def _mirror(folder: Path) -> None:
 
 
 class Noticed(logging.Handler):
-    """Counts warnings, which are lines."""
+    """Counts warnings, each of which must be one line."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -361,11 +362,11 @@ class Noticed(logging.Handler):
 
 
 def main(folder: Path, first: int, count: int, only: str | None) -> None:
-    """Try the cases; the number of the present one stands in ``FOLDER/current``."""
+    """Run the cases; ``FOLDER/current`` has the number of the present one."""
     runs = folder / "runs"
     shutil.rmtree(runs, ignore_errors=True)
     places = write_original(runs)
-    states.read_queue = lambda users: {}  # Slurm has no part in this, and may take its time
+    states.read_queue = lambda users: {}  # Slurm is not tested here, and may be slow
     warnings = Noticed()
     logging.getLogger("gsbench").addHandler(warnings)
     logging.getLogger("gsbench").propagate = False

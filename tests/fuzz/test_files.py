@@ -1,6 +1,6 @@
-"""Damaged COLMAP models and PLY files end in one line or in a right result.
+"""Damaged COLMAP models and PLY files are refused in one line or read with right values.
 
-Never in a crash, a hang or nonsense.
+They never cause a crash, a hang or nonsense.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CASES = 240  # in CI; `python -m tests.fuzz.models FOLDER 0 10000` tries more
 
 
-def test_damaged_files_are_refused_or_read_right(tmp_path: Path) -> None:
+def test_damaged_files_are_refused_or_read_with_right_values(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.fuzz.models", str(tmp_path), "0", str(CASES)]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
@@ -60,7 +60,7 @@ NAN = float("nan")
         ("points3D.bin", lambda data: data + b"\0", "1 bytes too many"),
     ],
 )
-def test_the_program_names_the_file(
+def test_the_program_names_the_damaged_file(
     file: str,
     harm: Callable[[bytes], bytes],
     words: str,

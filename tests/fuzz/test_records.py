@@ -1,6 +1,6 @@
-"""Damaged files of a runs folder cost themselves, never the rest.
+"""A damaged file of a runs folder does not harm the reading of the others.
 
-No crash, no hang, one line that names the file.
+It causes neither a crash nor a hang, but one line that names the file.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DAMAGES = {
 }
 
 
-def test_damaged_files_are_left_out_or_read_right(tmp_path: Path) -> None:
+def test_damaged_files_are_left_out_or_read_with_right_values(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.fuzz.records", str(tmp_path), "0", str(CASES)]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
@@ -54,7 +54,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
 
 @pytest.mark.parametrize("damage", [*DAMAGES, "fifo", "folder"])
 @pytest.mark.parametrize("name", ["results.json", "plan.json", "config.yaml", "metrics.jsonl"])
-def test_the_verbs_say_one_line_for_a_damaged_file(
+def test_verbs_print_one_line_for_a_damaged_file(
     name: str, damage: str, places: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = places[name]
@@ -72,7 +72,7 @@ def test_the_verbs_say_one_line_for_a_damaged_file(
         assert cli.run(argv) in (0, 1)
         captured = capsys.readouterr()
         said = [line for line in captured.err.splitlines() if line.startswith("left out")]
-        assert len(said) <= 2  # one trial of these has failed, and tables say so
+        assert len(said) <= 2  # one of these trials has failed, and tables report it
         if argv[0] == "tables":
             assert "psnr" in captured.out.lower()
             assert (
@@ -84,12 +84,12 @@ def test_the_verbs_say_one_line_for_a_damaged_file(
     assert cli.run(["explain", f"{EXPERIMENT}:courtyard:psnr:adc"]) == 0
 
 
-def test_every_kind_of_file_is_among_the_damaged(places: dict[str, Path]) -> None:
+def test_every_kind_of_file_is_damaged_in_turn(places: dict[str, Path]) -> None:
     assert set(places) == set(NAMES)
 
 
-# What is ours to read goes through the typed readers; what these files read is somebody else's or
-# their own process's.
+# gsbench's own files are read by the typed readers. These modules parse other files, or text of their
+# own process.
 READS_ITSELF = {
     "analysis/paper.py",
     "datasets/catalog.py",  # of the package
@@ -98,7 +98,7 @@ READS_ITSELF = {
     "runs/keys.py",  # text of this very process
     "analysis/differences.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py",  # text of this process
-    "system/install.py",  # what pip wrote of the package
+    "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
     "scene/load.py",  # prepared views, beside the store
     "parsing.py",
@@ -112,7 +112,7 @@ LOADERS = {
 }
 
 
-def test_no_file_of_ours_is_parsed_beside_its_reader() -> None:
+def test_only_typed_readers_parse_gsbenchs_files() -> None:
     package = Path(gsbench.__file__).parent
     found = set()
     for path in package.rglob("*.py"):

@@ -1,5 +1,4 @@
-"""The records of an experiment: which experiments there are, the search for an arm's settings,
-declared questions."""
+"""The records of an experiment: its folder, the search for settings, and declarations."""
 
 import json
 from pathlib import Path
@@ -53,7 +52,7 @@ def test_experiments_are_folders_that_are_not_hidden(tmp_path):
         experiment_home(tmp_path, "c")
 
 
-def test_the_folder_of_an_experiment_is_made_but_no_link(tmp_path):
+def test_the_folder_of_an_experiment_is_made_unless_it_is_a_link(tmp_path):
     make_home(tmp_path / "runs" / "x")
     make_home(tmp_path / "runs" / "x")
     assert (tmp_path / "runs" / "x").is_dir()
@@ -87,7 +86,7 @@ def test_the_best_point_is_the_one_with_the_best_value(tmp_path):
         ([{"settings": {"x": -1}, "value": 1.0}], "not above 0"),
     ],
 )
-def test_a_search_that_cannot_be_is_damaged(tmp_path, points, fault):
+def test_a_record_of_an_impossible_search_is_damaged(tmp_path, points, fault):
     with pytest.raises(DamagedError, match=fault):
         tuning(tmp_path, points=points)
     if "above" in fault:
@@ -130,7 +129,7 @@ def test_planned_trials_are_those_of_the_declaration_and_of_its_questions():
     assert [one.names_trials for one in named] == [False, True, False, True]
 
 
-def test_a_declaration_is_in_force_since_its_first_equal(tmp_path):
+def test_a_repeated_declaration_is_in_force_since_its_first_time(tmp_path):
     first, second, third = (
         declared(1, "psnr"),
         declared(2, "psnr"),
@@ -139,7 +138,7 @@ def test_a_declaration_is_in_force_since_its_first_equal(tmp_path):
     other, last = declared(2, "ssim"), declared(4, "ssim")
     assert latest_declaration([first]) is first
     assert latest_declaration([first, second]) is first
-    # what could not be tested asks nothing else
+    # what could not be tested does not change the questions
     assert latest_declaration([first, second, third]) is first
     assert latest_declaration([first, other, third]) is third
     assert latest_declaration([first, second, last]) is last
@@ -151,7 +150,7 @@ def test_declarations_are_kept_in_the_order_of_time(tmp_path):
     assert read_declarations(tmp_path) == []
     text = record_text([second, first])
     assert text.endswith("}\n")
-    # one that asks nothing
+    # a declaration without questions
     (tmp_path / "declared.jsonl").write_text(text + '{"time": "1970-01-01T03:00:00Z"}\n')
     assert read_declarations(tmp_path) == [first, second]
     repeated = [first.summary(), None, Declared(metric="lpips_vgg", time="1970-01-01T00:00:00Z")]

@@ -1,4 +1,4 @@
-"""Which code made a result: the rooms of gsbench behind a stage, and the modules of a user's."""
+"""The code that made a result: rooms of gsbench behind a stage, and modules of a user."""
 
 import hashlib
 import importlib
@@ -42,8 +42,8 @@ from tests.test_architecture import modules, reached
 SOURCE = (
     '"""A module."""\nX = 0.8  # weight\n\n\ndef loss(a):\n    """The loss."""\n    return X * a\n'
 )
-# Rooms that make no number: what is said, how processes run, where files lie. What `config` and
-# `settings` make of the user's words is in the keys as it is.
+# Rooms that determine no number: texts, processes, places of files. What `config` and `settings` make
+# of the user's words is itself in the keys.
 WITHOUT_NUMBERS = frozenset(
     """
     analysis app bench cli claims config datasets downloads errors files launch logs parsing renders runs
@@ -57,7 +57,8 @@ STEPS = {
     "ground_truth": "scene",
     "evaluate": "evaluate",
 }
-# Of what a step's module imports, what another stage's key stands for, or what makes objects alone.
+# Rooms that a step's module imports but that need not be in its key: another stage's key has them, or
+# they only make objects.
 BESIDE: dict[str, tuple[str, ...]] = {
     "scene": ("gaussians",),
     "init": (),
@@ -69,8 +70,10 @@ BESIDE: dict[str, tuple[str, ...]] = {
 
 @pytest.fixture
 def package(tmp_path, monkeypatch) -> Iterator[Path]:
-    """A copy of gsbench that is not the one that runs, without files of a release, read as by a new
-    process."""
+    """A copy of gsbench, other than the one that runs, without the files of a release.
+
+    It is read as by a new process.
+    """
     copy = shutil.copytree(
         PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__", "*.json")
     )
@@ -81,7 +84,7 @@ def package(tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def again() -> None:
-    """As in another process."""
+    """Forget what this process has read, as in a new process."""
     for cached in (keys._released, keys._state, keys._first_contents):
         cached.cache_clear()
 
@@ -115,7 +118,7 @@ def test_comments_docstrings_and_layout_do_not_count(edit):
         lambda text: text + "(",
     ],
 )
-def test_whatever_can_change_a_number_counts(edit):
+def test_edits_that_can_change_a_number_count(edit):
     assert syntax_of(edit(SOURCE).encode()) != syntax_of(SOURCE.encode())
 
 
@@ -134,12 +137,12 @@ def test_the_table_has_all_rooms_that_a_stage_imports(stage):
             assert any(file == room or file.startswith(f"{room}/") for room in known), file
 
 
-def test_rooms_are_there():
+def test_all_rooms_exist():
     for room in {room for rooms in ROOMS.values() for room in rooms}:
         assert (PACKAGE / room).exists(), room
 
 
-def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package):
+def test_the_next_process_notices_an_edit_but_not_a_comment(package):
     before = states_of(ROOMS["train"])
     assert changed_rooms(before) == []
     loss = package / "train" / "loss.py"
@@ -160,7 +163,7 @@ def test_an_edit_is_seen_by_the_next_process_and_a_comment_is_not(package):
     assert changed_rooms({"gone": "0"}) == ["gone"]
 
 
-def test_where_all_is_as_released_nothing_is_in_the_key(package, monkeypatch):
+def test_released_code_adds_nothing_to_keys(package, monkeypatch):
     # before the first release
     assert edited(states_of(ROOMS["train"])) == states_of(ROOMS["train"])
     script("released").main()
@@ -175,16 +178,13 @@ def test_where_all_is_as_released_nothing_is_in_the_key(package, monkeypatch):
     (package / "eval" / "ssim.py").write_text("C1 = 2\n")
     again()
     assert list(edited(states_of(ROOMS["train"]))) == changed_rooms(released) == ["eval/ssim.py"]
-    script(
-        "released"
-        # of the next release, where the version of the stage is bumped by hand, or the numbers are
-        # the same
-    ).main()
+    # the next release, for which the version of the stage was bumped, or the numbers are the same
+    script("released").main()
     again()
     assert changed_rooms(released) == []
 
 
-def test_an_edit_while_this_process_works_is_told(package):
+def test_an_edit_while_this_process_works_is_noticed(package):
     states_of(["train", "scene"])
     assert changed_since_asked(["train", "scene"]) == []
     with (package / "train" / "loss.py").open("a") as file:
@@ -200,7 +200,7 @@ CLASS = "class Mine: ...\n"
 
 @pytest.fixture
 def home(tmp_path, monkeypatch) -> Iterator[Path]:
-    """A folder in which somebody types, whose modules are allowed."""
+    """A folder in which a user types commands, whose modules are allowed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     allow_modules(NAMES[:3])
@@ -224,7 +224,7 @@ def values_of(
     }
 
 
-def test_a_users_class_has_all_modules_that_were_allowed(home):
+def test_the_code_of_a_users_class_includes_all_allowed_modules(home):
     for name in ("own_code", "helper", "unrelated"):
         (home / f"{name}.py").write_text(CLASS)
     assert user_modules(values_of("gsbench.densify.ADC")) == {}
@@ -234,7 +234,7 @@ def test_a_users_class_has_all_modules_that_were_allowed(home):
     assert user_modules(values_of("nowhere_to_be_found.X", allowed=("bash", "json", "yaml"))) == {}
 
 
-def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home):
+def test_a_package_is_hashed_by_all_its_code_files(home):
     (home / "pack" / "inner").mkdir(parents=True)
     (home / "pack" / "folder.py").mkdir()
     files = {
@@ -255,7 +255,7 @@ def test_a_package_is_hashed_whole_and_its_name_does_not_matter(home):
     assert module_digest("pack") == first
 
 
-def test_an_imported_file_is_taken_as_it_was_until_it_is_loaded_again(home):
+def test_an_imported_file_keeps_its_digest_until_it_is_loaded_again(home):
     own = home / "own_code.py"
     for text in ("A = 1\n", "A = 2\n"):  # not imported yet
         own.write_text(text)
@@ -271,7 +271,7 @@ def test_an_imported_file_is_taken_as_it_was_until_it_is_loaded_again(home):
     assert not has_changed_since_import("own_code")
 
 
-def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(home):
+def test_a_module_of_another_folder_is_found_even_if_its_namesake_is_imported(home):
     (home / "own_code.py").write_text(CLASS)
     importlib.import_module("own_code")
     other = home / "elsewhere"
@@ -283,7 +283,7 @@ def test_the_file_of_another_folder_is_found_whatever_this_process_has_imported(
     assert module_digest("own_code", str(home)) is None
 
 
-def test_what_was_imported_and_is_not_named_is_told(home):
+def test_imported_modules_that_are_not_named_are_listed(home):
     (home / "own_code.py").write_text(
         "import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS
     )
@@ -303,7 +303,7 @@ def test_a_module_whose_file_is_gone_has_no_digest(tmp_path):
     assert keys._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
 
 
-def test_a_file_that_has_just_come_is_found(home):
+def test_a_new_file_is_found_even_if_its_folder_keeps_its_time(home):
     """Python keeps the list of a folder's files as long as the folder has the same time."""
     assert module_digest("own_code") is None
     state = home.stat()
@@ -326,7 +326,7 @@ def test_a_digest_of_a_room_is_short():
     assert {len(state) for state in edited(states_of(ROOMS["evaluate"])).values()} <= {16}
 
 
-def test_flat_settings_keep_empty_groups_only_if_asked():
+def test_flattening_keeps_empty_groups_only_if_asked():
     nested = {"a": {"b": 1, "c": {}}, "d": {"e": {"f": None}}}
     assert flatten(nested) == {"a.b": 1, "d.e.f": None}
     assert flatten(nested, keep_empty=True) == {"a.b": 1, "a.c": {}, "d.e.f": None}
@@ -347,7 +347,7 @@ def test_a_users_class_enters_a_key_with_its_code_and_all_its_options():
     options = {"threads": 2, "place": "a", "pair": [1, 2]}
     named = {"class": "tests.runs.test_keys.Own", "source": {"tests": "0abc"}} | options
     assert options_of("densify", Own(), user) == named
-    # defined elsewhere, whatever it is called
+    # a class that is defined outside gsbench, under any name
     assert options_of("eval", Own(), user, "eval.extra.own") == named
     stage = Stage("scene", 1)  # of gsbench's own
     assert [user.is_behind(stage, place) for place in ("densify", "eval.extra.own", "init")] == [
@@ -374,7 +374,9 @@ def test_a_rasterizer_enters_a_key_by_its_name_or_as_a_users_class():
     assert rasterizer_inputs(Stage("cpu", 1)) == "cpu"
 
 
-def test_a_step_has_the_rooms_that_differ_and_asks_for_edits_only_of_processes(home, monkeypatch):
+def test_a_step_has_the_differing_rooms_and_checks_for_edits_only_if_it_starts_processes(
+    home, monkeypatch
+):
     monkeypatch.setattr(keys, "states_of", lambda rooms: {"scene": "released", "init": "1234"})
     monkeypatch.setattr(keys, "changed_since_asked", lambda rooms: ["init"])
     (home / "own_code.py").write_text(CLASS)

@@ -142,7 +142,7 @@ def test_without_a_ledger_the_command_that_begins_one_is_named(tmp_path: Path) -
         read_ledger(tmp_path / "night")
 
 
-def test_nothing_is_appended_for_none(home: Path) -> None:
+def test_nothing_is_appended_if_there_is_no_entry(home: Path) -> None:
     before = (home / LEDGER).read_bytes()
     assert isinstance(append(home, lambda ledger: None), Ledger)
     assert (home / LEDGER).read_bytes() == before

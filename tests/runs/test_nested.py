@@ -6,11 +6,11 @@ from gsbench.runs import keys as nested
 from gsbench.runs.keys import flatten
 
 
-def test_the_example_of_the_documentation_holds():
+def test_the_example_in_the_docstring_holds():
     assert doctest.testmod(nested).failed == 0
 
 
-def test_empty_mappings_are_kept_where_they_matter():
+def test_empty_mappings_are_kept_only_if_asked():
     values = {"a": {"b": {"c": 1}, "e": {}}, "f": None}
     assert flatten(values) == {"a.b.c": 1, "f": None}
     assert flatten(values, keep_empty=True) == {"a.b.c": 1, "a.e": {}, "f": None}

@@ -1,4 +1,4 @@
-"""The store: done once, whole or absent, damage named and mended, kills and rivals survived."""
+"""The store: no repeated work, no half results, damage repaired, kills and rivals survived."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def refuse(folder: Path) -> None:
 
 
 BUILD = Step(LETTERS, {"x": 1}, write_letters)
-FOUND = Step(LETTERS, {"x": 1}, refuse)  # the same step, which has its result already
+FOUND = Step(LETTERS, {"x": 1}, refuse)  # the same step, which must not be built again
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def store(tmp_path) -> Store:
     return Store(tmp_path / "store")
 
 
-def test_second_request_is_not_built(store):
+def test_a_second_request_is_not_built(store):
     first = store.get(BUILD)
     second = store.get(FOUND)
     assert not first.cached
@@ -50,7 +50,7 @@ def test_second_request_is_not_built(store):
     assert second.seconds == first.seconds
 
 
-def test_what_other_code_may_have_built_is_not_kept(store):
+def test_a_result_that_edited_code_may_have_built_is_not_kept(store):
     def changed():
         raise InputError("the code was edited meanwhile")
 
@@ -76,7 +76,7 @@ def test_every_input_and_the_version_make_another_key(store):
 
 @pytest.mark.parametrize("name", ["a.txt", "sub/b.bin", MANIFEST])
 @pytest.mark.parametrize("damage", ["flip", "truncate", "delete"])
-def test_damage_is_named_and_mended(store, name, damage, caplog):
+def test_damage_is_named_and_repaired(store, name, damage, caplog):
     path = store.get(BUILD).path / name
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 4
@@ -95,7 +95,7 @@ def test_damage_is_named_and_mended(store, name, damage, caplog):
     assert not list(store.root.glob("*/.*.removed"))
 
 
-def test_damage_is_removed_over_what_a_killed_removal_left(store):
+def test_damage_is_removed_despite_the_remains_of_a_killed_removal(store):
     path = store.get(BUILD).path
     left = path.with_name(f".{path.name}.removed")
     left.mkdir()
@@ -105,7 +105,7 @@ def test_damage_is_removed_over_what_a_killed_removal_left(store):
     assert not left.exists()
 
 
-def test_a_file_of_another_size_or_kind_is_damaged_whatever_its_time(store):
+def test_a_file_of_another_size_or_a_link_is_damaged_whatever_its_time(store):
     folder = store.get(BUILD).path
     path = folder / "a.txt"
     state = path.stat()
@@ -141,14 +141,14 @@ def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store):
 
 
 def flip_a_bit(path: Path) -> None:
-    """Change a file as a failing disk does: its size and the times of change stay."""
+    """Change a file as a failing disk does: its size and its times stay the same."""
     state, content = path.stat(), bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
 
 
-def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_look(store):
+def test_damage_that_keeps_size_and_time_is_found_by_a_thorough_check(store):
     folder = store.get(BUILD).path
     flip_a_bit(folder / "a.txt")
     read_manifest(folder)
@@ -176,13 +176,13 @@ def compare_no_checksums(folder: Path, thorough: bool = False) -> Manifest:
     return read_manifest(folder)
 
 
-def test_a_copy_of_the_store_is_believed_by_content(store, tmp_path):
+def test_a_copied_store_with_other_times_is_accepted_by_content(store, tmp_path):
     folder = store.get(BUILD).path
     os.utime(folder / "a.txt", ns=(1, 1))  # what copying does
     assert store.get(FOUND).cached
 
 
-def test_failed_build_is_not_published_and_starts_afresh(store):
+def test_a_failed_build_is_not_published_and_starts_from_an_empty_folder(store):
     def fail(folder):
         (folder / "half.txt").write_text("half")
         raise RuntimeError("no")
@@ -193,7 +193,7 @@ def test_failed_build_is_not_published_and_starts_afresh(store):
     assert not (store.get(BUILD).path / "half.txt").exists()
 
 
-def test_resumable_build_finds_what_was_left_without_temporaries(store):
+def test_a_resumable_build_finds_earlier_files_without_temporaries(store):
     stage = Stage("long", 1, resumable=True, scratch=("*.scratch",))
 
     def half(folder):
@@ -214,7 +214,7 @@ def test_resumable_build_finds_what_was_left_without_temporaries(store):
     assert set(read_manifest(entry.path).outputs) == {"half.txt", "rest.txt"}
 
 
-def test_a_killed_build_goes_on_without_its_links_and_its_torn_manifest(store):
+def test_a_killed_build_continues_without_its_links_and_its_torn_manifest(store):
     stage, seen = Stage("long", 1, resumable=True), list[tuple[Stage, Path]]()
     step = Step(stage, {}, lambda folder: None)
     partial = store.partial(stage, step.key)
@@ -230,9 +230,7 @@ def test_a_killed_build_goes_on_without_its_links_and_its_torn_manifest(store):
     assert not partial.exists()
 
 
-def test_files_are_on_the_disk_before_their_manifest_and_the_folder_after_it_is_named(
-    store, monkeypatch
-):
+def test_files_are_synced_before_their_manifest_and_the_folder_after_the_rename(store, monkeypatch):
     synced: list[tuple[str, bool]] = []
     note = lambda path: synced.append((path.name, (path.parent / MANIFEST).exists()))  # noqa: E731
     monkeypatch.setattr("gsbench.runs.store.sync_to_disk", note)
@@ -240,7 +238,7 @@ def test_files_are_on_the_disk_before_their_manifest_and_the_folder_after_it_is_
     assert synced == [("a.txt", False), ("b.bin", False), ("letters", False)]
 
 
-def test_killed_between_manifest_and_rename_is_only_published(store):
+def test_a_build_killed_between_manifest_and_rename_is_published_without_building(store):
     entry = store.get(BUILD)
     os.replace(entry.path, store.partial(LETTERS, entry.key))
     again = store.get(FOUND)
@@ -248,7 +246,7 @@ def test_killed_between_manifest_and_rename_is_only_published(store):
     assert store.find(FOUND) is not None
 
 
-def test_sweep_removes_leftovers_and_leaves_what_serves(store):
+def test_sweep_removes_leftovers_and_keeps_what_a_build_would_continue(store):
     long = Stage("long", 1, resumable=True)
     entry = store.get(Step(long, {"x": 1}, write_letters))
     stale = store.partial(long, entry.key)
@@ -277,9 +275,8 @@ def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.slow
-def test_killed_at_random_moments_the_work_is_finished_and_right(store):
-    """SIGKILL a process that builds three results, again and again; nothing torn is ever
-    published."""
+def test_builds_killed_at_random_moments_end_with_the_right_results(store):
+    """Kill a process that builds three results, again and again; nothing torn is ever published."""
     rng = random.Random(1)
     kills = 0
     for _ in range(100):
@@ -304,8 +301,7 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store):
     for number in range(3):
         entry = store.get(Step(TOY, toy_inputs(number), refuse))
         assert (entry.path / "lines.txt").read_text() == expected_text(number)
-    # Who held a lock may stand beside it, where its holder was killed between publishing and
-    # letting go.
+    # The note on a lock's holder remains if the holder was killed before it let go.
     left = {
         path.name
         for path in (store.root / "toy").iterdir()
@@ -315,7 +311,7 @@ def test_killed_at_random_moments_the_work_is_finished_and_right(store):
 
 
 @pytest.mark.slow
-def test_rivals_do_the_work_once_and_say_what_they_wait_for(store):
+def test_processes_that_want_the_same_result_build_it_once_and_say_what_they_wait_for(store):
     processes = [toy(store, 1, "--slow") for _ in range(4)]
     results = [process.communicate(timeout=300) for process in processes]
     assert [process.returncode for process in processes] == [0, 0, 0, 0]
@@ -324,7 +320,7 @@ def test_rivals_do_the_work_once_and_say_what_they_wait_for(store):
     assert any("waiting for toy" in err and "process" in err for err in waiting)
 
 
-def test_killed_rival_frees_its_lock(store):
+def test_a_killed_process_frees_its_lock(store):
     first = toy(store, 1, "--slow")
     key = TOY.key(toy_inputs(0))
     deadline = time.monotonic() + 20
@@ -341,7 +337,7 @@ def test_killed_rival_frees_its_lock(store):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A file system of one MiB; the test is skipped where this user may not mount one."""
+    """A file system of one MiB; skips the test if this user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
@@ -356,7 +352,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_full_disk_is_one_line_and_corrupts_nothing(small_disk):
+def test_a_full_disk_is_reported_in_one_line_and_corrupts_nothing(small_disk):
     store = Store(small_disk / "store")
     sound = store.get(BUILD)
 
@@ -372,7 +368,7 @@ def test_full_disk_is_one_line_and_corrupts_nothing(small_disk):
     assert not store.get(Step(LETTERS, {"x": 2}, write_letters)).cached
 
 
-def test_read_only_store_serves_what_it_has_and_says_so(small_disk):
+def test_a_read_only_store_gives_its_results_and_refuses_to_build(small_disk):
     store = Store(small_disk / "store")
     store.get(BUILD)
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)

@@ -1,4 +1,4 @@
-"""A runs folder of a stranger's: no link of it is followed, and nothing of it holds anybody up."""
+"""A runs folder of a stranger: none of its links is followed, and nothing in it blocks a reader."""
 
 import os
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def outside(tmp_path) -> Path:
 
 @pytest.fixture
 def trial(tmp_path) -> Path:
-    """A finished trial in the runs folder, by its results alone."""
+    """A finished trial in the runs folder, with results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
     named = {
         group: {"name": name} for group, name in {"scene": "s", "init": "a", "densify": "b"}.items()
@@ -68,7 +68,7 @@ def _declare(folder: Path) -> None:
     declare([trial])
 
 
-# What is a link in a trial's folder, and what then runs.
+# The file in a trial's folder that is a link, and the function that writes it.
 WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "the log": ("log.txt", _log),
     "a lock": (".lock", _hold),
@@ -89,12 +89,12 @@ def test_no_link_is_written_through(case, trial, outside):
 
 
 @pytest.mark.parametrize("level", range(3))
-def test_a_linked_folder_is_no_place_of_trials(level, trial, outside):
+def test_trials_in_a_linked_folder_are_ignored(level, trial, outside):
     doomed = [trial.parents[2], trial.parents[1], trial.parent][level]
     doomed.rename(outside / "moved")
     doomed.symlink_to(outside / "moved")
     home = trial.parents[2]
-    assert read_experiment(home).trials == () or level == 0  # a folder that is typed may be a link
+    assert read_experiment(home).trials == () or level == 0  # a named folder may be a link
     assert states_of_experiment(home) == [] or level == 0
     assert (list_experiments(home.parent) == []) == (level == 0)
     with pytest.raises(InputError, match="follows no links"):
@@ -118,7 +118,7 @@ def _pipe(path: Path, outside: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["per_view.csv", "renders", "ground_truth/v.png", "log.txt", ".lock.holder"]
 )
-def test_a_trial_that_holds_something_strange_is_left_out(name, make, trial, outside):
+def test_a_trial_with_a_link_or_a_pipe_is_left_out(name, make, trial, outside):
     assert len(read_experiment(trial.parents[2]).trials) == 1
     (trial / name).parent.mkdir(exist_ok=True)
     make(trial / name, outside)
@@ -139,7 +139,7 @@ def test_no_link_and_no_pipe_is_read(make, trial, outside):
     assert describe_holder(trial / ".lock") == "another process"
 
 
-def test_a_store_builds_in_no_linked_folder(tmp_path, outside):
+def test_the_store_builds_nothing_in_a_linked_folder(tmp_path, outside):
     store, step = (
         Store(tmp_path / "runs" / "store"),
         Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0)),
@@ -158,7 +158,7 @@ def test_a_store_builds_in_no_linked_folder(tmp_path, outside):
     assert (outside / "moved").is_dir()
 
 
-def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path, outside):
+def test_links_of_a_killed_build_are_removed_and_their_targets_stay(tmp_path, outside):
     partial = tmp_path / "partial"
     (partial / "work").mkdir(parents=True)
     (partial / "work" / "images").symlink_to(outside)
@@ -169,7 +169,7 @@ def test_what_a_killed_build_linked_is_removed_and_what_it_led_to_stays(tmp_path
     assert (outside / "private").read_text() == SECRET
 
 
-def test_a_pipe_in_the_place_of_a_lock_s_note_holds_nobody_up(tmp_path):
+def test_a_pipe_in_place_of_the_note_on_a_locks_holder_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "x.lock.holder")
     with hold(tmp_path / "x.lock", "this"):
         assert (tmp_path / "x.lock.holder").is_file()

@@ -1,5 +1,4 @@
-"""A finished trial's files are held against what was written down of them, and what was changed is
-named."""
+"""The files of a finished trial are compared with their recorded hashes, and changes are named."""
 
 import json
 import os
@@ -28,14 +27,14 @@ def trial(tmp_path, monkeypatch) -> Path:
 
 
 def edit(path: Path, old: str, new: str) -> None:
-    """Change a file and keep its time, as somebody might who wants no one to see it."""
+    """Change a file and keep its time, as somebody does who wants to hide the change."""
     state = path.stat()
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
 
 
-def test_changed_results_are_left_out_and_named(trial, capsys):
+def test_a_trial_with_changed_results_is_left_out_and_named(trial, capsys):
     edit(trial / "results.json", "26.5", "43.2")
     experiment = load_experiment(trial.parents[3], EXPERIMENT)
     assert [one.seed for one in experiment.trials] == [1]
@@ -54,7 +53,7 @@ def test_changed_results_are_left_out_and_named(trial, capsys):
     assert "2 trials: 1 done, 1 damaged" in shown
 
 
-def test_other_spaces_and_another_time_are_no_change(trial):
+def test_white_space_and_time_are_no_change_of_results(trial):
     path = trial / "results.json"
     path.write_text(json.dumps(json.loads(path.read_text())))
     os.utime(path, (1, 1))
@@ -62,7 +61,7 @@ def test_other_spaces_and_another_time_are_no_change(trial):
     assert TrialFolder(trial).state() == "done"
 
 
-def test_results_without_a_record_of_them_are_believed(trial):
+def test_results_without_made_of_are_accepted(trial):
     path = trial / "results.json"
     content = json.loads(path.read_text())
     del content["made_of"]
@@ -84,16 +83,15 @@ def test_changed_views_and_curves_are_not_used(trial, caplog):
     assert len(one.folder.curves("events.jsonl")) == 10
 
 
-def test_settings_are_those_that_the_results_were_made_by(trial):
-    """A configuration that is edited afterwards does not make the trial another one."""
+def test_settings_are_those_that_made_the_results(trial):
+    """Editing the configuration afterwards does not change the trial."""
     edit(trial / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')
     for one in load_experiment(trial.parents[3], EXPERIMENT).trials:
         assert one.config["densify.volume_threshold"] == 0.03
 
 
-def test_a_failed_trial_leaves_when_its_class_was_mended(trial):
-    """Equal settings under another hash: a class was edited meanwhile, and the later trial is
-    done."""
+def test_a_failed_trial_is_superseded_once_its_mended_class_has_results(trial):
+    """The settings are equal, but the class was edited since, and the later trial is done."""
     old = trial.with_name(f"0ld0ld00-{trial.name.partition('-')[2]}")
     old.mkdir()
     (old / "config.yaml").write_text((trial / "config.yaml").read_text())
@@ -103,19 +101,19 @@ def test_a_failed_trial_leaves_when_its_class_was_mended(trial):
     found = {one.folder: one for one in states_of_experiment(trial.parents[2])}
     assert found[old].state == "superseded"
     assert f"{trial.name} is done, made by later code: mine.Mine has no x" in found[old].note
-    # other settings: still missing
+    # with other settings it is still a failed trial
     edit(old / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')
     assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[
         old
     ] == "failed"
     edit(old / "config.yaml", '"volume_threshold": 0.04', '"volume_threshold": 0.03')
-    (trial / "results.json").unlink()  # nothing has taken its place
+    (trial / "results.json").unlink()  # no later trial is done
     assert {one.folder: one.state for one in states_of_experiment(trial.parents[2])}[
         old
     ] == "failed"
 
 
-def test_a_folder_knows_its_place(trial):
+def test_a_trial_folder_knows_its_runs_folder_key_and_label(trial):
     folder = TrialFolder(trial)
     values = folder.settings()
     assert TrialFolder.of(values).path == trial
@@ -126,7 +124,7 @@ def test_a_folder_knows_its_place(trial):
     assert folder.lock == trial / ".lock"
 
 
-def test_states_are_told_from_the_files(tmp_path):
+def test_the_state_of_a_trial_follows_from_its_files(tmp_path):
     folder = TrialFolder(tmp_path / "x" / "s" / "a-b" / "01234567-seed0")
     folder.path.mkdir(parents=True)
     assert (folder.state(), folder.has_failed()) == ("missing", False)
@@ -139,7 +137,7 @@ def test_states_are_told_from_the_files(tmp_path):
     assert folder.state() == "damaged"
 
 
-def test_the_stage_and_the_last_iteration_of_a_training(tmp_path):
+def test_the_stage_and_the_last_iteration_are_read_from_the_files_of_a_training(tmp_path):
     folder = TrialFolder(tmp_path)
     assert folder.stage_and_step() == ("", 0)
     (tmp_path / "building.json").write_text(
@@ -188,7 +186,7 @@ def test_equal_results_keep_their_time_and_others_do_not(trial):
     assert set(made_of.digests) == set(made_of.published)
 
 
-def test_only_small_files_and_what_tables_read_are_compared_by_content(trial, monkeypatch):
+def test_only_small_files_and_those_that_tables_read_have_digests(trial, monkeypatch):
     folder = TrialFolder(trial)
     values, record = folder.settings(), folder.record()
     for name, size in (("small.png", 4), ("large.png", 5)):
@@ -200,7 +198,7 @@ def test_only_small_files_and_what_tables_read_are_compared_by_content(trial, mo
     assert made_of.published.keys() - made_of.digests.keys() == {"large.png"}
 
 
-def test_views_are_checked_and_read_without_what_is_empty(trial):
+def test_views_are_checked_and_empty_values_are_left_out(trial):
     (trial / "results.json").unlink()
     path = trial / "per_view.csv"
     path.write_text("view,psnr,ssim\na,1e30,\nb,-2,0.5\n")
@@ -211,7 +209,7 @@ def test_views_are_checked_and_read_without_what_is_empty(trial):
             TrialFolder(trial).views()
 
 
-def test_a_changed_file_is_found_though_the_results_were_not_read_before(trial):
+def test_a_changed_file_is_found_even_if_the_results_were_not_read_before(trial):
     edit(trial / "per_view.csv", "25.5", "24.5")
     with pytest.raises(DamagedError, match=r"per_view\.csv was changed after it was written"):
         TrialFolder(trial).views()
@@ -243,7 +241,7 @@ def test_pictures_are_sorted_by_name(trial):
         ),
     ],
 )
-def test_what_has_changed_since_is_named(trial, place, value, reason):
+def test_each_change_since_the_results_were_written_is_named(trial, place, value, reason):
     folder, path = TrialFolder(trial), trial / "results.json"
     values = folder.settings()
     folder.write_finished(values, replace(folder.record(), hashes={"config": config_hash(values)}))
@@ -260,7 +258,7 @@ def test_what_has_changed_since_is_named(trial, place, value, reason):
     assert re.search(reason, folder.why_not_done(values))
 
 
-def test_a_metric_that_can_be_computed_by_now_is_a_reason(trial):
+def test_a_missing_metric_that_can_be_computed_now_is_a_reason_to_run(trial):
     folder = TrialFolder(trial)
     values = folder.settings() | {"eval": {"primary": "x"}}
     asked: list[dict[str, object]] = []

@@ -1,4 +1,4 @@
-"""The types of a trial's files: what is left out has its default, and what cannot be is damaged."""
+"""The types of a trial's files: defaults of missing values, and values that count as damage."""
 
 import json
 from pathlib import Path
@@ -44,7 +44,7 @@ def record(**changes: Any) -> Any:
     return record_from(json.dumps(RESULTS | changes).encode(), PATH)
 
 
-def test_results_without_a_count_are_those_of_renders_alone():
+def test_only_results_of_renders_may_lack_the_number_of_gaussians():
     assert record().num_gaussians == 2
     assert record(evaluated_from="renders").num_gaussians == 2
     assert record(evaluated_from="renders", num_gaussians=None).num_gaussians is None
@@ -53,7 +53,7 @@ def test_results_without_a_count_are_those_of_renders_alone():
             record(evaluated_from=evaluated_from, num_gaussians=None)
 
 
-def test_unfinished_results_are_told_from_damaged_ones():
+def test_unfinished_results_are_distinguished_from_damaged_ones():
     with pytest.raises(UnfinishedError, match="is unfinished, its status is 'running'"):
         record(status="running", seed="0")
     with pytest.raises(UnfinishedError, match="is unfinished, its status is missing"):
@@ -63,7 +63,7 @@ def test_unfinished_results_are_told_from_damaged_ones():
     assert not isinstance(caught.value, UnfinishedError)
 
 
-def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default():
+def test_omitted_facts_of_a_metric_or_a_failure_have_defaults():
     assert parse_typed(b'{"label": "a"}', MetricRecord, PATH) == MetricRecord(
         label="a", direction=0, decimals=3, unit=""
     )
@@ -88,7 +88,7 @@ def test_what_is_not_told_of_a_metric_or_a_failure_has_its_default():
         ({"split": "every_nth", "validation": True}, "every_nth, validation"),
     ],
 )
-def test_the_rule_of_a_split_in_words(settings, text):
+def test_the_rule_of_a_split_has_a_short_text(settings, text):
     assert split_text({f"scene.{name}": value for name, value in settings.items()}) == text
 
 
@@ -123,7 +123,7 @@ def test_a_row_has_an_iteration_and_numbers(row, sound, tmp_path):
         ([0, 1, 2, 3], [1, 0], False),
     ],
 )
-def test_a_histogram_has_an_edge_more_than_counts(edges, counts, sound, tmp_path):
+def test_a_histogram_has_one_edge_more_than_counts(edges, counts, sound, tmp_path):
     path = tmp_path / "volume_histograms.jsonl"
     path.write_text(json.dumps({"step": 3, "log10_edges": edges, "counts": counts}) + "\n")
     assert len(read_rows(path, Histogram)) == sound

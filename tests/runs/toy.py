@@ -1,8 +1,7 @@
-"""A stage that is slow enough to be killed and loads no torch: it writes numbered lines, going on
-where it was stopped.
+"""A stage that is slow enough to be killed, for tests; it loads no torch.
 
-Run as a program: ``python -m tests.runs.toy STORE COUNT [--slow] [--ready]``; the last says so when
-it begins.
+It writes numbered lines, and continues where it was stopped. Run it as a program: ``python -m
+tests.runs.toy STORE COUNT [--slow] [--ready]``. ``--ready`` prints a line when it begins.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ def expected_text(number: int) -> str:
 
 
 def build(folder: Path, number: int, pause: float) -> None:
-    """Keep the lines so far in a file that is replaced whole, as a training does with its
-    checkpoints."""
+    """Keep the lines so far in a file that is replaced as a whole, as a checkpoint is."""
     progress = folder / "so_far.progress"
     lines = progress.read_text().splitlines() if progress.exists() else []
     while len(lines) < LINES:

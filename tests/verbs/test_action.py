@@ -23,8 +23,10 @@ def steps() -> list[dict[str, Any]]:
 
 
 def ended(tmp_path: Path, code: int, **inputs: str) -> tuple[int, list[str]]:
-    """The exit code of the script where gsbench ends with ``code``, and the words that gsbench was
-    given."""
+    """Run the script with a gsbench that ends with the exit code ``code``.
+
+    Returns the script's exit code, and the words that gsbench was given.
+    """
     program = tmp_path / "gsbench"
     program.write_text(
         f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path / "words"}\necho passed\nexit {code}\n'
@@ -54,14 +56,14 @@ ENDS = [(0, "fail", 0), (1, "pass", 1), (2, "pass", 2), (3, "fail", 3), (3, "pas
 
 
 @pytest.mark.parametrize(("code", "undecided", "expected"), ENDS)
-def test_the_step_ends_as_the_gate_does(tmp_path, code, undecided, expected):
+def test_the_step_has_the_exit_code_of_the_gate(tmp_path, code, undecided, expected):
     found, words = ended(tmp_path, code, UNDECIDED=undecided)
     assert found == expected
     assert words == ["gate", "a b.zip", "x=1", "y=$(id)", "z=*", "--metric", "psnr"]
     assert "    passed" in (tmp_path / "s.md").read_text()
 
 
-def test_options_are_given_where_they_are_set_and_inputs_are_no_part_of_a_script(tmp_path):
+def test_only_options_that_are_set_are_given_and_inputs_are_not_inserted_into_scripts(tmp_path):
     _, words = ended(tmp_path, 0, LEAST="10%", SEEDS="4")
     assert words[-4:] == ["--least", "10%", "--seeds", "4"]
     assert not [step for step in steps() if "${{" in step["run"]]

@@ -19,7 +19,7 @@ def runs(tmp_path) -> Path:
     return tmp_path
 
 
-def test_it_names_designs_that_suffice(runs, capsys):
+def test_plan_names_designs_that_suffice(runs, capsys):
     assert plan(["exp", "--metric", "psnr", "--difference", "0.2"], runs) == 0
     out = capsys.readouterr().out
     assert "sfm-volumetric against sfm-adc" in out
@@ -27,7 +27,7 @@ def test_it_names_designs_that_suffice(runs, capsys):
     assert "scenes like these (from 6 scenes on)" in out
 
 
-def test_one_scene_does_not_speak_of_others(runs, capsys):
+def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(runs, capsys):
     assert plan(["one"], runs) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
 
@@ -42,6 +42,6 @@ def test_one_scene_does_not_speak_of_others(runs, capsys):
         (["nothing"], "no experiment"),
     ],
 )
-def test_bad_input_is_refused(runs, words, message):
+def test_bad_input_of_plan_is_refused(runs, words, message):
     with pytest.raises(InputError, match=message):
         plan(words, runs)

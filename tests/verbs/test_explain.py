@@ -27,7 +27,7 @@ def test_a_cell_names_its_trials_hashes_and_versions(tmp_path, capsys):
         assert expected in text
 
 
-def test_what_is_missing_is_said(tmp_path):
+def test_missing_trials_and_metrics_are_reported(tmp_path):
     paths = write_runs(tmp_path, Plan(scenes=("garden",)))
     (paths[0] / "results.json").unlink()
     text = explain_cell("exp:garden:psnr:adc", tmp_path)

@@ -1,4 +1,4 @@
-"""``gsbench ledger`` with trainings that are made up: results by idea, seed and scene."""
+"""``gsbench ledger`` with made-up trainings: results by idea, seed and scene."""
 
 from __future__ import annotations
 
@@ -119,7 +119,9 @@ def test_an_idea_stops_at_the_first_look_that_decides(home: Path, trainings: Tra
     assert len(trainings.trained) == 2 * 2  # two seeds of both
 
 
-def test_an_equal_idea_is_not_paid_twice(home: Path, trainings: Trainings) -> None:
+def test_an_equal_idea_is_neither_trained_nor_entered_twice(
+    home: Path, trainings: Trainings
+) -> None:
     attempt(f"{SPLIT}=0.02")
     before = len(trainings.trained), (home / LEDGER).read_bytes()
     assert attempt(f"{SPLIT}=0.02", "densify.name=another") == 0
@@ -130,11 +132,12 @@ def test_a_kept_idea_may_be_the_next_baseline(home: Path) -> None:
     attempt(f"{SPLIT}=0.02", "--as", "one")
     assert attempt(f"{SPLIT}=0.03", "--as", "two", "--against", "one") == 0
     assert entries(home, Ended)[1].difference.mean == pytest.approx(3, abs=0.5)
-    assert attempt(f"{SPLIT}=0.03", "--as", "three") == 0  # another question: the own baseline
+    # another question, against the ledger's own baseline
+    assert attempt(f"{SPLIT}=0.03", "--as", "three") == 0
     assert entries(home, Ended)[2].difference.mean == pytest.approx(6, abs=0.5)
 
 
-def test_an_idea_whose_trials_fail_gives_its_place_back(
+def test_an_idea_whose_trials_fail_does_not_count_as_tried(
     home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trainings.fails = {0.02}
@@ -147,7 +150,7 @@ def test_an_idea_whose_trials_fail_gives_its_place_back(
     assert len(entries(home, Started)) == 1
 
 
-def test_an_idea_that_fails_after_a_result_keeps_its_place(
+def test_an_idea_that_fails_after_a_result_counts_as_tried(
     home: Path, trainings: Trainings, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     trainings.noise = 30.0  # undecided at the first look
@@ -164,13 +167,14 @@ def test_an_idea_that_fails_after_a_result_keeps_its_place(
     assert read_ledger(home).tried == 1
 
 
-def test_a_baseline_that_fails_is_not_the_ideas_fault(home: Path, trainings: Trainings) -> None:
+def test_an_idea_may_be_tried_again_if_its_baseline_fails(home: Path, trainings: Trainings) -> None:
     trainings.fails = {0.01, 0.02}
     assert attempt(f"{SPLIT}=0.02") == 1
-    assert entries(home, Ended)[0].result == "failed"  # nothing was measured: it may come again
+    # nothing was measured, so it may be tried again
+    assert entries(home, Ended)[0].result == "failed"
 
 
-def test_when_all_ideas_were_tried_no_level_is_left(
+def test_after_all_planned_ideas_no_further_idea_is_tried(
     trainings: Trainings, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(["ledger", *NEW, "--ideas", "1"])
@@ -196,7 +200,7 @@ def test_when_all_ideas_were_tried_no_level_is_left(
         (["densify=nothing_like_it"], "nothing_like_it"),
     ],
 )
-def test_what_an_idea_cannot_be_is_refused_and_leaves_no_line(
+def test_settings_that_are_no_idea_are_refused_and_leave_no_line(
     home: Path, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (home / LEDGER).read_bytes()
@@ -235,7 +239,7 @@ def test_a_ledger_is_declared_once(
     assert "has no ledger" in capsys.readouterr().err
 
 
-def test_trials_that_the_ledger_does_not_know_are_named(
+def test_trials_that_the_ledger_does_not_know_are_refused(
     home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     attempt(f"{SPLIT}=0.02")
@@ -253,7 +257,7 @@ def test_edited_code_of_the_baseline_is_noticed(
     assert "the code of baseline have changed" in capsys.readouterr().err
 
 
-def test_a_ledger_of_somebody_else_runs_no_code(
+def test_a_ledger_cannot_allow_code_to_run(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.py").write_text("from gsbench.densify import ADC\nclass Mine(ADC): pass\n")
@@ -267,7 +271,7 @@ def test_a_ledger_of_somebody_else_runs_no_code(
 def test_a_kill_between_any_two_lines_changes_nothing(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The same command continues; the ledger is the one of a night without kills."""
+    """The same command continues; the ledger is that of a night without kills."""
     write = records._write
 
     def commands() -> None:
@@ -315,7 +319,7 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(
 ) -> None:
     for size in (0.02, 0.04, 0.03):
         attempt(f"{SPLIT}={size}")
-    trainings.effects[0.03] = 0.0  # it was luck
+    trainings.effects[0.03] = 0.0  # its gain was luck
     trainings.noise = 0.01
     capsys.readouterr()
     assert confirm(*PARK) == 0
@@ -401,10 +405,10 @@ def test_show_prints_all_for_programs(home: Path, capsys: pytest.CaptureFixture[
     assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
 
 
-def test_the_simulated_rule_is_the_ledgers(
+def test_the_simulated_rule_decides_as_the_ledger_does(
     trainings: Trainings, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The rates of docs/night.md are those of the program: the same draws, the same decisions."""
+    """The rates in docs/night.md hold for the program: equal draws give equal decisions."""
     monkeypatch.setattr(ledger_rates, "SCENES", 1)
     run(["ledger", *NEW[:-1], "seed=0,1,2,3,4,5"])
     draws = np.random.default_rng(1).normal(0.6, 1, (6, 6))

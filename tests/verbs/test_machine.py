@@ -1,5 +1,4 @@
-"""``gsbench doctor`` on machines that this one is not: with GPUs, without compilers, with folders
-that are shut."""
+"""``gsbench doctor`` on made-up machines: with GPUs, without GPUs, and as this one is."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ def no_gpu(monkeypatch) -> None:
 
 @pytest.fixture
 def gpus(monkeypatch) -> None:
-    """Two GPUs, as torch tells of them."""
+    """Two GPUs, as torch reports them."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda index: f"GPU {'AB'[index]}")
@@ -44,7 +43,7 @@ def gpus(monkeypatch) -> None:
     monkeypatch.setattr(torch.version, "hip", None)
 
 
-def test_gpus_with_their_memory(gpus, monkeypatch):
+def test_gpus_are_listed_with_their_memory(gpus, monkeypatch):
     assert said(of_devices("gpu")) == [("ok", f"GPU {name}, 20 GB of 24 GB free") for name in "AB"]
     monkeypatch.setattr(torch.version, "hip", "7.0")
     assert all(
@@ -52,13 +51,13 @@ def test_gpus_with_their_memory(gpus, monkeypatch):
     )
 
 
-def test_every_extra_is_known():
+def test_every_extra_of_the_package_is_checked():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = set(project["optional-dependencies"]) - {"dev", "docs"}
     assert {extra for _, extra in machine.OPTIONAL.values()} == extras
 
 
-def test_no_gpu_and_why(no_gpu, monkeypatch):
+def test_without_a_gpu_the_cause_is_named(no_gpu, monkeypatch):
     assert said(of_devices("gpu")) == [
         ("note", "none (this torch is a build for CPUs): raster=auto uses the CPU")
     ]
@@ -70,7 +69,7 @@ def test_no_gpu_and_why(no_gpu, monkeypatch):
     assert "no usable NVIDIA driver" in said(of_devices("gpu"))[0][1]
 
 
-def test_rasterizers(no_gpu, monkeypatch):
+def test_rasterizers_without_a_gpu(no_gpu, monkeypatch):
     texts = dict(text.split(" ", 1) for _, text in said(of_devices("rasterizer")))
     assert texts["raster=auto"] == "is cpu on cpu"
     assert texts["raster=cpu"].startswith("on cpu: compiled")
@@ -90,7 +89,7 @@ def test_rasterizers_on_a_gpu(gpus, monkeypatch):
     assert texts["raster=gsplat"].startswith("needs gsplat: ")
 
 
-def test_the_whole_of_it_on_this_machine(tmp_path, capsys):
+def test_doctor_on_this_machine_covers_all_topics(tmp_path, capsys):
     machine.doctor([], tmp_path / "runs")
     lines = capsys.readouterr().out.splitlines()
     topics = {line.split()[1] for line in lines}

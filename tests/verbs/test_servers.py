@@ -1,5 +1,4 @@
-"""Verbs that serve pages: what ends them ends all of them, and the current folder is no place of
-modules."""
+"""Verbs that serve pages end all their processes and import no module of the current folder."""
 
 from __future__ import annotations
 
@@ -22,7 +21,9 @@ SECONDS = 120
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
-def test_the_dashboard_ends_whole_and_runs_no_module_of_the_current_folder(tmp_path, signum):
+def test_all_processes_of_the_dashboard_end_and_none_imports_from_the_current_folder(
+    tmp_path, signum
+):
     (tmp_path / "runs").mkdir()
     connect(None, tmp_path / "runs")
     (tmp_path / "yaml.py").write_text(f"open({str(tmp_path / 'exploded')!r}, 'w')\n")

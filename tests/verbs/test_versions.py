@@ -1,4 +1,4 @@
-"""The search of ``gsbench bisect`` over commits whose trainings are made up."""
+"""The search of ``gsbench bisect`` over commits with made-up trainings."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ QUALITY = {"a": 26.0, "b": 26.001, "c": 25.0}  # PSNR, dB
 
 
 class Trainings:
-    """Writes a commit's results where its training would; ``fails`` names a commit that does not
-    train."""
+    """Writes a commit's results instead of training it.
+
+    ``fails`` names a commit that does not train.
+    """
 
     def __init__(self, fails: str = "") -> None:
         self.fails = fails
@@ -97,7 +99,9 @@ def test_the_commit_is_found_and_nothing_is_trained_twice(tmp_path, monkeypatch)
     )
 
 
-def test_a_commit_that_does_not_train_is_passed_over_but_not_the_last(tmp_path, monkeypatch):
+def test_a_commit_that_does_not_train_is_skipped_unless_it_is_the_first_or_last(
+    tmp_path, monkeypatch
+):
     search = begun(tmp_path, monkeypatch, Trainings(fails="b"))
     assert search.table()[1].endswith("not tried")
     assert first_worse(2, search.result) == (0, 2)

@@ -1,6 +1,6 @@
-"""Table cells (a mean with its deviation) and data frames from trials.
+"""Cells of tables (a mean with its deviation), and data frames of trials.
 
-Unlike trials are never averaged.
+Only repetitions of a trial are averaged: `check_averageable` refuses all others.
 """
 
 from __future__ import annotations
@@ -75,7 +75,10 @@ def field_value(trial: TrialResult, name: str) -> str:
 
 
 def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
-    """The settings that may contain ``name``; in the trial's own file if no result changes."""
+    """The settings in which to look up ``name``.
+
+    Settings that change no result are only in the trial's own file.
+    """
     is_hashed = name in trial.config or not name.startswith(NOT_HASHED)
     return trial.config if is_hashed else trial.whole_config
 
@@ -140,7 +143,10 @@ def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
 
 
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
-    """The trials with their values of the swept settings as ``variant``, so as different arms."""
+    """The trials, each with its values of the swept settings as `TrialResult.variant`.
+
+    Trials with different values thus belong to different arms.
+    """
     swept = swept_settings(trials)
     if not swept:
         return list(trials)
@@ -174,14 +180,17 @@ def make_cell(
 
 
 def short_reason(reason: str) -> str:
-    """The reason why a metric is missing, in a line; of weights results.json has the full text."""
+    """The reason why a metric is missing, in one line.
+
+    For missing weights, ``results.json`` has the full text.
+    """
     if reason.startswith("weights not found: "):
         return f"{reason.partition(' (')[0]}; gsbench doctor says where they come from"
     return reason
 
 
 def best_cells(cells: Mapping[K, Cell], quantity: Quantity) -> set[K]:
-    """The keys of the best means, rounded to the quantity's decimals; none if all are equal."""
+    """The keys of the best means after rounding; none if all are equal, or for a cost."""
     merits = {
         key: quantity.direction * round(cell.mean, quantity.decimals)
         for key, cell in cells.items()

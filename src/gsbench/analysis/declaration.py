@@ -1,5 +1,7 @@
-"""The declaration that a sweep's verdict follows, with the trials measured before it and those
-added later."""
+"""The declaration that a sweep's verdict follows.
+
+It comes with the trials that were measured before it, and those that were added later.
+"""
 
 import math
 from collections.abc import Sequence
@@ -38,13 +40,14 @@ class ActiveDeclaration:
 
     @property
     def beforehand(self) -> bool:
-        """Return whether metric and trials were fixed before any result: only then the metric is
-        tested alone."""
+        """Return whether metric and trials were fixed before any result.
+
+        Only then the metric is tested alone.
+        """
         return not self.seen and not self.added
 
     def sentences(self, name: str) -> list[str]:
-        """Sentences about the declaration of the metric called ``name``: when it was made, and what
-        it covers."""
+        """Sentences that say when the metric called ``name`` was declared, and for which trials."""
         when = self.declaration.when
         name += f" at {self.question}" if self.question else ""
         all_trials = counted(self.trials, "trial")
@@ -89,11 +92,11 @@ class ActiveDeclaration:
 
 
 def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:
-    """The latest declaration of the sweep in ``folder`` with these trials; None if nothing was
-    declared.
+    """The declaration in force for the sweep in ``folder``; None if nothing was declared.
 
-    Further commands may add trials to it until the first result. A trial that is added later counts
-    as ``added`` as soon as it is measured.
+    ``trials`` are all trials of the sweep. The latest declaration of a metric is in force.
+    Further commands may add trials to it until the first result; a trial that is added later
+    counts as ``added`` as soon as it is measured.
     """
     recorded = read_declarations(folder, (trial.record.declared for trial in trials))
     declared = [one for one in recorded if one.kind == "sweep"]

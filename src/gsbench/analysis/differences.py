@@ -1,5 +1,4 @@
-"""Differences between trials and between arms: conditions, settings, versions of the code, and
-*ingredients*.
+"""Differences between trials and between arms: conditions, settings, code and *ingredients*.
 
 An ingredient is one difference that may explain a result. Each setting is an ingredient; settings
 that belong together share one name. A densifier class adds the ingredients in which it departs from
@@ -41,13 +40,14 @@ IGNORED_SETTINGS = (
     ),
     *("eval.primary", "eval.controls", "densify.switches"),
 )
-MAX_NAMED = 6  # a sentence names so many ingredients and counts the rest
+MAX_NAMED = 6  # the most ingredients that a sentence names; it counts the rest
 NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
 ELSEWHERE = "a training elsewhere, which left no record"
 BY_PROGRAM = "everything that the program {} does differently"
 TARGET, INITIAL_CLOUD = "densify._target_", "initial cloud"
 
-# Ingredients of several settings. The name of any other is the setting's key without ``densify.``.
+# Ingredients that consist of several settings. Every other setting is an ingredient of its own,
+# named by its key without ``densify.``.
 INGREDIENT_NAMES = {
     "densify.gradient_threshold": "threshold",
     "densify.threshold_inclusive": "threshold",
@@ -95,10 +95,10 @@ FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$",
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
-    """The conditions in which trials differ, with their values; with ``code``, versions of the code
-    are conditions.
+    """The conditions in which trials differ, with their values.
 
-    Different budgets count only if a budget limited one of the trials.
+    With ``code``, versions of the code are conditions too. Different budgets count only if a
+    budget limited one of the trials.
     """
     values_by_condition: dict[str, set[str]] = defaultdict(set)
     for trial in trials:
@@ -126,10 +126,10 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
-    """The parts of the code (user's modules, gsbench's stages and rooms) of which trials used
-    several versions.
+    """The parts of the code of which the trials used several versions, with these versions.
 
-    Of several such rooms, the first stands for all, under a name that counts the others.
+    Parts are a user's modules, and gsbench's stages and rooms. If several rooms differ, the
+    first stands for all of them, under a name that counts the others.
     """
     trials = list(trials)
     differing = _with_several_versions(trials, lambda trial: trial.code)
@@ -153,8 +153,10 @@ def _with_several_versions(
 
 
 def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
-    """``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``, the oldest version
-    first."""
+    """The versions of a part of the code in one line, the oldest first.
+
+    For example ``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``.
+    """
     ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
     texts = [
         f"{short_version(version)} ({_scenes_and_seeds(own)}; {_when(own)})"
@@ -175,8 +177,7 @@ def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
-    """The time at which the trials were finished, to the minute: one time, or the first and the
-    last."""
+    """When the trials were finished, to the minute: one time, or the first and the last."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
     return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"
@@ -209,8 +210,10 @@ def find_superseded(
 
 
 def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
-    """The ingredients in which two configurations with dotted keys differ, those of the densifier
-    classes first."""
+    """The ingredients in which two configurations with dotted keys differ.
+
+    Those of the densifier classes come first.
+    """
     if not one or not other:
         return (NO_RECORD,)
     of_one_class = {*_class_ingredients(one)} ^ {*_class_ingredients(other)}
@@ -233,15 +236,13 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The settings in which two configurations differ, without those that do not change the trained
-    model."""
+    """The settings in which two configurations differ, without those in `WITHOUT_EFFECT`."""
     keys = [key for key in {**one, **other} if not key.startswith(WITHOUT_EFFECT)]
     return [key for key in keys if one.get(key) != other.get(key)]
 
 
 def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) -> tuple[str, ...]:
-    """The ingredients in which two arms of ``trials`` differ, in their configurations and in
-    versions of the code.
+    """The ingredients in which two arms of ``trials`` differ, versions of the code included.
 
     Only if there is exactly one, a difference of results can be put down to it.
     """
@@ -273,10 +274,10 @@ def is_mixed(names: Sequence[str]) -> bool:
 def representatives(
     trials: Iterable[TrialResult], first: Arm, second: Arm
 ) -> tuple[TrialResult, TrialResult]:
-    """One trial of each arm: of the same scene and seed if possible, else of the same scene, else
-    of the same seed.
+    """One trial of each arm: of the same scene and seed if possible.
 
-    Raises KeyError for an arm without trials.
+    Otherwise both are of the same scene, or else of the same seed. Raises KeyError for an arm
+    without trials.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     pairs = itertools.product(by_arm[first], by_arm[second])

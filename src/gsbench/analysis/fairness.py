@@ -27,13 +27,13 @@ from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
 from gsbench.words import counted, listed
 
-LONGEST = 60  # shown characters of a value
+LONGEST = 60  # the most characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
 ALIKE, UNLIKE = "", "≠"
 DIFFERS = "differs"  # heading of the column that marks differing rows
 # relative difference up to which counts are equal; densify.cap=governor holds counts closer
 EQUAL_COUNTS = 0.02
-MAX_VALUES = 8  # shown points of a search
+MAX_VALUES = 8  # the most points of a search that are shown
 NOTHING = (
     "No tuning is recorded: each arm ran with one choice of settings. What was tried "
     "elsewhere is not known."
@@ -42,7 +42,7 @@ VIEWS = "validation views"  # every search judges its points on them
 
 
 def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Sentences on unequal counts, several differing ingredients, and unequal tuning, or ""."""
+    """Sentences on unequal counts, several differing ingredients and unequal tuning, or ""."""
     names = ingredients_between(trials, first, second)
     mixed = ingredients_sentence(names, first, second) if is_mixed(names) else ""
     counts = counts_sentence(trials, first, second)
@@ -194,11 +194,11 @@ def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str
 
 
 def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
-    """``They were not tuned alike: sfm-adc none, sfm-volumetric 6 points of 1 seed …``
+    """Say that a pair's arms were not tuned alike; "" if both had the same tuning budget.
 
-    "" if both arms had the same tuning budget. A search counts if its best point has exactly the
-    arm's settings. Settings that were all run as arms are no search, since each has its own
-    verdict.
+    For example ``They were not tuned alike: sfm-adc none and sfm-volumetric 6 points of 1 seed
+    …``. A search counts if its best point has exactly the arm's settings. Settings that were
+    all run as arms are no search, since each has its own verdict.
     """
     budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
     if len(set(budgets)) < 2:
@@ -208,7 +208,10 @@ def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
 
 
 def _tuning_budget(trial: TrialResult) -> str:
-    """``6 points of 2 seeds on validation views``: the largest search it gains from, or none."""
+    """The budget of the largest search that chose the trial's settings; "none" without one.
+
+    For example ``6 points of 2 seeds on validation views``.
+    """
     searches = [search for search in _searches(trial).values() if _has_settings(trial, search.best)]
     if not searches:
         return "none"
@@ -222,7 +225,7 @@ def _tuning_budget(trial: TrialResult) -> str:
 def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
     """The searches of a trial's arm in its runs folder, by experiment.
 
-    Those for its own sweep, and those that tried exactly the trial's settings.
+    These are the searches for the trial's own sweep, and those that tried exactly its settings.
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
     searches = {}

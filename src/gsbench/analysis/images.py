@@ -28,7 +28,7 @@ Pixels = NDArray[np.uint8]  # [H, W, 3]
 
 
 def texture_energy(image: Pixels) -> Array:
-    """Local mean of the squared luminance gradient (8-bit levels²), [H, W], of [H, W, 3] uint8."""
+    """The local mean [H, W] of an image's squared luminance gradient, in 8-bit levels²."""
     from skimage.filters import gaussian  # here, since it is slow to import
 
     luminance = image.astype(np.float64) @ np.array(LUMINANCE)  # [H, W]
@@ -37,7 +37,7 @@ def texture_energy(image: Pixels) -> Array:
 
 
 def read_counted(trial: TrialResult, view: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] of a test view that count: all of the ``shape``, or those of a mask."""
+    """The pixels [H, W] of a test view that count: those that its mask keeps, or all."""
     path = trial.path / MASKS / f"{view}.png"
     return read_mask(path) if path.is_file() else np.ones(shape, dtype=bool)
 
@@ -55,10 +55,10 @@ class PixelMeasures(Record):
 
 
 def textured_error(trial: TrialResult) -> float:
-    """Mean error (8-bit levels) over each test photograph's most textured fifth, over views.
+    """The mean error (8-bit levels) in the most textured fifth of each test photograph.
 
-    This fifth shows grass, foliage, fabric or gravel. Raises InputError if neither renders nor
-    their stored measure exist.
+    It is averaged over views. This fifth shows grass, foliage, fabric or gravel. Raises
+    InputError if neither renders nor their stored measure exist.
     """
     stored = read_if_sound(trial.path / FROM_PIXELS, PixelMeasures)
     if stored is not None:
@@ -158,7 +158,7 @@ def compare_view(which: str, pair: TrialPair, view: str) -> ViewComparison:
     """
     first, second, truth = read_compared(*pair, view)
     errors = [absolute_error(image, truth=truth) for image in (first, second)]  # [H, W] each
-    nearer = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)  # [H, W], 1: the second is
+    nearer = np.clip((errors[0] - errors[1]) / FULL_COLOUR, -1, 1)  # [H, W], above 0: the second is
     gain = nearer[..., None]  # [H, W, 1]
     white, blue, red = (
         np.array(colour) for colour in ((255, 255, 255), (33, 102, 172), (178, 24, 43))
@@ -197,7 +197,11 @@ def _data_uri(picture: Image.Image, kind: str, **options: Any) -> str:
 
 
 def read_compared(one: TrialResult, other: TrialResult, view: str) -> list[Pixels]:
-    """Both renders and the photograph; equal stripes over ignored pixels show no error."""
+    """Both renders and the photograph of a view, [H, W, 3] each.
+
+    Ignored pixels have the same stripes in all three, so they show no error. Raises InputError
+    if the sizes differ.
+    """
     first = read_image(one.path / RENDERS / f"{view}.png")
     second = read_image(other.path / RENDERS / f"{view}.png")
     truth = read_image(one.path / GROUND_TRUTH / f"{view}.png")

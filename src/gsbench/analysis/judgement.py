@@ -30,15 +30,17 @@ from gsbench.words import counted, signed
 
 # deviations from the other trials of its scene and arm, beyond which a trial is outlying
 OUTLYING = 5.0
-LEAST_OTHERS = 2  # other trials that this needs
+LEAST_OTHERS = 2  # the fewest other trials that this needs
 # corrects the median sample deviation of three trials, which is too small: 1 / sqrt(ln 2)
 FEW = 1.2
 
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """One scene of a verdict: its mean paired difference, with a test adjusted for all scenes of
-    all questions."""
+    """The mean paired difference of one scene.
+
+    Its test is adjusted for all scenes of all questions.
+    """
 
     scene: str
     mean: float
@@ -79,8 +81,10 @@ class Verdict:
 
     @property
     def least(self) -> float | None:
-        """The least difference that matters; for a relative question in logarithms, in which it is
-        tested."""
+        """The least difference that matters, in the unit of the test.
+
+        A relative question is tested in logarithms.
+        """
         least = self.question.least
         return math.log1p(least) if self.question.relative and least is not None else least
 
@@ -128,12 +132,11 @@ class Verdict:
 
 
 def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdict]:
-    """The verdicts on the questions of ``declaration`` from ``trials``, in the order of the
-    questions.
+    """The verdicts on the questions of ``declaration``, in their order.
 
-    Questions share the error rate. If seeds come in looks, each question gets an equal share and is
-    answered at the first look that decides it; otherwise Holm's method adjusts them as one family.
-    Secondary questions have an error rate of their own.
+    Questions share the error rate. If seeds come in looks, each question gets an equal share
+    and is answered at the first look that decides it; otherwise Holm's method adjusts them as
+    one family. Secondary questions have an error rate of their own.
     """
     by_arm, by_folder = (
         group_by(trials, lambda trial: trial.arm),
@@ -176,7 +179,7 @@ def _with_pairs(
 ) -> Verdict:
     """The question with its pairs of trials, not judged yet."""
     pairs = pair(trials, question)
-    # an earlier baseline alone shows no difference
+    # trials of an earlier version alone show no difference, so they may be older
     new = pairs.trials[1::2] if question.versions else pairs.trials
     late = sum(trial.measured < declaration.moment for trial in new)
     quantity = asked_quantity(question.metric, trials)
@@ -203,8 +206,10 @@ def _with_pairs(
 
 
 def _candidate_metrics(verdict: Verdict) -> int:
-    """The number of metrics that could have been chosen by their results: 1 if the question was
-    asked beforehand."""
+    """The number of metrics that could have been chosen by their results.
+
+    It is 1 if the question was asked beforehand.
+    """
     if not verdict.late:
         return 1
     return len(
@@ -256,10 +261,10 @@ def _decide(verdict: Verdict, answer: Answer) -> Verdict:
 
 
 def _contradicts(rest: float, mean: float, outcome: Outcome, least: float | None) -> bool:
-    """Return whether ``rest``, the mean without outlying trials, contradicts the outcome that
-    ``mean`` led to.
+    """Return whether ``rest``, the mean without outlying trials, contradicts ``outcome``.
 
-    It does if it is not too small although the outcome says so, or if it has the other sign.
+    The outcome follows from ``mean``, the mean of all trials. It is contradicted if ``rest`` is
+    not too small although the outcome says so, or if ``rest`` has the other sign.
     """
     if outcome == TOO_SMALL:
         return least is not None and abs(rest) >= least
@@ -267,12 +272,12 @@ def _contradicts(rest: float, mean: float, outcome: Outcome, least: float | None
 
 
 def find_outlying(pairs: Pairs) -> list[TrialResult]:
-    """The trials that lie more than `OUTLYING` deviations from the mean of the other trials of
-    their scene and arm.
+    """The trials that are far from the other trials of their scene and arm.
 
-    The deviation of two or three trials is often small by chance. So the largest of three counts:
-    the other trials' deviation, that of the scene's other arm, and the typical deviation over all
-    scenes and arms.
+    Far is more than `OUTLYING` deviations from the mean of the others. The deviation of two or
+    three trials is often small by chance. So the largest of three counts: the other trials'
+    deviation, that of the scene's other arm, and the typical deviation over all scenes and
+    arms.
     """
     rows = [row for row in pairs.rows if len(row.seeds) > LEAST_OTHERS]
     deviations = [(float(row.baseline.std(ddof=1)), float(row.arm.std(ddof=1))) for row in rows]

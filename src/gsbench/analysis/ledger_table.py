@@ -11,7 +11,7 @@ HEADS = ("against", "level", "seeds", "difference", "Gaussians", "time", "result
 
 
 def describe_ledger(ledger: Ledger) -> list[str]:
-    """Sentences on what decides, and on what is left of the planned ideas."""
+    """Two lines: what decides, and how many of the planned ideas were tried and kept."""
     opened = ledger.opened
     least = least_text(opened.least, opened.relative)
     better = "more" if opened.sign > 0 else "less"

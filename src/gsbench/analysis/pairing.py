@@ -31,8 +31,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ScenePairs:
-    """The pairs of trials of one scene, one per seed in the order of adding seeds, with both arms'
-    values [K]."""
+    """The pairs of trials of one scene, one per seed, with both arms' values [K].
+
+    Seeds are in the order in which they are added.
+    """
 
     scene: str
     seeds: tuple[int, ...]
@@ -53,8 +55,10 @@ class ScenePairs:
 
 @dataclass(frozen=True)
 class Pairs:
-    """The pairs of trials of a question by scene, and a line on each thing that could not be
-    paired."""
+    """The pairs of trials of a question by scene.
+
+    ``left_out`` has a line on each thing that could not be paired.
+    """
 
     rows: tuple[ScenePairs, ...]
     left_out: tuple[str, ...] = ()
@@ -71,8 +75,10 @@ class Pairs:
 
     @cached_property
     def differences(self) -> Array:
-        """Arm minus baseline [S, K]. Seeds that some scenes lack are dropped, so that all scenes
-        weigh the same."""
+        """Arm minus baseline [S, K]; the logarithm of their ratio if ``relative``.
+
+        Seeds that some scenes lack are dropped, so that all scenes weigh the same.
+        """
         changes = [
             np.log(row.arm / row.baseline) if self.relative else row.arm - row.baseline
             for row in self.rows
@@ -110,13 +116,13 @@ class Pairs:
 
 
 def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
-    """Pair the trials of a question by scene and seed, and say which have no partner or cannot be
-    compared.
+    """Pair the trials of a question by scene and seed.
 
-    Trials are compared only under equal conditions. Budgets may differ if the question names its
-    trials itself, since a claim may be about arms with different budgets. Of seeds in planned
-    order, those after the first missing seed do not count: a seed that comes late cannot change
-    what an earlier look saw.
+    The result also says which trials have no partner or cannot be compared. Trials are compared
+    only under equal conditions. Budgets may differ if the question names its trials itself,
+    since a claim may be about arms with different budgets. If the seeds have a planned order,
+    those after the first missing seed do not count: a seed that comes late cannot change what
+    an earlier look saw.
     """
     rows, left_out = [], list[str]()
     for scene, sides in _sides(trials, question).items():
@@ -171,10 +177,10 @@ def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[
 def _match_seeds(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
 ) -> tuple[dict[int, TrialPair], list[str]]:
-    """The pairs of one scene by seed, in the planned order, and a line for each seed without a
-    partner.
+    """The pairs of one scene by seed, in the planned order, and a line for each unpaired seed.
 
-    Raises InputError if trials of one arm cannot be averaged, or if the arms' conditions differ.
+    Raises InputError if trials of one arm cannot be averaged, or if the arms' conditions
+    differ.
     """
     for own in (baseline, arm):
         if own:
@@ -200,8 +206,7 @@ def _match_seeds(
 def _pair_scene(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
 ) -> tuple[ScenePairs, list[str]]:
-    """The pairs of one scene that have values, and a line on each thing that could not be
-    paired."""
+    """The pairs of one scene that have values, and a line on each thing that was not paired."""
     pairs, faults = _match_seeds(scene, baseline, arm, question)
     values: dict[int, tuple[float, float]] = {}
     reasons: dict[str, list[str]] = {}
@@ -240,12 +245,11 @@ def choose_pairs(
     baseline: str = BASELINE,
     controls: Mapping[str, str] = MappingProxyType({}),
 ) -> list[tuple[Arm, Arm]]:
-    """The pairs (baseline, arm) of arms to compare: first those with the baseline, then those with
-    controls.
+    """The pairs (baseline, arm) of arms to compare: those with the baseline, then with controls.
 
     An arm is compared with the baseline densifier of the same initialiser, with the same swept
-    settings if such an arm exists. If no arm has the baseline, all are compared with the first of
-    ``arms``. ``controls`` maps a densifier to a further one that it is compared with
+    settings if such an arm exists. If no arm has the baseline, all are compared with the first
+    of ``arms``. ``controls`` maps a densifier to a further one that it is compared with
     (`controls_of`).
     """
 
@@ -271,8 +275,7 @@ def choose_pairs(
 
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
-    """The control of each densifier, another densifier that the trials' settings name
-    (``eval.controls``)."""
+    """The control of each densifier: another densifier that the trials' ``eval.controls`` name."""
     firsts = [group[0] for group in group_by(trials, lambda trial: trial.arm).values()]
     return {
         key.removeprefix(CONTROLS): str(value)

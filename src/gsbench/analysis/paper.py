@@ -63,8 +63,8 @@ class PrintedNumber:
 class Paper:
     """The paper of the method.
 
-    Its ``tables`` by name, where it contradicts itself (one sentence each), and what it says on
-    settings (``setup``, by topic).
+    ``tables`` has its tables by name. ``contradictions`` has a sentence on each place where it
+    contradicts itself. ``setup`` has what it says on settings, by topic.
     """
 
     tables: Mapping[str, Mapping[Key, PrintedNumber]]
@@ -121,7 +121,7 @@ def published_names() -> list[str]:
 
 @cache
 def load_published(name: str) -> Published:
-    """The numbers of the paper ``name``; raises InputError with the known names for another."""
+    """The numbers of the paper ``name``; raises InputError for an unknown name."""
     names = published_names()
     if name not in names:
         raise InputError(
@@ -136,7 +136,7 @@ def _read(name: str) -> Any:
 
 
 def layout_of(name: str) -> str | None:
-    """The paper's table that the experiment repeats: ``table1`` for ``table1_own``; or None."""
+    """The paper's table that the experiment repeats (``table1`` for ``table1_own``), or None."""
     table = name.removesuffix(OWN)
     return table if table in PAPER_TABLES else None
 

@@ -1,7 +1,7 @@
 """Arms ranked over scenes, with the critical difference of Nemenyi's test (Demšar 2006, JMLR 7, 1).
 
-Scenes are the units, as in statements about scenes like these. This is a picture of all arms at
-once, and no verdict.
+Scenes are the units, as in statements about scenes like these. A ranking shows all arms at once; it
+is not a verdict.
 """
 
 import math
@@ -49,7 +49,11 @@ class Ranking:
 
 
 def rank_arms(trials: Sequence[TrialResult], quantity: Quantity) -> Ranking | None:
-    """The ranking of all arms; None below `MIN_SCENES` scenes with comparable trials of each."""
+    """The ranking of all arms; None if the quantity has no direction, or if there is one arm.
+
+    It needs `MIN_SCENES` scenes on which all arms have trials that can be compared; below, the
+    result is None too.
+    """
     arms = sorted({trial.arm for trial in trials})
     means: dict[str, list[float]] = {}
     for scene, own in group_by(trials, lambda trial: trial.scene).items():
@@ -108,7 +112,7 @@ def critical_difference(arms: int, scenes: int, level: float = ALPHA) -> float:
 
 
 def rank_all(trials: Sequence[TrialResult], quantities: Sequence[Quantity]) -> list[Ranking]:
-    """The rankings in each of ``quantities`` that has one."""
+    """The ranking in each of ``quantities`` that is no cost and has one."""
     return [
         ranking
         for one in quantities

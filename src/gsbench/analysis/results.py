@@ -37,10 +37,9 @@ TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 class Configurations:
     """The settings that determine results, of all trials of an experiment.
 
-    Each file is read once for all seeds.
-
-    ``trial`` is the key that the seeds of a trial share (`TrialResult.key`). ``known`` has, by this
-    key, the settings of trials that have not run and thus have no file.
+    Each file is read once for all seeds. ``trial`` is the key that the seeds of a trial share
+    (`TrialResult.key`). ``known`` has, by this key, the settings of trials that have not run
+    and thus have no file.
     """
 
     def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
@@ -170,7 +169,7 @@ class TrialResult:
 
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:
-        """Every setting with dotted keys, also those that change no result; as `config`."""
+        """Every setting with dotted keys, also those that change no result; empty if unreadable."""
         try:
             return load_flat_config(self.path)
         except (FileNotFoundError, DamagedError):
@@ -277,7 +276,7 @@ class TrialResult:
 
     @property
     def budget_acted(self) -> bool:
-        """Return whether a cap that blocks or steers, or a time limit, may have changed it."""
+        """Return whether a cap on Gaussians or a time limit may have changed the result."""
         if self.made_elsewhere or self.program:
             return False
         budget, events = self.record.budget, self.record.events
@@ -358,10 +357,10 @@ def read_experiment(folder: Path) -> Experiment:
 
 
 def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> dict[str, str]:
-    """Read the settings that are needed; return what is wrong ("": nothing) by trials' `key`.
+    """Read the settings that are needed; return by trials' `key` what is wrong, "" if nothing.
 
-    Settings are needed only if trials of one scene, initialiser and densifier have different ones.
-    Other trials' files are not opened here, which saves time.
+    Settings are needed only if trials of one scene, initialiser and densifier have different
+    ones. Other trials' files are not opened here, which saves time.
     """
     faults: dict[str, str] = {}
     for own in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
@@ -377,9 +376,8 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
 def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     """The metrics of every test view, ``{view: {metric: value}}``.
 
-    Raises ``InputError`` if the file is damaged.
-
-    Its values must average to the trial's metrics, so a truncated file is detected.
+    Their means must equal the trial's metrics, so a truncated file is detected. Raises
+    ``InputError`` if the file is missing or damaged.
     """
     path = trial.path / PER_VIEW
     try:

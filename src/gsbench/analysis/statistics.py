@@ -1,8 +1,8 @@
-"""Tests of paired differences, about these scenes and about scenes like these, and planning from
-pilot trials.
+"""Tests of paired differences, and planning from pilot trials.
 
-Differences are matrices [S, K] of S scenes, each with K pairs of trainings. The views of a trial
-share its training, so a trial is the smallest independent unit.
+Tests are about these scenes, or about scenes like these. Differences are matrices [S, K] of S
+scenes, each with K pairs of trainings. The views of a trial share its training, so a trial is the
+smallest independent unit.
 
 *These scenes*: the mean over the given scenes, each with the same weight. Scenes are fixed, pairs
 within them are the units, and each scene has its own variance (Welch 1947; Satterthwaite 1946).
@@ -47,7 +47,7 @@ Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
 CAUTION = 2
 SPENDING_POWER = 1.5  # exponent of the error-spending function of looks
 DRAWS = 100_000  # simulated sequences of trainings, for the error rates of looks
-NOISY = 10.0  # times as noisy as the others is one scene, in a part of these sequences
+NOISY = 10.0  # in a part of these sequences, one scene is so many times as noisy as the others
 FIRST_LOOK = 2  # seeds: one training of each arm does not show how trainings differ
 # seeds up to which each seed is a look; more looks would save little and make bounds less precise
 EACH_UP_TO = 12
@@ -84,8 +84,10 @@ class StudentT:
         return float(2 * special.stdtr(self.degrees, -abs(self.mean / self.error)))
 
     def interval(self, alpha: float = ALPHA) -> Interval:
-        """The values that the test with error rate ``alpha`` does not reject; it excludes 0 exactly
-        if p < alpha."""
+        """The values that the test with error rate ``alpha`` does not reject.
+
+        The interval excludes 0 exactly if p < alpha.
+        """
         half = float(special.stdtrit(self.degrees, 1 - alpha / 2)) * self.error
         return Interval(self.mean - half, self.mean + half)
 
@@ -112,8 +114,10 @@ def t_test(differences: Array) -> StudentT | None:
 
 
 def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
-    """Standard errors and degrees of freedom [D] of means over scenes, from the scenes' variances
-    [D, S]."""
+    """The standard errors and degrees of freedom [D] of means over scenes.
+
+    ``variances`` [D, S] are those of the scenes; each scene has ``seeds`` pairs.
+    """
     total, squares = variances.sum(axis=1), (variances**2).sum(axis=1)
     satterthwaite = np.divide(
         total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0
@@ -124,13 +128,12 @@ def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
 
 
 def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
-    """The outcome of the claim "the difference has this sign, and matters", from the interval of
-    the difference.
+    """The outcome of the claim "the difference has this sign, and matters", from its interval.
 
     Too small to matter: the interval lies within ± ``least``. Supported: it lies on the claimed
     side of 0. Refuted: it lies on the other side. Otherwise undecided. Sign 0 claims that no
-    difference matters: supported within ± ``least``, refuted if the interval lies beyond it on one
-    side.
+    difference matters: supported within ± ``least``, refuted if the interval lies beyond it on
+    one side.
     """
     within = least is not None and max(-interval.low, interval.high) < least
     if not sign:
@@ -214,13 +217,13 @@ def holm_factors(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class LikeThese:
-    """A statement about scenes like the given ``scenes``. In ``helped`` of them the difference has
-    the asked sign.
+    """A statement about scenes like the given ``scenes``.
 
-    In ``beyond`` of them it is at least the least that matters; None if that is not known.
-    ``share`` is the exact interval (Clopper and Pearson 1934) of the share of such scenes with the
-    sign. ``median`` is the interval of their median effect, from order statistics; None with too
-    few scenes for ``level``. ``p`` is that of the sign test.
+    In ``helped`` of them the difference has the asked sign. In ``beyond`` of them it is at
+    least the least that matters; None if that is not known. ``share`` is the exact interval
+    (Clopper and Pearson 1934) of the share of such scenes with the sign. ``median`` is the
+    interval of their median effect, from order statistics; None with too few scenes for
+    ``level``. ``p`` is that of the sign test.
     """
 
     scenes: int
@@ -234,8 +237,7 @@ class LikeThese:
 
     @property
     def needed(self) -> int | None:
-        """The number of scenes that must have the same sign to decide; None if all of them would
-        not suffice."""
+        """The number of scenes that must agree in sign to decide; None if all would not suffice."""
         return sign_test_needs(self.scenes, self.level)
 
     def power(self, share: float = 0.9) -> float:
@@ -248,8 +250,10 @@ class LikeThese:
 def judge_like_these(
     means: Array, sign: int, least: float | None, level: float = ALPHA
 ) -> LikeThese | None:
-    """The statement about scenes like these from the scenes' mean differences [S]; None below
-    `MIN_SCENES`."""
+    """The statement about scenes like these, from the scenes' mean differences [S].
+
+    None below `MIN_SCENES` scenes.
+    """
     count = len(means)
     if count < MIN_SCENES:
         return None
@@ -269,8 +273,7 @@ def judge_like_these(
 
 
 def median_interval(values: Array, level: float) -> Interval | None:
-    """The exact interval of the median of the distribution of ``values`` [n], or None for too
-    few."""
+    """The exact interval of the median of which ``values`` [n] are a sample; None for too few."""
     count = len(values)
     outer = [k for k in range(count // 2) if 2 * float(special.bdtr(k, count, 0.5)) <= level]
     if not outer:
@@ -280,8 +283,7 @@ def median_interval(values: Array, level: float) -> Interval | None:
 
 
 def sign_test_needs(scenes: int, level: float) -> int | None:
-    """The fewest of ``scenes`` with the same sign for which the sign test's p is at most ``level``;
-    None if none is."""
+    """The fewest of ``scenes`` with one sign for which the sign test has p ≤ ``level``, or None."""
     return next(
         (agree for agree in range(scenes // 2 + 1, scenes + 1) if _sign_p(agree, scenes) <= level),
         None,
@@ -304,22 +306,24 @@ def _share_interval(helped: int, count: int, level: float) -> Interval:
 
 
 def plan_looks(maximum: int) -> tuple[int, ...]:
-    """The looks up to ``maximum`` seeds: each seed from `FIRST_LOOK` on, after `EACH_UP_TO` every
-    fourth."""
+    """The numbers of seeds at which there is a look, up to ``maximum``.
+
+    There is one at each number from `FIRST_LOOK` to `EACH_UP_TO`, then at every fourth, and at
+    ``maximum``.
+    """
     early = range(FIRST_LOOK, min(maximum, EACH_UP_TO) + 1)
     return tuple(dict.fromkeys([*early, *range(EACH_UP_TO, maximum, 4), maximum]))
 
 
 @cache
 def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[float, ...]:
-    """The error rate of the interval at each look, such that all looks together have the error rate
-    ``alpha``.
+    """The error rate of the interval at each look; all looks together have the rate ``alpha``.
 
     These are repeated confidence intervals (Jennison and Turnbull 1989): at whichever look one
-    stops, and for whatever reason, the chance of a false statement is at most ``alpha``. Looks up
-    to the share t of all seeds may spend ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and DeMets
-    1987). Looks share trials, so their errors overlap: the rates come from `DRAWS` simulated
-    sequences of trainings.
+    stops, and for whatever reason, the chance of a false statement is at most ``alpha``. Looks
+    up to the share t of all seeds may spend ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and
+    DeMets 1987). Looks share trials, so their errors overlap: the rates come from `DRAWS`
+    simulated sequences of trainings.
     """
     # Equally noisy scenes alone would not do: the test is cautious there, so each look would get
     # all that may be spent. The looks err most if one scene is so noisy that it hides the others.
@@ -343,8 +347,10 @@ def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[floa
 
 @cache
 def _p_at_looks(scenes: int, looks: tuple[int, ...], noise: float = 1.0) -> NDArray[np.float64]:
-    """The p at each look [L, DRAWS] of simulated sequences without an effect. The first of
-    ``scenes`` is ``noise`` times as noisy as the others."""
+    """The p at each look [L, DRAWS] of simulated sequences without an effect.
+
+    The first of ``scenes`` is ``noise`` times as noisy as the others.
+    """
     rng = np.random.default_rng(0)
     # of the differences of each scene
     totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))
@@ -367,11 +373,11 @@ def _p_at_looks(scenes: int, looks: tuple[int, ...], noise: float = 1.0) -> NDAr
 
 @dataclass(frozen=True)
 class Components:
-    """Deviations of paired differences: of the effect ``between`` scenes, and of trainings
-    ``within`` a scene.
+    """Deviations of paired differences, ``between`` scenes and ``within`` a scene.
 
-    ``between`` is None for a single scene; it is 0 if scenes differ by no more than trainings
-    explain.
+    ``between`` is the deviation of the effect over scenes: None for a single scene, 0 if scenes
+    differ by no more than trainings explain. ``within`` is the deviation over trainings of a
+    scene.
     """
 
     between: float | None
@@ -393,8 +399,7 @@ class Design:
 
 
 def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Components:
-    """Estimate the two deviations from the paired differences of pilot trials, an array for each
-    scene.
+    """Estimate the two deviations from pilot trials' paired differences, an array per scene.
 
     Raises InputError if no scene has two pairs.
     """
@@ -418,10 +423,10 @@ def estimate_components(differences: Sequence[NDArray[np.float64]]) -> Component
 
 
 def power(design: Design, difference: float, components: Components, like_these: bool) -> float:
-    """The chance to see ``difference`` in the mean of these scenes, or by the sign test of scenes
-    ``like_these``.
+    """The chance that a design shows ``difference`` by the test of its statement.
 
-    Raises InputError for scenes like these if the pilot had only one scene.
+    The statement is about the mean of these scenes, or about scenes ``like_these`` (the sign
+    test). Raises InputError for scenes like these if the pilot had only one scene.
     """
     if not like_these:
         return power_of_mean(components.within, design, difference)
@@ -439,12 +444,11 @@ def power(design: Design, difference: float, components: Components, like_these:
 
 
 def power_of_mean(deviation: float, design: Design, difference: float) -> float:
-    """The chance that the t test of these scenes sees ``difference`` if trainings differ by
-    ``deviation``.
+    """The chance that the t test of these scenes sees ``difference``.
 
-    The test estimates each scene's variance and its own degrees of freedom. Given these, the power
-    is that of a normal mean; the result is its average over simulated variances. The far tail of
-    the wrong sign is left out.
+    Trainings differ by ``deviation``. The test estimates each scene's variance and its own
+    degrees of freedom. Given these, the power is that of a normal mean; the result is its
+    average over simulated variances. The far tail of the wrong sign is left out.
     """
     if deviation == 0:
         return 1.0 if difference else 0.0
@@ -454,8 +458,10 @@ def power_of_mean(deviation: float, design: Design, difference: float) -> float:
 
 @cache
 def _thresholds(design: Design) -> NDArray[np.float64]:
-    """The significant means [DESIGN_DRAWS], in true standard errors, for simulated variances of the
-    scenes."""
+    """The smallest means [DESIGN_DRAWS] that are significant, in true standard errors.
+
+    Each belongs to one draw of simulated variances of the scenes.
+    """
     freedom = design.seeds - 1
     variances = np.random.default_rng(0).chisquare(freedom, (DESIGN_DRAWS, design.scenes)) / freedom
     error, degrees = error_and_degrees(variances, design.seeds)
@@ -463,8 +469,10 @@ def _thresholds(design: Design) -> NDArray[np.float64]:
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:
-    """Seeds of each arm on these ``scenes`` that see ``difference`` with a power of `POWER`; None
-    above `MAX_SEEDS`."""
+    """The seeds of each arm that see ``difference`` on these ``scenes`` with a power of `POWER`.
+
+    None above `MAX_SEEDS`.
+    """
     designs = (Design(scenes, seeds) for seeds in range(2, MAX_SEEDS + 1))
     return next(
         (one.seeds for one in designs if power_of_mean(deviation, one, difference) >= POWER), None
@@ -472,11 +480,12 @@ def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None
 
 
 def designs_needed(difference: float, components: Components, like_these: bool) -> list[Design]:
-    """The designs that see ``difference`` with a power of `POWER`: by number of scenes, the fewest
-    seeds.
+    """The designs that see ``difference`` with a power of `POWER`, one per number of scenes.
 
-    A number of scenes is left out if it needs more than ``MAX_SEEDS`` seeds, or no fewer seeds than
-    fewer scenes do. A statement about scenes like these starts at ``MIN_SCENES``.
+    Each has the fewest seeds. A number of scenes is left out if it needs more than
+    ``MAX_SEEDS`` seeds, or no fewer seeds than fewer scenes do. A statement about scenes like
+    these starts at ``MIN_SCENES``. Raises InputError for a difference of 0 or one that is not
+    finite.
     """
     if difference == 0 or not math.isfinite(difference):
         raise InputError(

@@ -281,8 +281,8 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
 def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
     """Lines on results that are worth little or may surprise.
 
-    Renders not better than one colour, executors that failed their proof, twins, and doubts about
-    initial points.
+    They are about renders not better than one colour, executors that failed their proof, pictures
+    made by different filters, twins, and doubts about initial points.
     """
     notes = []
     for trial in trials:

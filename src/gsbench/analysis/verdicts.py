@@ -42,11 +42,11 @@ SYMBOLS: dict[Outcome, str] = {
 
 @dataclass(frozen=True)
 class PairVerdicts:
-    """The verdicts on two arms, the declared metric's first; ``notes`` say what could not be
-    compared.
+    """The verdicts on two arms, that on the declared metric first.
 
-    ``declared`` is the declared metric, ``beforehand`` whether it was declared before any result.
-    ``missing`` says why it has no verdict for these arms.
+    ``notes`` say what could not be compared. ``declared`` is the declared metric,
+    ``beforehand`` whether it was declared before any result. ``missing`` says why it has no
+    verdict for these arms.
     """
 
     first: Arm
@@ -72,8 +72,10 @@ def judge_pairs(
     pairs: Sequence[ArmPair],
     declared: ActiveDeclaration | None = None,
 ) -> list[PairVerdicts]:
-    """Judge each pair of arms in every metric that has a direction, in the families that
-    ``declared`` defines."""
+    """Judge each pair of arms in every metric that has a direction.
+
+    ``declared`` defines the families of tests.
+    """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primary = None if declared is None else asked_quantity(declared.metric, trials)
     asked: list[tuple[ArmPair, Quantity]] = []
@@ -158,16 +160,20 @@ def _declaration(questions: Sequence[Question], declared: ActiveDeclaration | No
 
 
 def seeds_to_resolve(verdict: Verdict) -> int | None:
-    """The number of seeds that would resolve the worthwhile difference; None if unknown, or too
-    many to run."""
+    """The number of seeds that would resolve the worthwhile difference.
+
+    None if that is unknown, or if there would be too many to run.
+    """
     if verdict.deviation is None or verdict.quantity.worthwhile is None:
         return None
     return seeds_needed(verdict.deviation, len(verdict.scenes), verdict.quantity.worthwhile)
 
 
 def headline(judged: PairVerdicts) -> str:
-    """The verdicts on two arms in one sentence; if a metric was declared beforehand, only its
-    verdict."""
+    """The verdicts on two arms in one sentence.
+
+    If a metric was declared beforehand, the sentence has only its verdict.
+    """
     verdicts, against = judged.verdicts, f"{judged.second} against {judged.first}"
     if not verdicts:
         return (
@@ -194,8 +200,7 @@ def headline(judged: PairVerdicts) -> str:
 
 
 def secondary(judged: PairVerdicts) -> str:
-    """The verdicts in secondary metrics in one sentence; "" if there are none, or none with an
-    interval."""
+    """The verdicts in secondary metrics in one sentence; "" if none of them has an interval."""
     secondaries = [one for one in judged.verdicts if one.question.secondary]
     decidable = any(one.interval is not None for one in secondaries)
     return f"Secondary, adjusted for their number: {_by_word(secondaries)}." if decidable else ""
@@ -217,8 +222,7 @@ def _by_word(verdicts: Sequence[Verdict]) -> str:
 
 
 def _known_sign(verdict: Verdict) -> str:
-    """``, though better`` if the difference is too small to matter but its sign is known; else
-    ""."""
+    """``, though better`` if a difference is too small to matter but its sign is known; else ""."""
     has_sign = (
         verdict.outcome == TOO_SMALL
         and verdict.interval is not None
@@ -245,10 +249,10 @@ def detail_lines(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def by_scene_lines(verdicts: Sequence[Verdict]) -> list[str]:
-    """A line for each metric in which single scenes are decided (adjusted p below 5 %); it names
-    the scenes.
+    """A line for each metric in which single scenes are decided, with the names of these scenes.
 
-    A mean over scenes that disagree would hide both results.
+    A scene is decided if its adjusted p is below 5 %. A mean over scenes that disagree would
+    hide both results.
     """
     lines = []
     for one in verdicts:
@@ -319,8 +323,11 @@ def families(judged: Sequence[PairVerdicts]) -> list[str]:
 
 
 def in_words(verdict: Verdict) -> str:
-    """``better in LPIPS VGG raw on these scenes: −0.0123 (interval −0.0200 to −0.0046, p
-    0.012)``"""
+    """A verdict in words.
+
+    For example ``better in LPIPS VGG raw on these scenes: −0.0123 (interval −0.0200 to −0.0046,
+    p 0.012)``.
+    """
     word, name = WORDS[verdict.outcome], verdict.quantity.name
     text = f"{word} in {name} on {_scope(verdict)}: {verdict.shown(verdict.mean or 0.0)}"
     if verdict.interval is None:
@@ -335,10 +342,10 @@ def in_words(verdict: Verdict) -> str:
 
 
 def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) -> str:
-    """``scenes like these: undecided; it helps in 7 of 8 (sign test p 0.070, …)``; "" with too few
-    scenes.
+    """The statement about scenes like these in words; "" with too few scenes.
 
-    ``words`` are other words for outcomes.
+    For example ``scenes like these: undecided; it helps in 7 of 8 (sign test p 0.070, …)``.
+    ``words`` has other words for outcomes, ``what`` the words for a gain.
     """
     like = verdict.like_these
     if like is None:
@@ -361,8 +368,10 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
 
 
 def outlying_words(verdict: Verdict) -> str:
-    """``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``; "" if no
-    trial is outlying."""
+    """The outlying trials of a verdict in words; "" if there are none.
+
+    For example ``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``.
+    """
     if not verdict.outlying:
         return ""
     labels, word = (

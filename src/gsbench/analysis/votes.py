@@ -59,12 +59,13 @@ class PairVotes:
 
 @dataclass(frozen=True)
 class RoundVerdict:
-    """The result of a round. ``left_out`` says by person why the votes do not count.
+    """The result of a round.
 
-    ``final`` is False below the declared number of votes: then nothing is decided yet.
-    ``consistent`` is the share of the pairs shown again that had the same answer, ``left`` that of
-    votes for the left side; NaN without any. ``ranking`` has the arms of a round of several, with
-    their chance to win against the average arm, the best first.
+    ``left_out`` says by person why their votes do not count. ``final`` is False below the
+    declared number of votes: then nothing is decided yet. ``consistent`` is the share of the
+    pairs shown again that had the same answer, ``left`` that of votes for the left side; NaN
+    without any. ``ranking`` is filled if the round has more than two arms: each arm with its
+    chance to win against the average arm, the best first.
     """
 
     key: RoundKey

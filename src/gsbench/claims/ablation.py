@@ -28,9 +28,8 @@ TrialKeys = Mapping[str, str]  # scene -> folder of a run's trials, without the 
 def declared_switches(own: Mapping[str, Switch], values: Mapping[str, Any]) -> dict[str, Switch]:
     """The switches of a densifier's class (``own``) and of its settings.
 
-    Those whose ``off`` settings hold already are left out.
-
-    Raises InputError for a malformed switch.
+    Those whose ``off`` settings hold already are left out. Raises InputError for a malformed
+    switch.
     """
     in_settings = values.get("switches") or {}
     if not isinstance(in_settings, Mapping):
@@ -126,7 +125,7 @@ def run_name(run: Run, switches: Sequence[str]) -> str:
 def judge_runs(
     trials: Sequence[TrialResult], runs: Mapping[Run, TrialKeys], metric: str
 ) -> list[Verdict]:
-    """The verdicts on all ``runs`` against that with all switches on, in order, as one family."""
+    """The verdicts on all ``runs`` against the run with all switches on, as one family."""
     quantity = asked_quantity(metric, trials)
     full = max(runs, key=len)
     questions = []

@@ -67,12 +67,12 @@ PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # experiment needs.
 MAX_BYTES = 1 << 28  # bytes of one unpacked file
 MAX_TOTAL_BYTES = 1 << 30  # bytes of all unpacked files
-# of all files in the zip, so that archives do not depend on time: zip's earliest
+# the date of every file in the zip (the earliest possible), so that archives do not depend on time
 FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 PRIVATE = ("runs", "tracking")  # settings that only name the user's folders and servers
 PASSWORD = re.compile(r"(?<=://)[^/@\s]*@")  # user and password in a URL
 FOLDERS = re.compile(r"(?<=:)///+\S*/")  # folders in a file's URL, such as sqlite:////home/me/a.db
-ITEM = re.compile(r"[^=,\[\]{}'\"]+")  # of a word with a list of values
+ITEM = re.compile(r"[^=,\[\]{}'\"]+")  # one value in a word such as scene=[a,b]
 SEED_KEY = "seed"
 NO_CONFIGURATION = f"it has no {CONFIG}"
 NAMED_GROUPS = ("scene", "init", "densify")  # groups of settings whose names results.json repeats
@@ -179,7 +179,7 @@ def _shared_ledger(home: Path) -> bytes:
 
 
 def without_private_words(words: Sequence[str]) -> list[str]:
-    """Settings as words, without those of the user's folders and servers; paths have no folders."""
+    """Settings as words, without the user's folders and servers; of paths, only the names."""
     shared = []
     for word in words:
         group = re.split(r"[./=]", word.lstrip("+~"), maxsplit=1)[0]
@@ -245,7 +245,7 @@ def _check_configuration(
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest, and the content of the files that it lists, whose checksums were compared."""
+    """The manifest, and the content of the files that it lists, compared with their checksums."""
     # reading a pipe or a device may never end
     if file.exists() and not (file.is_file() or file.is_dir()):
         raise InputError("it is not a regular file: give an archive")

@@ -153,11 +153,9 @@ def prepare(
 ) -> Check:
     """Compose the first trial of each scene and arm of each claim.
 
-    Scenes with something missing are not tested.
-
-    ``permissions`` are words such as ``allow_targets=[mine]`` from the command line: a file of
-    claims cannot give permissions. Raises InputError that names claim, scene and arm for settings
-    that do not compose.
+    Scenes with something missing are not tested. ``permissions`` are words such as
+    ``allow_targets=[mine]`` from the command line: a file of claims cannot give permissions.
+    Raises InputError that names claim, scene and arm for settings that do not compose.
     """
     first_trials: dict[str, Trial] = {}
     composed: dict[tuple[str, ...], Trial] = {}
@@ -302,8 +300,8 @@ def make_page(
 ) -> Page:
     """The content of the page.
 
-    ``declared`` is the declaration that the verdicts follow, ``declarations`` are all under the
-    experiment's name.
+    ``declared`` is the declaration that the verdicts follow. ``declarations`` are all
+    declarations under the experiment's name.
     """
     counts = Counter(verdict.word for verdict in verdicts)
     shown = ", ".join(f"{counts[word]} {word}" for word in SYMBOLS if counts[word])

@@ -105,8 +105,9 @@ class Claim:
 class ClaimsFile:
     """A checked file of claims.
 
-    ``error_rate`` is the chance that any verdict is false; all tested claims share it. ``seeds`` is
-    the most of each scene and arm. ``size`` describes the paper's own experiments in words.
+    ``error_rate`` is the chance that any verdict is false; all tested claims share it.
+    ``seeds`` is the largest number of seeds of each scene and arm. ``size`` describes the
+    paper's own experiments in words.
     """
 
     name: Name
@@ -120,7 +121,7 @@ class ClaimsFile:
     size: str = ""
 
     def words(self, claim: Claim, scene: str, arm: str) -> list[str]:
-        """The settings of a claim's trials with this scene and arm, in words but seed and name."""
+        """The settings of a claim on a scene with an arm, as words without seed and name."""
         chosen = self.settings | self.scenes[scene] | self.arms[arm] | claim.split | claim.budget
         return [f"{key}={value_text(value)}" for key, value in chosen.items()]
 

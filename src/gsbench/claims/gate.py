@@ -30,16 +30,21 @@ ReadTrials = Callable[[], Iterable[TrialResult]]
 
 @dataclass(frozen=True)
 class Gate:
-    """A declared question about two versions, with functions that read each version's finished
-    trials."""
+    """A declared question about two versions.
+
+    ``baseline`` and ``new`` are functions that read each version's finished trials.
+    """
 
     declaration: Declaration
     baseline: ReadTrials
     new: ReadTrials
 
     def judged(self) -> list[Verdict]:
-        """The verdict so far. It is final also once the new version is not worse: a gate needs no
-        more."""
+        """The verdict so far.
+
+        It is final also as soon as the new version is shown not to be worse: a gate asks no
+        more.
+        """
         trials = [*_as_version(BASELINE, self.baseline()), *_as_version(NEW, self.new())]
         return [
             replace(one, final=one.final or result_of(one) == PASSED)
@@ -55,11 +60,11 @@ def declare_gate(
     values: Mapping[str, Any],
     error_rate: float = ERROR_RATE,
 ) -> Declaration:
-    """The declaration of a gate about ``metric`` on ``scenes``, each with the names of both arms,
-    such as ``sfm-adc``.
+    """The declaration of a gate about ``metric``.
 
-    Seeds are added in the order of ``seeds``. Raises InputError, one line, for a metric that cannot
-    be judged (`asked_difference`), and for too few seeds.
+    ``scenes`` has, for each scene, the names of both arms, such as ``sfm-adc``. Seeds are added
+    in the order of ``seeds``. Raises InputError, one line, for a metric that cannot be judged
+    (`asked_difference`), and for too few seeds.
     """
     sign, size = asked_difference(metric, least, values)
     if len(seeds) < FIRST_LOOK:
@@ -127,8 +132,10 @@ def result_of(verdict: Verdict) -> str:
 
 
 def describe(verdict: Verdict) -> str:
-    """The result in a sentence: ``worse in PSNR (dB): −1.20 (95 % interval over all looks −1.50 to
-    −0.90); …``"""
+    """The result in a sentence.
+
+    For example ``worse in PSNR (dB): −1.20 (95 % interval over all looks −1.50 to −0.90); …``.
+    """
     answer, question = verdict.answer, verdict.question
     if verdict.untestable:
         same = (
@@ -186,8 +193,10 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
 
 
 def _not_worse(verdict: Verdict) -> bool:
-    """Return whether the interval excludes a loss that matters, and the verdict does not rest on
-    outlying trials."""
+    """Return whether the interval excludes a loss that matters.
+
+    A verdict that rests on outlying trials shows nothing.
+    """
     if verdict.interval is None or verdict.least is None or verdict.rests_on_outlying:
         return False
     sign = verdict.question.sign
@@ -204,8 +213,9 @@ SPARE = 2  # undecided commits that the search skips before it ends with a range
 
 
 def most_steps(count: int) -> int:
-    """The most gates of a bisection of ``count`` commits: that of the last commit, the halvings,
-    and `SPARE`.
+    """The most gates that a bisection of ``count`` commits takes.
+
+    They are the gate of the last commit, the halvings, and `SPARE`.
 
     Examples:
         >>> most_steps(1), most_steps(12)
@@ -215,12 +225,12 @@ def most_steps(count: int) -> int:
 
 
 def first_worse(count: int, result: Callable[[int], str | None]) -> tuple[int, int] | None:
-    """(last good, first worse) of the commits 0 to ``count``; commits between the two remain
-    unknown.
+    """The last good and the first worse of the commits 0 to ``count``, as (good, worse).
 
-    Commit 0 is good, and quality is assumed to change once. ``result`` gives a commit's result
-    against commit 0: ``PASSED``, ``WORSE``, ``NOT_DECIDED``, or None if it does not train, which is
-    no step. Returns None if the last commit is not worse.
+    Commits between the two remain unknown. Commit 0 is good, and quality is assumed to change
+    once. ``result`` gives a commit's result against commit 0: ``PASSED``, ``WORSE``,
+    ``NOT_DECIDED``, or None if it does not train, which is no step. Returns None if the last
+    commit is not worse.
 
     Examples:
         >>> first_worse(12, lambda commit: WORSE if commit >= 7 else PASSED)

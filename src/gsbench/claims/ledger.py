@@ -51,8 +51,8 @@ def next_level(ledger: Ledger) -> float:
 def declaration_of(ledger: Ledger, idea: str) -> Declaration:
     """The question of an idea, answered in looks.
 
-    The level is that of keeping an idea, one side of the interval. So both sides have twice the
-    level.
+    An idea is kept by one side of the interval, and the idea's level is that of this side. So
+    the interval with both sides has twice the level.
     """
     started = ledger.started[idea]
     question = _question(
@@ -103,7 +103,7 @@ def _question(
 
 
 def judge_idea(trials: Iterable[TrialResult], declaration: Declaration) -> Verdict:
-    """The verdict on an idea so far. It is final also once the idea is given up."""
+    """The verdict on an idea so far; it is final also as soon as the idea is given up."""
     (verdict,) = judge(list(trials), declaration)
     return replace(verdict, final=verdict.final or result_of(verdict) != UNDECIDED)
 

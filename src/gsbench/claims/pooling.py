@@ -140,7 +140,6 @@ def pool_sources(
     """Pool all studies in ``sources``.
 
     Returns their mean, notes on them, and a line for each source or study that is left out.
-
     Raises InputError if no study is left.
     """
     studies, notes, faults = [], list[str](), list[str]()

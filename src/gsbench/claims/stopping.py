@@ -1,6 +1,6 @@
 """Adding seeds in planned looks until every question is decided, for checks and for sweeps.
 
-In such a sweep, each compared pair of arms is a question about ``eval.primary``.
+In a sweep, each compared pair of arms is a question about ``eval.primary``.
 """
 
 import itertools
@@ -161,8 +161,7 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
 
 
 def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
-    """The results of those ``trials`` that are done. Results of earlier code do not count as
-    done."""
+    """The results of those ``trials`` that are done; results of earlier code do not count."""
     by_folder = {trial.folder: trial for trial in trials}
 
     def is_done(result: TrialResult) -> bool:

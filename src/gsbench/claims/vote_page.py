@@ -28,7 +28,7 @@ from gsbench.runs.votes import BLURRED, PHOTOGRAPH, Chosen, Kind, RoundKey, Show
 PAGE, PICTURES = "index.html", "pictures"
 SHOWN_AGAIN = 10  # every tenth pair is shown a second time, with its sides swapped
 MIN_TRAPS, PAIRS_PER_TRAP = 4, 8
-# one of six traps may fail; of four or five none, which one guesser in sixteen passes
+# One of six traps may fail. Of four or five none may fail; one guesser in sixteen passes four.
 TRAPS_PER_MISTAKE = 6
 BLUR = 0.008  # of the longest side: the deviation (px) of a trap's blur, 3 px for a picture of 400
 MIN_BLUR = 2.0  # px
@@ -36,7 +36,10 @@ MIN_BLUR = 2.0  # px
 
 @dataclass(frozen=True)
 class Candidate:
-    """A view of two arms that may be shown; ``difference`` of its renders: mean 8-bit levels."""
+    """A view of two arms that may be shown.
+
+    ``difference`` is the mean difference of the two renders in 8-bit levels.
+    """
 
     trials: TrialPair
     view: str
@@ -80,7 +83,7 @@ def choose_views(
     }
     wanted = dict.fromkeys(left_over, 0)
     while sum(wanted.values()) < count and any(left_over.values()):
-        # The scene with the fewest chosen views that has more.
+        # The scene with the fewest chosen views among those that have more.
         scene = min((one for one, rest in left_over.items() if rest), key=lambda one: wanted[one])
         wanted[scene] += 1
         left_over[scene] -= 1
@@ -111,7 +114,7 @@ def make_round(
     for place, (one, other) in enumerate(combinations):
         wanted = pairs // len(combinations) + (place < pairs % len(combinations))
         chosen = choose_views(find_candidates(trials, one, other), wanted, rng)
-        # Each arm is on the left in half of the views, up to one.
+        # Each arm is on the left in half of the views; of an odd number, in one more or one fewer.
         swapped = rng.sample([False, True] * ((len(chosen) + 1) // 2), len(chosen))
         for (candidate, how), swap in zip(chosen, swapped, strict=True):
             sides = (other, one) if swap else (one, other)
@@ -122,7 +125,7 @@ def make_round(
     again = rng.sample(shown, max(1, len(shown) // SHOWN_AGAIN))
     views = [rng.choice(shown)[1] for _ in range(traps)]
     for place, candidate in enumerate(views):
-        # By turns, so that whoever always presses the same key fails.
+        # Sides take turns, so a person who always presses the same key fails.
         left, right = (PHOTOGRAPH, BLURRED) if place % 2 else (BLURRED, PHOTOGRAPH)
         shown.append((_showing("trap", candidate, left, right), candidate))
     rng.shuffle(shown)
@@ -130,7 +133,7 @@ def make_round(
         swapped_showing = replace(
             first, id=_new_id(), kind="again", left=first.right, right=first.left, of=first.id
         )
-        # In the last third, and so far from its first showing as that allows.
+        # At a random place in the last third, after its first showing.
         before = next(place for place, (one, _) in enumerate(shown) if one is first) + 1
         shown.insert(
             rng.randint(max(before, 2 * len(shown) // 3), len(shown)), (swapped_showing, candidate)
@@ -173,7 +176,7 @@ def _write_page(
     (out / PICTURES).mkdir(parents=True)
     entries: dict[str, dict[str, str]] = {}
     places = list(enumerate(key.showings))
-    rng.shuffle(places)  # times of files tell no order
+    rng.shuffle(places)  # so that the files' times do not tell the order
     for place, showing in places:
         pictures = _pictures(showing, candidates[place])
         names = {

@@ -1,4 +1,4 @@
 """The runs folder: layout, store, keys of steps, files of a trial, hashes, versions of code.
 
-Loads no torch.
+This package loads no torch.
 """

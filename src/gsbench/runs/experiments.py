@@ -32,7 +32,7 @@ def list_experiments(runs_dir: Path) -> list[str]:
 
 
 def experiment_home(runs_dir: Path, name: str) -> Path:
-    """The folder of the experiment ``name``; raises InputError with the known names for another."""
+    """The folder of the experiment ``name``; raises InputError if there is no such experiment."""
     names = list_experiments(runs_dir)
     if name not in names:
         raise InputError(
@@ -199,12 +199,11 @@ class Question(Record):
 class Declaration(Record):
     """Questions that were declared at ``time`` (UTC).
 
-    ``error_rate`` is the chance that any answer is false.
-
-    ``looks`` are the rising numbers of seeds at which a question may be decided; without looks, all
-    seeds are judged at once. ``trials`` are the planned trials if the questions name none; None if
-    they are not recorded. ``missing`` says by question what could not be tested, and why. ``votes``
-    is the number of people's votes at which the questions of the round ``vote_round`` are judged.
+    ``error_rate`` is the chance that any answer is false. ``looks`` are the rising numbers of
+    seeds at which a question may be decided; without looks, all seeds are judged at once.
+    ``trials`` are the planned trials if the questions name none; None if they are not recorded.
+    ``missing`` says by question what could not be tested, and why. ``votes`` is the number of
+    people's votes at which the questions of the round ``vote_round`` are judged.
     """
 
     time: str
@@ -234,7 +233,7 @@ class Declaration(Record):
     def kind(self) -> Literal["sweep", "claims", "votes"]:
         """The subject: a sweep's metric, people's votes, or claims (of a file or a gate).
 
-        The questions of claims are named.
+        Questions of claims have names; those of a sweep have none.
         """
         if self.vote_round:
             return "votes"
@@ -250,7 +249,7 @@ class Declaration(Record):
     def names_trials(self) -> bool:
         """Return whether the planned trials are recorded.
 
-        They are not in the part that a trial repeats.
+        The part that a trial's results repeat does not have them.
         """
         return self.trials is not None or any(question.scenes for question in self.questions)
 
@@ -314,7 +313,11 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
 
 
 def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
-    """The latest of ``declarations`` (in the order of time), and when it came into force."""
+    """The latest of ``declarations``, with the time since when it has been in force.
+
+    ``declarations`` are in the order of time. If the last ones are equal, the first of these is
+    returned.
+    """
     first = len(declarations) - 1
     while first > 0 and declarations[first - 1].hash == declarations[-1].hash:
         first -= 1

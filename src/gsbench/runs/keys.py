@@ -1,6 +1,7 @@
 """Hashes of what makes a result: of a configuration, of each step (its key), and of the code.
 
-A step is a stage with its inputs. Its key is known before it runs. Loads neither Hydra nor torch.
+A step is a stage with its inputs. Its key is known before it runs. This module loads neither Hydra
+nor torch.
 
 gsbench's own code is identified by *rooms* (parts of the package). If a room is as released
 (``released.json``), the versions of gsbench's stages, which are bumped by hand, stand for it. In a
@@ -66,7 +67,7 @@ def sha256_of(values: Any) -> str:
 
 
 def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, Any]:
-    """Nested mappings as one with dotted keys; without empty ones unless ``keep_empty``.
+    """Nested mappings as one mapping with dotted keys; ``keep_empty`` keeps empty mappings.
 
     Examples:
         >>> flatten({"a": {"b": 1, "c": {}}, "d": [2]})
@@ -88,11 +89,10 @@ def flatten(mapping: Mapping[str, Any], keep_empty: bool = False) -> dict[str, A
 class Stage:
     """A stage of the pipeline, such as training.
 
-    Bump ``version`` by hand when its code computes something else.
-
-    ``resumable`` stages continue from the files of a killed build; the others start in an empty
-    folder. Files that match ``scratch`` are needed only by the build, and removed when the result
-    is complete.
+    ``version`` is bumped by hand when the stage's code computes something else. ``resumable``
+    stages continue from the files of a killed build; the others start in an empty folder. Files
+    that match ``scratch`` are needed only by the build, and removed when the result is
+    complete.
     """
 
     name: str
@@ -150,7 +150,7 @@ class UserCode:
     targets: Mapping[str, str] = field(default_factory=dict)
 
     def is_behind(self, component: Any, place: str) -> bool:
-        """Return whether the component's class is named by, or comes from, a user's module."""
+        """Return whether the component's class comes from a user's module, or is named by one."""
         defined_in = f"{type(component).__module__}."
         return not (self.targets.get(place, OWN).startswith(OWN) and defined_in.startswith(OWN))
 
@@ -199,12 +199,11 @@ def step_of(
     user: UserCode = NO_USER_CODE,
     in_processes: bool = False,
 ) -> Step:
-    """A step.
+    """The step of ``stage`` with ``inputs``, which ``build`` computes.
 
-    Its inputs get the states of those parts of gsbench's source behind it that differ from the
-    release.
-
-    ``in_processes`` says that the build starts processes, which import the code anew.
+    If parts of gsbench's source behind it differ from the release, their states are added to
+    the inputs. ``in_processes`` says that the build starts processes, which import the code
+    anew.
     """
     rooms = ROOMS[stage.name]
     states = states_of(rooms)
@@ -284,7 +283,7 @@ def changed_since_asked(rooms: Iterable[str]) -> list[str]:
 
 @cache
 def _first_contents(room: str) -> dict[str, bytes]:
-    """The files of a room when first asked for: later edits change nothing in this process."""
+    """The files of a room as they were when this process first asked for them."""
     return _contents(room)
 
 
@@ -347,7 +346,7 @@ def room_digests(room: str) -> dict[str, str]:
 
 # ---- the user's code
 
-# the version stands for a package in these folders
+# packages in these folders are identified by their versions
 INSTALLED = frozenset({"site-packages", "dist-packages"})
 CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
 
@@ -377,11 +376,9 @@ def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
 def module_digest(name: str, folder: str | None = None) -> str | None:
     """The sha256 of a top-level module: of its file, or of all code in its package.
 
-    None if it is not found.
-
-    A module that this process has imported keeps its digest: that is the code that runs. With
-    ``folder``, the module is found as by a program that is started there, without regard to what
-    this process has imported.
+    None if it is not found. A module that this process has imported keeps its digest: that is
+    the code that runs. With ``folder``, the module is found as by a program that is started
+    there, without regard to what this process has imported.
     """
     loaded = sys.modules.get(name) if folder is None else None
     spec = _find_spec(name, folder) if loaded is None else loaded.__spec__
@@ -403,7 +400,7 @@ def has_changed_since_import(name: str) -> bool:
 
 
 def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
-    """The user's modules imported since ``before`` but not ``named``: their edits change no key."""
+    """The user's modules imported since ``before`` but not ``named``; no key has their code."""
     tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {
         *named,
         PACKAGE.name,

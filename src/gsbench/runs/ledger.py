@@ -91,10 +91,10 @@ class Difference(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Ended(Record):
-    """The result of an idea; "failed" if it ended without any result, which may be tried again.
+    """The result of an idea; "failed" if there is none, so that the idea may be tried again.
 
-    ``gaussians`` and ``seconds`` are the ratios of its numbers of Gaussians and training times to
-    those of what it was compared with.
+    ``gaussians`` and ``seconds`` are the ratios of its numbers of Gaussians and training times
+    to those of what it was compared with.
     """
 
     kind: Literal["ended"] = "ended"
@@ -167,7 +167,7 @@ class Ledger:
 
     @property
     def tried(self) -> int:
-        """The number of tests that count: an idea without any result tells nothing."""
+        """The number of tests that count; ideas that failed do not, since they tell nothing."""
         failed = sum(one.result == FAILED for one in self.ended.values())
         return len(self.started) - failed
 
@@ -210,7 +210,8 @@ class Ledger:
 def read_ledger(home: Path) -> Ledger:
     """The ledger of the experiment in ``home``.
 
-    Raises InputError, one line: there is none, or a line is damaged, edited, moved or missing.
+    Raises InputError, one line, if there is none, or if a line is damaged, edited, moved or
+    missing.
     """
     path = home / LEDGER
     try:

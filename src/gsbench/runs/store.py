@@ -1,8 +1,8 @@
 """A store of stage results by the key of their inputs, so that nothing is computed twice.
 
-``<root>/<stage>/<key>/`` is a finished result; its ``manifest.json`` is written last.
-``.<key>.partial/`` is the folder in which it is built, and which a killed build leaves. While one
-process holds ``.<key>.lock`` (an empty file that is never removed) and builds, others wait.
+``<root>/<stage>/<key>/`` is a finished result; its ``manifest.json`` is written last. A result is
+built in ``.<key>.partial/``, which a killed build leaves behind. While one process builds, it holds
+``.<key>.lock`` (an empty file that is never removed), and others wait.
 """
 
 import logging
@@ -68,7 +68,7 @@ class Manifest(Record):
 class StoredResult:
     """A finished result in the store.
 
-    ``cached``: it was not built now. ``seconds``: the time of building it.
+    ``cached`` says that it was not built now. ``seconds`` is the time that building it took.
     """
 
     path: Path
@@ -109,8 +109,8 @@ class Store:
     def get(self, step: Step) -> StoredResult:
         """The result of ``step``; it is built unless it exists, and published by an atomic rename.
 
-        A damaged result is built again, with a warning. Raises DiskFullError, or InputError if the
-        store is read-only.
+        A damaged result is built again, with a warning. Raises DiskFullError if the disk is
+        full, and InputError if the store is read-only.
         """
         final = self.path(step)
         # An existing result may become the input of further steps, so its checksums are compared
@@ -149,7 +149,7 @@ class Store:
         """
         final, partial, stage = self.path(step), self.partial(step.stage, step.key), step.stage
         seconds = None
-        # else the build was killed between writing the manifest and publishing
+        # A sound manifest here: an earlier build was killed after writing it, before publishing.
         with suppress(ValueError):
             seconds = read_manifest(partial, step.key).seconds
         if seconds is None:

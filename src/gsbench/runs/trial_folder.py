@@ -1,7 +1,7 @@
 """A trial's folder: its path, its state, reading and writing its files, and what it was made of.
 
 Nothing here follows a link (`gsbench.files.open_plain`): the runs folder may come from a stranger.
-Loads no torch.
+This module loads no torch.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from gsbench.system.locks import is_held
 
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
 
-TAIL_BYTES = 4096  # of a growing log, enough for its last rows
+TAIL_BYTES = 4096  # bytes at the end of a growing log, enough for its last rows
 
 
 class TrialFolder:
@@ -138,7 +138,7 @@ class TrialFolder:
         return read_if_sound(self.path / layout.BUILDING, Building) or Building()
 
     def stage_and_step(self) -> tuple[str, int]:
-        """The present stage of an unfinished trial ("" before the first), and last iteration."""
+        """The present stage of an unfinished trial ("" before the first) and its last iteration."""
         building = self.building()
         try:
             tail = (
@@ -201,7 +201,7 @@ class TrialFolder:
     def made_of(self) -> MadeOf | None:
         """The inputs of the results, not checked for changes; None if they are not recorded.
 
-        Raises as `record`.
+        Raises FileNotFoundError and DamagedError.
         """
         return read_typed(self.path / layout.RESULTS, ResultsFile).made_of
 
@@ -270,12 +270,12 @@ class TrialFolder:
         values: dict[str, Any],
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None,
     ) -> str:
-        """The cause to run or check the trial with the configuration ``values``; "" if done.
+        """The reason to run or check the trial with the configuration ``values``; "" if it is done.
 
-        It is done if none of its inputs has changed. If it lacks a metric whose weights or packages
-        were missing, it is done only if ``unavailable_now``, called with the ``eval`` settings,
-        still contains that metric. Without ``unavailable_now``, it is not known whether the metric
-        can be computed, so the trial is to be checked.
+        It is done if none of its inputs has changed. If it lacks a metric whose weights or
+        packages were missing, it is done only if ``unavailable_now``, called with the
+        ``eval`` settings, still contains that metric. Without ``unavailable_now``, it is
+        not known whether the metric can be computed, so the trial must be checked.
         """
         try:
             record, made_of = self.record(), self.made_of()
@@ -324,9 +324,10 @@ class TrialFolder:
         return sorted((self.path / kind).glob("*.png"))
 
     def _unchanged(self, name: str) -> bytes:
-        """The content of a file.
+        """The content of a file, as it was written.
 
-        Raises as `read_bytes`, and DamagedError if it was changed after it was written.
+        Raises FileNotFoundError, and DamagedError if it cannot be read or was changed
+        later.
         """
         content = read_bytes(self.path / name)
         if self._digests is None:

@@ -1,7 +1,7 @@
 """The types of a trial's files, for writing and for reading.
 
-``results.json``, the records of stages in the store (``training.json``, ``metrics.json``), and the
-JSON lines of a training.
+The files are ``results.json``, the records of stages in the store (``training.json``,
+``metrics.json``), and the JSON lines of a training.
 """
 
 import logging
@@ -126,9 +126,9 @@ class InitialCloud(Record):
 class TwinViews(Record):
     """Photographs that the capture has twice.
 
-    ``left_out`` maps each photograph that was not used to the one that it copies. ``near`` maps a
-    test view to the training view that looks nearly the same, as the next shot of a burst does; it
-    was used.
+    ``left_out`` maps each photograph that was not used to the one that it copies. ``near`` maps
+    a test view to the training view that looks nearly the same, as the next shot of a burst
+    does; both were used.
     """
 
     left_out: dict[str, str] = field(default_factory=dict)
@@ -160,10 +160,9 @@ class TrialRecord(Record):
     """A finished trial.
 
     A value that cannot be known is None; the file leaves out None if that is the default.
-
-    ``metrics`` are means over the test views. ``unavailable`` says why other metrics are missing;
-    ``awaited`` names those of them that need only weights or packages. ``seconds`` are by stage;
-    ``resolution`` is (width, height) in px.
+    ``metrics`` are means over the test views. ``unavailable`` says why other metrics are
+    missing; ``awaited`` names those of them that need only weights or packages. ``seconds`` are
+    by stage; ``resolution`` is (width, height) in px.
     """
 
     status: Literal["complete"]
@@ -216,7 +215,7 @@ class TrialRecord(Record):
 
     @property
     def remark(self) -> str:
-        """A line for a finished trial's state: why its results may surprise; else ""."""
+        """The reason why a finished trial's results may surprise, in one line; "" without one."""
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
@@ -271,7 +270,7 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
 class Training(Record):
     """The counts, time and memory of a training.
 
-    ``trained_by`` and ``evaluated_from`` are set if a program trained.
+    ``trained_by`` and ``evaluated_from`` are set if another program trained.
     """
 
     iterations: Count
@@ -376,12 +375,13 @@ class Building(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class MadeOf(Record):
-    """The configuration (``settings``), its hash (``config``), versions, and files with stamps.
+    """The inputs of a trial's results: configuration, versions, and files with their stamps.
 
-    ``results`` is the hash of the rest of ``results.json``. ``sources`` are the user's files,
-    ``folders`` their folders with times of change. ``entries`` are the stages' results in the
-    store. ``published`` are files in the trial's folder; ``digests`` has the sha256 of those that
-    tables and reports read, and of small ones.
+    ``settings`` is the configuration, ``config`` its hash, ``results`` the hash of the rest of
+    ``results.json``. ``sources`` are the user's files, ``folders`` their folders with times of
+    change. ``entries`` are the stages' results in the store. ``published`` are files in the
+    trial's folder; ``digests`` has the sha256 of those that tables and reports read, and of
+    small ones.
     """
 
     results: str

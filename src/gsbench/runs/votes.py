@@ -91,7 +91,10 @@ class Vote(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Ballot(Record):
-    """The file that a person saves at the end of a round; ``finished``: of the last answer."""
+    """The file that a person saves at the end of a round.
+
+    ``finished`` is the time of the last answer.
+    """
 
     round: RoundId
     person: PersonId

@@ -15,9 +15,7 @@ MAX_PORT = 65535
 class ArgumentParser(argparse.ArgumentParser):
     """An argparse parser that raises InputError for what it does not understand.
 
-    ``--help`` prints and exits.
-
-    ``gsbench VERB --help`` prints the verb's purpose, and ``more``.
+    ``gsbench VERB --help`` prints the verb's purpose and the text ``more``, and exits.
     """
 
     def __init__(self, verb: str = "", more: str = "", **options: Any) -> None:

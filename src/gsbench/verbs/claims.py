@@ -38,7 +38,7 @@ DEFAULT_METRIC = "psnr"
 
 
 def check(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 for any verdicts; raises InputError for bad input."""
+    """Run the verb: 0 whatever the verdicts are; raises InputError for bad input."""
     parser = ArgumentParser(
         "check", "It runs trials until each claim is decided, and writes a page (docs/claims.md)."
     )
@@ -245,7 +245,7 @@ def _above_zero(text: str) -> float:
 
 
 def ablate(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: the exit code says, as a sweep's does, whether a trial failed.
+    """Run the verb: the exit code says whether a trial failed, as that of a sweep does.
 
     Raises InputError for bad input.
     """

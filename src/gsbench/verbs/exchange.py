@@ -206,7 +206,7 @@ def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
 
 def pool(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: 0, or 1 if a source was left out; raises InputError if none can be read."""
-    # slow
+    # here, since they are slow to import
     from gsbench.claims.pooling import PooledQuestion, describe, markdown_table, pool_sources
 
     parser = ArgumentParser("pool", "It is their mean, each with the same weight.")

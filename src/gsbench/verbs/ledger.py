@@ -140,7 +140,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
 def _start(
     home: Path, trials: Trials, against: str, options: argparse.Namespace
 ) -> tuple[str, Ledger]:
-    """The name of the idea in the ledger, which has its level from now on."""
+    """Enter an idea with its level unless the ledger has it; return its name and the ledger."""
     keys, values = _keys(trials, home.name), next(iter(trials.values())).values
     nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
     identity = config_hash(nameless)
@@ -310,7 +310,7 @@ ACTIONS = {  # with the options that each of them takes
 
 
 def _compose(name: str, words: Sequence[str]) -> Trials:
-    """The trials of words by key and seed; raises InputError for settings that the ledger gives."""
+    """The trials of words by key and seed; raises InputError for settings that the ledger sets."""
     for word in words:
         if key_of(word) in OWN:
             raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
@@ -321,7 +321,7 @@ def _compose(name: str, words: Sequence[str]) -> Trials:
 
 
 def _keys(trials: Trials, name: str) -> dict[str, str]:
-    """The key of the one arm on each scene."""
+    """The key of the trials on each scene; raises InputError for several arms."""
     keys: dict[str, set[str]] = {}
     for (key, _), trial in trials.items():
         keys.setdefault(trial.values["scene"]["name"], set()).add(key)
@@ -352,14 +352,14 @@ def _permitted(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]
 
 
 def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:
-    """The words with changes: a word gives way to one of the same key, ``~KEY`` takes it away."""
+    """The words with ``changes``: each replaces the word of the same key, ``~KEY`` removes it."""
     given, changed = set(map(key_of, words)), set(map(key_of, changes))
     kept = [word for word in words if key_of(word) not in changed]
     return kept + [word for word in changes if not (word.startswith("~") and key_of(word) in given)]
 
 
 def _check_words(words: Sequence[str]) -> None:
-    """Raise InputError for a setting that is not an idea's to change."""
+    """Raise InputError for a setting that an idea may not change, and for no settings at all."""
     for key in map(key_of, words):
         if key.partition(".")[0].partition("/")[0] not in OF_IDEAS:
             raise InputError(f"{key}: an idea may change {listed(OF_IDEAS[:4])}, not what decides")

@@ -32,7 +32,7 @@ OPTIONAL = {  # module -> what needs it, and the extra that brings it
 }
 NOT_SHOWN = ("scene", "threads", "device")  # columns that only the JSON of `bench` has
 MAX_SIDE = 16_384  # px
-# of a proof, in one line
+# the errors of a proof that its line shows
 SHOWN_ERRORS = ("image", "gradient of means", "gradient of log_scales", "trained image")
 MAX_COUNT = 1_000_000_000
 

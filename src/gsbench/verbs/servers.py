@@ -33,6 +33,7 @@ LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 
 
 def view(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb: serves the viewer until Ctrl-C."""
     parser = ArgumentParser("view")
     parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)
     parser.add_argument(
@@ -112,7 +113,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
 
 
 def _serves(server: str, experiment: str, page: str) -> bool:
-    """Return whether an MLflow server there knows the experiment by the id in ``page``."""
+    """Return whether the MLflow server has the experiment under the id that is in ``page``."""
     place = f"{server}/api/2.0/mlflow/experiments/get-by-name"
     try:
         answer = requests.get(

@@ -80,7 +80,7 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
-        # str: of the folder
+        # `default` is for the folder, a Path
         print(json.dumps([asdict(trial) for trial in trials], indent=1, default=str))
     else:
         print("\n".join(lines_of(trials, options.all)))
@@ -178,7 +178,7 @@ def _age(trial: TrialState) -> str:
 
 
 def retry(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: the exit code says, as a sweep's does, whether a trial failed."""
+    """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
     from gsbench.app.command import run_trials
 
     parser = ArgumentParser("retry")
@@ -224,9 +224,9 @@ def retry(argv: Sequence[str], runs: Path) -> int:
 
 
 def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send results to a tracker which only a file names.
+    """Raise InputError for a trial that would send results to an address that only a file names.
 
-    The runs folder may be somebody else's, and its address theirs.
+    The runs folder may be somebody else's, and the address theirs.
     """
     typed_uri = next((word.partition("=")[2] for word in changes if key_of(word) == TRACKER), None)
     for trial in trials:

@@ -1,5 +1,4 @@
-"""Verbs that compare versions of a trainer: ``gsbench gate`` and ``gsbench bisect``
-(docs/gate.md)."""
+"""Verbs that compare versions of a trainer: ``gsbench gate`` and ``bisect`` (docs/gate.md)."""
 
 import argparse
 import os
@@ -34,8 +33,10 @@ LOG = "bisect.log"
 
 
 def gate(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 passed, 1 worse, 3 not decided; raises GsbenchError (1) if trials fail,
-    InputError (2)."""
+    """Run the verb: 0 passed, 1 worse, 3 not decided.
+
+    Raises GsbenchError (exit code 1) if trials fail, and InputError (2) for bad input.
+    """
     parser = ArgumentParser(
         "gate",
         "It trains this version on scenes and seeds of an archive (gsbench export --results), "
@@ -93,10 +94,10 @@ def gate(argv: Sequence[str], runs: Path) -> int:
 def _baseline(
     archived: Sequence[TrialResult], by_scene: Mapping[str, Trial]
 ) -> dict[str, list[TrialResult]]:
-    """The archive's trials of each scene. If it has several arms there, the one with the name of
-    the new trial's arm.
+    """The archive's trials of each scene.
 
-    Raises InputError for a scene that the archive lacks, and if several arms or settings are left.
+    If one of its arms there has the name of the new trial's arm, only that one counts. Raises
+    InputError for a scene that the archive lacks, and if several arms or settings are left.
     """
     baseline = {}
     for scene, new in by_scene.items():
@@ -125,8 +126,10 @@ def _seeds(baseline: Mapping[str, Sequence[TrialResult]], most: int | None) -> l
 
 
 def bisect(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb: 0 if the commit is found, 3 if not; raises TrainingError if GOOD or BAD does
-    not train."""
+    """Run the verb: 0 if the commit is found, 3 if not.
+
+    Raises TrainingError if GOOD or BAD does not train.
+    """
     parser = ArgumentParser(
         "bisect",
         "It searches the git repository of this folder: one with a densifier of your own, or "
@@ -155,8 +158,7 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
 
 @dataclass
 class CommitSearch:
-    """A search through ``commits``, the first of which is good, with one declaration for all its
-    steps."""
+    """A search through ``commits`` with one declaration for all steps; the first commit is good."""
 
     # an experiment without trials for the declaration; each commit's trials are in one of its own
     home: Path
@@ -169,8 +171,10 @@ class CommitSearch:
     answers: dict[int, str] = field(default_factory=dict)
 
     def result(self, number: int) -> str | None:
-        """The result of a commit against the first one; None if it does not train. Trains what is
-        missing."""
+        """The result of a commit against the first one; None if it does not train.
+
+        What is missing is trained.
+        """
         good, new = (
             self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}"
             for k in (0, number)

@@ -99,7 +99,7 @@ def line_chart(
 
 
 def forest_plot(title: str, rows: Sequence[ForestRow], x_label: str, better: int) -> str:
-    """Differences with intervals, one a row, and a line at 0; ``better``: an improvement's sign."""
+    """Differences with intervals, one per row, and a line at 0; ``better`` is a gain's sign."""
     if not rows:
         return ""
     intervals = [row.interval for row in rows if row.interval is not None]
@@ -142,7 +142,7 @@ LETTER = 6.6  # px, a letter of 12 px on average
 def rank_plot(ranking: Ranking) -> str:
     """Mean ranks, one arm per row.
 
-    A bar at the right joins arms that do not differ, the scale shows what would.
+    Bars at the right join arms that do not differ; the scale shows the critical difference.
     """
     names, count, groups = [str(arm) for arm in ranking.arms], len(ranking.scenes), ranking.groups
     left = 20 + LETTER * max(map(len, names))
