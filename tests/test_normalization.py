@@ -43,6 +43,21 @@ def test_models_that_colmap_normalized_keep_their_coordinates(seed: int, count: 
     assert find_normalization(as_colmap_leaves(cameras(seed, count))) is IDENTITY
 
 
+@pytest.mark.parametrize("count", [3, 4, 5, 11, 12, 13, 14])
+def test_other_units_get_the_size_that_colmap_gives(count: int) -> None:
+    for seed in range(6):
+        normalization = find_normalization(100 * as_colmap_leaves(cameras(seed, count)))
+        assert normalization.scale == pytest.approx(0.01, rel=1e-6), seed
+
+
+@pytest.mark.parametrize("count", [5, 6])
+def test_one_camera_far_away_decides_the_size_only_among_fewer_than_six(count: int) -> None:
+    centers = 100 * cameras(1, count)
+    centers[0] *= 1e4
+    size = COLMAP_SIZE / find_normalization(centers).scale
+    assert (size < 300) == (count >= 6)
+
+
 @given(SEEDS, st.integers(3, 60), st.floats(-4, 4), st.floats(0, 7))
 def test_normalized_cameras_do_not_depend_on_a_similarity(
     seed: int, count: int, log_scale: float, log_shift: float

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 # units: the diagonal of the cameras' box after COLMAP's Reconstruction::Normalize
 COLMAP_SIZE = 10.0
 TRIMMED = 0.1  # the share of cameras left out at each end of each axis, as COLMAP does
-MIN_TRIMMED = 6  # cameras; with fewer, none is left out
+MIN_TRIMMED = 6  # cameras; with fewer, none is left out (COLMAP: 11)
 # A size within this factor of COLMAP's stays. At a third of it, the near plane is at 0.6 of
 # COLMAP's units. None of 660,000 observations of two real captures (bonsai, herz_jesus_p25) is
 # nearer than 1.

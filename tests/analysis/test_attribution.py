@@ -123,6 +123,14 @@ def test_settings_that_only_name_or_place_a_trial_are_no_ingredients() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    "key", ["densify.name_noise", "init.weights_power", "scene.path_length", "raster.named"]
+)
+def test_a_users_setting_that_begins_like_an_ignored_one_is_an_ingredient(key: str) -> None:
+    other = config("adc") | {key: 2}
+    assert ingredients(other | {key: 1}, other) == (key.removeprefix("densify."),)
+
+
 def test_changes_outside_the_densifier_are_ingredients() -> None:
     other = config("adc", stop=9000) | {
         "train.opacity": 0.05,

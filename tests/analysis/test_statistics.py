@@ -194,10 +194,12 @@ def test_the_interval_of_the_median_is_exact() -> None:
     """The ends of eight values miss the median with probability 2 / 2^8; six reach 5 %, not 1 %."""
     values = np.arange(8.0)
     assert median_interval(values, 0.05) == Interval(0.0, 7.0)
-    assert median_interval(values, 0.3) == Interval(2.0, 5.0) or median_interval(
-        values, 0.3
-    ) == Interval(1.0, 6.0)
+    assert median_interval(values, 0.3) == Interval(2.0, 5.0)  # 2 P(at most 2 of 8) = 0.289
     assert median_interval(values[:6], 0.05) == Interval(0.0, 5.0)
+    # ranks of the exact 95 % interval in tables of the sign test, such as Conover's
+    for count, low, high in ((9, 2, 8), (12, 3, 10), (20, 6, 15), (40, 14, 27)):
+        ranks = np.arange(1.0, count + 1)
+        assert median_interval(ranks, 0.05) == Interval(low, high)
     assert median_interval(values[:6], 0.01) is None
 
 

@@ -27,6 +27,8 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert available_threads(10**6) == 1
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "7")
     assert available_threads(2) == 7
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "0")
+    assert available_threads(10**6) == 1
 
 
 @pytest.mark.parametrize(

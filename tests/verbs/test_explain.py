@@ -28,11 +28,13 @@ def test_a_cell_names_its_trials_hashes_and_versions(tmp_path, capsys):
 
 
 def test_missing_trials_and_metrics_are_reported(tmp_path):
-    paths = write_runs(tmp_path, Plan(scenes=("garden",)))
+    paths = write_runs(tmp_path, Plan(scenes=("garden",), densifiers=("adc", "adc_2")))
     (paths[0] / "results.json").unlink()
+    (paths[-1] / "results.json").unlink()  # of another arm, whose name has the arm's
     text = explain_cell("exp:garden:psnr:adc", tmp_path)
     assert "over 2 of 3 trials" in text
     assert "Left out\n  exp/garden/sfm-adc/c0ffee00-seed0: unfinished" in text
+    assert "adc_2" not in text
     assert "not available: weights file alexnet.pth not found" in explain_cell(
         "exp:garden:lpips_alex:adc", tmp_path
     )

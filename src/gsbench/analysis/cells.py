@@ -79,7 +79,7 @@ def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
 
     Settings that change no result are only in the trial's own file.
     """
-    is_hashed = name in trial.config or not name.startswith(NOT_HASHED)
+    is_hashed = name in trial.config or name.partition(".")[0] not in NOT_HASHED
     return trial.config if is_hashed else trial.whole_config
 
 

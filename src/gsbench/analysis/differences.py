@@ -26,19 +26,20 @@ from gsbench.words import counted, listed
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 
 # Settings in which trials of one cell may differ: they do not change what is computed.
+# "x" stands for x and all below it (x.y).
 IGNORED_SETTINGS = (
-    *(
-        "seed",
-        "name",
-        "device",
-        "threads",
-        "tracking.",
-        "launch.",
-        "hydra.",
-        "experiment",
-        "scene.path",
-    ),
-    *("eval.primary", "eval.controls", "densify.switches"),
+    "seed",
+    "name",
+    "device",
+    "threads",
+    "tracking",
+    "launch",
+    "hydra",
+    "experiment",
+    "scene.path",
+    "eval.primary",
+    "eval.controls",
+    "densify.switches",
 )
 MAX_NAMED = 6  # the most ingredients that a sentence names; it counts the rest
 NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
@@ -73,18 +74,23 @@ INGREDIENT_NAMES = {
 # Settings that do not change the trained model.
 WITHOUT_EFFECT = (
     *IGNORED_SETTINGS,
-    *(
-        "eval.",
-        "scene.name",
-        "init.name",
-        "densify.name",
-        "raster.name",
-        "runs",
-        "allow_targets",
-        "init.device",
-    ),
-    *("train.name", "train.log_every", "train.checkpoint_", "train.volume_histogram"),
-    *("init.weights", "init.download", "init.threads", "densify.time_limit_minutes"),
+    "eval",
+    "runs",
+    "allow_targets",
+    "scene.name",
+    "raster.name",
+    "init.name",
+    "init.device",
+    "init.weights",
+    "init.download",
+    "init.threads",
+    "densify.name",
+    "densify.time_limit_minutes",
+    "train.name",
+    "train.log_every",
+    "train.checkpoint_every",
+    "train.checkpoint_minutes",
+    "train.volume_histogram",
 )
 
 CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
@@ -120,7 +126,7 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     if len({trial.config_hash for trial in trials}) == 1:
         return {}
     configs = {trial.key: trial.config for trial in trials}.values()
-    keys = {key for config in configs for key in config if not key.startswith(IGNORED_SETTINGS)}
+    keys = {key for config in configs for key in config if not _is_among(key, IGNORED_SETTINGS)}
     values_by_key = {key: {canonical(config.get(key)) for config in configs} for key in keys}
     return {key: sorted(values) for key, values in sorted(values_by_key.items()) if len(values) > 1}
 
@@ -237,8 +243,18 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """The settings in which two configurations differ, without those in `WITHOUT_EFFECT`."""
-    keys = [key for key in {**one, **other} if not key.startswith(WITHOUT_EFFECT)]
+    keys = [key for key in {**one, **other} if not _is_among(key, WITHOUT_EFFECT)]
     return [key for key in keys if one.get(key) != other.get(key)]
+
+
+def _is_among(key: str, settings: Sequence[str]) -> bool:
+    """Return whether a dotted key is one of ``settings`` or below one of them.
+
+    A key that only begins with the same letters is another setting: a user's class may have the
+    option ``densify.name_noise``.
+    """
+    parts = key.split(".")
+    return any(".".join(parts[:count]) in settings for count in range(1, len(parts) + 1))
 
 
 def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ def check_start(
         warnings=[],
     )
     doubts = _doubts(facts, random_points)
-    if not random_points and len(colors) > 1 and colors.std(axis=0).max() < MIN_COLOR_SPREAD:
+    if not random_points and colors.std(axis=0).max() < MIN_COLOR_SPREAD:
         shade = ", ".join(str(level) for level in colors[0])
         doubts.append(
             f"all initial points have the colour ({shade}): export the cloud with its colours"

@@ -265,9 +265,8 @@ def explain_cell(address: str, runs: Path) -> str:
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
-    left_out = [
-        line for line in experiment.warnings if line.startswith(f"{name}/{scene}/") and arm in line
-    ]
+    folder = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}/"
+    left_out = [line for line in experiment.warnings if line.startswith(folder)]
     if left_out:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
