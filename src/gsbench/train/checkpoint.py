@@ -49,10 +49,7 @@ class CheckpointWriter:
         self._pending: Future[None] | None = None
 
     def save(self, step: int, state: dict[str, Any]) -> None:
-        """Save the state of ``step``, perhaps in the background.
-
-        Raises the error of the previous save if it failed.
-        """
+        """Save the state of ``step``. Raises the error of the previous save if it failed."""
         self.finish()
         if self._executor is None:
             save_checkpoint(self.folder, step, state)

@@ -46,7 +46,7 @@ def photometric_loss(
 class PhotometricLoss:
     """``photometric_loss`` as an object that reuses compiled kernels for float32 images.
 
-    On a CPU, kernels run on ``threads`` threads and give the same bits for any number of threads.
+    On a CPU, kernels run on ``threads`` threads; results have the same bits for any number of them.
     On a GPU with Triton, the host never waits for the device. Other devices and dtypes use torch.
     """
 
@@ -71,7 +71,7 @@ class PhotometricLoss:
         return self._compiled[device_type](image, target)
 
     def _compile(self, device_type: str) -> Loss:
-        """Return the loss for a type of device. Imports only the packages that it needs."""
+        """Return the loss for a type of device; import only the packages that it needs."""
         if device_type == "cpu":
             from gsbench.train.loss_cpu import CompiledLoss
 

@@ -233,7 +233,7 @@ def gradient_rows(
 
 
 class CompiledLoss:
-    """Calls the kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
+    """Calls the CPU kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
 
     def __init__(self, ssim_weight: float, threads: int | None) -> None:
         self.ssim_weight = ssim_weight
@@ -247,7 +247,7 @@ class CompiledLoss:
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
     ) -> tuple[float, float, Tensor | None]:
-        """Return mean SSIM, mean L1 and, if wanted, the gradient of the loss by ``image``."""
+        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient by ``image``."""
         height, width, _ = image.shape
         numbers = image.numel()
         pixels = image.detach().contiguous().numpy().reshape(-1)

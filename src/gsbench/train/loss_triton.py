@@ -56,7 +56,7 @@ def rows_of_program(height: int, numbers: int) -> int:
 
 @triton.jit
 def _weight(k: tl.constexpr):
-    """The window's weight ``k`` px from its centre."""
+    """The weight of the window at ``k`` px from its centre."""
     return (W0, W1, W2, W3, W4, W5)[k]
 
 

@@ -33,7 +33,7 @@ class TrainConfig(LearningRates):
     step_after_refine: bool = False
     # DashGaussian (train/resolution.py): training starts on small images
     resolution_schedule: Literal["none", "pictures", "pictures_and_count"] = "none"
-    visible_adam: bool = False  # update visible Gaussians only; a departure from the baseline
+    visible_adam: bool = False  # the optimiser updates visible Gaussians only; not in the baseline
     # time budget; training ends with the iteration that reaches it
     max_seconds: PositiveFloat | None = None
     # iterations after which a histogram of volumes is written (Fig. 5 of arXiv 2508.05187)

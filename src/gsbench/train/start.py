@@ -36,7 +36,7 @@ MIN_SEEN = 0.1
 MIN_AGREEMENT = 0.25
 MAX_IDENTICAL = 0.5
 MIN_SPREAD = 0.02
-MIN_COLOR_SPREAD = 1.0  # levels of 255; a cloud of one colour has nothing to agree with
+MIN_COLOR_SPREAD = 1.0  # levels of 255; the colours of a cloud of one colour say nothing
 MAX_FIELD_OF_VIEW = 150.0  # degrees; the widest pinhole lenses have 130
 MIN_FIELD_OF_VIEW = 0.2  # degrees; satellites have 1 or 2
 MAX_PIXEL_RATIO = 1.25  # of the focal lengths in x and y; unequal scaling of photographs gives 1.01
@@ -203,7 +203,7 @@ def _odd_about(camera: Camera) -> dict[str, str]:
 
 
 def camera_distances(scene: Scene) -> tuple[Array, Array]:
-    """The median place [3] of the training cameras, and the distance of each from it [V]."""
+    """The median position [3] of the training cameras, and the distance of each from it [V]."""
     centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
     middle = np.median(centers, axis=0)
     return middle, np.linalg.norm(centers - middle, axis=1)

@@ -48,7 +48,7 @@ SMOOTHING = 0.9  # weight of the previous mean in the smoothed loss
 class LossLog:
     """The losses of a training, in order of iterations. Losses from a GPU arrive with a delay.
 
-    ``smoothed`` is the exponential mean of the losses that have arrived, NaN before the first.
+    ``smoothed`` is the exponential mean of the losses that have arrived; NaN before the first.
     """
 
     def __init__(self) -> None:
