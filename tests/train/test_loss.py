@@ -15,7 +15,7 @@ SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 
 
 def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """A smooth picture with noise and, as target, an 8-bit picture like it."""
+    """A smooth image with noise and, as target, the smooth image in 8 bits."""
     generator = torch.Generator().manual_seed(height)
     y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
     smooth = torch.stack([x.sin(), y.cos(), (x + y).sin()], -1) * 0.3 + 0.5

@@ -43,7 +43,9 @@ def test_the_latest_loss_and_the_smoothed_loss_are_exact(late: bool) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_the_first_iteration_that_was_not_finite_is_named(late: bool, bad: float) -> None:
+def test_the_first_iteration_with_a_loss_that_is_not_finite_is_named(
+    late: bool, bad: float
+) -> None:
     losses = LossLog()
     losses.add(1, *scalars(1))
     with pytest.raises(FloatingPointError, match=f"the loss became {bad} at iteration 2"):  # noqa: PT012

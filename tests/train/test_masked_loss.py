@@ -122,7 +122,7 @@ def test_densifiers_get_no_error_at_ignored_pixels(picture) -> None:
     assert (scene.dissimilarity(0, image)[inside] < 1e-6).all()
 
 
-def test_masks_shrink_with_the_pictures(picture) -> None:
+def test_masks_are_reduced_with_their_images(picture) -> None:
     from gsbench.train.resolution import ScaledViews
 
     _, target, mask = picture

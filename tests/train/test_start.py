@@ -124,7 +124,7 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
     return float(np.mean(shares))
 
 
-def test_the_share_in_view_is_that_of_a_loop_over_points_and_views(scene: Scene) -> None:
+def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene: Scene) -> None:
     points = np.random.default_rng(1).uniform(-4, 8, (300, 3))
     colors = np.random.default_rng(2).integers(0, 256, points.shape, dtype=np.uint8)
     assert check_start(points, colors, scene, random_points=True).seen == seen_by_brute_force(
@@ -171,8 +171,8 @@ def test_colour_agreement_is_relative_to_all_pairs_of_points(
     points, colors = cloud
     swapped = colors[:, ::-1]
     facts, right = check_start(points, swapped, scene), check_start(points, colors, scene)
-    # The photographs show a point's own colour up to half a pixel, so these differences are near
-    # the exact ones.
+    # The photographs show a point's own colour up to half a pixel, so these differences are close
+    # to those that are measured.
     own = np.abs(swapped.astype(int) - colors).mean()
     pairs = np.abs(swapped[:, None].astype(int) - colors[None]).mean()
     assert facts.color_agreement == pytest.approx(1 - own / pairs, abs=0.05)
@@ -221,7 +221,7 @@ def test_cameras_at_one_place_are_refused_and_a_far_camera_causes_a_warning(
     assert "sets the scene extent to" in line
 
 
-def test_pixels_that_a_mask_ignores_show_no_colour(
+def test_ignored_pixels_have_no_effect_on_the_agreement(
     scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
 ) -> None:
     noise = np.random.default_rng(3).integers(0, 256, scene.train[0].image.shape, dtype=np.uint8)

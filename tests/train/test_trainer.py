@@ -229,7 +229,7 @@ def test_the_context_of_a_densifier_knows_a_white_background(
 
 
 @pytest.mark.parametrize(("spare", "resident"), [(0, True), (-2, False)])
-def test_images_may_take_half_of_the_free_memory(
+def test_images_may_use_half_of_the_free_memory(
     spare: int, resident: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = sum(view.image.size for view in lab.scene.train)
@@ -285,7 +285,7 @@ def test_a_checkpoint_is_written_some_minutes_after_the_last(
     assert lab.checkpoints() == [3, 6]
 
 
-def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
+def test_a_training_ends_with_the_iteration_that_reaches_the_time_budget_and_logs_it(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clocked(monkeypatch)
@@ -312,7 +312,7 @@ def test_on_a_cpu_checkpoints_are_written_without_a_thread(
     assert calls == [False, "close"]
 
 
-def test_the_last_iteration_is_logged_too(lab: Lab) -> None:
+def test_the_last_iteration_is_always_logged(lab: Lab) -> None:
     lab.train(NoDensifier(), iterations=7, log_every=3)
     assert lab.steps(METRICS) == [3, 6, 7]
 
