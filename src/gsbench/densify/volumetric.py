@@ -81,7 +81,7 @@ class Volumetric(ADC):
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    # what kappa divides: eigenvalues (eq. 7) or scales; nothing: children's scales are those of ADC
+    # kappa divides eigenvalues (eq. 7), scales, or nothing: then children's scales are those of ADC
     condition_of: Literal["eigenvalues", "scales", "nothing"] = "eigenvalues"
     # limits kappa, so that children of needles do not vanish
     max_condition: Annotated[float, Ge(1)] | None = None

@@ -48,7 +48,7 @@ class Executor:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """Why it cannot run on a device of this type, and the remedy; None if it can run."""
+        """The reason why it cannot run on this type of device, with a remedy; None if it can."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             alternatives = ", ".join(

@@ -136,7 +136,7 @@ class Readback:
 
     @property
     def arrived(self) -> bool:
-        """Whether ``values`` returns without waiting."""
+        """Return whether ``values`` returns without waiting."""
         return self._event is None or self._event.query()
 
     def values(self) -> Tensor:
