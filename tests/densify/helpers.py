@@ -1,4 +1,4 @@
-"""What tests of densifiers share: Gaussians in training, made-up renders, refinements, and one check of a round."""
+"""Helpers for tests of densifiers: Gaussians in training, made-up renders, checks of a round."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def trained(gaussians: Gaussians, extent: float = EXTENT) -> TrainableGaussians:
 
 
 def with_moments(gaussians: Gaussians) -> TrainableGaussians:
-    """After a step of Adam, so that an edit has moments to keep."""
+    """Take one step of Adam, so that there are moments for edits to keep."""
     trainable = trained(gaussians)
     for tensor in trainable.values.tensors().values():
         tensor.grad = torch.full_like(tensor, 1e-3)
@@ -40,7 +40,10 @@ def at(step: int, trainable: Any, seed: int = 0) -> Refinement:
 
 
 def rendered(gradient: Any, radii: Any = None, absolute: Any = None, **more: Any) -> RenderOutput:
-    """A render without pixels, of Gaussians with these screen gradients [N, 2], all visible."""
+    """A render without pixels, with the screen gradients ``gradient`` [N, 2].
+
+    All Gaussians are visible if no ``radii`` are given.
+    """
     points = torch.zeros(len(gradient), 2, dtype=torch.float64, requires_grad=True)
     points.grad = torch.as_tensor(gradient, dtype=torch.float64)
     seen = torch.ones(len(gradient)) if radii is None else torch.as_tensor(radii)
@@ -49,7 +52,7 @@ def rendered(gradient: Any, radii: Any = None, absolute: Any = None, **more: Any
 
 
 def gathered(densifier: Densifier, gradient: Any, absolute: Any = None) -> None:
-    """As if one iteration had seen all, with these gradients [N]."""
+    """Set the statistics as if all Gaussians were visible once, with these gradients [N]."""
     densifier.statistics["gradient_sum"] = torch.as_tensor(gradient)
     densifier.statistics["visible_count"][:] = 1
     if absolute is not None:
@@ -67,7 +70,7 @@ def to_rows(trainable: TrainableGaussians) -> list[Row]:
 
 
 def noise_of(seed: int, *counts: int) -> Any:
-    """The normal draws of the real code: one batch of [2 S, 3] per rule that splits S parents."""
+    """The rows of the real code's normal draws: [2 S, 3] for each rule that splits S parents."""
     rng = generator(seed)
     draws = [torch.randn(2 * s, 3, generator=rng, dtype=torch.float64).numpy() for s in counts]
     return iter([row for batch in draws for row in batch])
@@ -85,7 +88,7 @@ def assert_same(trainable: TrainableGaussians, rows: list[Row]) -> None:
 
 
 class Round:
-    """A real round at ``step``, with what was there before it; ``check`` compares the end."""
+    """A real round at ``step``, with the state before it; ``check`` compares the result."""
 
     def __init__(
         self, densifier: Densifier, trainable: TrainableGaussians, step: int, seed: int = 0
@@ -100,7 +103,7 @@ class Round:
         self.event = event
 
     def check(self, rows: list[Row], pruned: bool = False) -> None:
-        """``rows`` are restated: to be pruned as ADC does, unless they are ``pruned`` already."""
+        """Compare with the restated ``rows``, after pruning these as ADC does unless ``pruned``."""
         if not pruned:
             rows = restatement.prune(rows, self.step, EXTENT, self.counts)
         assert_same(self.trainable, rows)

@@ -1,8 +1,8 @@
-"""One refinement round, stated again from the formulas.
+"""A restatement of a refinement round: the formulas again in numpy, one Gaussian at a time.
 
-Numpy, one Gaussian at a time, no code shared with gsbench. A Gaussian is a dict of raw parameters
-with its two Adam moments. The normal draws come in as an iterator of rows, in the order in which
-the rules use them: all first children, then all second ones.
+It shares no code with gsbench. A Gaussian is a dict of raw parameters with its two Adam moments.
+Normal draws are an iterator of rows, in the order in which the rules use them: all first children,
+then all second ones.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 Row = dict[str, Any]
-DIFFERENCES: list[float] = []  # what comparisons with it found, for scripts/fidelity.py
+DIFFERENCES: list[float] = []  # found by comparisons with the real code, for scripts/fidelity.py
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 
 
@@ -49,10 +49,7 @@ def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
 def split_all(
     rows: list[Row], chosen: list[int], scales: dict[int, np.ndarray], noise: Iterator[np.ndarray]
 ) -> list[Row]:
-    """Two children for each chosen row, appended: every first child, then every second.
-
-    The parents go.
-    """
+    """Replace each chosen row by two children: append all first ones, then all second ones."""
     children = []
     for _ in range(2):
         for i in chosen:

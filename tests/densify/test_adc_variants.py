@@ -40,9 +40,10 @@ from tests.gaussians.helpers import random_gaussians
 def absgs_growth(
     rows: list[restatement.Row], signed: np.ndarray, absolute: np.ndarray, noise: object
 ) -> tuple[list[restatement.Row], int, int]:
-    """Small (largest scale at most .001 of the extent): a copy where signed >= .0002.
+    """Copy small Gaussians where signed >= 0.0002, split large ones where absolute >= 0.0004.
 
-    Large: split where absolute >= .0004, into two of 1 / 1.6.
+    A Gaussian is large if a scale is above 0.001 of the extent. A split divides the scales by 1.6.
+    Returns the rows, and the numbers of copied and of split Gaussians.
     """
     large = [np.exp(row["log_scales"]).max() > 0.001 * EXTENT for row in rows]
     clones = [i for i in range(len(rows)) if not large[i] and signed[i] >= 0.0002]
@@ -57,10 +58,10 @@ def absgs_growth(
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(3))
-def test_absgs_round(seed: int, step: int) -> None:
+def test_a_round_of_absgs_matches_the_restatement(seed: int, step: int) -> None:
     densifier = AbsGS()
     trainable, _ = prepared(densifier, seed)
-    trainable.values.log_scales.data[::4] -= 4.0  # a quarter below the size of a split
+    trainable.values.log_scales.data[::4] -= 4.0  # a quarter is too small for a split
     draw = np.random.default_rng(seed)
     signed, absolute = draw.uniform(0, 4e-4, 60), draw.uniform(0, 8e-4, 60)
     gathered(densifier, signed, absolute)
@@ -72,9 +73,9 @@ def test_absgs_round(seed: int, step: int) -> None:
     real.check(rows)
 
 
-def test_both_gradients_are_gathered() -> None:
+def test_absgs_gathers_both_gradients() -> None:
     densifier = AbsGS()
-    trainable, mean = prepared(densifier, 0)  # shows it the same for both
+    trainable, mean = prepared(densifier, 0)  # its renders have equal gradients of both kinds
     np.testing.assert_allclose(densifier.mean_gradient(), mean, rtol=1e-6)
     np.testing.assert_allclose(densifier.mean_absolute_gradient(), mean, rtol=1e-6)
     assert densifier.needs_absolute_gradient
@@ -100,11 +101,12 @@ def test_every_500_iterations_opacities_are_lowered_to_the_ceiling() -> None:
     assert float(trainable.values.opacities.detach().max()) == pytest.approx(0.01)
 
 
-def test_a_hard_cap_takes_those_farthest_above_their_own_threshold() -> None:
+def test_under_a_hard_cap_absgs_grows_the_gaussians_farthest_above_their_threshold() -> None:
     densifier = AbsGS(max_gaussians=62, cap="hard", prune_opacity=0.0)
     trainable, _ = prepared(densifier, 1)
     trainable.values.log_scales.data[:30] = -9.0
-    signed, absolute = torch.full((60,), 3e-4), torch.full((60,), 5e-4)  # 1.5 and 1.25 times theirs
+    # 1.5 and 1.25 times their thresholds
+    signed, absolute = torch.full((60,), 3e-4), torch.full((60,), 5e-4)
     signed[7], absolute[50] = 9e-4, 2e-3
     gathered(densifier, signed, absolute)
     event = densifier.refine(600, trainable, generator())
@@ -160,7 +162,7 @@ def started(seed: int, densifier: ADC) -> tuple[TrainableGaussians, Views]:
 
 @pytest.mark.parametrize("fraction", [0.37, 1.0, None])
 @pytest.mark.parametrize("seed", range(3))
-def test_pixel_gs_round(seed: int, fraction: float | None) -> None:
+def test_a_round_of_pixel_gs_matches_the_restatement(seed: int, fraction: float | None) -> None:
     densifier = PixelGS(near_fraction=fraction)
     trainable, views = started(seed, densifier)
     gradient = views.mean_gradient(fraction)
@@ -169,11 +171,11 @@ def test_pixel_gs_round(seed: int, fraction: float | None) -> None:
     noise = noise_of(seed, real.event.split_gradient)
     real.check(restatement.adc_growth(real.rows, gradient, EXTENT, noise, real.counts))
     assert min(real.event.cloned, real.event.split_gradient) > 0
-    assert not densifier.statistics["pixel_sum"].any()  # gathered anew
+    assert not densifier.statistics["pixel_sum"].any()  # reset after the round
 
 
-def test_views_of_equal_footprints_count_as_in_adc() -> None:
-    """Weights that are all alike cancel; views without a pixel do not count at all."""
+def test_pixel_gs_with_equal_footprints_has_the_mean_gradient_of_adc() -> None:
+    """Equal weights cancel; views without a pixel do not count."""
     views, densifier, baseline = Views(5), PixelGS(near_fraction=None), ADC()
     views.pixels[:] = 7
     views.radii[:] = 1
@@ -192,10 +194,10 @@ def test_views_of_equal_footprints_count_as_in_adc() -> None:
     assert not densifier.statistics["pixel_sum"].any()
 
 
-def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
-    """The paper's motive.
+def test_views_that_see_only_an_edge_do_not_lower_the_mean_gradient() -> None:
+    """The motive of the paper: one view sees most of a Gaussian, three see an edge of it.
 
-    One view in which much of it is seen, three that see an edge and have no gradient.
+    Only the first view has a gradient.
     """
     views, densifier, baseline = Views(0), PixelGS(near_fraction=None), ADC()
     views.gradients[:] = 0
@@ -208,7 +210,7 @@ def test_large_gaussians_at_the_edge_of_views_are_not_held_back() -> None:
     assert (densifier.mean_gradient() > 4e-4).all()
 
 
-def test_a_hard_cap_takes_those_of_the_largest_weighted_gradient() -> None:
+def test_under_a_hard_cap_pixel_gs_grows_the_largest_weighted_gradients() -> None:
     densifier = PixelGS(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
     trainable, views = started(1, densifier)
     event = densifier.refine(600, trainable, generator())
@@ -218,7 +220,7 @@ def test_a_hard_cap_takes_those_of_the_largest_weighted_gradient() -> None:
     assert sorted(parents.tolist()) == sorted(largest.tolist())
 
 
-def test_a_render_that_does_not_say_is_refused() -> None:
+def test_a_render_without_a_footprint_is_refused() -> None:
     densifier = PixelGS()
     densifier.begin(random_gaussians(2), DensifyContext(1.0))
     with pytest.raises(RuntimeError, match="footprint"):
@@ -227,10 +229,10 @@ def test_a_render_that_does_not_say_is_refused() -> None:
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("rate", [0.1, 0.5, 3.0])
-def test_quantile_round(rate: float, step: int) -> None:
-    """The share with the largest gradients grows as in ADC, nobody that was never seen.
+def test_a_round_of_quantile_adc_matches_the_restatement(rate: float, step: int) -> None:
+    """The share with the largest gradients grows as in ADC; Gaussians without a gradient do not.
 
-    Then the faintest go.
+    Then the faintest share is pruned.
     """
     densifier = QuantileADC(growth_rate=rate, prune_share=0.05)
     trainable, _ = prepared(densifier, 4)
@@ -252,7 +254,7 @@ def test_quantile_round(rate: float, step: int) -> None:
     assert event.pruned_opacity == len(rows) - len(bright) > 0
 
 
-def test_the_faintest_share_is_pruned_and_of_none_nobody() -> None:
+def test_the_faintest_share_is_pruned_and_an_empty_set_is_accepted() -> None:
     densifier, logits = QuantileADC(prune_share=0.1), torch.arange(11.0)
     assert densifier.faint(logits).tolist() == [True] + [False] * 10
     densifier.cull = 3.0
@@ -261,7 +263,7 @@ def test_the_faintest_share_is_pruned_and_of_none_nobody() -> None:
     assert densifier.faint(logits[:1]).tolist() == [False]
 
 
-def test_the_governor_moves_the_rate() -> None:
+def test_a_governed_round_of_quantile_adc_ends_at_its_target() -> None:
     densifier = QuantileADC(max_gaussians=80, cap="governor", start=500, stop=1200, prune_share=0.0)
     trainable, _ = prepared(densifier, 2)
     densifier.statistics["gradient_sum"] += 1e-6
@@ -284,10 +286,11 @@ def steep_gs_growth(
     threshold: float = -1e-6,
     share: float = 0.5,
 ) -> tuple[list[restatement.Row], int]:
-    """Two halves along the least eigenvector for who reaches .0002 with a value below.
+    """Split Gaussians with a gradient of at least 0.0002 and an eigenvalue below ``threshold``.
 
-    They lie on either side of the parent. Large: scales / 1.6, at the length of a draw each; small:
-    as large as before, a step of the means away.
+    Their halves lie on either side of the parent along the least eigenvector. The halves of a large
+    parent have its scales / 1.6, and each distance is the length of a draw. The halves of a small
+    parent have its scales, at the distance ``rate``. Returns the rows and the number of parents.
     """
     chosen = [
         i
@@ -309,9 +312,9 @@ def steep_gs_growth(
 
 
 def given(densifier: SteepGS, seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics of three visible iterations.
+    """Set the statistics of three visible iterations.
 
-    Mean gradients [N] and symmetric matrices [N, 3, 3], per iteration.
+    Returns gradients [N] and symmetric splitting matrices [N, 3, 3] per iteration.
     """
     draw = np.random.default_rng(seed)
     gradient = draw.uniform(0, 4e-4, count)
@@ -325,7 +328,7 @@ def given(densifier: SteepGS, seed: int, count: int = 60) -> tuple[np.ndarray, n
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(3))
-def test_steep_gs_round(seed: int, step: int) -> None:
+def test_a_round_of_steep_gs_matches_the_restatement(seed: int, step: int) -> None:
     densifier = SteepGS()
     trainable, _ = prepared(densifier, seed)
     trainable.values.log_scales.data[::4] -= 3.0  # small ones, too
@@ -342,7 +345,7 @@ def test_steep_gs_round(seed: int, step: int) -> None:
     assert densifier.statistics["splitting_sum"].shape == (len(trainable), 3, 3)
 
 
-def test_the_eigenvalue_is_one_of_the_mean_matrix_in_units_of_the_squared_extent() -> None:
+def test_the_least_eigenvalue_of_the_mean_matrix_is_in_units_of_the_squared_extent() -> None:
     densifier = SteepGS()
     prepared(densifier, 0)
     densifier.statistics["visible_count"][:] = 2
@@ -356,7 +359,7 @@ def test_the_eigenvalue_is_one_of_the_mean_matrix_in_units_of_the_squared_extent
     )
 
 
-def test_each_ingredient_can_be_taken_out() -> None:
+def test_the_parts_of_steep_gs_can_be_switched_off() -> None:
     densifier = SteepGS(eigenvalue_threshold=None, opacity_factor=1.0)
     trainable, _ = prepared(densifier, 1)
     gradient, matrices = given(densifier, 1)
@@ -367,7 +370,7 @@ def test_each_ingredient_can_be_taken_out() -> None:
     real.check(steep_gs_growth(real.rows, gradient, matrices, noise, rate, np.inf, 1.0)[0])
 
 
-def test_under_a_hard_cap_those_come_first_whom_a_split_helps_most() -> None:
+def test_under_a_hard_cap_steep_gs_splits_the_least_eigenvalues_first() -> None:
     densifier = SteepGS(max_gaussians=63, cap="hard", prune_opacity=0.0)
     trainable, _ = prepared(densifier, 2)
     gradient, matrices = given(densifier, 2)
@@ -381,7 +384,7 @@ def test_under_a_hard_cap_those_come_first_whom_a_split_helps_most() -> None:
     assert gone == set(order[:3])
 
 
-def test_a_round_solves_for_the_eigenvectors_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_round_of_steep_gs_computes_eigenvectors_once(monkeypatch: pytest.MonkeyPatch) -> None:
     densifier = SteepGS()
     trainable, _ = prepared(densifier, 1)
     gradient, _ = given(densifier, 1)
@@ -396,7 +399,7 @@ def test_a_round_solves_for_the_eigenvectors_once(monkeypatch: pytest.MonkeyPatc
     assert sizes == [(gradient >= 0.0002).sum()]
 
 
-def test_the_matrices_of_visible_iterations_add_up() -> None:
+def test_splitting_matrices_are_summed_until_the_window_ends() -> None:
     densifier = SteepGS()
     trainable, _ = prepared(densifier, 0)
     count = len(trainable)
@@ -412,7 +415,7 @@ def test_the_matrices_of_visible_iterations_add_up() -> None:
         densifier.observe(9, render)
 
 
-WINDOW = {"start": 700, "stop": 12_000}  # of the authors
+WINDOW = {"start": 700, "stop": 12_000}  # that of the authors' code
 
 
 def with_opacity(row: restatement.Row, value: float, moments: bool = True) -> restatement.Row:
@@ -425,9 +428,10 @@ def with_opacity(row: restatement.Row, value: float, moments: bool = True) -> re
 def residual_split(
     rows: list[restatement.Row], gradient: np.ndarray, stage: int, noise: Iterator[np.ndarray]
 ) -> list[restatement.Row]:
-    """Who reaches .00067 times 2^((level - stage) / 3), at most .00067, gets a child.
+    """Add a child to Gaussians whose gradient reaches 0.00067 min(1, 2^((level - stage) / 3)).
 
-    It keeps .3 of its opacity. The child is drawn from it, 1.6 times smaller, as opaque as it was.
+    The parent keeps 0.3 of its opacity. The child's mean is drawn from the parent's density; its
+    scales are the parent's / 1.6, its opacity is the parent's former one.
     """
     parents, children = [], []
     for i, row in enumerate(rows):
@@ -445,7 +449,7 @@ def residual_split(
 
 @pytest.mark.parametrize(("step", "stage"), [(800, 1), (2400, 3), (4100, 5)])
 @pytest.mark.parametrize("seed", range(2))
-def test_res_gs_round(seed: int, step: int, stage: int) -> None:
+def test_a_round_of_res_gs_matches_the_restatement(seed: int, step: int, stage: int) -> None:
     densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
     trainable, _ = prepared(densifier, seed)
     draw = np.random.default_rng(seed)
@@ -463,14 +467,15 @@ def test_res_gs_round(seed: int, step: int, stage: int) -> None:
     expected = [row.pop("level") for row in kept]
     real.check(kept, pruned=True)
     assert (event.pruned_opacity, event.pruned_size, event.cloned) == (len(grown) - len(kept), 0, 0)
-    assert densifier.statistics["level"].tolist() == expected  # and a round does not forget them
+    assert densifier.statistics["level"].tolist() == expected  # levels survive the round
     assert not densifier.statistics["gradient_sum"].any()
 
 
 def test_the_stages_are_those_of_the_authors_loop() -> None:
-    """Their counters, one iteration after another.
+    """The test runs the authors' counters, one iteration after another.
 
-    Three parts of each phase, changes at 2,500 and 6,000, a pause of 500 iterations after each.
+    Phases end at 2,500 and 6,000, with a pause of 500 iterations after each; a phase has three
+    stages.
     """
     changes, level, warm, last, ahead = [2500, 6000], 1, 0, 700, 2500
     count = (ahead - last) // 3
@@ -497,7 +502,7 @@ def test_the_stages_are_those_of_the_authors_loop() -> None:
     assert {stages[step] for step in range(800, 12_000, 100)} == set(range(1, 10))
 
 
-def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterations() -> None:
+def test_after_the_first_phase_all_opacities_fade_every_500_iterations() -> None:
     densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
     faded, pruned = [], []
     for step in range(500, 26_000, 500):
@@ -516,12 +521,12 @@ def test_from_the_end_of_the_first_phase_on_all_opacities_fade_every_500_iterati
             faded.append(step)
             if step >= 12_000:
                 pruned.append(event.pruned_opacity)
-    # their level has gone up when they ask: 45 times
+    # The authors' code has raised its level before it tests for this. So opacities fade 45 times.
     assert faded == list(range(2500, 25_000, 500))
     assert min(pruned) > 0
 
 
-def test_gradients_are_gathered_from_500_on_but_not_in_the_pauses() -> None:
+def test_res_gs_gathers_gradients_from_500_on_but_not_in_the_pauses() -> None:
     densifier = ResGS(**WINDOW)  # type: ignore[arg-type]
     trainable, _ = prepared(densifier, 0)
     rng = np.random.default_rng(0)
@@ -534,7 +539,7 @@ def test_gradients_are_gathered_from_500_on_but_not_in_the_pauses() -> None:
         densifier.statistics["visible_count"].zero_()
 
 
-def test_in_a_short_window_there_is_no_pause_and_phases_must_rise() -> None:
+def test_a_short_window_has_no_pause_and_phase_ends_must_rise() -> None:
     densifier = ResGS(start=200, stop=1000)
     stages = [densifier.stage(step) for step in range(300, 1000, 100)]
     assert stages == sorted(stages)
@@ -546,7 +551,7 @@ def test_in_a_short_window_there_is_no_pause_and_phases_must_rise() -> None:
         ResGS(phase_ends=[0.5, 0.2])
 
 
-def test_a_governed_round_ends_at_its_target() -> None:
+def test_a_governed_round_of_res_gs_ends_at_its_target() -> None:
     densifier = ResGS(max_gaussians=90, cap="governor", start=500, stop=1200)
     trainable, _ = prepared(densifier, 2)
     trainable.values.opacity_logits.data[:] = 1.0
@@ -555,7 +560,7 @@ def test_a_governed_round_ends_at_its_target() -> None:
     assert event.target == event.after == 90
 
 
-def test_a_hard_cap_admits_the_largest_gradients() -> None:
+def test_under_a_hard_cap_res_gs_grows_the_largest_gradients() -> None:
     densifier = ResGS(max_gaussians=63, cap="hard", **WINDOW)  # type: ignore[arg-type]
     trainable, _ = prepared(densifier, 2)
     trainable.values.opacity_logits.data[:] = 1.0

@@ -1,7 +1,4 @@
-"""Caps: freeze leaves a round out, the governor steers to a count.
-
-Against counting one Gaussian at a time.
-"""
+"""Caps: a frozen round changes nothing, the governor reaches a count, the training sets a limit."""
 
 from __future__ import annotations
 
@@ -22,10 +19,10 @@ from tests.gaussians.helpers import random_gaussians
 
 @pytest.mark.parametrize("kind", [ADC, Volumetric])
 def test_a_frozen_round_neither_grows_nor_prunes(kind: type[ADC]) -> None:
-    """And the optimiser's step of that iteration is not lost, as it is after an edit."""
+    """The optimiser step of that iteration is not skipped, as it is after an edit."""
     densifier = kind(max_gaussians=60, cap="freeze")
     trainable, _ = prepared(densifier, 3, count=60)
-    # at the limit a round may go beyond it
+    # a round that starts at the limit may exceed it
     assert densifier.refine(600, trainable, generator()).after > 60
     trainable.values.opacity_logits.data[:5] = -9.0  # to be pruned
     for tensor in trainable.values.tensors().values():
@@ -61,7 +58,7 @@ def test_a_frozen_training_still_resets_its_opacities() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_settling_is_as_good_as_trying_every_factor(seed: int) -> None:
+def test_bisection_finds_the_factor_that_meets_the_target(seed: int) -> None:
     draw = np.random.default_rng(seed)
     scores = draw.lognormal(0, 2, 200)
     target = int(draw.integers(0, 200))
@@ -72,8 +69,8 @@ def test_settling_is_as_good_as_trying_every_factor(seed: int) -> None:
     best = min(abs(count(f) - target) for f in scores)
     found = find_factor(count, target, 1e-3, 1e3)
     assert abs(count(found) - target) == best == 0
-    assert find_factor(count, 0, 1e-3, 1e-2) == pytest.approx(1e-2)  # never so few: the strictest
-    assert find_factor(count, 300, 1e-3, 1e3) == 1e-3  # never so many: the least strict
+    assert find_factor(count, 0, 1e-3, 1e-2) == pytest.approx(1e-2)  # even the strictest has more
+    assert find_factor(count, 300, 1e-3, 1e3) == 1e-3  # even the least strict has fewer
 
 
 COMBINATIONS = [
@@ -92,7 +89,9 @@ COMBINATIONS = [
 @pytest.mark.parametrize(
     ("kind", "options"), COMBINATIONS, ids=lambda value: getattr(value, "__name__", str(value))
 )
-def test_the_forecast_is_what_a_round_does(kind: type[ADC], options: dict[str, object]) -> None:
+def test_the_forecast_is_the_count_after_the_round(
+    kind: type[ADC], options: dict[str, object]
+) -> None:
     for seed, (step, strictness, cull) in enumerate(
         [(600, 1, 1), (3100, 0.3, 4), (3300, 5, 1), (3200, 0.01, 2)]
     ):
@@ -104,7 +103,7 @@ def test_the_forecast_is_what_a_round_does(kind: type[ADC], options: dict[str, o
 
 
 @pytest.mark.parametrize("kind", [ADC, Volumetric, MCMC])
-def test_who_keeps_to_the_curve_ends_at_the_limit(kind: type[Budgeted]) -> None:
+def test_targets_follow_the_curve_and_the_last_one_is_the_limit(kind: type[Budgeted]) -> None:
     densifier = kind(start=500, stop=1500, interval=100, max_gaussians=1100, cap="governor")  # type: ignore[call-arg]
     count, counts = 100, []
     for step in range(600, 1500, 100):
@@ -122,7 +121,7 @@ def test_who_keeps_to_the_curve_ends_at_the_limit(kind: type[Budgeted]) -> None:
 
 @pytest.mark.parametrize("kind", [ADC, Volumetric])
 def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
-    """The same strictness multiplies every threshold, and the event says what it was."""
+    """One strictness multiplies every threshold; the event records it."""
     densifier = kind(max_gaussians=450, cap="governor", stop=1200)
     trainable, gradient = prepared(densifier, 2, count=300)
     scales = np.array([row["log_scales"] for row in to_rows(trainable)])
@@ -143,8 +142,8 @@ def test_a_governed_round_ends_at_its_target(kind: type[ADC]) -> None:
 
 
 @pytest.mark.parametrize("dimension", [1, 3])
-def test_the_governor_moves_a_volume_or_the_size_that_it_is_of(dimension: int) -> None:
-    """Counted by hand: who is over the two thresholds that one factor gives."""
+def test_the_governor_scales_the_volume_threshold_or_its_size(dimension: int) -> None:
+    """One factor gives both thresholds; the test counts the Gaussians above them."""
     densifier = Volumetric(
         max_gaussians=450, cap="governor", stop=1200, governor_dimension=dimension
     )  # type: ignore[arg-type]
@@ -155,16 +154,16 @@ def test_the_governor_moves_a_volume_or_the_size_that_it_is_of(dimension: int) -
     assert factor != 1
     over, large = gradient >= 2e-4 * factor, sizes.max(-1) > 0.01 * EXTENT
     assert (event.cloned, event.split_gradient) == ((over & ~large).sum(), (over & large).sum())
-    # of a sphere of V_th
+    # radius of a sphere of volume V_th
     size = np.cbrt(0.03 / (4 / 3 * np.pi)) * (factor if dimension == 3 else np.cbrt(factor))
     geometric_mean = np.cbrt((sizes / np.where(over & large, 1.6, 1)[:, None]).prod(-1))
-    # clones and children of a split have the same volume as one another
+    # A Gaussian and its clone have the same volume, and so have the children of a split.
     copies = np.where(over, 2, 1)
     assert event.split_volume == copies[geometric_mean > size].sum() > 0
     assert abs(event.after - event.target) <= 2
 
 
-def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
+def test_far_above_its_target_a_round_prunes_more_faint_gaussians() -> None:
     densifier = ADC(max_gaussians=60, cap="governor", gradient_threshold=1.0, prune_size=100.0)
     trainable, _ = prepared(densifier, 5, count=60)
     densifier.max_gaussians = 30
@@ -175,11 +174,11 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
     assert [densifier.may_cull(step) for step in (3000, *rounds_after_a_reset)] == [True] + [
         False
     ] * 5 + [True] * 2
-    assert densifier.may_cull(6000)  # it resets after it has pruned
+    assert densifier.may_cull(6000)  # a round resets opacities after it has pruned
     locked = Refinement(3100, trainable, generator(), RefineEvent(3100, len(trainable)))
     densifier.govern(locked)
-    assert locked.event.target < 60  # and yet
-    assert locked.event.cull == 1
+    assert locked.event.target < 60
+    assert locked.event.cull == 1  # although the count is above the target
     opacities = trainable.values.opacities.detach().clone()
     event = densifier.refine(14_900, trainable, generator())  # the last round
     assert event.target == 30
@@ -190,7 +189,7 @@ def test_far_over_its_target_a_round_prunes_more_of_the_faint() -> None:
 
 
 @pytest.mark.parametrize(("target", "culls"), [(199, False), (198, True)])
-def test_up_to_one_percent_over_its_target_a_count_is_not_culled(target: int, culls: bool) -> None:
+def test_a_count_up_to_one_percent_above_its_target_is_not_culled(target: int, culls: bool) -> None:
     densifier = ADC(max_gaussians=200, cap="governor", gradient_threshold=1.0, prune_size=100.0)
     trainable, _ = prepared(densifier, 5, count=200)
     densifier.max_gaussians = target
@@ -202,7 +201,7 @@ def test_up_to_one_percent_over_its_target_a_count_is_not_culled(target: int, cu
     assert event.after == (target if culls else 200)
 
 
-def test_a_governed_mcmc_adds_what_is_missing() -> None:
+def test_governed_rounds_of_mcmc_end_at_their_targets() -> None:
     gaussians = random_gaussians(40)
     densifier = MCMC(start=0, stop=301, interval=100, max_gaussians=100, cap="governor")
     densifier.begin(gaussians, DensifyContext(1.0))
@@ -214,7 +213,7 @@ def test_a_governed_mcmc_adds_what_is_missing() -> None:
 
 
 @pytest.mark.parametrize("cap", ["freeze", "governor"])
-def test_who_cannot_say_where_a_round_leads_is_not_governed(cap: str) -> None:
+def test_a_cap_that_needs_a_forecast_or_a_limit_is_refused_without_it(cap: str) -> None:
     @dataclass
     class Silent(Budgeted):
         pass
@@ -253,7 +252,7 @@ def test_a_training_may_limit_the_count_further(
     densifier.begin(random_gaussians(3), DensifyContext(1.0, limit=limit))
     assert densifier.allowance(at(600, range(count))) == allowed  # type: ignore[arg-type]
     assert asked == [7 if cap == "hard" else None]
-    for own in ("curve", "freeze", "governor"):  # follow a rule of their own
+    for own in ("curve", "freeze", "governor"):  # these do not use the limit of the training
         densifier.cap = own  # type: ignore[assignment]
         densifier.allowance(at(600, range(count)))
     assert len(asked) == 1

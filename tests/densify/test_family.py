@@ -1,4 +1,4 @@
-"""The densifiers around ADC: what each changes, checked by what it must preserve."""
+"""Properties of ADC, MCMC, MRNF and the functions that densifiers share."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tests.gaussians.helpers import random_gaussians
 @pytest.mark.parametrize("copies", [1, 2, 3, 8])
 @pytest.mark.parametrize("opacity", [0.1, 0.6, 0.95])
 def test_shared_opacity_preserves_centre_and_integral(copies: int, opacity: float) -> None:
-    """n coincident copies.
+    """n copies at one place have the opacity of the original at the centre.
 
-    The same opacity at the centre, and the same integral along a line (numerically).
+    They also have the same integral of opacity along a line (computed numerically).
     """
     o = torch.tensor([opacity], dtype=torch.float64)
     new, factor = shared_opacity(o, torch.tensor([copies]))
@@ -50,7 +50,7 @@ def test_quantiles_are_those_of_numpy(share: float) -> None:
 
 
 @pytest.mark.parametrize("densifier", [MCMC(initial_opacity=0.2), MRNF(initial_opacity=0.2)])
-def test_a_training_begins_with_small_gaussians_of_one_opacity(densifier: MCMC | MRNF) -> None:
+def test_mcmc_and_mrnf_start_with_small_gaussians_of_one_opacity(densifier: MCMC | MRNF) -> None:
     initial = random_gaussians(5)
     gaussians = densifier.prepare(initial)
     torch.testing.assert_close(gaussians.opacities, torch.full((5,), 0.2, dtype=torch.float64))
@@ -59,7 +59,7 @@ def test_a_training_begins_with_small_gaussians_of_one_opacity(densifier: MCMC |
     torch.testing.assert_close(spread_out(initial, 0.7, 3.0).scales, 3 * initial.scales)
 
 
-def test_the_term_of_mcmc_in_the_loss() -> None:
+def test_mcmc_adds_mean_opacity_and_mean_scale_to_the_loss() -> None:
     gaussians = random_gaussians(5)
     expected = 0.3 * float(gaussians.opacities.mean()) + 0.05 * float(gaussians.scales.mean())
     assert float(
@@ -67,22 +67,22 @@ def test_the_term_of_mcmc_in_the_loss() -> None:
     ) == pytest.approx(expected)
 
 
-def test_mcmc_moves_and_adds_a_single_gaussian() -> None:
+def test_mcmc_can_move_and_add_a_single_gaussian() -> None:
     densifier, trainable = mcmc_state(8, max_gaussians=9, growth=0.5)
-    trainable.values.opacity_logits.data[1] = 0.0  # of two dead ones
+    trainable.values.opacity_logits.data[1] = 0.0  # only one of two stays dead
     event = densifier.refine(600, trainable, generator(0))
     assert (event.relocated, event.added, event.after) == (1, 1, 9)
     assert len(trainable) == 9
 
 
-def test_mcmc_leaves_a_model_alone_whose_gaussians_are_all_dead() -> None:
+def test_mcmc_does_not_change_a_model_whose_gaussians_are_all_dead() -> None:
     densifier, trainable = mcmc_state(8, max_gaussians=50, growth=0.5)
     trainable.values.opacity_logits.data[:] = -9.0
     event = densifier.refine(600, trainable, generator())
     assert (event.relocated, event.added, event.after) == (0, 0, 8)
 
 
-def test_mcmc_shares_an_opacity_of_one_as_a_finite_logit() -> None:
+def test_copies_of_an_opaque_gaussian_have_a_finite_logit() -> None:
     densifier, trainable = mcmc_state(4, max_gaussians=50, growth=5.0)
     trainable.values.opacity_logits.data[:] = 60.0
     densifier.refine(600, trainable, generator())
@@ -97,7 +97,7 @@ def mcmc_state(count: int = 40, **options: object) -> tuple[MCMC, TrainableGauss
     return densifier, trained(gaussians)
 
 
-def test_mcmc_moves_the_dead_and_grows_to_an_exact_cap() -> None:
+def test_mcmc_moves_dead_gaussians_and_grows_exactly_to_the_cap() -> None:
     densifier, trainable = mcmc_state(max_gaussians=50, growth=0.2)
     rng = generator(0)
     event = densifier.refine(600, trainable, rng)
@@ -111,14 +111,14 @@ def test_mcmc_moves_the_dead_and_grows_to_an_exact_cap() -> None:
     assert densifier.lineage.causes_of_living()["relocated"] > 0
 
 
-def test_mcmc_refuses_a_cap_below_the_initial_cloud() -> None:
+def test_a_cap_below_the_initial_cloud_is_refused() -> None:
     with pytest.raises(InputError, match=r"densify.max_gaussians .* initial cloud \(40\)"):
         mcmc_state(max_gaussians=39)
     with pytest.raises(InputError, match=r"densify.max_gaussians .* initial cloud"):
         ADC(max_gaussians=3).begin(random_gaussians(4), DensifyContext(1.0))
 
 
-def test_absolute_gradient_is_what_absgrad_reads() -> None:
+def test_only_the_option_absolute_gathers_the_absolute_gradient() -> None:
     gaussians = random_gaussians(3)
     absolute = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
     render = rendered(torch.zeros(3, 2), absolute=absolute)
@@ -134,7 +134,7 @@ def test_absolute_gradient_is_what_absgrad_reads() -> None:
     assert not signed.statistics["gradient_sum"].any()
 
 
-def test_curve_rises_from_the_cloud_to_the_cap() -> None:
+def test_the_curve_rises_from_the_initial_count_to_the_cap() -> None:
     curve, hard = (
         Budgeted(start=500, stop=1500, max_gaussians=1100, cap=cap) for cap in ("curve", "hard")
     )
@@ -143,7 +143,7 @@ def test_curve_rises_from_the_cloud_to_the_cap() -> None:
     assert hard.limit(600) == 1100
 
 
-def test_none_never_changes_anything() -> None:
+def test_no_densifier_changes_nothing() -> None:
     gaussians = random_gaussians(4)
     densifier = NoDensifier()
     densifier.begin(gaussians, DensifyContext(1.0))
@@ -152,8 +152,7 @@ def test_none_never_changes_anything() -> None:
     assert len(trainable) == 4
 
 
-def test_state_survives_saving() -> None:
-    """A densifier that is saved and loaded half-way gives the same events as one that is not."""
+def test_a_densifier_that_is_saved_and_loaded_gives_the_same_events() -> None:
     events = []
     for interrupted in (False, True):
         densifier = ADC(max_gaussians=500, cap="curve", start=500, stop=3000)
@@ -173,7 +172,7 @@ def test_state_survives_saving() -> None:
     assert sum(event is not None for _, event in plain) == 2
 
 
-def test_threshold_strictness() -> None:
+def test_a_gradient_at_the_threshold_grows_only_if_it_is_inclusive() -> None:
     counts = {}
     for inclusive in (True, False):
         densifier = ADC(threshold_inclusive=inclusive, gradient_threshold=2.5e-4)
@@ -182,24 +181,24 @@ def test_threshold_strictness() -> None:
         densifier.begin(trainable.values.detach(), DensifyContext(4.0))
         densifier.statistics["gradient_sum"][:] = torch.tensor(2.5e-4)
         densifier.statistics["visible_count"][:] = 1
-        # as float32 holds it
+        # the threshold, rounded to float32 like the gradient
         densifier.gradient_threshold = float(densifier.statistics["gradient_sum"][0])
         counts[inclusive] = densifier.refine(600, trainable, generator()).cloned
     assert counts == {True: 1, False: 0}
 
 
 @pytest.mark.parametrize("rule", ["relocate", "add"])
-def test_mcmc_begins_the_moments_of_all_six_tensors_anew_at_the_sources(rule: str) -> None:
+def test_mcmc_zeroes_the_moments_of_all_six_tensors_at_the_sources(rule: str) -> None:
     densifier, trainable = mcmc_state(max_gaussians=60, growth=0.5)
     for tensor in trainable.values.tensors().values():
         tensor.grad = torch.ones_like(tensor)
     trainable.optimizer_step()
     if rule == "add":
-        trainable.values.opacity_logits.data[:10] = -1.0  # nobody is dead
+        trainable.values.opacity_logits.data[:10] = -1.0  # none is dead
     before = trainable.values.opacity_logits.detach().clone()
     densifier.refine(600, trainable, generator(0))
     after = trainable.values.opacity_logits.detach()
-    count = 30 if rule == "relocate" else 40  # who lived stands first, in order
+    count = 30 if rule == "relocate" else 40  # the living come first, in order
     sources = (after[:count] != before[40 - count :]).numpy()
     assert 0 < sources.sum() < count
     for name, state in trainable.adam.items():
@@ -210,8 +209,8 @@ def test_mcmc_begins_the_moments_of_all_six_tensors_anew_at_the_sources(rule: st
             assert is_zero[count:].all(), name
 
 
-def test_mcmc_shares_an_opacity_among_fifty_at_most() -> None:
-    """The authors clamp the number of copies to 50, though their table of binomials has 51 rows."""
+def test_mcmc_shares_an_opacity_among_at_most_fifty_copies() -> None:
+    """The authors limit the number to 50, although their table of binomials has 51 rows."""
     densifier, trainable = mcmc_state(2, max_gaussians=200, growth=50.0)
     trainable.values.opacity_logits.data[:] = torch.tensor([-4.0, 8.0])
     opacity = float(trainable.values.opacities[1].detach())
@@ -232,15 +231,15 @@ def test_mcmc_shares_an_opacity_among_fifty_at_most() -> None:
         (MRNF, "opacity_decay", 1),
     ],
 )
-def test_values_that_would_empty_or_fill_the_memory_are_refused(
+def test_values_that_would_fill_the_memory_or_remove_all_opacity_are_refused(
     kind: type, setting: str, value: int
 ) -> None:
     with pytest.raises(InputError, match=rf"densify\.{setting} must be"):
         kind(**{setting: value})
 
 
-def test_mrnf_takes_an_empty_model() -> None:
-    """A decay that took all of it: the trainer then says that no Gaussian was left."""
+def test_mrnf_accepts_an_empty_model() -> None:
+    """If decay has removed all Gaussians, the trainer reports that none is left."""
     densifier, rng = MRNF(), generator()
     gaussians = trained(random_gaussians(3, seed=1), 1.0)
     densifier.begin(gaussians.values, DensifyContext(1.0))

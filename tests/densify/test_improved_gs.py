@@ -30,9 +30,10 @@ from tests.gaussians.helpers import random_gaussians
 
 
 def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[restatement.Row]:
-    """d = 0.45: centres at 3 d s along the longest axis.
+    """Replace Gaussians with a gradient of at least 0.0008 by two halves along the longest axis.
 
-    That axis times 0.55, the others times sqrt(1 - 0.2025).
+    With d = 0.45, the centres are 3 d s from the parent's. The longest axis is multiplied by 0.55,
+    the others by sqrt(1 - 0.2025).
     """
     chosen = [i for i in range(len(rows)) if mean_gradient[i] >= 0.0008]
     children = []
@@ -53,7 +54,7 @@ def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[resta
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(3))
-def test_long_axis_round(seed: int, step: int) -> None:
+def test_a_round_of_long_axis_matches_the_restatement(seed: int, step: int) -> None:
     densifier = LongAxis(gradient="absolute", gradient_threshold=0.0008)
     trainable, _ = prepared(densifier, seed)
     gradient = np.random.default_rng(seed).uniform(0, 0.0016, len(trainable))
@@ -74,10 +75,10 @@ def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
-def test_the_edge_aware_score_of_each_gaussian(step: int, views: int) -> None:
-    """The mean over the views drawn, each over its own mean.
+def test_edge_aware_scores_match_the_restatement(step: int, views: int) -> None:
+    """A score is the mean over the drawn views, each normalised by its own mean.
 
-    400 iterations after the first two resets, over all.
+    400 iterations after the first two resets, all views are used.
     """
     densifier = EdgeAware(score_views=2)
     trainable, _ = started(densifier, step)
@@ -89,7 +90,7 @@ def test_the_edge_aware_score_of_each_gaussian(step: int, views: int) -> None:
     )
 
 
-def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candidates() -> None:
+def test_in_the_last_500_iterations_the_score_is_the_gradient_and_the_threshold_is_lower() -> None:
     densifier = EdgeAware(gradient_threshold=3e-4)
     trainable, gradient = started(densifier, 0)
     for step, threshold in ((14_500, 3e-4), (14_600, 2e-4)):
@@ -99,15 +100,15 @@ def test_in_the_last_500_iterations_the_score_is_the_gradient_and_more_are_candi
     full = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT)
     trainable, _ = started(full, 0)
     over, _ = full.candidates(at(14_600, trainable))
-    np.testing.assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold stays
+    np.testing.assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold is not lowered
 
 
 @pytest.mark.parametrize("step", [600, 3100, 14_900])
 @pytest.mark.parametrize("seed", range(2))
-def test_edge_aware_round(seed: int, step: int) -> None:
-    """Who is drawn becomes two halves along the longest axis.
+def test_a_round_of_edge_aware_matches_the_restatement(seed: int, step: int) -> None:
+    """Drawn Gaussians are replaced by halves along the longest axis.
 
-    The faint go but in the last round, the huge stay.
+    Faint Gaussians are pruned except in the last round; huge ones are kept.
     """
     densifier = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT + 9, cap="hard")
     trainable, gradient = started(densifier, seed)
@@ -133,7 +134,7 @@ def test_edge_aware_round(seed: int, step: int) -> None:
     assert event.balances()
 
 
-def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> None:
+def test_a_candidate_that_covers_no_edge_is_not_split_even_if_there_is_room() -> None:
     densifier = EdgeAware(
         gradient_threshold=1e-9, max_gaussians=10 * COUNT, cap="hard", prune_opacity=0.0
     )
@@ -146,10 +147,10 @@ def test_a_candidate_that_covers_no_edge_is_not_split_though_there_is_room() -> 
 
 
 @pytest.mark.parametrize("room", [0, 9])
-def test_where_nothing_can_grow_no_view_is_rendered(
+def test_no_view_is_rendered_if_nothing_can_grow(
     room: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without room all candidates are told as blocked; without candidates none is."""
+    """Without room, all candidates count as blocked; without candidates, none does."""
     densifier = EdgeAware(max_gaussians=COUNT + room, cap="hard")
     trainable, _ = started(densifier, 0)
     monkeypatch.delattr(EdgeAware, "scores")
@@ -160,13 +161,13 @@ def test_where_nothing_can_grow_no_view_is_rendered(
     assert blocked == candidates.sum()
 
 
-def test_the_growth_control_is_a_root() -> None:
+def test_the_root_cap_rises_with_the_square_root_of_the_progress() -> None:
     densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
     trainable, _ = started(densifier, 0)
     rng = generator()
     allowed = [densifier.allowance(at(step, trainable)) for step in (600, 7500, 14_500, 14_900)]
     assert allowed == [int(10_000 * np.sqrt(x)) - COUNT for x in (100 / 14_000, 0.5, 1, 1)]
-    # shorter than the closing rounds
+    # a window shorter than the closing rounds
     short = EdgeAware(max_gaussians=1000, start=100, stop=400, interval=100)
     assert [short.limit(step) for step in (150, 200, 300)] == [707, 1000, 1000]
     densifier.max_gaussians = COUNT
@@ -176,16 +177,17 @@ def test_the_growth_control_is_a_root() -> None:
     assert event.blocked_by_cap > 0
 
 
-def test_the_prunings_of_the_schedule() -> None:
-    """At iteration 300 below .02.
+def test_edge_aware_prunes_once_early_and_after_two_resets() -> None:
+    """At iteration 300, opacities below 0.02 are pruned.
 
-    At 3,300 and 6,300, after the round, the faintest fifth; resets go to .05.
+    At 3,300 and 6,300, the faintest fifth is pruned after the round. Resets lower opacities to
+    0.05.
     """
     densifier, events = EdgeAware(max_gaussians=60), {}
     for step in (299, 300, 3000, 3200, 3300, 6300, 9300, 12_300, 15_300):
         trainable, _ = prepared(densifier, 2)
         rows = to_rows(trainable)
-        densifier.statistics["gradient_sum"].zero_()  # nobody grows
+        densifier.statistics["gradient_sum"].zero_()  # nothing grows
         event = events[step] = densifier.refine(step, trainable, generator())
         if step == 3000:
             assert max(opacity(row) for row in to_rows(trainable)) == pytest.approx(0.05)
@@ -202,9 +204,9 @@ def test_the_prunings_of_the_schedule() -> None:
     assert [step for step, event in events.items() if event is None] == [299, 15_300]
 
 
-def test_gradients_are_gathered_from_iteration_500_on() -> None:
+def test_edge_aware_gathers_gradients_after_iteration_500() -> None:
     densifier = EdgeAware()
-    trainable, _ = prepared(densifier, 0)  # shows it iterations 1 to 3
+    trainable, _ = prepared(densifier, 0)  # observes iterations 1 to 3
     observe(densifier, trainable, np.random.default_rng(0), 500)
     assert not densifier.statistics["visible_count"].any()
     observe(densifier, trainable, np.random.default_rng(0), 501)
@@ -233,8 +235,8 @@ def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> f
 @pytest.mark.parametrize(
     ("step", "soft"), [(15_001, True), (15_951, True), (16_001, False), (22_951, False)]
 )
-def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
-    """Against the formula and its central differences, also through the divisor."""
+def test_the_pressure_and_its_gradient_match_the_formula(step: int, soft: bool) -> None:
+    """Central differences show that the gradient also flows through the divisor."""
     densifier, gaussians = begun(max_gaussians=20)
     densifier.step = step - 1
     gaussians = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
@@ -250,10 +252,11 @@ def test_the_pressure_and_its_gradient(step: int, soft: bool) -> None:
 
 
 @pytest.mark.parametrize("sinks", [0.0, 2.0])
-def test_the_weight_follows_an_aim_that_falls_to_nothing(sinks: float) -> None:
-    """The authors' schedule by iterations, for opacities that stay once the aim is set.
+def test_the_weight_follows_an_aim_that_falls_to_zero(sinks: float) -> None:
+    """The schedule of the authors, iteration by iteration, for constant opacities.
 
-    Where they sank, the weight falls first, rests while the aim passes, and rises.
+    If opacities sink once after the aim is set, the weight first falls, then stays while the aim
+    passes the opacity, then rises.
     """
     densifier, gaussians = begun(max_gaussians=20)
     last = float(gaussians.opacities.sort(descending=True).values[19])
@@ -290,7 +293,7 @@ def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, pl
     )
 
 
-def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
+def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget() -> None:
     densifier = GNS(max_gaussians=40)
     trainable, _ = started(densifier, 0)
     rng = generator(0)
@@ -298,8 +301,8 @@ def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
     assert densifier.refine(15_000, trainable, rng) is not None  # the learning rate
     assert trainable.adam["opacity_logits"].rate == pytest.approx(4 * 0.05)
     assert densifier.refine(15_050, trainable, rng) is None
-    assert densifier.refine(15_950, trainable, rng) is None  # nobody is pruned yet
-    trainable.values.opacity_logits.data[:10] = -8.0  # .0003
+    assert densifier.refine(15_950, trainable, rng) is None  # nothing is pruned yet
+    trainable.values.opacity_logits.data[:10] = -8.0  # opacity 0.0003
     event = densifier.refine(16_000, trainable, rng)
     assert (event.pruned_opacity, event.after) == (10, COUNT - 10)
     trainable.values.opacity_logits.data[:9] = -8.0
@@ -321,7 +324,7 @@ def test_it_grows_to_three_times_the_budget_and_selects_down_to_it() -> None:
     assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
 
 
-def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(
+def test_at_the_end_of_the_pressure_the_excess_is_removed_at_random(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     densifier = GNS(max_gaussians=20)
@@ -335,7 +338,7 @@ def test_at_the_end_of_its_time_the_budget_is_met_whatever_the_opacities(
     )
 
 
-def test_a_selection_that_has_met_its_budget_warns_of_nothing(
+def test_a_selection_close_to_its_budget_logs_no_warning(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     densifier = GNS(max_gaussians=COUNT - 1)
@@ -344,7 +347,7 @@ def test_a_selection_that_has_met_its_budget_warns_of_nothing(
     assert caplog.text == ""
 
 
-def test_the_pressure_of_the_shortest_window_lasts_a_round() -> None:
+def test_the_pressure_lasts_at_least_one_round() -> None:
     shortest = GNS(start=0, stop=3, interval=1, pressure_length=1e-3)
     shortest.begin(random_gaussians(3), DensifyContext(1.0))
     assert (shortest.pressure_interval, shortest.pressure_time) == (1, 1)
@@ -354,7 +357,7 @@ def test_the_pressure_of_the_shortest_window_lasts_a_round() -> None:
     assert [usual.in_first_part(step) for step in (15_999, 16_000)] == [True, False]
 
 
-def test_the_selection_survives_saving() -> None:
+def test_the_selection_continues_after_saving_and_loading() -> None:
     densifier, gaussians = begun(max_gaussians=20)
     for step in range(15_000, 15_200):
         densifier.regularizer(gaussians)
@@ -370,7 +373,7 @@ def test_the_selection_survives_saving() -> None:
     assert twin.weight == densifier.weight != 2e-4
 
 
-def test_the_rate_of_a_parameter_is_kept_in_its_state() -> None:
+def test_the_learning_rate_of_a_parameter_is_saved() -> None:
     trainable = trained(random_gaussians(4), 1.0)
     trainable.set_rate("opacity_logits", 0.2)
     again = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 1.0)

@@ -25,14 +25,14 @@ from tests.gaussians.helpers import random_gaussians
 def drawn(
     rows: list[restatement.Row], weights: list[float], count: int, rng: torch.Generator
 ) -> list[int]:
-    """With replacement: where uniform numbers fall on the line of all weights."""
+    """Draw with replacement: the places where uniform numbers fall in the cumulative weights."""
     line = np.cumsum(weights)
     numbers = torch.rand(count, generator=rng, dtype=torch.float64).numpy() * line[-1]
     return [next(i for i in range(len(rows)) if line[i] > number) for number in numbers]
 
 
 def shared(row: restatement.Row, copies: int) -> restatement.Row:
-    """eq. 9: opacity and scale of each of so many, and moments that begin anew."""
+    """Opacity and scale of each of ``copies`` copies (eq. 9), with moments of zero."""
     o, n = opacity(row), min(copies, 50)
     new = 1 - (1 - o) ** (1 / n)
     total = sum(
@@ -63,7 +63,7 @@ def prepared(count: int, seed: int, **options: Any) -> tuple[MCMC, TrainableGaus
 
 @pytest.mark.parametrize("growth", [0.05, 0.5])
 @pytest.mark.parametrize("seed", range(3))
-def test_mcmc_round(seed: int, growth: float) -> None:
+def test_a_round_of_mcmc_matches_the_restatement(seed: int, growth: float) -> None:
     densifier, trainable = prepared(40, seed, max_gaussians=55, growth=growth)
     rows = to_rows(trainable)
     event = densifier.refine(600, trainable, generator(seed))
@@ -71,7 +71,7 @@ def test_mcmc_round(seed: int, growth: float) -> None:
     dead = [opacity(row) <= 0.005 for row in rows]
     weights = [0.0 if gone else opacity(row) for row, gone in zip(rows, dead, strict=True)]
     sources = drawn(rows, weights, sum(dead), rng)
-    place = np.cumsum([not gone for gone in dead]) - 1  # of the living, when the dead have gone
+    place = np.cumsum([not gone for gone in dead]) - 1  # index of each living one among the living
     alive = [row for row, gone in zip(rows, dead, strict=True) if not gone]
     rows = with_copies(alive, [int(place[i]) for i in sources])
     more = min(int((1 + growth) * 40), 55) - 40
@@ -80,8 +80,8 @@ def test_mcmc_round(seed: int, growth: float) -> None:
     assert (event.relocated, event.added) == (10, more)
 
 
-def test_mcmc_noise() -> None:
-    """R S S R^T times a normal draw, sigmoid(-100 (o - .005)), 5e5 and the means' rate."""
+def test_the_noise_of_mcmc_matches_the_formula() -> None:
+    """R S S R^T times a normal draw, sigmoid(-100 (o - 0.005)), 5e5 and the means' rate."""
     densifier, trainable = prepared(40, 1)
     trainable.values.opacity_logits.data.copy_(torch.linspace(-9, 2, 40))
     trainable.set_step(1)
@@ -96,9 +96,9 @@ def test_mcmc_noise() -> None:
 
 
 def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views.
+    """The largest refine weight [N] over the three views, and the factor for edges [N].
 
-    The largest refine weight, and 1 + .25 times the mean edge score over its median.
+    The factor is 1 + 0.25 times the mean edge score divided by its median.
     """
     room, weight, edge = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
@@ -111,9 +111,9 @@ def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 
 
 def half(row: restatement.Row, side: int) -> restatement.Row:
-    """Half a standard deviation to a side along the longest axis, which is halved.
+    """A child, moved by half a standard deviation along the longest axis to one ``side``.
 
-    The others times .85.
+    The scale of that axis is halved; the other scales are multiplied by 0.85.
     """
     scales = np.exp(row["log_scales"])
     longest = int(np.argmax(scales))
@@ -143,14 +143,14 @@ def placed(densifier: MRNF, seed: int) -> TrainableGaussians:
 def begun(densifier: MRNF, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
     trainable = placed(densifier, seed)
     trainable.values.opacity_logits.data[:6] = -7.0  # transparent
-    trainable.values.means.data[6, 0] = 1e6  # out of the scene
+    trainable.values.means.data[6, 0] = 1e6  # far outside the scene
     seen = np.random.default_rng(seed).random(COUNT) < 0.8
     densifier.statistics = {"seen": torch.from_numpy(seen)}
     return trainable, seen
 
 
 @pytest.mark.parametrize(("step", "room"), [(600, 1000), (600, 5), (600, 0), (16_000, 1000)])
-def test_mrnf_round(step: int, room: int) -> None:
+def test_a_round_of_mrnf_matches_the_restatement(step: int, room: int) -> None:
     densifier = MRNF(max_gaussians=COUNT + room, growth_share=0.4, growth_threshold=0.5)
     trainable, seen = begun(densifier, 1)
     rows, (weight, guidance) = to_rows(trainable), scored(trainable.values.detach())
@@ -181,7 +181,7 @@ def test_mrnf_round(step: int, room: int) -> None:
     assert not densifier.statistics["seen"].any()
 
 
-def test_a_replacement_is_no_growth() -> None:
+def test_without_growth_mrnf_still_replaces_pruned_gaussians() -> None:
     densifier = MRNF(growth_share=0.0)
     trainable, _ = begun(densifier, 1)
     event = densifier.refine(600, trainable, generator(0))
@@ -206,14 +206,14 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
     assert single.values.opacity_logits.tolist() == pytest.approx(expected, abs=0.1)
 
 
-def test_rounds_and_their_end() -> None:
+def test_mrnf_has_a_round_every_200_iterations_until_its_window_ends() -> None:
     densifier = MRNF(stop=1000)
     trainable, _ = begun(densifier, 0)
     due = [step for step in range(1, 1100) if densifier.refine(step, trainable, generator())]
     assert due == [200, 400, 600, 800]
 
 
-def test_what_leaves_the_scene_by_size_goes() -> None:
+def test_gaussians_larger_than_the_scene_or_too_small_are_pruned() -> None:
     densifier = MRNF()
     trainable = placed(densifier, 0)
     half_size = bounds(trainable.values.means.detach())[1]
@@ -230,7 +230,7 @@ def test_the_bounds_hold_the_central_four_fifths() -> None:
     assert (half_size, middle) == (400, 80)
 
 
-def test_noise_moves_the_faint_that_were_seen_and_is_limited() -> None:
+def test_the_noise_of_mrnf_moves_faint_seen_gaussians_and_is_limited() -> None:
     densifier, gaussians = MRNF(), random_gaussians(300, 2)
     gaussians.opacity_logits[:100], gaussians.opacity_logits[100:] = -9.0, 2.0
     trainable = trained(gaussians)

@@ -1,7 +1,4 @@
-"""Whole refinement rounds against the slow restatement.
-
-The same Gaussians, optimiser moments and events.
-"""
+"""Whole refinement rounds give the Gaussians, moments and events of the slow restatement."""
 
 from __future__ import annotations
 
@@ -21,9 +18,9 @@ from tests.gaussians.helpers import random_gaussians
 def prepared(
     densifier: Densifier, seed: int, count: int = 60
 ) -> tuple[TrainableGaussians, np.ndarray]:
-    """Gaussians with uneven Adam moments, and three observed iterations.
+    """Gaussians with different Adam moments, after three observed iterations.
 
-    Also the mean gradient of each.
+    Also returns the mean gradient of each.
     """
     rng = np.random.default_rng(seed)
     gaussians = random_gaussians(count, seed, log_scale=(-6.0, 0.3))
@@ -45,10 +42,7 @@ def prepared(
 def observe(
     densifier: Densifier, trainable: TrainableGaussians, rng: np.random.Generator, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Show the densifier a made-up render.
-
-    Returns the gradients [N, 2] and radii [N] of the points in it.
-    """
+    """Let the densifier observe a made-up render; return its gradients [N, 2] and radii [N]."""
     count = len(trainable)
     gradient, radii = rng.exponential(2e-4, (count, 2)), rng.integers(0, 3, count)
     probe = torch.zeros(count, 3, 3, dtype=torch.float64, requires_grad=True)
@@ -60,7 +54,7 @@ def observe(
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("step", [600, 3100])
-def test_adc_round(seed: int, step: int) -> None:
+def test_a_round_of_adc_matches_the_restatement(seed: int, step: int) -> None:
     trainable, gradient = prepared(densifier := ADC(), seed)
     real = Round(densifier, trainable, step, seed)
     noise = noise_of(seed, real.event.split_gradient)
@@ -69,8 +63,8 @@ def test_adc_round(seed: int, step: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_absgrad_round(seed: int) -> None:
-    """As ADC, of another gradient at four times the threshold."""
+def test_a_round_by_absolute_gradient_matches_the_restatement(seed: int) -> None:
+    """It is a round of ADC with another gradient and four times the threshold."""
     densifier = ADC(gradient="absolute", gradient_threshold=0.0008)
     trainable, gradient = prepared(densifier, seed)
     densifier.statistics["gradient_sum"] *= 4
@@ -80,8 +74,8 @@ def test_absgrad_round(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_revised_round(seed: int) -> None:
-    """As ADC, but clone, original and children of a split each have 1 - sqrt(1 - o)."""
+def test_a_round_with_revised_opacity_matches_the_restatement(seed: int) -> None:
+    """Clone, original and children of a split each have the opacity 1 - sqrt(1 - o)."""
     trainable, gradient = prepared(densifier := ADC(revised_opacity=True), seed)
     real = Round(densifier, trainable, 600, seed)
     noise = noise_of(seed, real.event.split_gradient)
@@ -93,8 +87,7 @@ def test_revised_round(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_volumetric_once_round(seed: int) -> None:
-    """Who would be over the threshold again is left alone."""
+def test_gaussians_whose_children_would_be_split_again_are_not_split(seed: int) -> None:
     densifier = Volumetric(volume_threshold=0.03, split_isotropic=False)
     trainable, gradient = prepared(densifier, seed, count=200)
     real = Round(densifier, trainable, 600, seed)
@@ -112,7 +105,7 @@ def test_volumetric_once_round(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("step", [600, 3100])
-def test_volumetric_round(seed: int, step: int) -> None:
+def test_a_volumetric_round_matches_the_restatement(seed: int, step: int) -> None:
     trainable, gradient = prepared(densifier := Volumetric(volume_threshold=0.03), seed)
     real = Round(densifier, trainable, step, seed)
     noise = noise_of(seed, real.event.split_gradient, real.event.split_volume)
@@ -130,7 +123,7 @@ def test_volumes_may_be_split_before_the_gradient_rule(seed: int, step: int) -> 
     noise = noise_of(seed, real.event.split_volume, real.event.split_gradient)
     sizes = np.exp([row["log_scales"] for row in real.rows])
     rows = restatement.volume_growth(real.rows, 0.03, noise, real.counts)
-    # nobody has seen the children yet
+    # the children have no gradient yet
     staying = gradient[4 / 3 * np.pi * sizes.prod(-1) <= 0.03]
     gradient = np.concatenate([staying, np.zeros(len(rows) - len(staying))])
     real.check(restatement.adc_growth(rows, gradient, EXTENT, noise, real.counts))
@@ -171,10 +164,10 @@ SWITCHES: dict[str, list[object]] = {
 
 
 @pytest.mark.parametrize("seed", range(80))
-def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> None:
-    """A pairwise-covering draw of the switches.
+def test_any_combination_of_options_runs_through_several_rounds(seed: int) -> None:
+    """Options are drawn at random; all seeds together cover all pairs.
 
-    Every round balances, stays finite and keeps to an exact cap.
+    Every event balances, values stay finite, and an exact cap is kept.
     """
     rng = np.random.default_rng(seed)
     options = {name: values[rng.integers(len(values))] for name, values in SWITCHES.items()}
@@ -195,7 +188,7 @@ def test_any_combination_of_switches_goes_through_several_rounds(seed: int) -> N
             assert len(trainable) <= 90
 
 
-def test_optimizer_step_is_skipped_after_a_refinement_and_goes_on_after_it() -> None:
+def test_the_optimizer_skips_the_step_after_a_refinement_and_takes_the_next() -> None:
     densifier = ADC()
     trainable, _ = prepared(densifier, 0)
     for tensor in trainable.values.tensors().values():
@@ -222,11 +215,8 @@ def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
     assert trainable.adam["means"].first.all()
 
 
-def test_refinements_of_the_paper_schedule() -> None:
-    """144 refinements at 600, 700 ...
-
-    14,900 and resets at 3000, 6000, 9000, 12,000 (the baseline's own count).
-    """
+def test_adc_refines_and_resets_at_the_iterations_of_3dgs() -> None:
+    """144 refinements from 600 to 14,900, and resets at 3000, 6000, 9000 and 12,000."""
     densifier = ADC()
     gaussians = random_gaussians(4)
     gaussians = Gaussians(**gaussians.tensors())
@@ -243,7 +233,7 @@ def test_refinements_of_the_paper_schedule() -> None:
     assert resets == [3000, 6000, 9000, 12_000]
 
 
-def test_windows_are_those_of_a_training() -> None:
+def test_default_windows_agree_with_the_options_of_training() -> None:
     window = TrainConfig.densify_start, TrainConfig.densify_stop, TrainConfig.densify_interval
     assert (ADC.start, ADC.stop, ADC.interval) == window == (500, 15_000, 100)
     assert (MCMC.start, MCMC.stop, MCMC.interval) == (500, TrainConfig.mcmc_stop, 100)
@@ -252,7 +242,7 @@ def test_windows_are_those_of_a_training() -> None:
 
 
 @pytest.mark.parametrize(("white", "resets"), [(False, [3000, 6000]), (True, [500, 3000, 6000])])
-def test_before_a_white_background_opacities_are_reset_at_the_start_too(
+def test_with_a_white_background_opacities_are_also_reset_at_the_start(
     white: bool, resets: list[int]
 ) -> None:
     densifier = ADC(stop=9000)
@@ -265,7 +255,7 @@ def test_before_a_white_background_opacities_are_reset_at_the_start_too(
     assert found == resets
 
 
-def test_gradients_and_radii_are_gathered_until_the_window_ends() -> None:
+def test_adc_gathers_gradients_and_radii_until_the_window_ends() -> None:
     densifier = ADC(stop=800)
     densifier.begin(random_gaussians(3), DensifyContext(EXTENT))
     shown = [(1, [4, 0, 2]), (799, [3, 5, 2]), (800, [9, 9, 9])]  # the last is after the window
@@ -277,7 +267,7 @@ def test_gradients_and_radii_are_gathered_until_the_window_ends() -> None:
     assert densifier.mean_gradient().tolist() == [5.0] * 3
 
 
-def test_the_huge_are_pruned_after_the_first_reset_by_size_or_by_radius() -> None:
+def test_huge_gaussians_are_pruned_by_size_or_radius_after_the_first_reset() -> None:
     densifier = ADC(prune_screen_radius=20.0)
     densifier.begin(random_gaussians(4), DensifyContext(EXTENT))
     densifier.statistics["max_radii"] = torch.tensor([0, 20, 21, 0], dtype=torch.int32)

@@ -1,4 +1,4 @@
-"""FastGS against a restatement: counts of bad pixels, who grows, who is drawn to go."""
+"""FastGS against a restatement: counts of bad pixels, growth, and the draw for pruning."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from tests.densify.test_scores import BLACK, COUNT, Room, alphas, started
 
 
 def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Over the three views.
+    """The count and the pruning score [N] of each Gaussian over the three views.
 
-    The mean number of bad pixels, rounded down, and loss times number, scaled to [0, 1].
+    The count is the mean number of bad pixels, rounded down. The score is the sum of loss times
+    number, scaled to [0, 1].
     """
     room, total, weighted = Room(), np.zeros(COUNT), np.zeros(COUNT)
     for view, camera in enumerate(room.cameras):
@@ -46,7 +47,7 @@ def ready(densifier: FastGS, seed: int) -> tuple[TrainableGaussians, np.ndarray,
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(2))
-def test_fast_gs_round(seed: int, step: int) -> None:
+def test_a_round_of_fast_gs_matches_the_restatement(seed: int, step: int) -> None:
     densifier = FastGS(error_threshold=0.5)
     trainable, signed, absolute = ready(densifier, seed)
     trainable.values.opacity_logits.data[20:40] = -9.0
@@ -57,7 +58,7 @@ def test_fast_gs_round(seed: int, step: int) -> None:
     torch.randperm(3, generator=rng)  # the views: all three
     several = counts[0] > 5
     assert 5 < several.sum() < COUNT - 5
-    splits = several & (absolute >= 1.2e-3)  # .0004 in the restatement of AbsGS
+    splits = several & (absolute >= 1.2e-3)  # the restatement of AbsGS has 0.0004
     clones = several & (signed >= 2e-4)
     large = np.array([np.exp(row["log_scales"]).max() > 0.001 * EXTENT for row in rows])
     drawn = torch.randn(
@@ -90,10 +91,10 @@ def test_fast_gs_round(seed: int, step: int) -> None:
     assert event.balances()
 
 
-def test_after_the_window_the_rather_faint_and_those_that_err_most_go() -> None:
+def test_after_the_window_low_opacities_and_high_scores_are_pruned() -> None:
     densifier = FastGS()
     trainable, _, _ = ready(densifier, 1)
-    trainable.values.opacity_logits.data[:5] = -3.0  # .047
+    trainable.values.opacity_logits.data[:5] = -3.0  # opacity 0.047
     rows, (_, scores) = to_rows(trainable), counted(trainable.values.detach(), 0.1)
     event = densifier.refine(18_000, trainable, generator())
     opacities = np.array([opacity(row) for row in rows])
@@ -107,7 +108,7 @@ def test_after_the_window_the_rather_faint_and_those_that_err_most_go() -> None:
     assert densifier.refine(16_500, trainable, generator()) is None
 
 
-def test_without_bad_pixels_nobody_grows() -> None:
+def test_without_bad_pixels_nothing_grows() -> None:
     densifier = FastGS(error_threshold=1.0)
     trainable, _, _ = ready(densifier, 0)
     event = densifier.refine(600, trainable, generator())
@@ -125,6 +126,6 @@ def test_without_bad_pixels_nobody_grows() -> None:
 
 
 @pytest.mark.parametrize("cap", ["freeze", "governor"])
-def test_caps_that_ask_where_a_round_leads_are_refused(cap: str) -> None:
+def test_caps_that_need_a_forecast_are_refused(cap: str) -> None:
     with pytest.raises(InputError, match=r"densify\.cap must be"):
         FastGS(cap=cap)  # type: ignore[arg-type]

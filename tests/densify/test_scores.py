@@ -1,4 +1,4 @@
-"""Edge maps, sums over pixels, draws, and two densifiers, against restatements in numpy."""
+"""Edge maps, sums over pixels, random draws and Taming 3DGS against restatements in numpy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BLACK = torch.zeros(3, dtype=torch.float64)
 
 
 class Room:
-    """Three views of made-up photographs; float64."""
+    """Training views: three made-up photographs, rendered in float64."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
@@ -69,7 +69,7 @@ class Room:
 
 
 def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """alpha T of every Gaussian in every pixel, [N, H, W], taken apart from all sums."""
+    """alpha T of every Gaussian in every pixel, [N, H, W]."""
     found = np.zeros((len(gaussians), HEIGHT, WIDTH))
     projected = project(gaussians, camera)
     for tile, members in bin_gaussians(projected.depths, *tile_rectangles(projected, camera), 3):
@@ -88,7 +88,7 @@ def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def find_edges(image: torch.Tensor) -> np.ndarray:
-    """By Pillow, with the outermost pixels taken away."""
+    """The edges that Pillow finds, with 0 in the outermost pixels."""
     edges = np.array(
         Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64
     )
@@ -106,7 +106,7 @@ def over_median(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_edges_are_those_that_pillow_finds(seed: int) -> None:
+def test_edge_maps_match_pillow(seed: int) -> None:
     image = torch.from_numpy(np.random.default_rng(seed).integers(0, 256, (13, 17, 3), np.uint8))
     image[3:9, 4:12] = torch.tensor([200, 30, 90], dtype=torch.uint8)
     np.testing.assert_allclose(edge_map(image), find_edges(image), atol=1e-6)
@@ -126,7 +126,7 @@ def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
     assert (expected[:, 0] > 0).sum() > 30
 
 
-def test_by_median_leaves_out_what_is_not_positive() -> None:
+def test_median_and_mean_ignore_values_that_are_not_positive() -> None:
     values = torch.tensor([0.0, -3.0, float("nan"), 4.0, 2.0, 8.0, 6.0])
     assert by_median(values).tolist() == [0, 0, 0, 1, 0.5, 2, 1.5]
     assert by_mean(values).tolist() == pytest.approx([0, 0, 0, 0.8, 0.4, 1.6, 1.2])
@@ -135,9 +135,9 @@ def test_by_median_leaves_out_what_is_not_positive() -> None:
 
 
 def test_draws_are_in_proportion_and_without_replacement() -> None:
-    """Of four, two are drawn.
+    """Two of four are drawn: first one by score, then another of the rest by score.
 
-    The chance of each pair is known (first one, then one of the rest, by score).
+    So the chance of each is known.
     """
     scores = torch.tensor([9.0, 1.0, 2.0, 0.0, 3.0])
     candidates = torch.tensor([False, True, True, True, True])
@@ -154,7 +154,7 @@ def test_draws_are_in_proportion_and_without_replacement() -> None:
     assert counts[0] == counts[3] == 0
     for i, chance in expected.items():
         assert abs(counts[i] / rounds - chance) < 5 * np.sqrt(chance * (1 - chance) / rounds)
-    # the one without a score comes last
+    # the candidate with score 0 comes last
     assert draw(candidates, scores, 4, rng).tolist() == candidates.tolist()
     assert draw(candidates, scores, 9, rng).tolist() == candidates.tolist()
     assert not draw(candidates, scores, 0, rng).any()
@@ -209,7 +209,7 @@ def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.nda
     return total + 1e-6
 
 
-def test_the_taming_score_of_each_gaussian() -> None:
+def test_taming_scores_match_the_restatement() -> None:
     densifier = Taming(max_gaussians=COUNT)
     trainable, gradient = started(densifier, 0)
     densifier.score(at(600, trainable))
@@ -218,8 +218,7 @@ def test_the_taming_score_of_each_gaussian() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_taming_round(seed: int) -> None:
-    """Scores, shares and draws; the other rules against the restatement of ADC."""
+def test_a_round_of_taming_matches_the_restatement(seed: int) -> None:
     densifier = Taming(max_gaussians=COUNT + 12, cap="hard")
     trainable, gradient = started(densifier, seed)
     rows, expected = to_rows(trainable), {}
@@ -247,7 +246,7 @@ def test_taming_round(seed: int) -> None:
     assert event.balances()
 
 
-def test_taming_lets_a_single_candidate_grow() -> None:
+def test_taming_grows_a_single_candidate() -> None:
     densifier = Taming(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
     trainable, _ = started(densifier, 0)
     densifier.statistics["gradient_sum"][1:] = 0.0
@@ -263,7 +262,7 @@ def with_forty_faint() -> tuple[Taming, TrainableGaussians]:
     return densifier, trainable
 
 
-def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
+def test_taming_prunes_at_most_half_of_the_faint_and_only_in_its_first_rounds() -> None:
     for step in (600, 500 + 2700, 600 + 2700):
         densifier, trainable = with_forty_faint()
         event = densifier.refine(step, trainable, generator())
@@ -274,8 +273,8 @@ def test_taming_prunes_half_as_many_draws_as_there_are_to_prune() -> None:
     assert not densifier.statistics["score"].any()
 
 
-def test_taming_prunes_rather_those_of_low_score() -> None:
-    """Of forty faint ones the twenty of the highest score are drawn a million times as rarely."""
+def test_taming_prunes_gaussians_with_low_scores_more_often() -> None:
+    """Of forty faint Gaussians, the twenty with high scores are drawn a million times as rarely."""
     densifier, trainable = with_forty_faint()
     densifier.statistics["score"] = torch.where(torch.arange(COUNT) % 2 == 0, 1e6, 1.0)
     refinement = at(600, trainable, 0)
@@ -289,8 +288,8 @@ def test_taming_prunes_rather_those_of_low_score() -> None:
     assert refinement.event.pruned_opacity == len(gone) <= 20
 
 
-def test_taming_prunes_nobody_without_a_score() -> None:
-    """Children of the same round have none."""
+def test_taming_does_not_prune_gaussians_without_a_score() -> None:
+    """Children of the same round have no score."""
     densifier, trainable = with_forty_faint()
     densifier.statistics["score"] = torch.where(torch.arange(COUNT) < 40, 0.0, 1e-3)
     refinement = at(600, trainable, 0)
@@ -319,7 +318,7 @@ def test_caps_without_a_limit_are_refused(kind: type[ADC], cap: str) -> None:
         kind(cap=cap)  # type: ignore[arg-type]
 
 
-def test_without_views_it_says_what_is_missing() -> None:
+def test_a_densifier_that_needs_views_names_the_missing_setting() -> None:
     densifier = Taming(max_gaussians=COUNT)
     trainable, _ = started(densifier, 0)
     densifier.context = DensifyContext(EXTENT)

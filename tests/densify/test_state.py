@@ -1,7 +1,4 @@
-"""What the base keeps for every densifier.
-
-Statistics that follow edits, lineage, saving, and the table of causes.
-"""
+"""The state of every densifier: statistics that follow edits, lineage, saving, and causes."""
 
 from __future__ import annotations
 
@@ -39,7 +36,7 @@ def started(densifier: Densifier, count: int) -> Refinement:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_statistics_and_lineage_follow_every_edit(seed: int) -> None:
-    """Against a list of rows that is edited one Gaussian at a time."""
+    """The test edits a list of rows in the same way, one Gaussian at a time."""
     draw = np.random.default_rng(seed)
     densifier = Gathering()
     refinement = started(densifier, 12)
@@ -87,7 +84,7 @@ def test_statistics_are_saved_and_reset() -> None:
     assert saved["statistics"]["sum"].tolist() == [3.0] * 5  # a copy
 
 
-def test_the_count_of_the_initial_cloud_survives_growth_and_saving() -> None:
+def test_the_initial_count_does_not_change_by_growth_or_saving() -> None:
     densifier = Gathering()
     refinement = started(densifier, 4)
     densifier.clone(refinement, torch.tensor([True, False, True, True]))
@@ -126,14 +123,14 @@ def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order: str, 
     assert densifier.rules(refinement) == []
 
 
-def test_every_cause_has_words_and_a_colour_of_its_own() -> None:
+def test_every_cause_has_its_own_words_and_colour() -> None:
     assert [cause.value for cause in Cause] == list(range(len(Cause)))  # lineage.npz indexes by it
     for first, second in combinations(Cause, 2):
         assert first.words != second.words
         assert np.abs(np.subtract(first.color, second.color)).max() > 60
 
 
-def test_an_event_that_does_not_add_up_says_so() -> None:
+def test_an_event_balances_only_if_its_counts_add_up() -> None:
     event = RefineEvent(
         600,
         before=10,
@@ -178,7 +175,7 @@ def test_normal_draws_on_another_device_are_seeded_by_the_generator(
     assert seeds == [int(torch.randint(2**62, (1,), generator=again))]
 
 
-def test_a_keyword_that_no_base_takes_is_refused() -> None:
+def test_an_unknown_class_keyword_is_refused() -> None:
     with pytest.raises(TypeError, match="keyword"):
 
         class Wrong(Densifier, wrong=1): ...
@@ -186,11 +183,8 @@ def test_a_keyword_that_no_base_takes_is_refused() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_state_goes_through_a_checkpoint_on_a_gpu() -> None:
-    """As the trainer does: everything in the checkpoint is moved to the GPU.
-
-    The lineage belongs on the CPU.
-    """
+def test_state_can_be_loaded_from_a_checkpoint_on_a_gpu() -> None:
+    """The trainer moves everything in a checkpoint to the GPU, but the lineage stays on the CPU."""
     cuda = torch.device("cuda")
     densifier = Gathering()
     gaussians = trained(random_gaussians(6).map(lambda tensor: tensor.to(cuda)), 1.0)

@@ -1,4 +1,4 @@
-"""The paper's formulas on cases computed by hand, and the thresholds and budgets around them."""
+"""The formulas of the volume rule on cases computed by hand, and its thresholds and budgets."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ def scales(*rows: tuple[float, float, float]) -> torch.Tensor:
     return torch.tensor(rows, dtype=torch.float64).log()
 
 
-def test_isotropic_keeps_its_size() -> None:
+def test_children_of_an_isotropic_gaussian_have_its_size() -> None:
     sphere = scales((0.2, 0.2, 0.2))
     assert math.exp(log_volume(sphere)) == pytest.approx(4 / 3 * math.pi * 0.008)
     assert math.exp(log_condition(sphere)) == pytest.approx(1)
     torch.testing.assert_close(Volumetric().child_log_scales(sphere), sphere)
 
 
-def test_elongated_by_two() -> None:
-    """Axes 2, 1, 1: kappa = 4.
+def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand() -> None:
+    """A Gaussian with axes 2, 1, 1 has kappa = 4.
 
-    Eigenvalues 4, 1, 1 become 1, 1/4, 1/4; axes 1, 1/2, 1/2; volume divided by 8 = 4^1.5.
+    Its eigenvalues 4, 1, 1 become 1, 1/4, 1/4, so its axes become 1, 1/2, 1/2. The volume is
+    divided by 8 = 4^1.5.
     """
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
@@ -43,7 +44,7 @@ def test_elongated_by_two() -> None:
     )
 
 
-def test_needle_vanishes_and_the_limit_prevents_it() -> None:
+def test_children_of_a_needle_vanish_unless_kappa_is_limited() -> None:
     needle = scales((1.0, 1e-3, 1e-3))  # kappa = 1e6
     torch.testing.assert_close(
         Volumetric().child_log_scales(needle).exp(),
@@ -76,8 +77,7 @@ def radius_of(volume: float) -> float:
     return (volume * 3 / (4 * math.pi)) ** (1 / 3)
 
 
-def test_threshold_is_exclusive() -> None:
-    """Exactly at the threshold is not above it."""
+def test_only_a_volume_above_the_threshold_is_split() -> None:
     radius = radius_of(0.03)
     at = torch.full((1, 3), math.log(radius), dtype=torch.float64)
     exact = math.exp(float(log_volume(at)[0]))
@@ -87,7 +87,7 @@ def test_threshold_is_exclusive() -> None:
     assert event.split_volume == 1
 
 
-def test_isotropic_gaussians_are_split_again_and_again() -> None:
+def test_isotropic_gaussians_are_split_in_every_round() -> None:
     trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=5)
     assert [event.isotropic_resplit for event in events] == [1, 2, 4, 8, 16]
     assert len(trainable) == 32
@@ -101,11 +101,13 @@ def test_isotropic_gaussians_are_split_again_and_again() -> None:
     trainable, events, _ = run_volume_rule(
         scales((0.5, 0.5, 0.5)), rounds=8, max_gaussians=11, cap="soft"
     )
-    assert len(trainable) == 16  # 8 is not over the cap, so one more round; 16 is
+    assert (
+        len(trainable) == 16
+    )  # a round that starts with 8 exceeds the cap, the next does not grow
 
 
 def test_vanishing_needles_are_reported() -> None:
-    # children of the disc have axes of 1e-4 and less
+    # children of the disc have axes of at most 1e-4
     shapes = scales((30.0, 30.0, 1e-4), (0.6, 0.5, 0.4))
     _, (event,), _ = run_volume_rule(shapes)
     assert event.split_volume == 2
@@ -114,7 +116,7 @@ def test_vanishing_needles_are_reported() -> None:
     assert event.vanished == 0
 
 
-def test_threshold_modes() -> None:
+def test_each_threshold_mode_selects_the_expected_number() -> None:
     log_scales = random_gaussians(1000, log_scale=(-4, 0)).log_scales
     volumes = log_volume(log_scales)
 
@@ -135,7 +137,7 @@ def test_threshold_modes() -> None:
     assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
 
 
-def test_auto_threshold_does_not_depend_on_the_gauge() -> None:
+def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene() -> None:
     log_scales = random_gaussians(500, log_scale=(-5, 0.5)).log_scales
     log_scales[:5] += 2.5
     counts = {
@@ -164,7 +166,7 @@ def test_bad_values_name_their_key(options: dict[str, object], key: str) -> None
         Volumetric(**options)  # type: ignore[arg-type]
 
 
-def test_admit_takes_the_best_and_says_how_many_it_refused() -> None:
+def test_admit_chooses_the_best_scores_and_counts_the_refused() -> None:
     candidates = torch.tensor([True, True, False, True])
     score = torch.tensor([1.0, 3.0, 9.0, 3.0])
     admitted, refused = admit(candidates, score, 1, 2)
@@ -189,11 +191,13 @@ def test_admit_takes_the_best_and_says_how_many_it_refused() -> None:
         (12, 10, "governor", None),
     ],
 )
-def test_limits_by_hand(count: int, most: int | None, cap: str, allowed: int | None) -> None:
+def test_each_cap_allows_the_expected_number(
+    count: int, most: int | None, cap: str, allowed: int | None
+) -> None:
     assert allowance(count, most, cap) == allowed  # type: ignore[arg-type]
 
 
-def test_the_volume_rule_can_have_a_window_of_its_own() -> None:
+def test_the_volume_rule_can_have_its_own_window() -> None:
     own = Volumetric(volume_start=1000, volume_stop=2000, volume_interval=200)
     assert [step for step in range(100, 3000, 100) if own.volume_due(step)] == [
         1200,
@@ -206,5 +210,5 @@ def test_the_volume_rule_can_have_a_window_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("mode", ["quantile", "auto"])
-def test_no_volume_is_above_the_threshold_of_none(mode: str) -> None:
+def test_the_threshold_of_an_empty_set_is_infinite(mode: str) -> None:
     assert Volumetric(threshold_mode=mode).log_threshold(torch.zeros(0)) == math.inf  # type: ignore[arg-type]

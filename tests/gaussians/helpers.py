@@ -37,8 +37,7 @@ def random_gaussians(
 def front_camera(
     width: int = 40, height: int = 30, shift: tuple[float, float] = (0.0, 0.0)
 ) -> Camera:
-    """A camera at the origin, slightly turned, that looks along z; ``shift`` moves the principal
-    point (px)."""
+    """A camera near the origin, looking nearly along z; ``shift`` moves the principal point, px."""
     angle = 0.05
     rotation = np.array(
         [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -48,6 +47,6 @@ def front_camera(
 
 
 def differences(one: Gaussians, other: Gaussians) -> list[str]:
-    """The parameters in which two sets are not equal to the last bit."""
+    """The names of the parameters whose bits differ between two sets."""
     others = other.tensors()
     return [name for name, value in one.tensors().items() if not torch.equal(value, others[name])]

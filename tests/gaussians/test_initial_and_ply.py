@@ -1,4 +1,4 @@
-"""From cloud to Gaussians, and the PLY layout that viewers read."""
+"""Gaussians made from point clouds, and PLY files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def save(table: np.ndarray, path: Path) -> Path:
     return path
 
 
-def test_first_scales_are_the_root_mean_square_of_three_neighbours() -> None:
+def test_initial_scales_are_the_root_mean_square_distance_to_three_neighbours() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]])
     colors = np.array([[255, 0, 127]] * 5, dtype=np.uint8)
     gaussians = gaussians_from_cloud(points, colors)
@@ -47,12 +47,12 @@ def test_first_scales_are_the_root_mean_square_of_three_neighbours() -> None:
     assert shown.tolist() == pytest.approx([1.0, 0.0, 127 / 255], abs=1e-6)
 
 
-def test_coincident_points_keep_a_floor() -> None:
+def test_scales_of_coincident_points_have_a_lower_limit() -> None:
     gaussians = gaussians_from_cloud(np.zeros((6, 3)), np.zeros((6, 3), dtype=np.uint8))
     assert float(gaussians.scales[0, 0]) == pytest.approx(math.sqrt(1e-7), rel=1e-5)
 
 
-def test_too_few_or_broken_points_are_refused() -> None:
+def test_too_few_points_and_points_that_are_not_finite_are_refused() -> None:
     with pytest.raises(InputError, match="3 points"):
         gaussians_from_cloud(np.zeros((3, 3)), np.zeros((3, 3), dtype=np.uint8))
     with pytest.raises(InputError, match="not finite"):
@@ -66,8 +66,8 @@ def test_ply_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_an_element_without_rows_is_no_damage(tmp_path: Path, text: bool) -> None:
-    """As programs that know meshes write them: no faces."""
+def test_an_element_without_rows_is_accepted(tmp_path: Path, text: bool) -> None:
+    """Programs for meshes write an element for faces even if there are none."""
     table = table_of(tmp_path / "a.ply")
     faces = PlyElement.describe(np.empty(0, dtype=[("a", "i4"), ("b", "i4"), ("c", "i4")]), "face")
     vertex = PlyElement.describe(table, "vertex")
@@ -77,7 +77,7 @@ def test_an_element_without_rows_is_no_damage(tmp_path: Path, text: bool) -> Non
 
 
 def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
-    """Read with plyfile alone: names, order, and harmonics stored channel by channel."""
+    """plyfile finds the names in 3DGS's order, and harmonics stored channel by channel."""
     gaussians = random_gaussians(4, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "a.ply")
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
@@ -93,7 +93,7 @@ def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
     assert vertex["rot_0"][1] == gaussians.quaternions[1, 0].item()  # w first
 
 
-def test_a_torn_ply_is_named(tmp_path: Path) -> None:
+def test_an_error_names_a_ply_that_is_cut_short(tmp_path: Path) -> None:
     write_ply(random_gaussians(20, dtype=torch.float32), tmp_path / "a.ply")
     whole = (tmp_path / "a.ply").read_bytes()
     for length in (10, 400, len(whole) // 2, len(whole) - 1):
@@ -103,7 +103,7 @@ def test_a_torn_ply_is_named(tmp_path: Path) -> None:
 
 
 def rewritten(path: Path, old: bytes, new: bytes) -> Path:
-    """The file with another header."""
+    """Replace ``old``, which occurs once in the file, by ``new``; return the path."""
     content = path.read_bytes()
     assert content.count(old) == 1
     path.write_bytes(content.replace(old, new))
@@ -111,8 +111,10 @@ def rewritten(path: Path, old: bytes, new: bytes) -> Path:
 
 
 @pytest.mark.parametrize(("text", "bytes_each"), [(False, 61 * 4 + 8), (True, 62 * 2)])
-def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes_each: int) -> None:
-    """Its header alone says so: of 62 numbers, one double; in text two characters each or more."""
+def test_a_header_that_promises_more_than_the_file_has_is_refused(
+    tmp_path: Path, text: bool, bytes_each: int
+) -> None:
+    """The header promises 62 numbers each, one of them a double; in text, at least two bytes."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
     path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
     many = b"comment a property float b\nelement vertex 1000000"
@@ -137,7 +139,7 @@ def test_more_than_a_file_can_hold_is_not_read(tmp_path: Path, text: bool, bytes
         (b"property float f_rest_43\nproperty float f_rest_44\n", b"", "it has 43"),
     ],
 )
-def test_harmonics_that_would_shift_are_refused(
+def test_harmonics_with_a_wrong_name_or_number_are_refused(
     tmp_path: Path, old: bytes, new: bytes, said: str
 ) -> None:
     write_ply(random_gaussians(4, seed=2), tmp_path / "a.ply")
@@ -145,15 +147,15 @@ def test_harmonics_that_would_shift_are_refused(
         read_ply(rewritten(tmp_path / "a.ply", old, new))
 
 
-def test_coefficients_become_colours_again() -> None:
+def test_rgb_to_dc_and_dc_to_rgb_are_inverse() -> None:
     assert dc_to_rgb(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0.5, 0.78209479])
     rgb = torch.tensor([0.0, 0.25, 1.0])
     assert dc_to_rgb(rgb_to_dc(rgb)).tolist() == pytest.approx(rgb.tolist())
 
 
 @pytest.mark.parametrize(("degree", "stored"), [(0, 0), (1, 3), (2, 8), (3, 15)])
-def test_fewer_harmonics_are_read(tmp_path: Path, degree: int, stored: int) -> None:
-    """Other programs store fewer coefficients, channel by channel; the others are zero."""
+def test_a_ply_of_a_lower_degree_is_read(tmp_path: Path, degree: int, stored: int) -> None:
+    """Some programs store fewer coefficients, channel by channel; the missing ones become zero."""
     table = table_of(tmp_path / "a.ply")
     gaussians = read_ply(tmp_path / "a.ply")
     places = [15 * channel + k for channel in range(3) for k in range(stored)]  # in the full table
@@ -177,7 +179,7 @@ SIZES |= dict.fromkeys(["double", "float64"], 8)
 
 
 @pytest.mark.parametrize("kind", SIZES)
-def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> None:
+def test_the_promised_size_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.ply"
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex 1000\nproperty {kind} "
@@ -191,7 +193,7 @@ def test_a_promise_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> N
     check_ply(path)
 
 
-def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
+def test_the_end_of_a_header_is_searched_in_the_first_64_kib(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     for length, fits in ((60_000, True), (66_000, False)):
         comment = f"comment {'x' * length}"
@@ -208,7 +210,7 @@ def test_a_header_without_end_is_not_searched_for_long(tmp_path: Path) -> None:
         ("rot_", 0.0, r"a Gaussian has a rotation of \(0, 0, 0, 0\)"),
     ],
 )
-def test_values_without_meaning_are_named(
+def test_an_error_names_the_property_with_an_invalid_value(
     tmp_path: Path, name: str, value: float, said: str
 ) -> None:
     table = table_of(tmp_path / "a.ply")
@@ -288,7 +290,7 @@ def test_opacities_of_zero_and_one_are_read(
         read_ply(save(table, tmp_path / "b.ply"))
 
 
-def test_what_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
+def test_a_value_beyond_float32_is_refused(tmp_path: Path) -> None:
     table = with_type(table_of(tmp_path / "a.ply"), "x", "f8")
     table["x"][1] = 1e300
     said = r"x is not a finite number everywhere: it is 1e\+300 in row 1"
@@ -306,7 +308,7 @@ def test_what_float32_cannot_hold_is_refused(tmp_path: Path) -> None:
         ("opacity", (0.0, 1.01), ""),
     ],
 )
-def test_values_that_look_activated_are_warned_of(
+def test_values_that_look_activated_cause_a_warning(
     tmp_path: Path, prefix, values, said: str, caplog
 ) -> None:
     table = table_of(tmp_path / "a.ply")
@@ -322,7 +324,7 @@ def test_values_that_look_activated_are_warned_of(
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 10.0, 1000.0, 1e5])
 @pytest.mark.parametrize("activated", [False, True])
-def test_lengths_are_told_from_logarithms_in_any_unit(
+def test_lengths_and_logarithms_are_told_apart_in_any_unit(
     tmp_path: Path, unit: float, activated: bool, caplog
 ) -> None:
     random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Optimiser surgery and updates, against torch's own Adam."""
+"""Steps and edits of trainable Gaussians, compared with torch's own Adam."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def step_with(trainable: TrainableGaussians, seed: int, **arguments: object) -> 
     trainable.optimizer_step(**arguments)  # type: ignore[arg-type]
 
 
-def test_steps_are_those_of_torchs_adam() -> None:
-    """To the last bit; a parameter without a gradient stays as it is and counts no step."""
+def test_steps_equal_those_of_torchs_adam() -> None:
+    """The bits are equal. A parameter without a gradient does not change and counts no step."""
     ours = TrainableGaussians(random_gaussians(6, dtype=torch.float32), LearningRates(), 2.0)
     theirs = ours.values.map(lambda tensor: tensor.detach().clone().requires_grad_(True)).tensors()
     groups = [{"params": [tensor], "lr": ours.adam[name].rate} for name, tensor in theirs.items()]
@@ -39,7 +39,7 @@ def test_steps_are_those_of_torchs_adam() -> None:
     assert not differences(ours.values, Gaussians(**theirs))
 
 
-def test_visible_only_equals_adam_where_all_are_visible() -> None:
+def test_a_step_with_all_gaussians_visible_equals_a_plain_step() -> None:
     whole = TrainableGaussians(random_gaussians(6), LearningRates(), 2.0)
     sparse = TrainableGaussians(random_gaussians(6), LearningRates(), 2.0)
     for seed in range(4):
@@ -50,7 +50,7 @@ def test_visible_only_equals_adam_where_all_are_visible() -> None:
     )
 
 
-def test_visible_only_leaves_the_others_alone() -> None:
+def test_a_step_of_visible_gaussians_does_not_change_the_others() -> None:
     trainable = TrainableGaussians(random_gaussians(6), LearningRates(), 2.0)
     before = trainable.values.detach().map(torch.clone)
     visible = torch.tensor([True, False, True, False, False, True])
@@ -59,8 +59,8 @@ def test_visible_only_leaves_the_others_alone() -> None:
     assert not torch.isclose(trainable.values.means[visible], before.means[visible]).any()
 
 
-def test_idle_harmonics_count_their_steps_as_adam_would() -> None:
-    """Degree 0, then degree 3: the same as Adam with zero gradients in the first steps."""
+def test_steps_at_degree_0_count_for_the_unused_harmonics() -> None:
+    """Steps at degree 0, then at degree 3, equal Adam with zero gradients in the first steps."""
     quick = TrainableGaussians(random_gaussians(5), LearningRates(), 1.0)
     plain = TrainableGaussians(random_gaussians(5), LearningRates(), 1.0)
     for seed in range(3):
@@ -87,7 +87,7 @@ def test_load_restores_parameters_and_moments() -> None:
     assert not differences(trainable.values, copy.values)
 
 
-def test_all_tensors_stay_in_step() -> None:
+def test_moments_have_the_shapes_of_their_parameters_after_an_edit() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     trainable.edit(append=random_gaussians(3, seed=1))
     tensors = trainable.values.tensors()
@@ -102,7 +102,7 @@ def test_values_of_another_shape_are_refused() -> None:
         trainable.overwrite("opacity_logits", torch.zeros(4, dtype=torch.float64))
 
 
-def test_overwriting_forgets_the_moments_where_it_is_said() -> None:
+def test_overwriting_clears_the_moments_of_the_chosen_gaussians() -> None:
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
     means = trainable.adam["means"]
@@ -122,7 +122,7 @@ def test_overwriting_forgets_the_moments_where_it_is_said() -> None:
     assert means.step == 1
 
 
-def test_an_edit_keeps_moments_and_appends_zeros() -> None:
+def test_an_edit_keeps_old_moments_and_appends_zeros() -> None:
     trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 3.0)
     step_with(trainable, 0)
     old, added = trainable.values.detach(), random_gaussians(2, seed=1)

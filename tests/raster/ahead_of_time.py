@@ -1,6 +1,6 @@
-"""Compile Triton kernels for GPUs that are not there, and read what came out.
+"""Compile Triton kernels, with the arguments of real launches, for GPUs that are not present.
 
-The arguments are those of real launches.
+Then read registers, spills and loops from the machine code.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BINARIES = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
 
 @dataclass(frozen=True)
 class Launch:
-    """One launch of a kernel: its arguments, and of these the constants and options."""
+    """One launch of a kernel: its positional arguments, and the named ones, constants and options."""
 
     kernel: JITFunction
     arguments: tuple[Any, ...]
@@ -40,7 +40,7 @@ class Launch:
 
 @contextmanager
 def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
-    """Inside, kernels are not run; their launches end up in the list."""
+    """Within this context, kernels do not run; their launches are appended to the list."""
     launches: list[Launch] = []
 
     def run(kernel: JITFunction, *arguments: Any, grid: Any, warmup: bool, **named: Any) -> None:
@@ -52,9 +52,9 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
 
 
 def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, ...]:
-    """What Triton compiles a kernel anew for.
+    """The properties for which Triton compiles a kernel separately.
 
-    Types, constants, and which arguments are divisible by 16.
+    These are types, constants, and which arguments are divisible by 16.
     """
     backend = make_backend(GPUTarget("cuda", compute_capability, 32))
     binder = create_function_from_signature(launch.kernel.signature, launch.kernel.params, backend)
@@ -64,7 +64,7 @@ def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, .
 
 @dataclass(frozen=True)
 class Compiled:
-    """What the assembler says of a kernel."""
+    """What the assembler reports about a kernel."""
 
     registers: int
     spilled: int  # bytes of local memory
@@ -101,7 +101,7 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
 
 
 def innermost_loops(text: str) -> dict[str, int]:
-    """Instructions between a label and a branch back to it, of the innermost loops."""
+    """For each innermost loop, the number of instructions from its label to the branch back."""
     labels: dict[str, int] = {}
     loops: dict[str, tuple[int, int]] = {}
     place = 0
@@ -112,7 +112,7 @@ def innermost_loops(text: str) -> dict[str, int]:
             place += 1
             if (jump := re.search(r"\bBRA(?:\.U)?\b.*`\((\.L_\w+)\)", line)) and jump[1] in labels:
                 loops[jump[1]] = (labels[jump[1]], place)
-    # not the trap at the end
+    # leave out the trap at the end, a jump to itself
     loops = {label: (begin, end) for label, (begin, end) in loops.items() if end - begin > 1}
     inner = {
         label

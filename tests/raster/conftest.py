@@ -1,6 +1,6 @@
-"""Triton's interpreter runs kernels on the CPU.
+"""Triton's interpreter, which runs kernels on the CPU.
 
-It must be chosen before Triton is imported, so the tests that use it run in processes of their own,
+It must be chosen before Triton is imported. So the tests that use it run in separate processes,
 which ``test_triton.py`` starts.
 """
 
@@ -13,10 +13,7 @@ INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def interpreter_fault(triton: str, numpy: str) -> str | None:
-    """Why the interpreter of this version of Triton fails with this version of NumPy.
-
-    None if it works.
-    """
+    """Why this Triton's interpreter fails with this NumPy; None if it works."""
     versions = [
         tuple(int(number) for number in re.findall(r"\d+", text)[:2]) for text in (triton, numpy)
     ]
@@ -34,8 +31,8 @@ collect_ignore = [] if INTERPRETING else ["test_triton_interpreted.py"]
 def _patch_once() -> None:
     """Let the interpreter patch Triton's language once for each module.
 
-    Otherwise it does at every call of a function. That is most of its time; the patches of calls
-    within a kernel are never taken back anyway.
+    It would patch it at every call of a function, which takes most of its time. The patches made by
+    calls within a kernel are never undone anyway.
     """
     from triton.runtime import interpreter
 

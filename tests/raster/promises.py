@@ -1,4 +1,4 @@
-"""What gsbench's own executors promise beyond the contract: each function is a test of one of them."""
+"""Tests of what gsbench's own executors promise beyond the contract, one function per promise."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ BLACK = torch.zeros(3)
 
 @dataclass(frozen=True)
 class Subject:
-    """An executor, and scenes of two sizes that it renders in a moment."""
+    """An executor, and scenes of two sizes that it renders quickly."""
 
     make: Callable[[], Any]
     small: Case
     large: Case
-    needle_limit: float  # of the largest gradient of a needle
+    needle_limit: float  # largest error, as a fraction of the largest gradient of a needle
 
 
 def bits(output: RenderOutput, gradients: dict[str, Tensor]) -> list[bytes]:
@@ -44,7 +44,10 @@ def leaves(case: Case) -> Gaussians:
 def both(
     subject: Subject, gaussians: Gaussians, case: Case, degree: int, name: str
 ) -> list[Tensor]:
-    """The gradients by the parameter ``name`` of the squared image, and those of the reference."""
+    """The gradients by the parameter ``name``: those of the executor, and those of the reference.
+
+    The loss is the sum of the squared image.
+    """
     found = []
     for rasterizer, dtype in (
         (subject.make(), torch.float32),
@@ -74,7 +77,7 @@ def equal_depths_are_blended_in_the_order_of_the_index(subject: Subject) -> None
 
 
 def needles_keep_their_gradients(subject: Subject) -> None:
-    """Long thin Gaussians: the determinant of their covariance loses its digits as ac - b^2."""
+    """A needle is long and thin: computed as ac - b^2, its determinant loses all digits."""
     case = Case(50, 40, 20, sh_degree=0)
     gaussians = case.gaussians()
     gaussians.log_scales[:, 0] = 0.5
@@ -85,7 +88,10 @@ def needles_keep_their_gradients(subject: Subject) -> None:
 
 
 def turning_a_ball_has_no_gradient(subject: Subject) -> None:
-    """Not even a rounding error, which Adam would turn into a full step; what is nearly one has."""
+    """A sphere has no gradient, not even a rounding error, which Adam would scale to a full step.
+
+    A Gaussian that is almost a sphere has one.
+    """
     for stretch in (0.0, 0.01):
         gaussians = subject.large.gaussians()
         gaussians.log_scales[:] = gaussians.log_scales[:, :1]
@@ -96,7 +102,7 @@ def turning_a_ball_has_no_gradient(subject: Subject) -> None:
 
 
 def renders_may_be_differentiated_late_and_twice(subject: Subject) -> None:
-    """Two graphs at once, in the opposite order, and one of them twice."""
+    """Two graphs exist at once; the second is differentiated first, the first one twice."""
     rasterizer, cases = subject.make(), (subject.small, subject.large)
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
     parameters = [leaves(case) for case in cases]

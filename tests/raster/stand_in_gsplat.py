@@ -1,9 +1,9 @@
 """A stand-in for the module ``gsplat`` on the CPU.
 
-The signatures, shapes and habits that the CUDA code of 1.5 has; `head` is that of 1.6. Projection,
-crossings and harmonics are gsplat's own torch definitions. Compositing is written here in plain
-torch, behind an autograd function that saves the means it was given and leaves the absolute
-gradient on them, as gsplat's does.
+It has the signatures, shapes and side effects of the CUDA code of 1.5; `head` has those of 1.6.
+Projection, intersections and harmonics are gsplat's own torch definitions. Compositing is written
+here in plain torch. Its autograd function saves the means that it was given and stores the absolute
+gradient as an attribute of them, as gsplat's does.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from gsplat.cuda import _torch_impl as definitions
 from torch import Tensor
 
 ALPHA_MIN = 1 / 255
-ALPHA_MAX = 0.999  # gsplat 1.5; no gradient passes
+ALPHA_MAX = 0.999  # gsplat 1.5; the clamp blocks the gradient
 TRANSMITTANCE_MIN = 1e-4
 
-calls: list[str] = []  # what was called, by name
-# to every compositing in an autograd graph: dead when the graph is freed
+calls: list[str] = []  # the names of the functions that were called
+# one for every compositing in an autograd graph; it is dead when the graph is freed
 graphs: list[weakref.ref] = []
 
 
@@ -79,10 +79,7 @@ def spherical_harmonics(
 
 
 def head() -> SimpleNamespace:
-    """gsplat 1.6, as far as it differs.
-
-    Its harmonics find the camera in the pose, and check every shape.
-    """
+    """The stand-in for gsplat 1.6, whose harmonics take poses and check every shape."""
 
     def spherical_harmonics(
         degrees_to_use: int,
@@ -130,9 +127,9 @@ def rasterize_to_pixels(
 
 
 class _Rasterize(torch.autograd.Function):
-    """The picture again in ``backward``, with a copy of the means for each pixel.
+    """Composites again in ``backward``, with a copy of the means for each pixel.
 
-    Absolute values can be summed.
+    So the absolute values of each pixel's gradient can be summed.
     """
 
     @staticmethod
@@ -173,9 +170,9 @@ def _composite(
     backgrounds: Tensor,
     settings: Any,
 ) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-    """Image [1, H, W, 3] and alpha [1, H, W, 1].
+    """Return image [1, H, W, 3], alpha [1, H, W, 1] and a list with two tensors for each tile.
 
-    And a tile's Gaussians [K] with copies of their means [P, K, 2].
+    These are the tile's Gaussians [K] and copies of their means for each pixel [P, K, 2].
     """
     width, height, tile, offsets, members, _ = settings
     bounds = [*offsets.flatten().tolist(), len(members)]

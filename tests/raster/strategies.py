@@ -1,7 +1,4 @@
-"""Hypothesis strategies of extreme scenes.
-
-The seeded ones of ordinary Gaussians are ``gsbench.raster.contract``'s.
-"""
+"""Hypothesis strategies for extreme scenes; ordinary ones are in ``gsbench.raster.contract``."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ _LOGITS = st.sampled_from([-100.0, -6.0, 0.0, 5.0, 100.0])
 
 @st.composite
 def extreme_gaussians(draw: st.DrawFn) -> Gaussians:
-    """0 to 6 float32 Gaussians of any size behind, on, or far outside the frustum."""
+    """0 to 6 float32 Gaussians of any size, in, behind or far outside the frustum."""
     count = draw(st.integers(0, 6))
 
     def rows(elements: st.SearchStrategy[float], width: int) -> Tensor:

@@ -1,7 +1,4 @@
-"""Every executor that runs here against the float64 reference.
-
-The contract of ``gsbench.raster.base``.
-"""
+"""The contract of ``gsbench.raster.base``: every executor that runs here against the reference."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera
 from tests.raster.strategies import extreme_gaussians
 
-PEERS = ("gsplat",)  # to measure against: their departures from the contract stand in their modules
+PEERS = ("gsplat",)  # only for comparison; their modules list their departures from the contract
 
 
 def _home(executor: Executor) -> str:
@@ -62,19 +59,19 @@ def rasterizer(request: pytest.FixtureRequest, device: str) -> Rasterizer:
 def test_values_and_gradients_match_the_reference(
     rasterizer: Rasterizer, device: str, case: Case
 ) -> None:
-    """`departures` has tests of its own, which plant each kind of departure."""
+    """Tests in ``test_executors.py`` show that `departures` finds each kind of departure."""
     assert departures(rasterizer, device, (case,)) == []
     expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
     assert torch.equal(output.radii.cpu(), expected.radii)
     assert expected.visible.sum() > case.count / 4
-    for name, reference in references.items():  # or else nothing was compared
+    for name, reference in references.items():  # if all were 0, nothing was compared
         if not (name == "sh_rest" and case.sh_degree == 0):
             assert reference.abs().max() > 0, name
     assert find_executor(rasterizer.name).has_footprint
     assert offers(rasterizer.name, "has_splitting_matrix")
     assert "splitting_probe" in gradients
-    # asked after the backward pass
+    # here the footprint is computed after the backward pass
     assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE
 
 
@@ -89,7 +86,7 @@ def test_unused_coefficients_get_a_zero_gradient(rasterizer: Rasterizer, device:
 def test_the_gradient_of_the_colour_clamp_passes_at_zero(
     rasterizer: Rasterizer, device: str
 ) -> None:
-    """max(0, SH + 0.5): no gradient below 0, all of it at exactly 0."""
+    """The colour is max(0, SH + 0.5): no gradient below 0, the whole gradient at exactly 0."""
     gaussians = _one_gaussian(device)
     c0 = math.sqrt(1 / (4 * math.pi))
     at_zero = np.float32(-0.5) / np.float32(c0)
@@ -110,7 +107,9 @@ def test_the_gradient_of_the_colour_clamp_passes_at_zero(
     assert gradient[0] == pytest.approx(gradient[2].item(), rel=1e-5)
 
 
-def test_nothing_to_see_is_the_background(rasterizer: Rasterizer, device: str) -> None:
+def test_without_visible_gaussians_the_image_is_the_background(
+    rasterizer: Rasterizer, device: str
+) -> None:
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
     for gaussians in (
         _one_gaussian(device, z=-5.0),
@@ -157,7 +156,7 @@ def test_extreme_gaussians_give_finite_results(
     "name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"]
 )
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_values_that_are_not_finite_are_named(
+def test_an_error_names_the_parameter_that_is_not_finite(
     rasterizer: Rasterizer, device: str, name: str, value: float
 ) -> None:
     gaussians = _one_gaussian(device)
@@ -166,7 +165,7 @@ def test_values_that_are_not_finite_are_named(
         rasterizer.render(gaussians, _camera(16, 16), 3, torch.zeros(3, device=device))
 
 
-def test_inputs_that_cannot_be_used_are_named(rasterizer: Rasterizer, device: str) -> None:
+def test_an_error_names_the_input_that_cannot_be_used(rasterizer: Rasterizer, device: str) -> None:
     gaussians, black = _one_gaussian(device), torch.zeros(3, device=device)
     camera = _camera(16, 16)
     for word, view, degree, background in (

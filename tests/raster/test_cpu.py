@@ -1,6 +1,6 @@
 """What the compiled CPU rasterizer promises beyond the contract.
 
-The same bits, memory safe to keep, any host.
+Results have the same bits on every run, their memory is not overwritten, and any CPU will do.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ def test_tiles_are_divided_by_their_work(
 
 
 def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndarray:
-    """The largest log2(alpha) of records [R, 16] in squares of side ``size``.
+    """The largest log2(alpha) of records [R, 16] in squares of side ``size``, [R, squares].
 
-    At the mean, or else on an edge.
+    It is at the mean if the square contains it, or else on an edge.
     """
     mean_x, mean_y, shear, curve_t, curve_y, top = (
         records[:, k, None].astype(np.float64) for k in range(6)
@@ -111,8 +111,8 @@ def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndar
     return best
 
 
-def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
-    """All that have a pixel with alpha >= 1/255, and no others, up to a margin for rounding."""
+def test_a_record_is_listed_in_the_tiles_and_blocks_that_its_contour_reaches() -> None:
+    """These have a pixel with alpha >= 1/255; a margin for rounding is allowed."""
     case = Case(96, 64, 150, sh_degree=0, log_scale=-2.5, logit=-3.0)  # faint: no pixel stops
     output = CpuRasterizer(threads=1).render(
         case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
@@ -155,7 +155,7 @@ def test_tiles_and_blocks_are_those_that_a_contour_reaches() -> None:
     spans = integers[:, [layout.TILES_X, layout.TILES_Y]]
     low, high = spans & 0xFFFF, spans >> 16
     in_span = (x >= low[:, :1]) & (x < high[:, :1]) & (y >= low[:, 1:]) & (y < high[:, 1:])
-    narrow = high[:, :1] - low[:, :1] == 1  # not looked at closer
+    narrow = high[:, :1] - low[:, :1] == 1  # one column: all its tiles are listed
     assert (listed <= np.where(narrow, in_span, allowed)).all()
     assert (listed >= (narrow & in_span)).all()
     assert 0.3 < listed.sum() / in_square.sum() < 0.6
@@ -202,7 +202,9 @@ def test_gradients_accumulate() -> None:
     assert torch.equal(own.sh_rest.grad, 2 * once)
 
 
-def test_an_interrupted_backward_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_backward_pass_does_not_change_later_gradients(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for threads in (1, 2):
         rasterizer = CpuRasterizer(threads=threads)
         _, expected = render_with_gradients(rasterizer, CASE, torch.float32)
@@ -218,15 +220,15 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_no_threads_are_refused() -> None:
+def test_zero_threads_are_refused() -> None:
     with pytest.raises(ValueError, match="threads"):
         CpuRasterizer(threads=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cpu", ["generic"])
-def test_hosts_without_wide_vectors(cpu: str, tmp_path: Path) -> None:
-    """Compiled for the plainest CPU of this architecture (SSE2 on x86), in a process of its own."""
+def test_hosts_without_wide_vectors_match_the_reference(cpu: str, tmp_path: Path) -> None:
+    """A separate process compiles for the simplest CPU of this architecture (SSE2 on x86)."""
     script = """
 import sys, torch
 from gsbench.raster.cpu import CpuRasterizer
@@ -270,7 +272,7 @@ def _vector_functions(a, b, out):  # type: ignore[no-untyped-def]
     return simd.mask_bits(mask), simd.lowest_bit(np.uint64(0b101000))
 
 
-def test_vector_functions() -> None:
+def test_vector_functions_match_numpy() -> None:
     generator = np.random.default_rng(0)
     a, b = generator.normal(size=(2, 16)).astype(np.float32)
     out = np.full(96, np.nan, np.float32)
@@ -303,7 +305,7 @@ def _logarithms(x, out):  # type: ignore[no-untyped-def]
     "kind", [types.Array(types.float64, 1, "C"), types.Array(types.float32, 1, "A"), types.intp]
 )
 @pytest.mark.parametrize("name", ["load", "load_numbers", "store", "gather", "scatter"])
-def test_only_contiguous_float32_has_vectors(name: str, kind: types.Type) -> None:
+def test_only_contiguous_float32_arrays_are_accepted(name: str, kind: types.Type) -> None:
     define = getattr(simd, name)._defn
     others = [types.intp] * (define.__code__.co_argcount - 2)
     define(None, types.Array(types.float32, 2, "C"), *others)
@@ -311,7 +313,7 @@ def test_only_contiguous_float32_has_vectors(name: str, kind: types.Type) -> Non
         define(None, kind, *others)
 
 
-def test_logarithms_and_roots_over_their_range() -> None:
+def test_logarithms_and_roots_are_accurate_over_their_range() -> None:
     x = np.exp2(np.linspace(-126, 100, 16 * 4096)).astype(np.float32)
     out = np.empty((2, len(x)), np.float32)
     _logarithms(x, out)
@@ -327,7 +329,7 @@ def _gather_and_scatter(array, indices, out):  # type: ignore[no-untyped-def]
     simd.scatter(array, indices, 3, 2, value)
 
 
-def test_gather_and_scatter() -> None:
+def test_gather_and_scatter_match_numpy_indexing() -> None:
     array = np.arange(60, dtype=np.float32).reshape(20, 3)
     before = array.copy()
     indices = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7])
@@ -353,7 +355,7 @@ def _shuffles(matrix, rest, basis, out, moved):  # type: ignore[no-untyped-def]
     simd.store(out, 128, shuffle.as_integers(simd.load(basis, 0)))
 
 
-def test_shuffles() -> None:
+def test_shuffles_move_each_number_to_its_place() -> None:
     matrix = np.arange(256, dtype=np.float32)
     rest, moved = np.arange(135, dtype=np.float32), np.zeros(135, np.float32)
     basis, out = np.arange(16, dtype=np.float32), np.zeros(144, np.float32)
@@ -370,7 +372,7 @@ def test_shuffles() -> None:
     np.testing.assert_array_equal(integers[128:144], np.arange(16))
 
 
-def test_exp2_over_its_range() -> None:
+def test_exp2_is_accurate_over_its_range() -> None:
     x = np.linspace(-126, 127, 16 * 4096).astype(np.float32)
     out = np.empty_like(x)
 
@@ -383,7 +385,7 @@ def test_exp2_over_its_range() -> None:
     np.testing.assert_allclose(out, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
 
 
-def test_memory_is_used_again() -> None:
+def test_memory_is_reused_when_nothing_refers_to_it() -> None:
     pool = TensorPool()
     first = pool.empty((100, 3))
     address = first.data_ptr()
@@ -403,7 +405,7 @@ def test_memory_is_used_again() -> None:
     assert not arena.take("a", (1000,), np.float32, zero=True).any()
 
 
-def test_memory_that_is_not_used_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unused_memory_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
     pool = TensorPool()
     del (large := [pool.empty((100_000,))])[:]
     assert not large
@@ -419,7 +421,7 @@ def test_memory_that_is_not_used_is_let_go(monkeypatch: pytest.MonkeyPatch) -> N
     assert allocate(10).size == 10
 
 
-def test_a_single_thread_is_that_of_the_caller() -> None:
+def test_a_runner_with_one_thread_uses_the_calling_thread() -> None:
     threads = {}
 
     def note(first: int, past: int) -> None:
@@ -433,7 +435,7 @@ def test_a_single_thread_is_that_of_the_caller() -> None:
     assert threading.get_ident() not in threads.values()
 
 
-def test_after_an_error_nothing_runs_any_more() -> None:
+def test_no_shard_runs_after_an_error_was_raised() -> None:
     second_began, done = threading.Event(), []
 
     def work(first: int, past: int) -> None:
@@ -447,8 +449,8 @@ def test_after_an_error_nothing_runs_any_more() -> None:
     with pytest.raises(ZeroDivisionError):
         ShardRunner(2).run(12, work)
     finished = list(done)
-    assert 1 in finished  # it was waited for
-    assert len(finished) < 11  # the others were called off
+    assert 1 in finished  # the runner waited for it
+    assert len(finished) < 11  # the runner cancelled the others
     time.sleep(0.1)
     assert done == finished
 

@@ -1,7 +1,4 @@
-"""The CPU kernels as machine code for processors that are not here.
-
-Every one compiles, with vector instructions.
-"""
+"""The CPU kernels compile, with vector instructions, for processors that are not present."""
 
 from __future__ import annotations
 
@@ -28,13 +25,13 @@ TARGETS = {  # triple, processor
     "sve": ("aarch64-unknown-linux-gnu", "neoverse-v1"),
     "apple": ("arm64-apple-macosx", "apple-m1"),
 }
-# counting and moving
+# They only count and move numbers.
 FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles", "pair_shards"}
 
 
 @cache
 def kernels() -> dict[str, Any]:
-    """The kernels of a training step and of a footprint, by name, after one such step."""
+    """The kernels of a training step and of a footprint, by name; runs one step to compile them."""
     case = Case(33, 49, 50, sh_degree=3)
     trainable = TrainableGaussians(case.gaussians().map(torch.Tensor.float), LearningRates(), 1.0)
     output = CpuRasterizer(threads=1).render(trainable.values, case.camera(), 3, torch.zeros(3))
@@ -53,7 +50,7 @@ def kernels() -> dict[str, Any]:
 
 @cache
 def intermediate_code(name: str) -> str:
-    """LLVM's code of a kernel, without what says for which processor it is."""
+    """LLVM's code of a kernel, without the lines and attributes that name the processor."""
     function = kernels()[name]
     compiled = numba.njit(nogil=True, error_model="numpy", _nrt=False)(function.py_func)
     compiled.compile(function.signatures[0])

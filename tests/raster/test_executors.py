@@ -1,7 +1,4 @@
-"""The table of executors.
-
-What `raster=` accepts, what `auto` takes, and that nothing else lists them.
-"""
+"""The table of executors: what `raster=` accepts, what `auto` takes, how departures are reported."""
 
 from __future__ import annotations
 
@@ -29,14 +26,14 @@ CPU = torch.device("cpu")
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
-    """Make as if of the executors' packages these were installed, and no others."""
+    """Pretend that ``packages`` are installed, and no other packages of executors."""
     monkeypatch.setattr(
         executors.importlib.util, "find_spec", lambda name: object() if name in packages else None
     )
 
 
 @pytest.mark.parametrize("executor", EXECUTORS, ids=lambda executor: executor.name)
-def test_facts_agree_with_the_class(executor: Executor) -> None:
+def test_the_facts_of_an_executor_agree_with_its_class(executor: Executor) -> None:
     if executor.name == "triton" and not executor.is_installed:
         pytest.skip("Triton has no wheels for this system")
     kind = locate(executor.target, "raster", [])
@@ -49,14 +46,14 @@ def test_every_executor_has_its_file_in_conf() -> None:
     assert {path.stem for path in (conf_dir() / "raster").glob("*.yaml")} == set(executors.names())
 
 
-def test_names_are_the_same_everywhere() -> None:
+def test_the_documents_name_every_executor() -> None:
     root = Path(__file__).resolve().parents[2]
     for document in ("README.md", "docs/rasterizer.md"):
         for name in executors.names():
             assert f"`{name}`" in (root / document).read_text(encoding="utf-8"), (document, name)
 
 
-def test_the_table_loads_no_torch() -> None:
+def test_the_table_does_not_import_torch() -> None:
     code = (
         "import sys, gsbench.raster.executors, gsbench.raster.base; sys.exit('torch' in "
         "sys.modules)"
@@ -64,7 +61,9 @@ def test_the_table_loads_no_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
 
-def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_auto_takes_the_best_installed_executor(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     assert resolve("auto", "cpu").name == "cpu"
     installed(monkeypatch, "gsplat")
     assert resolve("auto", "cuda").name == "gsplat"
@@ -76,7 +75,9 @@ def test_auto(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture)
     assert resolve("auto", "mps").name == "reference"
 
 
-def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_executor_that_cannot_run_is_refused_with_a_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert resolve("reference", "cpu").name == "reference"
     assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
     for name, device, said in (
@@ -94,13 +95,13 @@ def test_what_cannot_run_is_said_with_what_can(monkeypatch: pytest.MonkeyPatch) 
     assert find_executor("gsplat").obstacle("cuda") is not None
 
 
-def test_departures_are_told() -> None:
+def test_departures_lists_errors_and_accepts_missing_options() -> None:
     class Broken(ReferenceRasterizer):
         def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
             raise RuntimeError("no kernel")
 
     class Plain(ReferenceRasterizer):
-        name = "plain"  # and no offers
+        name = "plain"  # not in the table, and without attributes that offer optional outputs
 
     case = CASES[-1]
     assert departures(ReferenceRasterizer(), cases=(case,)) == []
@@ -111,10 +112,10 @@ def test_departures_are_told() -> None:
     ]
 
 
-def test_python_headers_are_looked_for_where_the_usual_scheme_has_them(
+def test_python_headers_are_searched_in_the_usual_scheme(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Debian's own scheme for packages, ``posix_local``, names a folder that has no headers."""
+    """Debian's own scheme, ``posix_local``, names a folder without headers."""
     asked = []
     monkeypatch.setattr(
         executors.sysconfig,
@@ -139,7 +140,7 @@ def test_python_headers_are_looked_for_where_the_usual_scheme_has_them(
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
-def test_a_gpu_that_cannot_be_used_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_says_why_the_gpu_cannot_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("triton")
     monkeypatch.setattr(executors, "missing_tools", list)
     with pytest.raises(InputError, match=r"^Triton cannot start: "):
@@ -149,7 +150,7 @@ def test_a_gpu_that_cannot_be_used_is_explained(monkeypatch: pytest.MonkeyPatch)
         executors.load_driver()
 
 
-def test_settings_are_checked() -> None:
+def test_an_unknown_rasterizer_is_refused() -> None:
     assert RasterConfig(name="cpu").name == "cpu"
     with pytest.raises(
         InputError, match=r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"
@@ -162,7 +163,7 @@ TINY = CASES[-1]
 
 
 class Changed(ReferenceRasterizer):
-    """The reference, with what ``change`` makes of its render of so many Gaussians."""
+    """The reference, with changed outputs: ``change`` gets the number of Gaussians and the output."""
 
     def __init__(self, change: Callable[[int, RenderOutput], dict[str, object]]) -> None:
         self.change = change
@@ -173,7 +174,7 @@ class Changed(ReferenceRasterizer):
 
 
 def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint]:
-    """The footprint of a view with some of its fields multiplied."""
+    """The footprint of a view with some fields multiplied by the factors ``changes``."""
 
     def footprint(values: torch.Tensor | None = None) -> Footprint:
         true = out.require_footprint(values)
@@ -209,7 +210,7 @@ def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint
         ),
     ],
 )
-def test_each_departure_is_told(
+def test_each_kind_of_departure_is_listed(
     change: Callable[[RenderOutput], dict[str, object]], told: str
 ) -> None:
     (line,) = departures(Changed(lambda n, out: change(out) if n else {}), cases=(TINY,))
@@ -217,21 +218,21 @@ def test_each_departure_is_told(
 
 
 @pytest.mark.parametrize("name", ["image", "alpha"])
-def test_without_gaussians_there_is_the_background(name: str) -> None:
+def test_departures_tests_the_image_without_gaussians(name: str) -> None:
     wrong = Changed(lambda n, out: {name: getattr(out, name) + (n == 0)})
     assert departures(wrong, cases=(TINY,)) == [
         "without Gaussians: the image is not the background"
     ]
 
 
-def test_without_gaussians_there_is_a_backward_pass() -> None:
+def test_departures_tests_the_backward_pass_without_gaussians() -> None:
     wrong = Changed(lambda n, out: {} if n else {"image": out.image.detach()})
     (told,) = departures(wrong, cases=(TINY,))
     assert told.startswith("without Gaussians: RuntimeError: ")
 
 
-def test_the_scenes_are_the_same_in_every_version() -> None:
-    """Reports of rasterizers elsewhere name them."""
+def test_the_scenes_of_the_contract_do_not_change() -> None:
+    """Reports about rasterizers outside gsbench name these scenes."""
     assert [str(case) for case in CASES] == [
         "33x49-n50-sh3",
         "97x65-n250-sh3",

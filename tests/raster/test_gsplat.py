@@ -1,6 +1,6 @@
-"""The adapter on gsplat, without a GPU.
+"""The adapter for gsplat against the float64 reference, without a GPU.
 
-On a stand-in with gsplat's signatures, against the float64 reference.
+It runs on a stand-in with gsplat's signatures.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ def test_values_and_gradients_match_the_reference(library: ModuleType) -> None:
         assert (gradient - reference).abs().max() < 1e-3 * reference.abs().max(), name
     both = output.visible & expected.visible
     assert both.sum() > 0.9 * expected.visible.sum()
-    assert not (output.visible & ~expected.visible).any()  # its box culls more, never less
-    assert (output.radii - expected.radii)[both].abs().max() <= 1  # ceil may fall either way
+    assert not (output.visible & ~expected.visible).any()  # gsplat's box culls more, never less
+    assert (output.radii - expected.radii)[both].abs().max() <= 1  # rounding may change the ceil
 
 
-def test_the_two_versions_of_gsplat_give_the_same(library: ModuleType) -> None:
+def test_the_two_versions_of_gsplat_give_the_same_results(library: ModuleType) -> None:
     (image, gradients), (expected, references) = (
         render_with_gradients(GsplatRasterizer(library=version), FAINT, torch.float32)
         for version in (library.head(), library)
@@ -65,7 +65,7 @@ def test_the_two_versions_of_gsplat_give_the_same(library: ModuleType) -> None:
         assert (gradients[name] - reference).abs().max() <= 1e-5 * reference.abs().max(), name
 
 
-def test_late_and_repeated_backward_without_the_absolute_gradient(library: ModuleType) -> None:
+def test_backward_may_run_late_and_twice_without_the_absolute_gradient(library: ModuleType) -> None:
     rasterizer = GsplatRasterizer(library=library)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
     background = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
@@ -82,7 +82,9 @@ def test_late_and_repeated_backward_without_the_absolute_gradient(library: Modul
     assert torch.equal(outputs[0].screen_points.grad[:, 0] != 0, once.abs().sum(-1) != 0)
 
 
-def test_screen_points_have_a_gradient_though_nothing_else_wants_one(library: ModuleType) -> None:
+def test_screen_points_have_a_gradient_even_if_no_parameter_requires_one(
+    library: ModuleType,
+) -> None:
     _, expected = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
     gaussians = FAINT.gaussians().map(torch.Tensor.float)
     output = GsplatRasterizer(library=library).render(
@@ -95,10 +97,10 @@ def test_screen_points_have_a_gradient_though_nothing_else_wants_one(library: Mo
     assert torch.equal(output.screen_points.grad.double(), expected["screen_points"])
 
 
-def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
-    """Without the garbage collector.
+def test_a_step_leaves_no_tensor_and_no_graph_alive(library: ModuleType) -> None:
+    """All memory is freed without the garbage collector.
 
-    A cycle through the graph would keep 60 MB a step at a million Gaussians.
+    A cycle through the graph would keep 60 MB per step at a million Gaussians.
     """
     rasterizer = GsplatRasterizer(library=library)
     camera, black = FAINT.camera(), torch.zeros(3)
@@ -124,7 +126,7 @@ def test_nothing_stays_alive_after_a_step(library: ModuleType) -> None:
         gc.enable()
 
 
-def test_no_gaussians_never_reach_gsplat(library: ModuleType) -> None:
+def test_gsplat_is_not_called_without_gaussians(library: ModuleType) -> None:
     none = (
         Case(20, 17, 1, 3)
         .gaussians()
@@ -144,7 +146,7 @@ def test_no_gaussians_never_reach_gsplat(library: ModuleType) -> None:
     assert output.screen_gradient_abs.shape == (0, 2)
 
 
-def test_values_that_are_not_finite_are_named(library: ModuleType) -> None:
+def test_an_error_names_the_parameter_that_is_not_finite(library: ModuleType) -> None:
     rasterizer = GsplatRasterizer(library=library)
     for name in ("means", "opacity_logits", "sh_rest"):
         gaussians: Gaussians = FAINT.gaussians().map(torch.Tensor.float)
@@ -153,7 +155,7 @@ def test_values_that_are_not_finite_are_named(library: ModuleType) -> None:
             rasterizer.render(gaussians, FAINT.camera(), 3, torch.zeros(3))
 
 
-def test_a_camera_is_uploaded_once_and_forgotten_with_it(library: ModuleType) -> None:
+def test_a_camera_is_uploaded_once_and_its_copy_is_freed_with_it(library: ModuleType) -> None:
     rasterizer = GsplatRasterizer(library=library)
     camera = FAINT.camera()
     gaussians = FAINT.gaussians().map(torch.Tensor.float)
@@ -167,7 +169,7 @@ def test_a_camera_is_uploaded_once_and_forgotten_with_it(library: ModuleType) ->
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_on_a_gpu_it_departs_only_as_its_module_says() -> None:
+def test_on_a_gpu_only_radii_depart_from_the_contract() -> None:
     pytest.importorskip("gsplat")
     told = departures(GsplatRasterizer(), "cuda", cases=(FAINT,))
     assert [line for line in told if "radius" not in line] == []
@@ -177,18 +179,18 @@ def test_square_radii_are_those_of_the_reference() -> None:
     projected = project(random_gaussians(300, seed=4, log_scale=(-4, 0.5)), front_camera(64, 48))
     seen = torch.ones(1, len(projected.index), dtype=torch.bool)
     radii = _square_radii(projected.conics.unsqueeze(0), seen)[0]
-    # ceil may fall either way on an exact integer
+    # near an integer, rounding may change the ceil
     assert (radii - projected.radii).abs().max() <= 1
     assert (radii == projected.radii).double().mean() > 0.99
 
 
-def test_reach_agrees_with_the_tiles_of_the_reference() -> None:
+def test_a_gaussian_that_reaches_a_tile_of_the_reference_reaches_the_image() -> None:
     camera = front_camera(64, 48)
     projected = project(random_gaussians(300, seed=6, log_scale=(-4, 0)), camera)
     low, high = tile_rectangles(projected, camera)
     reached = ((high - low) > 0).all(-1)
     ours = _reaches_image(projected.means + 0.5, projected.radii, 64, 48)
-    assert (ours | ~reached).all()  # whatever reaches a tile there reaches the image here
+    assert (ours | ~reached).all()
 
 
 def test_a_square_that_only_touches_the_image_does_not_reach_it() -> None:
@@ -200,7 +202,7 @@ def test_a_square_that_only_touches_the_image_does_not_reach_it() -> None:
     assert _reaches_image(means, radii, 64, 48).tolist() == expected
 
 
-def test_the_camera_takes_the_world_to_pixels() -> None:
+def test_the_uploaded_camera_projects_points_to_pixels() -> None:
     camera = front_camera(64, 48, (3.0, -2.0))
     point = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
     on_device = _DeviceCamera.of(camera, point)

@@ -1,7 +1,4 @@
-"""A rasterizer from a file outside gsbench.
-
-That of docs/rasterizer.md, in the real program and by the contract.
-"""
+"""A rasterizer from a file outside gsbench: the one of docs/rasterizer.md, in the real program."""
 
 from __future__ import annotations
 
@@ -71,7 +68,7 @@ def gsbench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> None:
+def test_the_real_program_trains_with_it_and_records_its_source(folder: Path) -> None:
     first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     assert first.returncode == 0, first.stderr
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
@@ -92,7 +89,7 @@ def test_the_real_program_trains_with_it_and_knows_its_source(folder: Path) -> N
     assert "missing" in changed.stdout
 
 
-def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
+def test_its_options_are_checked_and_are_part_of_the_key(folder: Path) -> None:
     values = composed(*OWN, "+raster.rows=7")
     rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
@@ -111,7 +108,7 @@ def test_options_are_checked_and_the_key_has_them(folder: Path) -> None:
         compose_one(OWN[:1])
 
 
-def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) -> None:
+def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder: Path) -> None:
     Parts(composed(*OWN)).check(on_this_machine=False)
     parts = Parts(composed(*OWN, "densify=pixelgs"))
     with pytest.raises(
@@ -123,7 +120,7 @@ def test_without_a_footprint_it_is_refused_where_one_is_asked_for(folder: Path) 
     parts.check(on_this_machine=False)
 
 
-def test_only_rasterizers_with_a_name_of_their_own(folder: Path) -> None:
+def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder: Path) -> None:
     (folder / "untiled.py").write_text(
         "from gsbench.raster.reference import ReferenceRasterizer\n"
         "class Same(ReferenceRasterizer):\n    pass\n"

@@ -1,6 +1,6 @@
-"""The proof of an executor.
+"""The proof of an executor: it passes correct kernels, and finds faults that a test plants.
 
-It passes sound kernels, catches planted faults, and is made once for each version.
+It is made once for each version.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def passing(raster: str = "triton", failures: tuple[str, ...] = ()) -> RasterPro
     )
 
 
-def test_the_kernels_of_the_cpu_pass_with_room_to_spare() -> None:
+def test_the_cpu_kernels_pass_with_small_errors() -> None:
     proof = prove(CpuRasterizer(), CPU)
     assert proof.failures == []
     assert {
@@ -81,7 +81,7 @@ def test_a_departure_names_the_quantity_and_the_place() -> None:
     assert all(line.startswith("7x5-n20-sh3: ") for line in failures)
 
 
-def test_a_fault_of_the_loss_is_seen_in_the_training_steps() -> None:
+def test_a_fault_of_the_loss_is_a_failure() -> None:
     proof = prove(
         CpuRasterizer(),
         CPU,
@@ -91,7 +91,7 @@ def test_a_fault_of_the_loss_is_seen_in_the_training_steps() -> None:
     assert "7x5-n20-sh3: loss is off by up to" in proof.failures[0]
 
 
-def test_an_error_of_the_driver_is_a_failure_and_memory_that_is_full_is_not() -> None:
+def test_a_driver_error_is_a_failure_and_a_lack_of_memory_is_raised() -> None:
     class Broken(ReferenceRasterizer):
         error: Exception = RuntimeError("CUDA error: an illegal memory access\nmore")
 
@@ -106,7 +106,7 @@ def test_an_error_of_the_driver_is_a_failure_and_memory_that_is_full_is_not() ->
         prove(Broken(), CPU, (TINY,))
 
 
-def test_bits_that_differ_between_runs_are_caught_where_they_are_promised() -> None:
+def test_bits_that_differ_between_runs_are_a_failure_if_the_same_bits_are_promised() -> None:
     class Restless(CpuRasterizer):
         count = 0
 
@@ -120,7 +120,7 @@ def test_bits_that_differ_between_runs_are_caught_where_they_are_promised() -> N
     assert "image" in line
 
 
-# ---- once for what it depends on
+# ---- a proof is kept for the versions that it depends on
 
 
 def count_proofs(made: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,7 +153,7 @@ def test_a_proof_is_kept_and_made_again_for_another_version(
 @pytest.mark.parametrize(
     "source", ["raster/triton/composite.py", "raster/staged.py", "train/loss_triton.py"]
 )
-def test_a_change_of_the_kernels_calls_for_a_new_proof(
+def test_a_changed_source_file_of_the_kernels_changes_the_version(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
 ) -> None:
     before = module.versions_on(CPU)
@@ -167,7 +167,7 @@ def test_a_change_of_the_kernels_calls_for_a_new_proof(
     assert {name for name in before if before[name] != changed[name]} == {"kernels"}
 
 
-def test_a_failed_proof_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_proof_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     results = [passing("cpu", failures=("image is off",)), passing("cpu")]
     monkeypatch.setattr(module, "prove_apart", lambda *_: results.pop(0))
     assert not proof_of("cpu", CPU).passed
@@ -175,7 +175,7 @@ def test_a_failed_proof_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     assert proof_of("cpu", CPU).passed
 
 
-def test_a_cache_that_cannot_be_written_proves_each_time_and_says_so(
+def test_without_a_writable_cache_each_call_proves_again_and_logs_it(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     made: list[str] = []
@@ -197,7 +197,7 @@ def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.slow
-def test_two_processes_prove_once(tmp_path: Path) -> None:
+def test_two_processes_make_one_proof(tmp_path: Path) -> None:
     code = (
         "import torch; from gsbench.train.proof import proof_of; assert proof_of('cpu', "
         "torch.device('cpu')).passed"
@@ -221,7 +221,7 @@ def test_two_processes_prove_once(tmp_path: Path) -> None:
     assert sorted("comparing it with the reference" in text for text in logs) == [False, True]
 
 
-# ---- which executor is taken
+# ---- the choice of an executor
 
 
 @pytest.fixture
@@ -249,7 +249,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         (["gsplat"], "triton"),
     ],
 )
-def test_auto_takes_the_next_that_passes(
+def test_auto_takes_the_first_executor_that_passes(
     gpu: dict[str, list[str]], failing: list[str], taken: str, caplog
 ) -> None:
     gpu |= {
@@ -288,7 +288,7 @@ def test_nothing_is_proven_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (chosen.rasterizer.name, chosen.proof, chosen.passed_over) == ("cpu", None, ())
 
 
-def test_doctor_proves_on_request_and_shows_what_is_known(
+def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = {"cpu": passing("cpu")}
@@ -310,7 +310,7 @@ def test_doctor_proves_on_request_and_shows_what_is_known(
     assert run(["doctor", "--json"]) == 2
 
 
-# ---- faults in the kernels, each planted in a copy of gsbench that Triton's interpreter runs
+# ---- faults in the kernels: each is planted in a copy of gsbench that Triton's interpreter runs
 
 COMPOSITE, PROJECTION, GEOMETRY = (
     f"raster/triton/{name}.py" for name in ("composite", "projection", "geometry")
@@ -362,7 +362,8 @@ FAULTS = {
         "(W0, W1, W2, W3, W5, W4)[k]",
     ),
 }
-# Small, for the interpreter: rows of blocks, lists of several segments, harmonics of all degrees.
+# Small for the interpreter, but with rows of blocks, lists of several segments, and harmonics of
+# all degrees.
 SCENE = "Case(18, 17, 40, sh_degree=3, log_scale=-1.0, logit=-1.0, spread=0.4)"
 PROVE = f"""
 import json, torch
@@ -377,7 +378,7 @@ print(json.dumps(prove(TritonRasterizer(), torch.device("cpu"), ({SCENE},), Trit
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_planted_fault_is_caught(tmp_path: Path, fault: str) -> None:
+def test_a_planted_fault_is_found(tmp_path: Path, fault: str) -> None:
     triton = pytest.importorskip("triton")
     if reason := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(reason)

@@ -1,4 +1,4 @@
-"""The reference rasterizer against finite differences, a restatement and gsplat's torch code."""
+"""The reference rasterizer against finite differences, plain loops and gsplat's torch code."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from tests.gaussians.helpers import front_camera, random_gaussians
 def brute_force(
     gaussians: Gaussians, camera: Camera, background: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every pixel by itself, in plain Python from the published formulas; colours of degree 0 only.
+    """Render pixel by pixel in plain Python from the published formulas, with colours of degree 0.
 
-    Image, opacity, and [N, 3] of each Gaussian over the pixels it is blended into: their number,
-    the sum of column + 100 row, and that of their distances to its mean.
+    Returns image, opacity and footprints [N, 3]. Over the pixels that a Gaussian is blended into, a
+    footprint is their number, the sum of column + 100 row, and the sum of distances to its mean.
     """
     items = []
     for i in range(len(gaussians)):
@@ -106,7 +106,7 @@ def brute_force(
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (5.0, -4.0)])
-def test_matches_brute_force(shift: tuple[float, float]) -> None:
+def test_images_and_footprints_match_brute_force(shift: tuple[float, float]) -> None:
     gaussians = random_gaussians(60, seed=3, log_scale=(-3.5, -0.5))
     # opaque ones reach both the clamp of alpha and the early stop
     gaussians.opacity_logits[:8] = 6.0
@@ -165,9 +165,9 @@ def test_gradients_match_finite_differences(degree: int) -> None:
 
 
 def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
-    """Moving the principal point moves every projected mean alike.
+    """A shift of the principal point shifts all projected means by the same distance.
 
-    The sum of the screen gradients says by how much.
+    So the sum of the screen gradients is the derivative of the loss by the shift.
     """
     gaussians = random_gaussians(30, seed=5)
     background = torch.zeros(3, dtype=torch.float64)
@@ -214,7 +214,7 @@ def test_projection_matches_gsplat() -> None:
         eps2d=0.3,
     )
     projected = project(gaussians, camera)
-    # gsplat's first pixel centre is 0.5
+    # gsplat's first pixel centre is at 0.5
     torch.testing.assert_close(projected.means + 0.5, means[0, projected.index])
     torch.testing.assert_close(projected.conics, conics[0, projected.index])
     torch.testing.assert_close(projected.depths, depths[0, projected.index])
@@ -236,8 +236,8 @@ def test_spherical_harmonics_match_gsplat() -> None:
         torch.testing.assert_close(ours, (theirs + 0.5).clamp_min(0))
 
 
-def test_the_pixel_at_a_mean_has_the_whole_opacity() -> None:
-    # pixel centres lie at halves
+def test_the_alpha_of_the_pixel_at_a_mean_is_the_opacity() -> None:
+    # a principal point of 20.5 is the centre of pixel 20
     camera = Camera(40, 30, 36.0, 36.0, 20.5, 15.5, np.eye(3), np.zeros(3))
     one = random_gaussians(1)
     one.means[0] = torch.tensor([0.0, 0.0, 4.0])
@@ -246,7 +246,7 @@ def test_the_pixel_at_a_mean_has_the_whole_opacity() -> None:
     assert out.alpha[15, 20] == out.alpha.max()
 
 
-def test_nothing_visible_gives_the_background() -> None:
+def test_without_visible_gaussians_the_image_is_the_background() -> None:
     gaussians = random_gaussians(5)
     gaussians.means[:, 2] = -5.0
     out = ReferenceRasterizer().render(

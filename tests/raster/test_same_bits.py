@@ -1,7 +1,7 @@
 """Three runs of a step with raster=triton and its loss kernel give the same bits.
 
-On a GPU, or interpreted if tiny. The runs are on new memory, on used memory, and by new objects
-with new memory pools.
+The tests need a GPU; the tiny one also runs in Triton's interpreter. The first run uses new memory,
+the second reuses it, and the third uses new objects with new memory pools.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def test_three_runs_give_the_same_bits(width: int, height: int, count: int) -> N
 
     rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
     first = run(rasterizer, loss)
-    assert first["gradient of means"].abs().max() > 0  # else equal bits would say nothing
+    assert first["gradient of means"].abs().max() > 0  # otherwise, equal bits would prove nothing
     for other in (run(rasterizer, loss), run(TritonRasterizer(), TritonLoss(0.2))):
         assert [
             name for name, tensor in first.items() if not torch.equal(tensor, other[name])

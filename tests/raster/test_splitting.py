@@ -1,4 +1,4 @@
-"""Splitting matrices against second derivatives by autograd, and against splits."""
+"""Splitting matrices against second derivatives by autograd, and against real splits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CASES = (
 
 
 def image_of(camera: Camera, mean: Tensor) -> Tensor:
-    """Where a point [3] is on the image, px."""
+    """Project a point [3] to the image, [2] px."""
     x, y, z = mean.new_tensor(camera.rotation) @ mean + mean.new_tensor(camera.translation)
     return torch.stack([camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5])
 
@@ -39,9 +39,9 @@ def heights(pixels: Tensor, mean: Tensor, conic: Tensor, opacity: Tensor) -> Ten
 
 
 class Slow:
-    """A case composited pixel by pixel from the heights of its Gaussians, and its loss.
+    """A case composited pixel by pixel from the heights of its Gaussians.
 
-    A fixed weighting.
+    A height is opacity times density at a pixel. The loss weights the image with fixed numbers.
     """
 
     def __init__(self, case: Case) -> None:
@@ -70,10 +70,13 @@ class Slow:
         tiles = (self.pixels // CONSTANTS.tile).unsqueeze(0)  # [1, P, 2]
         self.reached = ((tiles >= first.unsqueeze(1)) & (tiles < past.unsqueeze(1))).all(
             -1
-        )  # [M, P] as far as it goes
+        )  # [M, P] pixels in the tiles of each Gaussian
 
     def height(self, k: int, displacement: Tensor) -> Tensor:
-        """Of the k-th projected Gaussian, moved by ``displacement`` [3], linearly on the image."""
+        """Heights [P] of the k-th projected Gaussian, moved by ``displacement`` [3].
+
+        The movement on the image is linearised.
+        """
         moved = self.projected.means[k] + self.linear[k] @ displacement
         return heights(
             self.pixels,
@@ -88,10 +91,7 @@ class Slow:
         )
 
     def loss(self, s: Tensor) -> Tensor:
-        """Of heights [M, P].
-
-        The clamp to .99 passes the gradient; the heights decide what is skipped.
-        """
+        """The loss as a function of the heights [M, P]; the clamp to 0.99 passes the gradient."""
         colour = torch.zeros(len(self.pixels), 3).double()
         through = torch.ones(len(self.pixels)).double()
         alive = torch.ones(len(self.pixels), dtype=torch.bool)
@@ -107,7 +107,7 @@ class Slow:
         return (image * self.weights.reshape(-1, 3)).sum()
 
     def matrices(self, rasterizer: str) -> Tensor:
-        """As the rasterizer gives them, [N, 3, 3] float64."""
+        """The splitting matrices that the rasterizer computes, [N, 3, 3] float64."""
         dtype = torch.float64 if rasterizer == "reference" else torch.float32
         gaussians = self.gaussians.map(
             lambda tensor: tensor.detach().clone().to(dtype).requires_grad_()
@@ -122,7 +122,7 @@ class Slow:
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) -> None:
-    """The paper's definition, one Gaussian at a time, all derivatives by autograd."""
+    """The paper's definition, computed for one Gaussian at a time with autograd."""
     slow = Slow(case)
     s = slow.all_heights().detach().requires_grad_()
     (gradient,) = torch.autograd.grad(slow.loss(s), s)
@@ -139,7 +139,7 @@ def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) 
     torch.testing.assert_close(exact, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
     compiled = slow.matrices("cpu")
     sizes = expected.abs().amax((1, 2), keepdim=True)
-    # of each Gaussian's own
+    # errors are relative to each Gaussian's own matrix
     assert ((compiled - expected).abs() <= 1e-3 * sizes + 1e-6 * expected.abs().max()).all()
 
 
@@ -147,8 +147,8 @@ def second_difference(of: Callable[[float], Tensor], step: float) -> float:
     return float(of(step) - 2 * of(0.0) + of(-step)) / step**2
 
 
-def test_it_foretells_what_two_halves_do_to_the_loss() -> None:
-    """Half the height on either side at a distance e changes the loss by e^2 v S v / 2."""
+def test_the_matrix_predicts_how_a_split_changes_the_loss() -> None:
+    """Two halves at the distances e and -e along v change the loss by e^2 v S v / 2."""
     slow = Slow(CASES[1])
     s, matrices = slow.all_heights(), slow.matrices("reference")
     generator = torch.Generator().manual_seed(5)
@@ -163,7 +163,7 @@ def test_it_foretells_what_two_halves_do_to_the_loss() -> None:
             halves = (
                 slow.height(k, distance * direction) + slow.height(k, -distance * direction)
             ) / 2
-            # stays skipped: where a pixel begins to count is no derivative
+            # A skipped pixel stays skipped: the matrix has no derivative of the threshold.
             skipped = s[k] < CONSTANTS.alpha_min
             kept = torch.where(skipped, s[k], halves.clamp_min(CONSTANTS.alpha_min))
             return slow.loss(torch.cat([s[:k], kept.unsqueeze(0), s[k + 1 :]]))
@@ -174,7 +174,7 @@ def test_it_foretells_what_two_halves_do_to_the_loss() -> None:
     assert compared >= 5
 
 
-def test_only_where_it_is_asked_for() -> None:
+def test_matrices_are_computed_only_on_request() -> None:
     case = CASES[0]
     plain = ReferenceRasterizer().render(
         case.gaussians(), case.camera(), 0, torch.zeros(3).double()

@@ -1,7 +1,4 @@
-"""What executors share.
-
-Checks of their inputs, reads from a device that do not wait, and the node of autograd.
-"""
+"""Code that executors share: checks of inputs, asynchronous reads, and the node in autograd."""
 
 from __future__ import annotations
 
@@ -39,7 +36,7 @@ def camera(width: int = 4, height: int = 3, **others: float) -> Camera:
 
 
 class Recording(StagedRasterizer[str]):
-    """Stages without a picture: an opacity of 1/4 everywhere, and gradients that are constant."""
+    """Stages that render nothing: alpha is 1/4 everywhere, and gradients are constant."""
 
     name = "recording"
 
@@ -73,7 +70,7 @@ class Recording(StagedRasterizer[str]):
         return Footprint(*[torch.zeros(2)] * 4)
 
 
-def test_gradients_reach_the_stage_and_come_back() -> None:
+def test_gradients_reach_the_backward_stage_and_its_results_the_parameters() -> None:
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     background = BLACK.clone().requires_grad_()
@@ -93,7 +90,7 @@ def test_gradients_reach_the_stage_and_come_back() -> None:
     assert background.grad.tolist() == [2 * 12 * 0.75] * 3
 
 
-def test_the_opacity_alone_may_be_differentiated() -> None:
+def test_alpha_may_be_differentiated_without_the_image() -> None:
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
@@ -106,7 +103,7 @@ def test_the_opacity_alone_may_be_differentiated() -> None:
     assert request.absolute is None
 
 
-def test_a_footprint_gets_the_frame_and_values() -> None:
+def test_the_footprint_stage_gets_the_frame_and_the_values() -> None:
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     view = camera()
@@ -120,7 +117,7 @@ def test_a_footprint_gets_the_frame_and_values() -> None:
     assert passed is values
 
 
-def test_a_rasterizer_may_refuse() -> None:
+def test_errors_of_the_checks_are_raised() -> None:
     with pytest.raises(ValueError, match="one is too few"):
         Recording().render(random_gaussians(1), camera(), 0, BLACK)
     with pytest.raises(ValueError, match="sh_degree"):
@@ -151,7 +148,7 @@ def test_the_largest_settings_are_accepted() -> None:
     check_settings(random_gaussians(1), camera(cx=400.0, cy=-300.0, fx=0.004, fy=3e6), 0, BLACK)
 
 
-def test_settings_that_do_not_fit_are_named() -> None:
+def test_an_error_names_the_setting_that_does_not_fit() -> None:
     gaussians = random_gaussians(2)
     with pytest.raises(ValueError, match="sh_degree: must be 0 to 3, got -1"):
         check_settings(gaussians, camera(), -1, BLACK)
@@ -166,12 +163,12 @@ def test_settings_that_do_not_fit_are_named() -> None:
         check_settings(gaussians, camera(), 0, torch.zeros(4, dtype=torch.float64))
     with pytest.raises(ValueError, match="background: must be three finite numbers"):
         check_settings(gaussians, camera(), 0, BLACK + math.inf)
-    # not looked at
+    # values on a device are not read
     check_settings(gaussians.map(lambda tensor: tensor.to("meta")), camera(), 0, BLACK.to("meta"))
 
 
 @pytest.mark.parametrize("name", ["means", "opacity_logits", "sh_rest"])
-def test_the_first_bad_value_is_named(name: str) -> None:
+def test_the_first_gaussian_with_a_bad_value_is_named(name: str) -> None:
     gaussians = random_gaussians(5)
     assert not bad_values(gaussians, BLACK)
     raise_for_values(gaussians, BLACK)
@@ -185,7 +182,7 @@ def test_the_first_bad_value_is_named(name: str) -> None:
             refuse()
 
 
-def test_a_rotation_without_length_and_a_bad_background_are_named() -> None:
+def test_a_quaternion_of_length_zero_and_a_bad_background_are_named() -> None:
     gaussians = random_gaussians(4)
     gaussians.quaternions[[1, 2]] = 1e-13
     assert bad_values(gaussians, BLACK)
@@ -201,7 +198,7 @@ def test_a_rotation_without_length_and_a_bad_background_are_named() -> None:
 
 
 class Event:
-    """Stands in for an event of a GPU, which does not happen before it is waited for."""
+    """A stand-in for a CUDA event, which completes only when ``synchronize`` is called."""
 
     def __init__(self) -> None:
         self.recorded: object = None
@@ -218,7 +215,7 @@ class Event:
         self.happened = True
 
 
-def test_a_readback_waits_only_for_what_has_not_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_readback_waits_only_if_its_copy_has_not_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
     host = SimpleNamespace(copied=[])
     host.copy_ = lambda source, non_blocking: host.copied.append((source, non_blocking))
     device = SimpleNamespace(type="cuda", index=1)

@@ -1,6 +1,6 @@
-"""The Triton rasterizer without a GPU.
+"""The Triton rasterizer without a GPU: runs its tests in Triton's interpreter, by parts.
 
-Its tests in Triton's interpreter, each part in a process of its own.
+Each part runs in a separate process.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ ROOT = Path(__file__).resolve().parents[2]
 CONTRACT = "tests/raster/test_contract.py"
 INTERPRETED = "tests/raster/test_triton_interpreted.py"
 EVERY = "match_the_reference"
-ONE_SCENE = "33x49"  # more than one tile each way, the last of one pixel, harmonics of every degree
+ONE_SCENE = "33x49"  # several tiles each way, the last ones of one pixel, harmonics of all degrees
 PARTS = {
     "contract": [CONTRACT, "-k", f"triton and (not {EVERY} or {ONE_SCENE})"],
     "every scene": [CONTRACT, "-k", f"triton and {EVERY} and not {ONE_SCENE}"],
     "kernels and training": [INTERPRETED],
 }
-# s, for one that hangs: below the limit of a test in pyproject.toml; minutes on a quiet machine
+# s; stops a part that hangs, before the limit of a test in pyproject.toml does. A part takes minutes.
 LIMIT = 1700
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_in_the_interpreter(part: str) -> None:
+def test_a_part_passes_in_the_interpreter(part: str) -> None:
     if fault := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(fault)
     environment = os.environ | {
@@ -73,11 +73,13 @@ def test_in_the_interpreter(part: str) -> None:
         (("3.10.0", "2.5.2"), True),
     ],
 )
-def test_which_interpreter_works_with_which_numpy(versions: tuple[str, str], works: bool) -> None:
+def test_versions_of_triton_and_numpy_that_do_not_fit_are_known(
+    versions: tuple[str, str], works: bool
+) -> None:
     assert (interpreter_fault(*versions) is None) == works
 
 
-def test_no_test_is_in_two_parts_or_in_none() -> None:
+def test_every_test_is_in_exactly_one_part() -> None:
     environment = os.environ | {"TRITON_INTERPRET": "1"}
 
     def collected(arguments: list[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The Triton kernels compiled for GPUs that are not here, and what else a step asks of one."""
+"""The Triton kernels compiled for GPUs that are not present, and how often a step waits for one."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, s
 pytestmark = pytest.mark.slow
 
 CASE = Case(33, 49, 50, sh_degree=3)
-# Bounds on the instructions of the loops that take most of the time, a third above what Triton 3.7
-# makes of them: a slip by which values leave their registers, or are summed across lanes too early,
-# costs more. An entry is 128 pixels.
+# Limits of the instructions per entry in the loops that take most of the time, a third above those
+# of Triton 3.7. A mistake that moves values out of registers, or sums them across lanes too early,
+# costs more than that. An entry is blended into 128 pixels.
 FORWARD_ENTRY, BACKWARD_ENTRY = 125, 285
-# What makes the host wait for a device.
+# Operations for which the host waits for the device.
 WAITING = (
     "_local_scalar_dense",
     "nonzero",
@@ -43,10 +43,7 @@ WAITING = (
 
 
 class Answer:
-    """In place of `gsbench.raster.staged.Readback`.
-
-    As if 2 rows of blocks and 7 pairs had been counted.
-    """
+    """A stand-in for `gsbench.raster.staged.Readback` that always reads 2 units and 7 pairs."""
 
     asked = 0
 
@@ -59,7 +56,7 @@ class Answer:
 
 @pytest.fixture
 def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
-    """Kernels are recorded instead of run."""
+    """The launches of kernels, which are recorded instead of run."""
     Answer.asked = 0
     monkeypatch.setattr(lists, "Readback", Answer)
     with recorded(monkeypatch) as record:
@@ -69,7 +66,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
 def step(
     case: Case, device: str = "cpu", absolute: bool = False, footprint: bool = False
 ) -> tuple[Gaussians, RenderOutput]:
-    """One training step's render, loss and backward."""
+    """The render, the loss and the backward pass of one training step."""
     gaussians = case.gaussians().map(lambda tensor: tensor.float().to(device).requires_grad_())
     output = TritonRasterizer().render(
         gaussians, case.camera(), case.sh_degree, torch.zeros(3, device=device), absolute
@@ -88,7 +85,7 @@ def test_kernels_compile_without_spills(
 ) -> None:
     step(CASE)
     step(CASE, absolute=True, footprint=True)
-    # the other variants: the lower degrees, and blocks that are numbered in 32 bits
+    # further variants: lower degrees, and 32-bit numbers of blocks
     if target == 90:
         monkeypatch.setattr(lists, "MAX_INT16", 0)
         for degree in (0, 1, 2):
@@ -98,7 +95,7 @@ def test_kernels_compile_without_spills(
         variant = launch.name, str(specialization(launch, target))
         if variant in compiled:
             continue
-        # no longer the default from Triton 3.10 on
+        # the default of Triton only before 3.10
         assert launch.named["enable_fp_fusion"] is True, variant
         compiled[variant] = made = compile_for(launch, target)
         print(
@@ -114,11 +111,8 @@ def test_kernels_compile_without_spills(
     assert len(compiled) == (23 if target == 90 else 16)
 
 
-def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
-    """Numbers of Gaussians, units and pixels change all the time.
-
-    No kernel may be special to one of them.
-    """
+def test_no_kernel_is_compiled_again_for_other_sizes(launches: list[Launch]) -> None:
+    """The numbers of Gaussians, units and pixels change all the time."""
     cases = (Case(33, 49, 50, 3), Case(32, 48, 64, 3), Case(1, 16, 1, 3))
     for case in cases:
         step(case)
@@ -133,8 +127,8 @@ def test_growing_compiles_nothing_anew(launches: list[Launch]) -> None:
 @pytest.mark.parametrize(
     "size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str
 )
-def test_a_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
-    """The fullest filters fewer rows than with programs of 32 rows, and few are idle."""
+def test_the_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
+    """The busiest one filters fewer rows than with programs of 32 rows."""
     strips = -(-3 * size[0] // STRIP)
 
     def counted(rows: int) -> tuple[int, int]:
@@ -152,7 +146,7 @@ def test_a_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
 
 
 class Watch(TorchDispatchMode):
-    """Collects the operations that wait for a device, or carry values between it and the host."""
+    """Collects the operations that wait for the device or copy between it and the host."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -174,10 +168,10 @@ class Watch(TorchDispatchMode):
         return result
 
 
-def test_a_step_waits_once(launches: list[Launch]) -> None:
-    """On torch's device "meta", whose tensors have no values.
+def test_a_step_waits_once_for_the_device(launches: list[Launch]) -> None:
+    """The step runs on torch's device "meta", whose tensors have no values.
 
-    Reading one raises, copying one is seen.
+    Reading a value raises an error, and `Watch` records every copy.
     """
     gaussians = CASE.gaussians().map(lambda tensor: tensor.float().to("meta").requires_grad_())
     background = torch.zeros(3, device="meta")

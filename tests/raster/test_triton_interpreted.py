@@ -1,6 +1,6 @@
 """What the Triton rasterizer promises beyond the contract, in Triton's interpreter.
 
-Run by ``test_triton.py``.
+``test_triton.py`` runs these tests.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def test_the_same_bits_on_every_run() -> None:
 
 
 def shorten_segments(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lists of the tests' scenes have many segments then."""
+    """Make segments so short that the lists of the tests' scenes have many."""
     for module in (layout, composite):
         monkeypatch.setattr(module, "SEGMENT", tl.constexpr(8))
 
@@ -66,10 +66,10 @@ def shorten_segments(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Programs in any order, memory full of NaN and of places far outside.
+    """No kernel reads memory before it is written, and the order of programs does not matter.
 
-    Nothing is read before it is written. Of the long lists of opaque Gaussians many entries are
-    such that no pixel comes to them.
+    The second run starts with memory full of NaN and of places far outside, and shuffles the
+    programs. The Gaussians are opaque, so compositing does not reach many entries of the lists.
     """
     shorten_segments(monkeypatch)
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=4.0)
@@ -104,7 +104,7 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(
 
 
 def misses(case: Case, gaussians: Gaussians) -> tuple[dict[str, float], RenderOutput]:
-    """The largest errors against the reference, each as a share of the largest value."""
+    """The largest errors against the reference, each relative to the largest value; the output."""
     results = []
     for rasterizer, dtype in (
         (TritonRasterizer(), torch.float32),
@@ -134,10 +134,10 @@ def misses(case: Case, gaussians: Gaussians) -> tuple[dict[str, float], RenderOu
     return {name: float(error) for name, error in errors.items()}, output
 
 
-def test_a_long_list_is_walked_backward_in_segments() -> None:
-    """Some 600 faint Gaussians before one block, three segments.
+def test_the_backward_pass_of_a_long_list_runs_in_segments() -> None:
+    """One block has a list of about 600 faint Gaussians, which are three segments.
 
-    Opaque ones between stop some of the pixels.
+    Some opaque Gaussians among them stop some of the pixels.
     """
     case = Case(16, 8, 620, sh_degree=1)
     gaussians = case.gaussians()
@@ -154,12 +154,12 @@ def test_a_long_list_is_walked_backward_in_segments() -> None:
 
 
 @pytest.mark.parametrize("logit", [0.0, 4.0])
-def test_segments_change_nothing_but_the_last_digits(
+def test_lists_with_short_segments_match_the_reference(
     monkeypatch: pytest.MonkeyPatch, logit: float
 ) -> None:
-    """Six blocks of some 60 entries, eight a segment.
+    """Six blocks have lists of about 60 entries, in segments of eight.
 
-    Some are behind where all pixels of a block have stopped.
+    All pixels of a block have stopped before some of the segments.
     """
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=logit)
     shorten_segments(monkeypatch)
@@ -171,8 +171,8 @@ def test_segments_change_nothing_but_the_last_digits(
     assert max(errors.values()) < 1e-5
 
 
-def test_far_from_the_origin_nothing_is_lost() -> None:
-    """A scene and its camera moved by 1,000 units, by amounts that float32 holds exactly."""
+def test_a_scene_far_from_the_origin_gives_the_same_image() -> None:
+    """Scene and camera are moved by about 1,000 units, a distance that is exact in float32."""
     shift = torch.tensor([1024.0, -512.0, 256.0])
     here, camera = TINY.gaussians(), TINY.camera()
     here.means = (here.means * 2**10).round() / 2**10
@@ -196,7 +196,7 @@ def test_far_from_the_origin_nothing_is_lost() -> None:
     assert images[0].std() > 0.01
 
 
-def test_a_render_for_inference_does_not_spoil_the_memory_for_training() -> None:
+def test_memory_of_a_render_in_inference_mode_can_be_reused_for_training() -> None:
     rasterizer = TritonRasterizer()
     with torch.inference_mode():
         image = rasterizer.render(leaves(TINY), TINY.camera(), 3, BLACK).image
@@ -206,11 +206,8 @@ def test_a_render_for_inference_does_not_spoil_the_memory_for_training() -> None
     assert torch.equal(gradients["means"], expected["means"])
 
 
-def test_a_step_leaves_nothing_alive() -> None:
-    """Without Python's collector of cycles.
-
-    What a step made is freed as soon as its names are gone.
-    """
+def test_nothing_stays_alive_after_a_step() -> None:
+    """All memory is freed without the garbage collector."""
     rasterizer, loss = TritonRasterizer(), TritonLoss(0.2)
     parameters = leaves(TINY)
     target = torch.zeros(TINY.height, TINY.width, 3, dtype=torch.uint8)
@@ -244,11 +241,8 @@ def test_a_step_leaves_nothing_alive() -> None:
             gc.enable()
 
 
-def test_more_rows_than_were_expected() -> None:
-    """Gaussians as large as the image.
-
-    The memory for their rows grows, and the result is that of a second render.
-    """
+def test_memory_grows_if_there_are_more_units_than_expected() -> None:
+    """The Gaussians are as large as the image. A second render gives the same image."""
     gaussians = random_gaussians(6, seed=1, log_scale=(0.5, 1.0)).map(Tensor.float)
     camera = Camera(90, 120, 90, 90, 45, 60, np.eye(3), np.zeros(3))
     rasterizer = TritonRasterizer()
@@ -262,7 +256,7 @@ def test_more_rows_than_were_expected() -> None:
     assert (first.image - reference.image).abs().max() < 1e-5
 
 
-def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_32_bit_numbers_of_blocks_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = bits_of(TritonRasterizer(), TINY)
     monkeypatch.setattr(lists, "MAX_INT16", 0)
     assert bits_of(TritonRasterizer(), TINY) == expected
@@ -271,7 +265,7 @@ def test_many_blocks_are_numbered_in_more_bits(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     "case", [TINY, SMALL, Case(20, 17, 80, sh_degree=1, log_scale=-0.5)], ids=str
 )
-def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
+def test_the_memory_of_a_render_is_the_documented_one(case: Case) -> None:
     rasterizer = TritonRasterizer()
     output = rasterizer.render(leaves(case), case.camera(), case.sh_degree, BLACK)
     frame = output.footprint.args[0]
@@ -293,8 +287,8 @@ def test_the_memory_that_is_kept_is_counted_from_its_shapes(case: Case) -> None:
     assert room >= 2 * count
     assert pairs > count / 2
     borders = (pairs - 1) // layout.SEGMENT.value * layout.BORDER.value * 4
-    # A Gaussian, a row of its blocks, a pair, a block: as docs/gpu.md says; and of a render: the
-    # record that cannot be seen, the end of the lists, flags, status.
+    # bytes per Gaussian, unit, pair and block, as docs/gpu.md says; and once per render: the
+    # invisible record, the end of the lists, flags and status
     stated = 136 * count + 20 * room + 84 * pairs + 1052 * blocks + borders + (64 + 4 + 4 + 3 * 8)
     assert sum(tensor.nbytes for tensor in buffers) == stated
 
@@ -306,7 +300,7 @@ def test_more_pairs_than_can_be_sorted_are_refused(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_background_that_is_not_finite_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a device it is not looked at before the kernels do."""
+    """On a device, only the kernels read it."""
     monkeypatch.setattr(staged, "check_settings", lambda *_: None)
     with pytest.raises(ValueError, match="background"):
         TritonRasterizer().render(
@@ -325,11 +319,11 @@ def tiny_scene(truth: Gaussians) -> Scene:
     return Scene("tiny", tuple(views), tuple(views[:1]))
 
 
-def test_a_training_equals_the_references(tmp_path: Path) -> None:
-    """Thirty iterations, of which the twentieth refines.
+def test_training_matches_that_of_the_reference(tmp_path: Path) -> None:
+    """Thirty iterations; the densifier changes the Gaussians once, after the twentieth.
 
-    The initial Gaussians are round: the gradients of their rotations are rounding errors, which
-    Adam takes for a direction. That shows once a split places the halves along rotated axes.
+    The initial Gaussians are spheres. If rounding errors gave their rotations a gradient, Adam
+    would turn them. It would show when a split places the halves along the rotated axes.
     """
     truth = random_gaussians(10, seed=2, log_scale=(-2.0, -1.0)).map(Tensor.float)
     truth.opacity_logits += 2
@@ -367,7 +361,7 @@ def test_a_training_equals_the_references(tmp_path: Path) -> None:
     ("size", "weight"), [((3, 4), 0.2), ((11, 16), 0.0), ((11, 16), 1.0), ((37, 53), 0.2)], ids=str
 )
 def test_the_loss_matches_float64(size: tuple[int, int], weight: float) -> None:
-    """The last size is more than one strip of numbers and more than one of rows."""
+    """The last size is wider than one strip and higher than one program."""
     image, target = picture(*size)
     for wanted in (target, target / 255):
         leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
@@ -383,7 +377,7 @@ def test_the_loss_matches_float64(size: tuple[int, int], weight: float) -> None:
         assert not values[2].requires_grad
 
 
-def test_the_loss_of_equal_images_and_without_gradient() -> None:
+def test_equal_images_have_no_loss_and_an_image_without_gradient_has_the_same_loss() -> None:
     image, target = picture(11, 16)
     leaf = image.clone().requires_grad_()
     loss, l1, similarity = TritonLoss(0.2)(leaf, image)

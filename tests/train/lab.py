@@ -1,4 +1,4 @@
-"""Short trainings of a tiny scene, as most tests of this room run them."""
+"""Short trainings of a tiny scene, for most tests of this folder."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def small(kind: type[ADC] = ADC, **changes: Any) -> ADC:
     return kind(**(window | changes))
 
 
-# Densifiers with a state of their own that a training must go on from.
+# Densifiers whose own state a resumed training must restore.
 STATEFUL: dict[str, Callable[[], Densifier]] = {
     "adc": small,
     "mcmc": lambda: MCMC(start=20, stop=110, interval=20),
@@ -63,7 +63,7 @@ def same(a: Gaussians, b: Gaussians) -> bool:
 
 
 class StopError(Exception):
-    """Stands for a kill: nothing is saved on the way out."""
+    """Stands for a kill: nothing is saved when it is raised."""
 
 
 def stop_at(step: int) -> Callable[[Status], None]:

@@ -1,8 +1,8 @@
-"""Count what would make the host wait for a GPU in one training step, on the CPU.
+"""Count the operations of one training step for which the host would wait for a GPU.
 
-Run as a program: ``python -m tests.train.one_step RASTER``. Triton's kernels run in its interpreter
-(``TRITON_INTERPRET=1``); every read-back is late, as on a GPU that is behind.
-Prints one JSON object for each densifier.
+Run as a program, on the CPU: ``python -m tests.train.one_step RASTER``. Triton's kernels run in its
+interpreter (``TRITON_INTERPRET=1``). No read-back has arrived before it is waited for, as on a GPU
+that is behind. Prints one JSON object for each densifier.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-import tests.raster.conftest  # noqa: F401 - makes the interpreter quicker
+import tests.raster.conftest  # noqa: F401 - makes the interpreter faster
 from gsbench.bench.measure import NEVER, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
@@ -32,14 +32,14 @@ DENSIFIERS = {
 
 def main(raster: str) -> None:
     Readback.arrived = property(lambda self: False)  # type: ignore[assignment, method-assign]
-    # on a GPU its values are not looked at there
+    # On a GPU, this check does not read the values.
     staged._check_background = lambda background: None
     gaussians, scene = make_scene("trained", 20, 20, 12)
     for name, densifier in DENSIFIERS.items():
         rasterizer = create_rasterizer(raster, torch.device("cpu"))
         trainer = Trainer(scene, gaussians, densifier, rasterizer, constant_scene_options(), 0)
         trainer.loss = torch_photometric_loss  # type: ignore[assignment] # no kernel of the CPU
-        for _ in range(2):  # one of every kind of memory is there
+        for _ in range(2):  # afterwards, all memory is allocated
             trainer.iterate(Path())
         with counting_waits(pretend=True) as counts:
             trainer.iterate(Path())

@@ -1,4 +1,4 @@
-"""Checkpoints: what is loaded is what was saved, or it is not loaded."""
+"""Checkpoints are loaded as they were saved, or not at all; and signals to stop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def state(step: int) -> dict[str, object]:
 
 
 def kept(folder: Path) -> list[int]:
-    """The iterations of the checkpoints in ``folder``, where nothing else may be."""
+    """The iterations of the checkpoints in ``folder``; fails if it has other files."""
     return sorted(int(path.name[len("checkpoint-") : -len(".pt")]) for path in folder.iterdir())
 
 
@@ -47,7 +47,7 @@ def equal(first: object, second: object) -> bool:
     return first == second
 
 
-def test_newest_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
+def test_the_newest_checkpoint_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
     assert load_checkpoint(tmp_path) is None
     for step in (10, 20, 30):
         save_checkpoint(tmp_path, step, state(step))
@@ -68,12 +68,12 @@ def test_the_folder_is_synced_and_the_thread_ends(
     assert not any(thread.name.startswith("gsbench-checkpoint") for thread in threading.enumerate())
 
 
-def test_torch_reads_the_file_by_itself(tmp_path: Path) -> None:
+def test_torch_load_reads_a_checkpoint_file(tmp_path: Path) -> None:
     save_checkpoint(tmp_path, 1, state(1))
     assert equal(torch.load(tmp_path / "checkpoint-00000001.pt", weights_only=True), state(1))
 
 
-def test_any_flipped_or_missing_byte_is_noticed_and_the_one_before_serves(
+def test_a_damaged_checkpoint_is_detected_and_the_one_before_is_loaded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     save_checkpoint(tmp_path, 10, state(10))
@@ -96,13 +96,13 @@ def test_any_flipped_or_missing_byte_is_noticed_and_the_one_before_serves(
     assert equal(load_checkpoint(tmp_path), state(20))
 
 
-def test_all_damaged_means_none(tmp_path: Path) -> None:
+def test_nothing_is_loaded_if_all_checkpoints_are_damaged(tmp_path: Path) -> None:
     save_checkpoint(tmp_path, 10, state(10))
     (tmp_path / "checkpoint-00000010.pt").write_bytes(b"")
     assert load_checkpoint(tmp_path) is None
 
 
-def test_nothing_in_a_checkpoint_is_run_as_code(tmp_path: Path) -> None:
+def test_loading_a_checkpoint_runs_no_code_from_it(tmp_path: Path) -> None:
     class Evil:
         def __reduce__(self) -> object:
             return os.mkdir, (str(tmp_path / "hacked"),)
@@ -116,7 +116,7 @@ def full(*arguments: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_failed_write_leaves_the_old_one_and_no_temporary(
+def test_a_failed_write_leaves_the_old_checkpoint_and_no_temporary_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_checkpoint(tmp_path, 10, state(10))
@@ -126,8 +126,8 @@ def test_failed_write_leaves_the_old_one_and_no_temporary(
     assert kept(tmp_path) == [10]
 
 
-def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> None:
-    """The training goes on, in place, while the thread writes."""
+def test_in_the_background_the_state_at_the_call_of_save_is_written(tmp_path: Path) -> None:
+    """Training continues and changes tensors in place while the thread writes."""
     writer = CheckpointWriter(tmp_path, background=True)
     live = {
         "step": 0,
@@ -148,7 +148,7 @@ def test_in_the_background_the_state_is_that_of_the_moment(tmp_path: Path) -> No
     assert torch.equal(loaded["view"], live["view"])  # type: ignore[arg-type]
 
 
-def test_an_error_in_the_background_is_raised_and_not_lost(
+def test_an_error_in_the_background_is_raised_by_the_next_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = CheckpointWriter(tmp_path, background=True)
@@ -164,8 +164,8 @@ def test_an_error_in_the_background_is_raised_and_not_lost(
     assert kept(tmp_path) == [10, 40]
 
 
-def test_a_state_goes_to_another_device_whole() -> None:
-    """A checkpoint lies where the model's device needs it, on the CPU and elsewhere."""
+def test_a_state_is_loaded_completely_on_another_device() -> None:
+    """All tensors of a loaded state are on the device of the model."""
     rates = LearningRates()
     gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
     gaussians.values.means.square().sum().backward()
@@ -179,7 +179,9 @@ def test_a_state_goes_to_another_device_whole() -> None:
 
 
 @pytest.mark.parametrize("background", [False, True])
-def test_killed_while_writing_leaves_a_readable_one(background: bool, tmp_path: Path) -> None:
+def test_a_kill_during_a_write_leaves_a_readable_checkpoint(
+    background: bool, tmp_path: Path
+) -> None:
     code = (
         "import sys, torch; from pathlib import Path; from gsbench.train.checkpoint import "
         "CheckpointWriter\n"
@@ -205,7 +207,7 @@ def test_killed_while_writing_leaves_a_readable_one(background: bool, tmp_path: 
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR2])
-def test_signals_stop_at_once_or_where_it_suits(signum: signal.Signals) -> None:
+def test_a_signal_stops_at_once_or_at_the_next_deferred_check(signum: signal.Signals) -> None:
     earlier = signal.getsignal(signum)
     with stop_on_signals():
         with pytest.raises(Stopped) as stop:
@@ -222,7 +224,7 @@ def test_signals_stop_at_once_or_where_it_suits(signum: signal.Signals) -> None:
         assert steps == [0, 1, 2, 3]
         with stop_on_signals(), pytest.raises(Stopped), deferred():  # noqa: PT012
             signal.raise_signal(signum)
-            signal.raise_signal(signum)  # a second one does not wait
+            signal.raise_signal(signum)  # a second signal stops at once
             raise AssertionError("went on after the second signal")
     assert signal.getsignal(signum) is earlier
     assert not requested()

@@ -1,7 +1,4 @@
-"""Arms under the governor, in whole trainings.
-
-One count at the end, equal numbers of rounds, thresholds on record.
-"""
+"""Trainings under the governor end at one count, with equal rounds and recorded thresholds."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
 
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.slow
-def test_arms_end_within_two_percent_of_one_count(arm: str, lab: Lab) -> None:
+def test_trainings_end_within_two_percent_of_one_count(arm: str, lab: Lab) -> None:
     kind, own = ARMS[arm]
     if kind is not MCMC:
         own = own | {"opacity_reset_interval": 120}  # in the middle of the window
@@ -42,7 +39,7 @@ def test_arms_end_within_two_percent_of_one_count(arm: str, lab: Lab) -> None:
     assert [event["step"] for event in rounds] == list(range(40, 240, 20))
     assert rounds[-1]["target"] == LIMIT
     strictness = [event["strictness"] for event in rounds]
-    assert len(set(strictness)) > 3  # it moved
+    assert len(set(strictness)) > 3  # the governor changed it
     assert all(1e-3 <= factor <= 1e3 for factor in strictness)
 
 
@@ -51,10 +48,10 @@ def rounds_of(lab: Lab, densifier: Budgeted) -> list[dict[str, Any]]:
     return [event for event in lab.records(EVENTS) if event["step"] % 20 == 0]
 
 
-def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(lab: Lab) -> None:
-    """A threshold in other units than the scene's.
+def test_if_the_strictest_growth_is_too_much_faint_gaussians_are_culled(lab: Lab) -> None:
+    """The threshold is in other units than the scene's.
 
-    A thousandth of it and a thousand times it select everybody.
+    The strictness is between 0.001 and 1000; at both ends, the threshold selects all Gaussians.
     """
     own = {
         "volume_threshold": 1e-24,
@@ -74,8 +71,8 @@ def test_where_the_strictest_growth_is_too_much_the_faint_are_culled(lab: Lab) -
         assert event["after"] == event["before"] + grown - pruned
 
 
-def test_a_frozen_training_changes_nothing_more(lab: Lab) -> None:
-    """Only the first round beyond the limit acts; later ones say what they would add."""
+def test_a_frozen_training_changes_no_gaussian_after_the_limit(lab: Lab) -> None:
+    """Only the first round beyond the limit acts; later rounds record what they would add."""
     own = {
         "cap": "freeze",
         "max_gaussians": 100,

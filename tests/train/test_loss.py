@@ -1,4 +1,4 @@
-"""The photometric loss against scikit-image, autograd in float64, and itself on several threads."""
+"""The photometric loss compared with scikit-image, float64 autograd, and itself on more threads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 
 
 def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """A smooth picture with noise and, as target, an 8-bit picture like it."""
+    """A smooth image with noise and, as target, the smooth image in 8 bits."""
     generator = torch.Generator().manual_seed(height)
     y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
     smooth = torch.stack([x.sin(), y.cos(), (x + y).sin()], -1) * 0.3 + 0.5
@@ -23,7 +23,7 @@ def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     return image, (smooth.clamp(0, 1) * 255).to(torch.uint8)
 
 
-def test_window() -> None:
+def test_the_window_has_eleven_weights_of_a_gaussian() -> None:
     taps = window().numpy()
     assert len(taps) == 11
     assert taps.sum() == pytest.approx(1)
@@ -47,17 +47,17 @@ def test_ssim_matches_scikit_image_in_the_interior() -> None:
     np.testing.assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
 
 
-def test_zero_padding() -> None:
-    """At a corner the window sees zeros outside; by hand for constant pictures of 1 and 0.5."""
+def test_ssim_pads_images_with_zeros() -> None:
+    """The value at a corner, for constant pictures of 1 and 0.5, is computed by hand."""
     ones = torch.ones(30, 30, 3, dtype=torch.float64)
-    share = window()[:6].sum().item() ** 2  # of the window that lies inside at a corner
+    share = window()[:6].sum().item() ** 2  # share of the window inside the image at a corner
     variance = share - share**2
     expected = (2 * share * share * 0.5 + 1e-4) / (share**2 * 1.25 + 1e-4)
     expected *= (2 * 0.5 * variance + 9e-4) / (1.25 * variance + 9e-4)
     assert ssim_map(ones, ones / 2)[0, 0, 0].item() == pytest.approx(expected, rel=1e-9)
 
 
-def test_the_kernels_are_taken_on_a_cpu_in_single_precision_and_torch_elsewhere() -> None:
+def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise() -> None:
     loss, (image, target) = PhotometricLoss(0.3, threads=1), _images(12, 13)
     expected, _, _ = loss(image.double(), target)
     assert not loss._compiled
@@ -69,7 +69,7 @@ def test_the_kernels_are_taken_on_a_cpu_in_single_precision_and_torch_elsewhere(
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("weight", [0.2, 0.0, 1.0])
-def test_compiled_matches_float64(size: tuple[int, int], weight: float) -> None:
+def test_the_compiled_loss_matches_float64(size: tuple[int, int], weight: float) -> None:
     image, target = _images(*size)
     for wanted in (target, target / 255):
         leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
@@ -83,7 +83,7 @@ def test_compiled_matches_float64(size: tuple[int, int], weight: float) -> None:
         assert error < 1e-4
 
 
-def test_equal_images() -> None:
+def test_equal_images_have_no_loss_and_no_gradient() -> None:
     image, _ = _images(20, 33)
     leaf = image.clone().requires_grad_()
     loss, l1, similarity = photometric_loss(leaf, image)
@@ -93,7 +93,7 @@ def test_equal_images() -> None:
     assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
 
 
-def test_the_same_bits_for_any_number_of_threads() -> None:
+def test_any_number_of_threads_gives_the_same_bits() -> None:
     image, target = _images(64, 65)
     results = []
     for threads in (1, 1, 2, 4):
@@ -106,7 +106,7 @@ def test_the_same_bits_for_any_number_of_threads() -> None:
     assert len(set(results)) == 1
 
 
-def test_without_gradient_and_other_dtypes() -> None:
+def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images() -> None:
     image, target = _images(16, 18)
     loss = PhotometricLoss(threads=1)
     with torch.no_grad():

@@ -1,7 +1,4 @@
-"""Losses from a device that is behind are the same; one that is not finite is never saved.
-
-And histograms of volumes.
-"""
+"""The log of losses, also from a device that is behind; records; and histograms of volumes."""
 
 from __future__ import annotations
 
@@ -23,13 +20,13 @@ def scalars(step: int, total: float | None = None) -> tuple[Tensor, ...]:
 
 @pytest.fixture(params=["at once", "late"])
 def late(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Readbacks as on a device that is behind: none has arrived until it is waited for."""
+    """Whether the device is behind: then no readback has arrived before it is waited for."""
     if request.param == "late":
         monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
     return bool(request.param == "late")
 
 
-def test_the_latest_and_the_mean(late: bool) -> None:
+def test_the_latest_loss_and_the_smoothed_loss_are_exact(late: bool) -> None:
     losses = LossLog()
     assert math.isnan(losses.smoothed)
     expected = math.nan
@@ -46,7 +43,9 @@ def test_the_latest_and_the_mean(late: bool) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_the_first_iteration_that_was_not_finite_is_named(late: bool, bad: float) -> None:
+def test_the_first_iteration_with_a_loss_that_is_not_finite_is_named(
+    late: bool, bad: float
+) -> None:
     losses = LossLog()
     losses.add(1, *scalars(1))
     with pytest.raises(FloatingPointError, match=f"the loss became {bad} at iteration 2"):  # noqa: PT012
@@ -56,7 +55,7 @@ def test_the_first_iteration_that_was_not_finite_is_named(late: bool, bad: float
         losses.wait()
 
 
-def test_regularisers_of_another_type_and_graphs_are_taken() -> None:
+def test_a_total_of_another_dtype_and_scalars_with_gradients_are_accepted() -> None:
     losses = LossLog()
     leaf = torch.ones((), requires_grad=True)
     losses.add(1, leaf * 2, torch.tensor(0.5), torch.tensor(0.25), (leaf * 3).double())
@@ -69,8 +68,8 @@ def test_readers_see_a_record_at_once(tmp_path: Path) -> None:
         assert (tmp_path / "events.jsonl").read_text() == '{"step": 1}\n'
 
 
-def test_volumes_are_counted_by_quarter_decades() -> None:
-    """One by one; what is beyond the ends counts in the outermost bins."""
+def test_volumes_are_counted_in_bins_of_a_quarter_decade() -> None:
+    """Volumes beyond the range count in the outermost bins."""
     log_scales = (
         torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 4
     )

@@ -1,6 +1,6 @@
-"""A loss with a mask: what is ignored adds nothing to it and has no gradient.
+"""The loss with a mask: ignored pixels add nothing and have no gradient.
 
-What counts weighs what it did.
+The other pixels have the same weight as without a mask.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CAMERA = Camera(
 
 @pytest.fixture
 def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A render, a photograph and the mask [H, W, 1] of a disc and a margin."""
+    """A render, a photograph, and a mask [H, W, 1] that ignores a disc and the right margin."""
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
     target = (torch.rand(HEIGHT, WIDTH, 3, generator=generator) * 255).to(torch.uint8)
@@ -33,10 +33,10 @@ def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return image, target, mask[..., None]
 
 
-def test_the_loss_with_a_mask_is_its_definition(picture) -> None:
-    """L1 summed over what counts.
+def test_the_loss_with_a_mask_matches_its_definition(picture) -> None:
+    """L1 is a sum over the pixels that count, divided by all pixels.
 
-    SSIM by scikit-image, of pictures that are equal under the mask; over all pixels.
+    SSIM is that of scikit-image over all pixels, for pictures that are equal under the mask.
     """
     image, target, mask = picture
     loss, l1, ssim = PhotometricLoss(0.2, threads=1)(replace_ignored(image, target, mask), target)
@@ -62,7 +62,9 @@ def test_the_loss_with_a_mask_is_its_definition(picture) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_no_gradient_and_no_value_comes_from_under_the_mask(picture, dtype: torch.dtype) -> None:
+def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(
+    picture, dtype: torch.dtype
+) -> None:
     image, target, mask = picture
     results = []
     for noise in (0.0, 5.0):
@@ -76,10 +78,10 @@ def test_no_gradient_and_no_value_comes_from_under_the_mask(picture, dtype: torc
     assert torch.equal(results[0][1], results[1][1])
 
 
-def test_far_from_the_mask_a_pixel_pulls_as_without_one(picture) -> None:
-    """So thresholds on gradients mean the same.
+def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture) -> None:
+    """Thresholds on gradients keep their meaning, because the loss is divided by all pixels.
 
-    The loss is divided by all pixels, not by those that count. Far: 11 px, a window on a window.
+    Far means at least 11 px: the gradient has two windows of SSIM, each of radius 5.
     """
     image, target, _ = picture
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
@@ -93,7 +95,7 @@ def test_far_from_the_mask_a_pixel_pulls_as_without_one(picture) -> None:
     assert not torch.equal(gradients[0][:, 20:30], gradients[1][:, 20:30])
 
 
-def test_densifiers_see_no_error_under_a_mask(picture) -> None:
+def test_densifiers_get_no_error_at_ignored_pixels(picture) -> None:
     from gsbench.gaussians.initial import gaussians_from_cloud
 
     _, target, mask = picture
@@ -120,7 +122,7 @@ def test_densifiers_see_no_error_under_a_mask(picture) -> None:
     assert (scene.dissimilarity(0, image)[inside] < 1e-6).all()
 
 
-def test_masks_shrink_with_the_pictures(picture) -> None:
+def test_masks_are_reduced_with_their_images(picture) -> None:
     from gsbench.train.resolution import ScaledViews
 
     _, target, mask = picture

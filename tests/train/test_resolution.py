@@ -1,7 +1,4 @@
-"""The schedule of sizes against a restatement of the rule.
-
-Small pictures, the count that follows, and resuming.
-"""
+"""Training on small pictures: the schedule of sizes, the limit on the count, and resuming."""
 
 from __future__ import annotations
 
@@ -47,7 +44,7 @@ BOTH = "pictures_and_count"
 
 
 def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArray[np.uint8]]:
-    """Noise whose amplitude falls with the frequency, as that of photographs does."""
+    """Noise whose amplitude falls with the frequency, as in photographs."""
     rng = np.random.default_rng(seed)
     frequency = (
         np.hypot(np.fft.fftfreq(height)[:, None] * height, np.fft.fftfreq(width)[None] * width) + 1
@@ -63,7 +60,7 @@ def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArra
 
 
 def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
-    """The scale of each iteration from 0 to ``until``, one bisection at a time; for even sides."""
+    """The scale of each iteration from 0 to ``until``, found by bisection; for even sides."""
     height, width, _ = pictures[0].shape
 
     def window(spectrum: NDArray[np.float64], scale: float) -> float:
@@ -104,17 +101,17 @@ def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
 @pytest.mark.parametrize(
     ("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)]
 )
-def test_the_schedule_of_sizes(height: int, width: int, until: int) -> None:
+def test_the_schedule_of_sizes_matches_a_restatement(height: int, width: int, until: int) -> None:
     pictures = soft_pictures(3, height, width, height)
     found = scale_schedule(pictures, until)
     expected = stated_again(pictures, until)
     assert [found.at(step) for step in range(until + 1)] == expected
-    assert expected[0] > 2  # or else nothing was tested
+    assert expected[0] > 2  # the pictures start small
     assert expected == sorted(expected, reverse=True)
     assert found.at(10 * until) == 1
 
 
-def test_pictures_of_several_shapes_and_without_content() -> None:
+def test_pictures_of_several_shapes_and_without_content_have_a_schedule() -> None:
     mixed = [*soft_pictures(2, 47, 63, 1), *soft_pictures(1, 64, 31, 2)]
     found = scale_schedule(mixed, 500)
     assert found.scales[-1] == 1
@@ -122,13 +119,13 @@ def test_pictures_of_several_shapes_and_without_content() -> None:
     assert list(found.scales) == sorted(found.scales, reverse=True)
     black = scale_schedule([*mixed, np.zeros((8, 8, 3), np.uint8)], 500)
     assert {black.at(step) for step in range(501)} == {1}
-    # all is the mean: any size shows it
+    # a constant picture has energy only at frequency zero, which is in every window
     grey = scale_schedule([np.full((8, 8, 3), 99, np.uint8)], 500)
     assert grey.at(500) == 1
 
 
 def weights(size: int, smaller: int) -> NDArray[np.float64]:
-    """Of a triangle as wide as two small pixels to each side, [smaller, size]."""
+    """Weights [smaller, size] of a triangular filter, one small pixel wide on each side."""
     scale = size / smaller
     centres = (np.arange(smaller) + 0.5) * scale
     triangle = np.maximum(0, 1 - np.abs(np.arange(size) + 0.5 - centres[:, None]) / scale)
@@ -136,7 +133,7 @@ def weights(size: int, smaller: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(("scale", "height", "width"), [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
-def test_a_small_picture_is_the_filtered_one_from_the_same_place(
+def test_a_small_picture_is_filtered_and_its_camera_is_resized(
     scale: int, height: int, width: int
 ) -> None:
     camera = orbit_camera(0.3)
@@ -156,10 +153,10 @@ def test_a_small_picture_is_the_filtered_one_from_the_same_place(
 
 
 @pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
-def test_the_energy_within_a_window(height: int, width: int) -> None:
-    """A window has as many pixels on either side of frequency zero.
+def test_the_energy_of_a_window_is_the_sum_over_its_frequencies(height: int, width: int) -> None:
+    """A window has the same number of pixels on both sides of frequency zero.
 
-    The last is the whole spectrum.
+    The last window is the whole spectrum.
     """
     (picture,) = soft_pictures(1, height, width, 3)
     spectrum = sum(np.abs(np.fft.fftshift(np.fft.fft2(picture[..., c] / 255.0))) for c in range(3))
@@ -175,14 +172,14 @@ def test_the_energy_within_a_window(height: int, width: int) -> None:
     assert found[-1] == pytest.approx(float(spectrum.sum()))
 
 
-def test_a_picture_keeps_a_pixel_at_least() -> None:
+def test_a_picture_keeps_at_least_one_pixel() -> None:
     view = View("a.png", orbit_camera(0.0, 5, 3), np.full((3, 5, 3), 7, np.uint8))
     cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(8)
     assert (cameras[0].width, cameras[0].height) == (1, 1)
     assert targets.get(0).tolist() == [[[7, 7, 7]]]
 
 
-def test_rounds_tell_the_schedule_of_their_candidates(lab: Lab) -> None:
+def test_each_round_is_reported_to_the_resolution(lab: Lab) -> None:
     training, told = lab.new(small(), resolution_schedule=BOTH, iterations=50, **SHORT), []
     assert training.resolution is not None
     training.resolution.observe = told.append  # type: ignore[method-assign]
@@ -194,7 +191,7 @@ def scheduled(scene: Scene) -> Resolution:
     return Resolution(options(resolution_schedule=BOTH, **SHORT), scene.train, 100)
 
 
-def test_sizes_change_after_rounds_and_rates_wait_for_them(tiny_scene: Scene) -> None:
+def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_scene: Scene) -> None:
     resolution = scheduled(tiny_scene)
     scales = [resolution.scale(step) for step in range(1, 121)]
     assert scales[0] >= 2
@@ -211,7 +208,7 @@ def test_sizes_change_after_rounds_and_rates_wait_for_them(tiny_scene: Scene) ->
     assert resolution.position_step(wait + 1) == wait
 
 
-def test_the_count_that_a_round_may_reach(tiny_scene: Scene) -> None:
+def test_the_limit_on_the_count_and_the_momentum_follow_their_formulas(tiny_scene: Scene) -> None:
     resolution = scheduled(tiny_scene)
     resolution.scale = lambda step: 3  # type: ignore[method-assign]
 
@@ -237,7 +234,7 @@ def test_the_count_that_a_round_may_reach(tiny_scene: Scene) -> None:
 
 @pytest.mark.parametrize("kind", [*STATEFUL, "edgeaware"])
 @pytest.mark.slow
-def test_interrupted_in_the_middle_it_ends_in_the_same_bits(kind: str, lab: Lab) -> None:
+def test_an_interrupted_training_ends_with_the_same_bits(kind: str, lab: Lab) -> None:
     make = STATEFUL.get(kind, lambda: small(EdgeAware, max_gaussians=200, cap="root"))
     settings = {"resolution_schedule": BOTH, "checkpoint_every": 30, **SHORT}
     whole = lab.train(make(), "whole", **settings)
@@ -251,10 +248,7 @@ def test_interrupted_in_the_middle_it_ends_in_the_same_bits(kind: str, lab: Lab)
 
 
 def test_masks_are_as_small_as_their_pictures(lab: Lab) -> None:
-    """What a mask ignores has no part in a small picture either.
-
-    Whatever stands there, the training is the same.
-    """
+    """In small pictures, too, the content of ignored pixels does not change the training."""
     trained = []
     for value in (0, 255):
         views = []
@@ -262,7 +256,7 @@ def test_masks_are_as_small_as_their_pictures(lab: Lab) -> None:
             counts = np.ones(view.image.shape[:2], bool)
             counts[:24, :28] = False
             image = view.image.copy()
-            image[:3, :3] = value  # at half the size farther away than two windows of SSIM reach
+            image[:3, :3] = value  # at half size, two windows of SSIM do not reach it from outside
             views.append(replace(view, image=image, mask=counts))
         own = lab.with_views(train=tuple(views))
         training = own.new(
@@ -278,7 +272,7 @@ def test_masks_are_as_small_as_their_pictures(lab: Lab) -> None:
     assert same(*trained)
 
 
-def test_pictures_alone_leave_the_count_to_the_densifier(lab: Lab) -> None:
+def test_a_schedule_of_pictures_alone_does_not_limit_the_count(lab: Lab) -> None:
     counts = {}
     for kind in ("none", "pictures", BOTH):
         lab.train(small(), kind, resolution_schedule=kind, **SHORT)
@@ -290,7 +284,7 @@ def test_pictures_alone_leave_the_count_to_the_densifier(lab: Lab) -> None:
     assert "scale" not in lab.records(METRICS, "none")[0]
 
 
-def test_it_is_an_ingredient_of_its_own_and_in_the_hash() -> None:
+def test_the_schedule_is_an_ingredient_and_part_of_the_hash() -> None:
     without, with_it = composed(), composed("train.resolution_schedule=pictures")
     assert config_hash(without) != config_hash(with_it)
     plain = {"densify._target_": "gsbench.densify.ADC", "train.resolution_schedule": "none"}
@@ -299,7 +293,7 @@ def test_it_is_an_ingredient_of_its_own_and_in_the_hash() -> None:
     )
 
 
-def test_a_name_that_is_none_is_refused() -> None:
+def test_an_unknown_schedule_is_refused() -> None:
     with pytest.raises(
         ValueError,
         match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'",
@@ -316,7 +310,7 @@ def test_a_name_that_is_none_is_refused() -> None:
         ((3.0, 1.0, 1.0, 1.0), 0),
     ],
 )
-def test_full_pictures_begin_where_the_last_scale_of_two_or_more_ends(
+def test_full_size_begins_at_the_last_point_with_a_scale_of_two_or_more(
     scales: tuple[float, ...], full: int
 ) -> None:
     assert ScaleSchedule((0, 100, 200, 300), scales).full_from == full

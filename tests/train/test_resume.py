@@ -1,4 +1,4 @@
-"""A training that is stopped anywhere, any number of times, ends in the same bits."""
+"""A training that is stopped anywhere, any number of times, ends with the same bits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ MAKERS: dict[str, Callable[[], Densifier]] = STATEFUL | {
 
 
 @pytest.mark.parametrize("name", list(MAKERS))
-def test_crashes_and_signals_at_random_iterations(name: str, lab: Lab) -> None:
+def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(
+    name: str, lab: Lab
+) -> None:
     make = MAKERS[name]
     whole = lab.train(make(), "whole", log_every=1)
     rng = random.Random(name)
@@ -72,7 +74,7 @@ def test_crashes_and_signals_at_random_iterations(name: str, lab: Lab) -> None:
     assert timeless[0] == timeless[1]
 
 
-def test_checkpoints_come_by_the_clock_too(lab: Lab) -> None:
+def test_checkpoints_are_also_written_by_the_clock(lab: Lab) -> None:
     settings = {"log_every": 1, "checkpoint_every": 10**6, "checkpoint_minutes": 1e-9}
     with pytest.raises(StopError):
         lab.train(small(), "", stop_at(5), **settings)
@@ -91,7 +93,7 @@ def test_a_stop_in_the_last_iteration_loses_nothing(lab: Lab) -> None:
     assert same(whole, lab.train(small(), "broken"))
 
 
-def test_records_later_than_the_checkpoint_and_a_torn_line_are_dropped(tmp_path: Path) -> None:
+def test_records_after_the_checkpoint_and_an_incomplete_line_are_removed(tmp_path: Path) -> None:
     file = tmp_path / "metrics.jsonl"
     lines = [json.dumps({"step": step}) + "\n" for step in range(1, 8)]
     for torn in ("", '{"step": 3, "lo', '{"loss": 1}\n', "5\n"):
@@ -107,10 +109,8 @@ def test_records_later_than_the_checkpoint_and_a_torn_line_are_dropped(tmp_path:
 )
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
 @pytest.mark.slow
-def test_a_kill_while_a_resumed_training_tidies_its_records_loses_none(
-    share: float, tmp_path: Path
-) -> None:
-    """The system ends the process as soon as it has written ``share`` of the file."""
+def test_a_kill_while_records_are_removed_loses_no_record(share: float, tmp_path: Path) -> None:
+    """The system kills the process as soon as it has written ``share`` of the file."""
     file = tmp_path / "events.jsonl"
     lines = [json.dumps({"step": step, "cloned": step}) + "\n" for step in range(1, 5001)]
     file.write_text("".join(lines))

@@ -1,4 +1,4 @@
-"""What is said of initial points of a scene whose points and colours are known."""
+"""The checks of initial points and cameras, in a scene whose points and colours are known."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ WALL_Z = 4.0
 
 
 def wall_color(points: np.ndarray) -> np.ndarray:
-    """The colours [P, 3] of points on the wall z = 4, which is painted in soft waves."""
+    """The colours [P, 3] of points on the wall z = 4, which has a smooth pattern."""
     waves = [np.sin(1.1 * points[:, 0] + k) + np.cos(0.9 * points[:, 1] - k) for k in range(3)]
     return (127 + 60 * np.stack(waves, axis=1)).clip(0, 255).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Nine views of the wall, made by intersecting the rays of their pixels with it."""
+    """Nine views of the wall: the ray of each pixel is intersected with it."""
     views = []
     for index, angle in enumerate(np.linspace(-0.6, 0.6, 9)):
         camera = orbit_camera(float(angle))
@@ -52,7 +52,7 @@ def cloud() -> tuple[np.ndarray, np.ndarray]:
     return points, wall_color(points)
 
 
-def test_a_sound_cloud_is_seen_agrees_and_raises_no_doubt(
+def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(
     scene: Scene, cloud: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
 ) -> None:
     facts = check_start(*cloud, scene)
@@ -74,7 +74,7 @@ def test_a_sound_cloud_is_seen_agrees_and_raises_no_doubt(
         (lambda camera: {"cx": 1.2 * camera.cx, "fy": 1.1 * camera.fx}, ""),
     ],
 )
-def test_intrinsics_that_no_lens_has_are_named_once(
+def test_intrinsics_that_no_lens_has_cause_one_warning(
     scene: Scene,
     cloud: tuple[np.ndarray, np.ndarray],
     change,
@@ -97,7 +97,7 @@ def test_intrinsics_that_no_lens_has_are_named_once(
 
 
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
-def test_a_cloud_without_colours_is_warned_of(
+def test_a_cloud_of_one_colour_causes_a_warning(
     scene: Scene, cloud: tuple[np.ndarray, np.ndarray], level: int
 ) -> None:
     points, colors = cloud
@@ -124,7 +124,7 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
     return float(np.mean(shares))
 
 
-def test_the_share_in_view_is_that_of_a_loop_over_points_and_views(scene: Scene) -> None:
+def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene: Scene) -> None:
     points = np.random.default_rng(1).uniform(-4, 8, (300, 3))
     colors = np.random.default_rng(2).integers(0, 256, points.shape, dtype=np.uint8)
     assert check_start(points, colors, scene, random_points=True).seen == seen_by_brute_force(
@@ -150,7 +150,7 @@ def test_the_share_in_view_is_that_of_a_loop_over_points_and_views(scene: Scene)
         ),
     ],
 )
-def test_a_wrong_cloud_is_doubted_and_random_ones_are_not_doubted_for_their_colours(
+def test_a_wrong_cloud_causes_a_warning_and_a_random_one_none_about_colours_or_views(
     scene: Scene,
     cloud: tuple[np.ndarray, np.ndarray],
     caplog: pytest.LogCaptureFixture,
@@ -165,12 +165,14 @@ def test_a_wrong_cloud_is_doubted_and_random_ones_are_not_doubted_for_their_colo
     assert not any("agree" in line or "in view" in line for line in at_random.warnings)
 
 
-def test_agreement_is_that_of_all_pairs(scene: Scene, cloud: tuple[np.ndarray, np.ndarray]) -> None:
+def test_colour_agreement_is_relative_to_all_pairs_of_points(
+    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
+) -> None:
     points, colors = cloud
     swapped = colors[:, ::-1]
     facts, right = check_start(points, swapped, scene), check_start(points, colors, scene)
-    # The photographs show a point's own colour up to half a pixel, so these differences are near
-    # the exact ones.
+    # The photographs show a point's own colour up to half a pixel, so these differences are close
+    # to those that are measured.
     own = np.abs(swapped.astype(int) - colors).mean()
     pairs = np.abs(swapped[:, None].astype(int) - colors[None]).mean()
     assert facts.color_agreement == pytest.approx(1 - own / pairs, abs=0.05)
@@ -191,7 +193,7 @@ def test_agreement_is_that_of_all_pairs(scene: Scene, cloud: tuple[np.ndarray, n
         ),
     ],
 )
-def test_a_start_that_cannot_be_learnt_from_is_refused_in_one_line(
+def test_a_start_from_which_nothing_can_be_learnt_is_refused(
     scene: Scene, points: np.ndarray, error: str
 ) -> None:
     colors = np.zeros(points.shape, dtype=np.uint8)
@@ -199,13 +201,13 @@ def test_a_start_that_cannot_be_learnt_from_is_refused_in_one_line(
         check_start(points, colors, scene)
 
 
-def test_messages_have_the_given_coordinates(scene: Scene) -> None:
+def test_messages_have_the_scenes_own_coordinates(scene: Scene) -> None:
     points, colors = np.array([[0, 0, 4.0]] * 9), np.zeros((9, 3), dtype=np.uint8)
     with pytest.raises(InputError, match=r"\(500000, 5400000, 308\)"):
         check_start(points, colors, scene, normalization=Normalization((5e5, 5.4e6, 300.0), 0.5))
 
 
-def test_cameras_at_one_place_are_refused_and_one_far_off_is_named(
+def test_cameras_at_one_place_are_refused_and_a_far_camera_causes_a_warning(
     scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
 ) -> None:
     first = scene.train[0]
@@ -214,12 +216,12 @@ def test_cameras_at_one_place_are_refused_and_one_far_off_is_named(
     far_off = first.camera.translation + np.array([3e3, 0, 0])
     away = replace(first, camera=replace(first.camera, translation=far_off))
     facts: InitialCloud = check_start(*cloud, Scene("wall", (away, *scene.train[1:]), ()))
-    (line,) = facts.warnings  # and the other facts are measured by the other cameras
+    (line,) = facts.warnings  # other facts do not depend on the far camera
     assert line.startswith("the camera of 1.png is ")
     assert "sets the scene extent to" in line
 
 
-def test_pixels_that_a_mask_ignores_show_no_colour(
+def test_ignored_pixels_have_no_effect_on_the_agreement(
     scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
 ) -> None:
     noise = np.random.default_rng(3).integers(0, 256, scene.train[0].image.shape, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Training images stay on the device where there is room; they are the same where not."""
+"""Training images stay on the device if they fit; if not, they are copied unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def views() -> list[View]:
     return [View(f"{k}.png", front_camera(i.shape[1], i.shape[0]), i) for k, i in enumerate(images)]
 
 
-def test_what_fits_is_resident(views: list[View]) -> None:
+def test_images_that_fit_stay_on_the_device(views: list[View]) -> None:
     size = sum(view.image.size for view in views)
     for budget in (None, size):
         targets = Targets(views, CPU, budget)
@@ -33,7 +33,7 @@ def test_what_fits_is_resident(views: list[View]) -> None:
     assert not Targets(views, CPU, size - 1).resident
 
 
-def test_images_without_room_are_the_same(views: list[View]) -> None:
+def test_images_that_do_not_fit_are_copied_unchanged(views: list[View]) -> None:
     targets = Targets(views, CPU, budget=0)
     for index, view in enumerate(views):
         assert np.array_equal(targets.get(index).numpy(), view.image)

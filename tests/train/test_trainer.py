@@ -1,7 +1,4 @@
-"""The training loop.
-
-It learns, it follows the schedule, it is repeatable, and it goes on where it was stopped.
-"""
+"""The training loop: it learns, follows the schedule, is repeatable, and can be resumed."""
 
 from __future__ import annotations
 
@@ -40,13 +37,13 @@ def test_training_learns_the_scene(lab: Lab) -> None:
     assert [degrees[step] for step in (30, 40, 80, 120, 500)] == [0, 1, 2, 3, 3]
 
 
-def test_same_seed_same_bits_other_seed_not(lab: Lab) -> None:
+def test_only_the_same_seed_gives_the_same_bits(lab: Lab) -> None:
     runs = [lab.train(small(), str(i), seed=i // 2) for i in range(3)]
     assert same(runs[0], runs[1])
     assert not same(runs[0], runs[2])
 
 
-def test_events_add_up_to_the_gaussians(lab: Lab) -> None:
+def test_counts_in_events_add_up_to_the_trained_gaussians(lab: Lab) -> None:
     densifier = small(Volumetric, volume_threshold=0.01)
     trained = lab.train(densifier)
     events = lab.records(EVENTS)
@@ -62,7 +59,7 @@ def test_events_add_up_to_the_gaussians(lab: Lab) -> None:
 
 
 def test_nothing_is_refined_in_the_last_iteration(lab: Lab) -> None:
-    """3DGS saves its model before it would refine or step."""
+    """3DGS saves its model before it refines and steps."""
     lab.train(small(), iterations=100)
     assert lab.steps(EVENTS) == [40, 60, 80]
 
@@ -76,16 +73,16 @@ class Explode(NoDensifier):
         return None if self.left else torch.tensor(float("inf"))
 
 
-def test_non_finite_loss_names_the_iteration(lab: Lab) -> None:
+def test_a_loss_that_is_not_finite_is_an_error_with_the_iteration(lab: Lab) -> None:
     with pytest.raises(TrainingError, match=r"iteration 57.*last good state"):
         lab.train(Explode(57))
     assert lab.checkpoints() == [50]
 
 
-def test_no_checkpoint_holds_a_state_after_a_loss_that_was_not_finite(
+def test_no_checkpoint_is_written_after_a_loss_that_is_not_finite(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a device that is behind, a loss arrives only when it is waited for."""
+    """On a device that is behind, a loss arrives only when the host waits for it."""
 
     monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
     with pytest.raises(TrainingError, match="iteration 3;"):
@@ -93,7 +90,7 @@ def test_no_checkpoint_holds_a_state_after_a_loss_that_was_not_finite(
     assert lab.checkpoints()[-1] == 2
 
 
-def test_a_full_device_names_the_last_checkpoint_and_what_to_lower(lab: Lab) -> None:
+def test_the_error_of_a_full_device_names_the_checkpoint_and_a_remedy(lab: Lab) -> None:
     class Full(NoDensifier):
         def observe(self, step: int, render: RenderOutput) -> None:
             if step == 57:
@@ -112,13 +109,10 @@ def test_a_full_device_names_the_last_checkpoint_and_what_to_lower(lab: Lab) -> 
 
 
 @pytest.mark.parametrize("kind", ["adc", "mcmc"])
-def test_as_on_a_device_that_is_behind(
+def test_a_device_that_is_behind_gives_the_same_bits(
     kind: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Losses that arrive late, images without room, checkpoints written by a thread.
-
-    The same bits, stopped or not.
-    """
+    """Losses arrive late, images do not fit on the device, and a thread writes checkpoints."""
 
     make = STATEFUL[kind]
     whole = lab.train(make(), "whole")
@@ -141,7 +135,7 @@ def test_every_view_is_used_once_before_any_is_used_again() -> None:
     assert drawn[:7] != drawn[7:14]
 
 
-def test_learning_rate_of_the_means_is_log_linear() -> None:
+def test_the_learning_rate_of_the_means_is_log_linear() -> None:
     rates = TrainConfig(name="x")
     assert rates.position(0) == pytest.approx(1.6e-4)
     assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
@@ -149,7 +143,9 @@ def test_learning_rate_of_the_means_is_log_linear() -> None:
     assert rates.position(99_000) == pytest.approx(1.6e-6)
 
 
-def test_a_densifier_that_was_never_due_is_told(lab: Lab, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_densifier_that_was_never_due_causes_a_warning(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
     lab.train(ADC(start=500), "adc", iterations=15)
     assert "not one refinement was due in 15 iterations" in caplog.text
     caplog.clear()
@@ -157,7 +153,7 @@ def test_a_densifier_that_was_never_due_is_told(lab: Lab, caplog: pytest.LogCapt
     assert "refinement" not in caplog.text
 
 
-def test_a_snapshot_is_the_model_of_a_training_that_ends_there(lab: Lab) -> None:
+def test_a_snapshot_equals_the_model_of_a_training_that_ends_there(lab: Lab) -> None:
     """Iteration 60 is due for a refinement and an opacity reset: 3DGS saves before both."""
     lab.train(small(), "long", snapshot_at=[60])
     short = lab.train(small(), "short", iterations=60)
@@ -165,7 +161,7 @@ def test_a_snapshot_is_the_model_of_a_training_that_ends_there(lab: Lab) -> None
 
 
 def test_defaults_are_those_of_3dgs() -> None:
-    """As ``arguments/__init__.py`` of the 2023 code of 3DGS has them."""
+    """The source is ``arguments/__init__.py`` of the 2023 code of 3DGS."""
     published = {
         "iterations": 30_000,
         "position_initial": 0.00016,
@@ -210,7 +206,7 @@ def test_the_optimiser_steps_after_or_before_a_refinement(before: bool, lab: Lab
 
 
 @pytest.mark.parametrize("visible_adam", [False, True])
-def test_only_visible_gaussians_are_updated_if_asked(visible_adam: bool, lab: Lab) -> None:
+def test_visible_adam_updates_only_visible_gaussians(visible_adam: bool, lab: Lab) -> None:
     training = lab.new(NoDensifier(), visible_adam=visible_adam, sh_interval=1)
     given = []
     training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)  # type: ignore[method-assign]
@@ -223,7 +219,7 @@ def test_only_visible_gaussians_are_updated_if_asked(visible_adam: bool, lab: La
 @pytest.mark.parametrize(
     ("background", "white"), [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)]
 )
-def test_a_densifier_is_told_of_a_white_background(
+def test_the_context_of_a_densifier_knows_a_white_background(
     background: list[float], white: bool, lab: Lab
 ) -> None:
     context = lab.new(NoDensifier(), background=background).context
@@ -233,7 +229,7 @@ def test_a_densifier_is_told_of_a_white_background(
 
 
 @pytest.mark.parametrize(("spare", "resident"), [(0, True), (-2, False)])
-def test_images_may_take_half_of_the_free_memory(
+def test_images_may_use_half_of_the_free_memory(
     spare: int, resident: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = sum(view.image.size for view in lab.scene.train)
@@ -242,7 +238,7 @@ def test_images_may_take_half_of_the_free_memory(
 
 
 def clocked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that goes on by a second each time the trainer looks at it."""
+    """Give the trainer a clock that advances by a second each time it is read."""
     seconds = itertools.count(0.0, 1.00004)  # the last digit is not written
     monkeypatch.setattr(
         trainer,
@@ -251,10 +247,10 @@ def clocked(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_seconds_and_rates_go_on_from_a_checkpoint(
+def test_seconds_and_rates_continue_from_a_checkpoint(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The trainer looks at the clock twice in an iteration that is logged."""
+    """The trainer reads the clock twice in an iteration that is logged."""
     settings, shown = {"iterations": 5, "log_every": 1, "checkpoint_every": 2}, []
 
     def look(status: Status) -> None:
@@ -274,12 +270,12 @@ def test_seconds_and_rates_go_on_from_a_checkpoint(
     assert shown == [(k, 80, pytest.approx(0.5, rel=1e-3)) for k in (1, 2, 3, 3, 4, 5)]
 
 
-def test_checkpoints_come_so_many_minutes_after_the_last(
+def test_a_checkpoint_is_written_some_minutes_after_the_last(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A clock that goes on by half a minute each time.
+    """The clock advances by half a minute each time it is read.
 
-    At the start, in each iteration, and after each checkpoint.
+    The trainer reads it at the start, in each iteration, and after each checkpoint.
     """
     looks, clock = itertools.count(), SimpleNamespace(perf_counter=time.perf_counter)
     clock.monotonic = lambda: 30.0 * next(looks)
@@ -289,7 +285,7 @@ def test_checkpoints_come_so_many_minutes_after_the_last(
     assert lab.checkpoints() == [3, 6]
 
 
-def test_a_time_budget_ends_with_the_iteration_that_reaches_it_and_logs_it(
+def test_a_training_ends_with_the_iteration_that_reaches_the_time_budget_and_logs_it(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clocked(monkeypatch)
@@ -316,12 +312,12 @@ def test_on_a_cpu_checkpoints_are_written_without_a_thread(
     assert calls == [False, "close"]
 
 
-def test_the_last_iteration_is_logged_too(lab: Lab) -> None:
+def test_the_last_iteration_is_always_logged(lab: Lab) -> None:
     lab.train(NoDensifier(), iterations=7, log_every=3)
     assert lab.steps(METRICS) == [3, 6, 7]
 
 
-def test_a_model_without_gaussians_or_out_of_range_ends_the_training(lab: Lab) -> None:
+def test_a_model_without_gaussians_or_with_invalid_values_is_an_error(lab: Lab) -> None:
     class Emptying(NoDensifier):
         left = 0
 
@@ -345,7 +341,7 @@ def test_a_model_without_gaussians_or_out_of_range_ends_the_training(lab: Lab) -
         broken.iterate(lab.folder)
 
 
-def test_every_stream_of_random_numbers_is_seeded_by_numpy() -> None:
+def test_every_random_stream_has_a_seed_from_numpys_seed_sequence() -> None:
     for stream, name in enumerate(STREAMS):
         seed = int(np.random.SeedSequence([3, stream]).generate_state(1, np.uint64)[0]) // 2
         assert generators(3)[name].initial_seed() == seed

@@ -1,4 +1,4 @@
-"""What a densifier sees of the training views is what the training sees."""
+"""Densifiers get the training views as the training renders and measures them."""
 
 from __future__ import annotations
 
@@ -43,12 +43,14 @@ def test_views_are_rendered_and_measured_as_in_training(
         assert float(views.dissimilarity(index, photograph).abs().max()) < 1e-6
 
 
-def test_looking_at_a_view_leaves_no_gradient(tiny_scene: Scene, truth: Gaussians) -> None:
+def test_rendering_a_view_for_scores_leaves_no_gradient(
+    tiny_scene: Scene, truth: Gaussians
+) -> None:
     trainer = Trainer(tiny_scene, cloud(truth), NoDensifier(), ReferenceRasterizer(), options(), 0)
     views, gaussians = trainer.context.training_views, trainer.gaussians.values
     with torch.no_grad():
         sums, render = blended_sums(views, 0, gaussians, 100, torch.ones(*views.image(0).shape))
     assert torch.equal(sums[:, 0], sums[:, 2])
-    # light that is blended anywhere
+    # the sum of all blending weights
     torch.testing.assert_close(sums[:, 0].sum(), render.alpha.sum())
     assert all(tensor.grad is None for tensor in gaussians.tensors().values())

@@ -17,7 +17,7 @@ from gsbench.events import Cause
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import OpenFraction, Switch
 
-# of one split: more is a mistake in the settings, and would fill the memory in one round
+# limit for the children of one split; more would fill the memory in one round
 MAX_CHILDREN = 64
 OPACITY_RESET = Switch(
     {"opacity_reset_interval": NEVER},
@@ -30,9 +30,9 @@ LOCKED_ROUNDS = 5
 class Grown(NamedTuple):
     """Results of the growth of a round for each of N Gaussians, before pruning."""
 
-    number: Tensor  # [N] of Gaussians in its place, itself included
-    log_scales: Tensor  # [N, 3] of each of them
-    opacity_logits: Tensor  # [N] of each of them
+    number: Tensor  # [N] number of Gaussians that take its place, itself included
+    log_scales: Tensor  # [N, 3] log scales of each of these
+    opacity_logits: Tensor  # [N] opacity logit of each of these
 
 
 @dataclass
@@ -127,14 +127,15 @@ class ADC(Budgeted):
     def mean_gradient(self) -> Tensor:
         """Mean gradient [N] NDC over the iterations in which a Gaussian was visible.
 
-        It is 0 if it never was.
+        It is 0 for a Gaussian that was never visible.
         """
         return self.statistics["gradient_sum"] / self.statistics["visible_count"].clamp_min(1)
 
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
-        """Two masks [N]: Gaussians whose mean gradient reaches the threshold.
+        """Return two masks [N]: the Gaussians to grow, and all large Gaussians.
 
-        The other has the Gaussians to split rather than clone.
+        A Gaussian grows if its mean gradient reaches the threshold. A large one is then split, a
+        small one cloned.
         """
         log_scales = refinement.gaussians.values.log_scales
         large = log_scales.amax(-1) > math.log(self.split_size * self.context.extent)
@@ -143,7 +144,7 @@ class ADC(Budgeted):
     def reaches(self, mean: Tensor, threshold: float) -> Tensor:
         """Mask [N] of the Gaussians whose ``mean`` gradient [N] reaches a growth ``threshold``.
 
-        The threshold is multiplied by ``strictness``.
+        ``strictness`` multiplies the threshold.
         """
         limit = threshold * self.strictness
         return mean >= limit if self.threshold_inclusive else mean > limit
@@ -157,7 +158,7 @@ class ADC(Budgeted):
         return admit(candidates, self.mean_gradient(), gain, self.allowance(refinement))
 
     def grown(self, refinement: Refinement) -> Grown:
-        """Result of growth for each Gaussian if the cap admitted all candidates."""
+        """Return the result of growth for each Gaussian if the cap admitted all candidates."""
         values = refinement.gaussians.values
         over, large = self.candidates(refinement)
         logits = torch.where(over, revised_logits(values.opacity_logits), values.opacity_logits)
@@ -199,10 +200,7 @@ class ADC(Budgeted):
         return opacity_logits.sigmoid() < self.prune_opacity * self.cull
 
     def huge(self, step: int, log_scales: Tensor) -> Tensor:
-        """Mask [N] of the Gaussians to prune by size.
-
-        There are none until the first opacity reset has passed.
-        """
+        """Mask [N] of the Gaussians to prune by size; all False until the first opacity reset."""
         if not self.prunes_by_size or step <= self.opacity_reset_interval:
             return log_scales.new_zeros(len(log_scales), dtype=torch.bool)
         huge = log_scales.amax(-1) > math.log(self.prune_size * self.context.extent)
@@ -211,10 +209,7 @@ class ADC(Budgeted):
         return huge
 
     def may_cull(self, step: int) -> bool:
-        """Return False in the first rounds after an opacity reset.
-
-        Then nearly all opacities are low.
-        """
+        """Return False in the first rounds after an opacity reset, when most opacities are low."""
         since_reset = step % self.opacity_reset_interval
         return (
             step <= self.opacity_reset_interval
@@ -227,20 +222,21 @@ class ADC(Budgeted):
         return self.faint(values.opacity_logits), self.huge(refinement.step, values.log_scales)
 
     def prune(self, refinement: Refinement) -> None:
-        """Remove the Gaussians ``to_prune``."""
+        """Remove the Gaussians that `to_prune` selects."""
         self.remove(refinement, *self.to_prune(refinement))
 
     def prune_drawn(self, refinement: Refinement, known: Tensor, weights: Tensor) -> None:
-        """Remove those ``to_prune`` that are among half as many draws from the mask ``known`` [N].
+        """Remove the Gaussians that `to_prune` selects and that a random draw selects, too.
 
-        The draws are in proportion to ``weights`` [N].
+        The draw takes Gaussians from the mask ``known`` [N], in proportion to ``weights`` [N], and
+        half as many as `to_prune` selects.
         """
         faint, huge = self.to_prune(refinement)
         drawn = draw(known, weights, int((faint | huge).sum()) // 2, refinement.rng)
         self.remove(refinement, faint & drawn, huge & drawn)
 
     def reset_opacity(self, refinement: Refinement) -> None:
-        """Lower all opacities: those of needed Gaussians rise again, the others are pruned."""
+        """Lower all opacities. Those of needed Gaussians rise again; other Gaussians are pruned."""
         self.limit_opacity(refinement, self.opacity_reset_value)
         refinement.event.opacity_reset = True
 

@@ -67,7 +67,7 @@ class AbsGS(ADC):
     def mean_absolute_gradient(self) -> Tensor:
         """Absolute mean gradient [N] NDC over the iterations in which a Gaussian was visible.
 
-        It is 0 if it never was.
+        It is 0 for a Gaussian that was never visible.
         """
         return self.statistics["absolute_sum"] / self.statistics["visible_count"].clamp_min(1)
 
@@ -138,7 +138,7 @@ class PixelGS(ADC):
     def mean_gradient(self) -> Tensor:
         """Mean gradient [N] NDC over the views since the last refinement, weighted by pixels.
 
-        It is 0 without pixels.
+        It is 0 for a Gaussian that was blended into no pixel.
         """
         return self.statistics["weighted_gradient_sum"] / self.statistics["pixel_sum"].clamp_min(1)
 
@@ -147,9 +147,10 @@ class PixelGS(ADC):
 class QuantileADC(ADC):
     """ADC with a growth rate, after the AdaptiveStrategy of gsplat's pull request 941.
 
-    In each round the Gaussians with the largest mean gradients grow, as many as raise the count by
-    ``growth_rate``. Gaussians that no view has seen do not grow. The ``prune_share`` with the
-    lowest opacities are pruned, and huge Gaussians are pruned as in ADC.
+    Each round grows the Gaussians with the largest mean gradients, so many that the count rises by
+    the share ``growth_rate``. Gaussians without a gradient do not grow. The share ``prune_share``
+    of all Gaussians, those with the lowest opacities, is pruned. Huge Gaussians are pruned as in
+    ADC.
     """
 
     growth_rate: PositiveFloat = 0.05
@@ -190,12 +191,12 @@ class Saddles(NamedTuple):
 
 @dataclass
 class SteepGS(ADC):
-    """ADC that splits only where a split lowers the loss (SteepGS, arXiv 2505.05587).
+    """ADC that splits only where a split lowers the loss (Wang et al., arXiv 2505.05587).
 
-    By Wang et al., CVPR 2025. Replace a Gaussian by two halves at small offsets +-d. To second
-    order the loss changes by d S d / 2, where S is the splitting matrix: the sum over pixels of (d
-    loss / d s) times the second derivative of s by the mean, with s the opacity times the density
-    at the pixel. So a split lowers the loss only if S has a negative eigenvalue, and most along the
+    Consider a split of a Gaussian into two halves at small offsets +-d. To second order, the loss
+    changes by d S d / 2, where S is the splitting matrix: the sum over pixels of (d loss / d s)
+    times the second derivative of s by the mean, with s the opacity times the density at the pixel.
+    So a split lowers the loss only if S has a negative eigenvalue, and lowers it most along the
     eigenvector of the least eigenvalue. Halves of equal weight are best.
 
     A candidate of ADC grows only if the least eigenvalue of its S, averaged over the iterations in
@@ -204,8 +205,8 @@ class SteepGS(ADC):
     ``opacity_factor`` times its opacity. If it is large, their scales are divided by
     ``split_shrink``, and each offset has the length of a draw from the parent's density. If it is
     small, their scales are the parent's, and the offset is the present learning rate of the means.
-    Under a cap, the least eigenvalues come first. ``split_children`` and ``revised_opacity`` have
-    no effect.
+    Under a cap, candidates with the least eigenvalues come first. ``split_children`` and
+    ``revised_opacity`` have no effect.
     """
 
     STATISTICS: ClassVar[Mapping[str, torch.dtype | Statistic]] = {
@@ -231,10 +232,10 @@ class SteepGS(ADC):
             self.statistics["splitting_sum"] += render.require_splitting_matrix()
 
     def steepest(self, where: Tensor) -> tuple[Tensor, Tensor]:
-        """The least eigenvalue [S] and its eigenvector [S, 3] of the mean splitting matrices.
+        """The least eigenvalue [S] of each mean splitting matrix, and its eigenvector [S, 3].
 
-        They are those of the S Gaussians at the mask ``where`` [N]. Eigenvalues are in units of the
-        loss per squared extent. The largest component of each eigenvector is positive.
+        The S Gaussians are those at the mask ``where`` [N]. Eigenvalues are in units of the loss
+        per squared extent. The largest component of each eigenvector is positive.
         """
         seen = self.statistics["visible_count"][where].clamp_min(1)  # [S]
         mean = self.statistics["splitting_sum"][where].double() / seen[:, None, None]  # [S, 3, 3]
@@ -290,7 +291,7 @@ class SteepGS(ADC):
         refinement.event.blocked_by_cap += blocked
 
 
-# gradients are gathered from so many rounds before the window (200 iterations in the authors' code)
+# rounds before the window in which gradients are gathered (200 iterations in the authors' code)
 GATHER_ROUNDS = 2
 
 
@@ -312,7 +313,7 @@ class ResGS(ADC):
     reset, and no pruning by size.
     """
 
-    # residual splits that made a Gaussian
+    # number of residual splits from an initial Gaussian to this one
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"level": torch.int32}
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -345,7 +346,7 @@ class ResGS(ADC):
             raise InputError(f"densify.phase_ends must rise, got {list(self.phase_ends)}")
 
     def iteration_at(self, fraction: float) -> int:
-        """The iteration of the round nearest to the given fraction of the window."""
+        """The iteration of the round that is nearest to ``fraction`` of the window."""
         rounds = round(fraction * (self.stop - self.start) / self.interval)
         return self.start + rounds * self.interval
 
@@ -384,7 +385,7 @@ class ResGS(ADC):
     def candidates(self, refinement: Refinement) -> tuple[Tensor, Tensor]:
         _, large = super().candidates(refinement)
         behind = (self.stage(refinement.step) - self.statistics["level"]).clamp_min(0)  # [N] levels
-        # instead of a lower threshold
+        # a higher mean instead of a lower threshold
         mean = self.mean_gradient() * self.level_factor ** behind.to(torch.float64)
         return self.reaches(mean, self.gradient_threshold), large
 
@@ -396,7 +397,7 @@ class ResGS(ADC):
         return int((~self.faint(parents)).sum()) + int(children.sum())
 
     def grow_by_gradient(self, refinement: Refinement) -> None:
-        """Give each candidate a child, then make the candidate fainter."""
+        """Add a child for each candidate, then lower the candidate's opacity."""
         gaussians, before = refinement.gaussians, len(refinement.gaussians)
         over, _ = self.candidates(refinement)
         selected, blocked = self.choose(refinement, over, 1)

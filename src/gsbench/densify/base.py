@@ -1,7 +1,6 @@
-"""The contract of a densifier.
+"""The contract of a densifier: hyper-parameters, saved state, lineage, and record of refinements.
 
-Its hyper-parameters, its saved state, the lineage of every Gaussian, and a record of each
-refinement. At the end stand functions that several densifiers share.
+At the end of the module are functions that several densifiers share.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ from gsbench.settings import Switch, check_settings
 class Lineage:
     """Identity, parent and cause of every Gaussian that ever existed in a training.
 
-    Always on the CPU. ``ids`` [N] are the identities of the present Gaussians. ``parents``,
-    ``causes`` and ``steps`` [T] are the history of all T Gaussians, indexed by identity; the parent
-    of an initial Gaussian is -1.
+    All tensors are on the CPU. ``ids`` [N] are the identities of the present Gaussians. The history
+    of all T Gaussians, ``parents``, ``causes`` and ``steps`` [T], is indexed by identity; the
+    parent of an initial Gaussian is -1.
     """
 
     def __init__(self, num_gaussians: int) -> None:
         self.ids = torch.arange(num_gaussians)  # [N]
         self.initial_count = num_gaussians
-        # joined when asked for
+        # one entry per edit; ``state_dict`` joins them
         self._history = [self._entries(torch.full((num_gaussians,), -1), Cause.INITIAL, 0)]
         self._total = num_gaussians
 
     @staticmethod
     def _entries(parents: Tensor, cause: Cause, step: int) -> dict[str, Tensor]:
-        """The history of Gaussians born together, with the identities [A] of their parents."""
+        """The history of new Gaussians, given the identities [A] of their parents."""
         causes = torch.full_like(parents, int(cause), dtype=torch.uint8)
         return {
             "parents": parents,
@@ -48,9 +47,9 @@ class Lineage:
         }
 
     def edit(self, keep: Tensor | None, parents: Tensor | None, cause: Cause, step: int) -> None:
-        """Keep those at the mask ``keep`` [N], then append a child of each of ``parents`` [A].
+        """Keep the Gaussians at the mask ``keep`` [N]; then append a child for each parent.
 
-        ``parents`` are indices from before the edit.
+        ``parents`` [A] are indices from before the edit. None keeps all and appends none.
         """
         living = self.ids if keep is None else self.ids[keep.cpu()]
         if parents is not None:
@@ -65,10 +64,7 @@ class Lineage:
         return {cause.key: int(counts[cause]) for cause in Cause}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return ``ids``, ``parents``, ``causes`` and ``steps`` as tensors.
-
-        ``lineage.npz`` of a trial holds the same.
-        """
+        """Return the tensors ``ids``, ``parents``, ``causes``, ``steps``, as in ``lineage.npz``."""
         return {"ids": self.ids} | {
             name: torch.cat([entries[name] for entries in self._history])
             for name in self._history[0]
@@ -85,7 +81,7 @@ class Lineage:
 
 
 CPU = torch.device("cpu")
-NEVER = 10**9  # an iteration, or an interval, beyond any training
+NEVER = 10**9  # an iteration or interval longer than any training
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,7 @@ class DensifyContext:
 
     @property
     def training_views(self) -> TrainingViews:
-        """``views``, or RuntimeError if there are none; the trainer always gives them."""
+        """Return ``views``, which the trainer always sets. Raises RuntimeError if they are None."""
         if self.views is None:
             raise RuntimeError(
                 "this densifier looks at training views: give them as DensifyContext.views"
@@ -112,10 +108,7 @@ class DensifyContext:
 
 @dataclass
 class Refinement:
-    """One refinement in progress.
-
-    What its rules read and change, and the event that counts their edits.
-    """
+    """One refinement in progress: what its rules read and change, and the record of their edits."""
 
     step: int
     gaussians: TrainableGaussians
@@ -144,8 +137,8 @@ class Densifier:
     it, then ``refine``, then the optimiser step, then ``after_step``. A subclass defines:
 
     - ``rules``: what a refinement does;
-    - ``STATISTICS``: what it gathers, in addition to the statistics of its base class;
-    - ``SWITCHES``: its parts that ``gsbench ablate`` can turn off.
+    - ``STATISTICS``: the statistics that it gathers, in addition to those of its base class;
+    - ``SWITCHES``: the parts that ``gsbench ablate`` can turn off.
 
     The state is ``context``, ``lineage`` and ``statistics``. ``statistics`` has one tensor [N] for
     each name in ``STATISTICS`` ([N, …] for a `Statistic` with a shape), zero at the start, on the
@@ -201,18 +194,15 @@ class Densifier:
         cls.STATISTICS = {name: dtype for table in tables for name, dtype in table.items()}
 
     def __post_init__(self) -> None:
-        """Check each hyper-parameter against its annotation.
+        """Check each hyper-parameter against its annotation. Raises InputError.
 
-        A subclass adds checks that involve several of them.
+        A subclass may add checks that involve several hyper-parameters.
         """
         check_settings(self, "densify")
 
     @property
     def most_gaussians(self) -> int | None:
-        """The largest count during training: ``max_gaussians`` if the class has it.
-
-        None means no limit.
-        """
+        """The largest count during training, ``max_gaussians`` if it is set; None: no limit."""
         return getattr(self, "max_gaussians", None)
 
     def prepare(self, gaussians: Gaussians) -> Gaussians:
@@ -233,19 +223,16 @@ class Densifier:
         """Gather statistics of iteration ``step`` (1, 2, …) after its backward pass."""
 
     def rules(self, refinement: Refinement) -> list[Rule]:
-        """Return the rules that are due at ``refinement.step``, in order.
-
-        It is empty if no rule is due.
-        """
+        """Return the rules that are due at ``refinement.step``, in order; [] if none is due."""
         return []
 
     @torch.no_grad()
     def refine(
         self, step: int, gaussians: TrainableGaussians, rng: torch.Generator
     ) -> RefineEvent | None:
-        """Apply the rules that are due.
+        """Apply the rules that are due and return the record of their edits.
 
-        Return the record of what they did, or None if no rule was due.
+        Returns None if no rule is due.
         """
         refinement = Refinement(step, gaussians, rng, RefineEvent(step=step, before=len(gaussians)))
         rules = self.rules(refinement)
@@ -257,7 +244,7 @@ class Densifier:
         return refinement.event
 
     def after_step(self, step: int, gaussians: TrainableGaussians, rng: torch.Generator) -> None:
-        """Act after the optimiser step of iteration ``step``, such as by noise on the means."""
+        """Act after the optimiser step of iteration ``step``; for example, move the means."""
 
     def edit(
         self,
@@ -269,8 +256,8 @@ class Densifier:
     ) -> None:
         """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append ``append`` [A].
 
-        Optimiser state, lineage and statistics are edited alike. ``parents`` [A] are the indices,
-        from before the edit, of the parents of ``append``.
+        Optimiser state, lineage and statistics are edited in the same way. ``parents`` [A] are the
+        indices of the parents of ``append``, from before the edit.
         """
         refinement.gaussians.edit(keep, append)
         self.lineage.edit(keep, parents, cause, refinement.step)
@@ -314,16 +301,16 @@ class Densifier:
     ) -> int:
         """Replace each Gaussian at the mask ``selected`` [N] by ``children`` new ones.
 
-        Return by how many the count grew. ``child_log_scales`` [S, 3] has one row per selected
-        Gaussian. With ``keep_parent``, parents stay beside their children. The means of children
-        are drawn from the density of their parent (``sampled``), or equal its mean.
+        Returns by how many the count grew. ``child_log_scales`` [S, 3] has one row per selected
+        Gaussian. With ``keep_parent``, the parents are kept, too. With ``sampled``, the means of
+        children are drawn from the density of their parent; otherwise they are the parent's mean.
         """
         parents = selected.nonzero().squeeze(-1)  # [S]
         new = Gaussians.concatenate(
             [refinement.gaussians.values.detach().select(parents)] * children
         )
         if sampled:
-            # along each one's axes
+            # along the axes of each Gaussian
             offsets = standard_normal((len(new), 3), refinement.rng, new.means) * new.scales
             new.means = new.means + (new.rotations @ offsets.unsqueeze(-1)).squeeze(-1)
         new.log_scales = child_log_scales.repeat(children, 1)
@@ -338,7 +325,8 @@ class Densifier:
     ) -> None:
         """Replace each Gaussian at the mask ``selected`` [N] by two ``children`` [2 S].
 
-        The first halves of all come first, then the second ones. They count as splits.
+        ``children`` has the first halves of all parents, then the second halves. Each parent counts
+        as one split.
         """
         parents = selected.nonzero().squeeze(-1)  # [S]
         self.edit(refinement, ~selected, children, parents.repeat(2), Cause.SPLIT_GRADIENT)
@@ -356,7 +344,7 @@ class Densifier:
         self.edit(refinement, keep=~pruned)
 
     def reset_statistics(self, refinement: Refinement) -> None:
-        """Set all statistics to zero: the rule that ends a round."""
+        """Set all statistics to zero. This is the last rule of a round."""
         self.statistics = self._zeros(len(refinement.gaussians), refinement.gaussians.device)
 
     def state_dict(self) -> dict[str, Any]:
@@ -390,11 +378,11 @@ class NoDensifier(Densifier):
 
 
 def standard_normal(shape: tuple[int, ...], rng: torch.Generator, like: Tensor) -> Tensor:
-    """Draw normal numbers of ``shape`` with the CPU generator ``rng``.
+    """Draw normal numbers with the dtype and the device of ``like``.
 
-    They have the dtype and the device of ``like``. On another device, a temporary generator there
-    draws the numbers, seeded by ``rng``. So no numbers are uploaded, and the state of ``rng`` is
-    all that a checkpoint must save. The same seed gives other numbers there than on the CPU.
+    ``rng`` is a CPU generator. For another device, it seeds a temporary generator there, which
+    draws the numbers. So no numbers are uploaded, and a checkpoint must save only the state of
+    ``rng``. The same seed gives other numbers there than on the CPU.
     """
     if like.device.type == "cpu":
         return torch.randn(shape, generator=rng, dtype=like.dtype)
@@ -407,24 +395,23 @@ MIN_REVISED_OPACITY = 1e-6  # keeps the logit finite
 
 
 def revised_logits(opacity_logits: Tensor) -> Tensor:
-    """Logits of 1 - sqrt(1 - o).
+    """The logits of 1 - sqrt(1 - o) for opacities o (Revising Densification, arXiv 2404.06109).
 
-    Two such children, one behind the other, are as opaque as the parent. From Revising
-    Densification (arXiv 2404.06109).
+    Two Gaussians of this opacity, one behind the other, are as opaque as one of opacity o.
     """
     transmittance = (-opacity_logits).sigmoid().sqrt()  # sqrt(1 - o)
     return torch.logit((1 - transmittance).clamp_min(MIN_REVISED_OPACITY))
 
 
 def faded(opacity_logits: Tensor, factor: float) -> Tensor:
-    """Logits of ``factor`` (at most 1) times the opacity."""
+    """The logits of ``factor`` (at most 1) times the opacities."""
     return torch.logit(factor * opacity_logits.sigmoid())
 
 
 def quantile(ordered: Tensor, q: float) -> float:
     """The ``q``-quantile of sorted values [N], interpolated linearly.
 
-    torch.quantile refuses more than 16 M values.
+    Unlike torch.quantile, it accepts more than 16 M values.
     """
     position = q * (len(ordered) - 1)
     low = math.floor(position)

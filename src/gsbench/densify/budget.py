@@ -1,7 +1,4 @@
-"""Caps on the number of Gaussians.
-
-Their arithmetic, and the base class of densifiers that have one.
-"""
+"""Caps on the number of Gaussians, and the base class of densifiers that have one."""
 
 import math
 from collections.abc import Callable
@@ -23,9 +20,10 @@ BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spaci
 def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> int | None:
     """The number of Gaussians that a growth step may add; None: no limit.
 
-    ``soft``: no limit while the count is at most ``max_gaussians``, nothing above it. So one step
-    may overshoot, as the paper's cap does (its counts end at 3.41 to 3.57 M for a cap of 3.4 M).
-    ``hard`` and ``curve``: never above it. ``freeze`` and ``governor``: no limit within a round.
+    - ``soft``: no limit if the count is at most ``max_gaussians``, 0 if it is above. So one step
+      may exceed the cap, as in the paper (its counts end at 3.41 to 3.57 M for a cap of 3.4 M).
+    - ``hard`` and ``curve``: the difference to ``max_gaussians``.
+    - ``freeze`` and ``governor``: no limit within a round.
     """
     if max_gaussians is None or cap in ("freeze", "governor"):
         return None
@@ -35,10 +33,10 @@ def allowance(num_gaussians: int, max_gaussians: int | None, cap: CapKind) -> in
 
 
 def admit(candidates: Tensor, score: Tensor, gain: int, allowed: int | None) -> tuple[Tensor, int]:
-    """Choose the candidates that the allowance admits, best ``score`` first (ties by index).
+    """Choose the candidates with the highest scores, as many as ``allowed`` admits.
 
-    Count those refused. ``candidates`` is a mask [N], ``score`` is [N]; each candidate adds
-    ``gain`` Gaussians.
+    ``candidates`` is a mask [N], ``score`` is [N]; each candidate adds ``gain`` Gaussians. Of equal
+    scores, the first index wins. Returns a mask [N] and the number of refused candidates.
     """
     count = int(candidates.sum())
     if allowed is None or count * gain <= allowed:
@@ -92,7 +90,7 @@ class Budgeted(Densifier):
     - ``governor``: thresholds are adjusted so that the count follows that curve and ends at it
       (`govern`).
 
-    Under ``soft`` and ``hard``, the training may set a limit for each round too
+    Under ``soft`` and ``hard``, the training may also set a limit for each round
     (``train.resolution_schedule``).
 
     A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``,
@@ -158,9 +156,9 @@ class Budgeted(Densifier):
     def limit(self, step: int) -> int | None:
         """The limit on the count at iteration ``step``; None: no limit.
 
-        It is ``max_gaussians``, except under ``curve``. That limit rises from n0, the size of the
-        initial cloud, at ``start`` to n = ``max_gaussians`` at ``stop`` along n0 + (n - n0) (2x -
-        x^2), with x the progress of the window. So all arms grow alike and the last refinements are
+        It is ``max_gaussians``, except under ``curve``. There, the limit is n0 + (n - n0) (2x -
+        x^2), where x is the progress of the window, n0 the size of the initial cloud, and n =
+        ``max_gaussians``. So all arms of an experiment grow alike, and the last refinements are
         small (the idea of Taming 3DGS, arXiv 2406.15643).
         """
         if self.max_gaussians is None or self.cap != "curve":
@@ -188,21 +186,21 @@ class Budgeted(Densifier):
         return self.cap == "freeze" and over
 
     def governing(self) -> list[Rule]:
-        """The rules to put first in a round: `govern` under ``cap=governor``, else none."""
+        """The rules that come first in a round: `govern` under ``cap=governor``, otherwise none."""
         return [self.govern] if self.cap == "governor" else []
 
     def skip_round(self, refinement: Refinement) -> None:
-        """The only rule of a frozen round: record how many Gaussians it would have added."""
+        """Record how many Gaussians this round would have added; a frozen round does only this."""
         # With infinite strictness nothing grows: the difference is growth alone, without the effect
         # of pruning.
         without_growth = self._forecast_at(refinement, math.inf)
         refinement.event.blocked_by_cap += self._forecast_at(refinement) - without_growth
 
     def govern(self, refinement: Refinement) -> None:
-        """The first rule of a governed round.
+        """Set ``strictness`` and ``cull`` so that the round ends at the target count.
 
-        Set ``strictness`` and ``cull`` so that the round ends at the target. From Bisht and Kolb,
-        "Smart Target Point Control for Gaussian Splatting Methods" (arXiv 2605.16158):
+        This is the first rule of a governed round. From Bisht and Kolb, "Smart Target Point Control
+        for Gaussian Splatting Methods" (arXiv 2605.16158):
 
         - the target is n0 + (n - n0) (2x - x^2) (their eq. 3 to 5);
         - only the growth thresholds and the opacity for pruning are adjusted;
@@ -210,13 +208,13 @@ class Budgeted(Densifier):
           deadband applies;
         - ``cull`` is not raised for some time after an opacity reset (eq. 13).
 
-        Ours:
+        What differs here:
 
         - the curve ends at the last round, x = 1;
         - one factor multiplies all growth thresholds;
         - that factor is not updated in bounded steps (eq. 8 to 12, whose gains are not stated).
-          Bisection finds the factor for which ``forecast`` meets the target, so short windows work
-          too (10 rounds instead of 144).
+          Bisection finds the factor for which ``forecast`` meets the target, so short windows also
+          work (10 rounds instead of 144).
         """
         event = refinement.event
         target = self.target(refinement)
@@ -235,12 +233,12 @@ class Budgeted(Densifier):
     def target(self, refinement: Refinement) -> int:
         """The count at which a governed round should end; ``max_gaussians`` in the last round.
 
-        With progress x0 before the round and x after it, the curve closes the share 1 - ((1 - x) /
-        (1 - x0))^2 of its distance to ``max_gaussians``. The target closes the same share of the
-        actual distance. So a count on the curve stays on it, and a count below it catches up
+        With progress x0 before the round and x after it, the curve covers the share 1 - ((1 - x) /
+        (1 - x0))^2 of its remaining distance to ``max_gaussians``. The target covers the same share
+        of the actual distance. So a count on the curve stays on it, and a count below it catches up
         gradually.
         """
-        assert self.max_gaussians is not None  # __post_init__ asks for it
+        assert self.max_gaussians is not None  # __post_init__ requires it
         last = (self.stop - 1) // self.interval
         left_after = last - refinement.step // self.interval  # rounds, proportional to 1 - x
         left_before = min(left_after + 1, last - self.start / self.interval)
@@ -248,10 +246,7 @@ class Budgeted(Densifier):
         return count + round((self.max_gaussians - count) * (1 - (left_after / left_before) ** 2))
 
     def may_cull(self, step: int) -> bool:
-        """Return whether the governor may raise ``cull`` now.
-
-        It is False soon after opacities were reset.
-        """
+        """Return whether the governor may raise ``cull`` at iteration ``step``."""
         return True
 
     def _forecast_at(

@@ -1,7 +1,4 @@
-"""Improved-GS and GNS.
-
-Long-axis splits of candidates drawn by the edges that they cover, and natural selection.
-"""
+"""Improved-GS (long-axis splits of candidates drawn by edges) and GNS (natural selection)."""
 
 import logging
 import math
@@ -22,17 +19,17 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Fraction, OpenFraction, Switch
 
-REACH = 3.0  # standard deviations at which a Gaussian is taken to end
+REACH = 3.0  # the assumed extent of a Gaussian, in standard deviations
 
 
 @dataclass
 class LongAxis(ADC):
     """ADC that splits all candidates along their longest axis (Deng et al., arXiv 2508.12313).
 
-    It clones none. With d = ``split_distance`` and s the longest semi-axis, two children replace
-    the parent. They lie at 3 d s on either side of it along that axis. Their longest semi-axis is
-    (1 - d) s, their other axes are the parent's times sqrt(1 - d^2), and their opacity is the
-    parent's times ``opacity_factor``. The split is not random. The options ``split_size``,
+    No Gaussian is cloned. With d = ``split_distance`` and s the longest semi-axis, two children
+    replace the parent. They lie at 3 d s on either side of it along that axis. Their longest
+    semi-axis is (1 - d) s, their other axes are the parent's times sqrt(1 - d^2), and their opacity
+    is the parent's times ``opacity_factor``. The split is not random. The options ``split_size``,
     ``split_children``, ``split_shrink`` and ``revised_opacity`` of ADC have no effect.
     """
 
@@ -74,11 +71,11 @@ class LongAxis(ADC):
 def halves(
     parents: Gaussians, offset: float, longest: float, across: float, opacity: float
 ) -> Gaussians:
-    """Two children of each of ``parents`` [S], [2 S].
+    """Make two children [2 S] of each of ``parents`` [S], one on either side.
 
-    First all children on one side, then all on the other. They lie ``offset`` standard deviations
-    from the parent along its longest axis. ``longest`` multiplies the scale of that axis,
-    ``across`` the other scales, and ``opacity`` the opacity.
+    All children on one side come first. They are ``offset`` standard deviations from the parent
+    along its longest axis. ``longest`` multiplies the scale of that axis, ``across`` the other
+    scales, and ``opacity`` the opacity.
     """
     axis = parents.log_scales.argmax(-1)  # [S]
     directions = parents.rotations[torch.arange(len(axis), device=axis.device), :, axis]  # [S, 3]
@@ -91,9 +88,9 @@ def halves(
 
 
 def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
-    """``log_scales`` [N, 3], changed by factors on the scales.
+    """Multiply the scale of the longest axis by ``longest`` and the other two by ``across``.
 
-    The longest axis gets ``longest``, the others ``across``.
+    Takes and returns the logarithms of the scales, [N, 3].
     """
     index = log_scales.argmax(-1, keepdim=True)
     is_longest = torch.zeros_like(log_scales, dtype=torch.bool).scatter(-1, index, True)
@@ -102,8 +99,8 @@ def shrunk(log_scales: Tensor, longest: float, across: float) -> Tensor:
     return log_scales + factors[is_longest.long()]
 
 
-# The authors' code has iterations: a round every 100, an opacity reset every 3,000. These are
-# rounds and resets.
+# The authors' code counts iterations: a round every 100, an opacity reset every 3,000. The
+# constants here count rounds and resets.
 # the last rounds of the window: cap=root has reached its budget, and the score is the gradient
 CLOSING_ROUNDS = 5
 # divides the threshold in the closing rounds, while there is room below the cap
@@ -116,7 +113,7 @@ RESETS = 3  # RECOVERY and ALL_VIEWS apply until this opacity reset
 
 @dataclass
 class EdgeAware(LongAxis):
-    """The long-axis split of candidates drawn by edges (Deng et al., arXiv 2508.12313).
+    """Long-axis splits of candidates that are drawn by edges (Deng et al., arXiv 2508.12313).
 
     Each round draws ``score_views`` training views. The score of a Gaussian in a view is the sum
     over pixels of (edge strength of the photograph) alpha T, divided by the mean of this sum over
@@ -126,9 +123,9 @@ class EdgeAware(LongAxis):
 
     ``cap=root`` is the authors' growth control: a limit of ``max_gaussians`` sqrt(x), where x is
     the progress of the window up to the closing rounds. Faint Gaussians are pruned in each round
-    but the last, huge ones never. Gaussians below ``early_prune_opacity`` are pruned once early,
-    and the ``recovery_share`` with the lowest opacities three rounds after an opacity reset.
-    Gradients are gathered only within the window.
+    but the last, huge ones never. Gaussians below ``early_prune_opacity`` are pruned once, early.
+    Three rounds after an opacity reset, the share ``recovery_share`` with the lowest opacities is
+    pruned. Gradients are gathered only within the window.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -171,9 +168,9 @@ class EdgeAware(LongAxis):
         return rules
 
     def rounds_after_reset(self, step: int) -> float:
-        """Rounds since the last opacity reset (or the start of training).
+        """Rounds since the last opacity reset or the start of training.
 
-        It is infinite from the last counted reset on.
+        It is infinite from the reset number `RESETS` on.
         """
         if step >= RESETS * self.opacity_reset_interval:
             return math.inf
@@ -217,9 +214,9 @@ class EdgeAware(LongAxis):
         return edge_scores(views, draw_views(views, count, rng), gaussians, step, by_mean)
 
     def prune_unrecovered(self, refinement: Refinement) -> None:
-        """Remove the ``recovery_share`` with the lowest opacities.
+        """Remove the share ``recovery_share`` of the Gaussians with the lowest opacities.
 
-        They did not recover from the opacity reset.
+        Their opacities did not recover from the opacity reset.
         """
         opacities = refinement.gaussians.values.opacities.detach()
         if len(opacities):
@@ -232,11 +229,12 @@ class EdgeAware(LongAxis):
 log = logging.getLogger(__name__)
 
 # From the authors' code, whose pressure acts every 50 iterations from iteration 15,000 to 23,000.
-# first part of the pressure: its term depends on opacity, and no Gaussian is pruned
+# length of the pressure's first part, in which its term depends on opacity and nothing is pruned
 SOFT_SHARE = 1 / 8
-FIRST_AIM = 0.8  # of the opacity of the last Gaussian within the budget, when the pressure begins
+# the first aim, as a share of the opacity of the last Gaussian within the budget at the start
+FIRST_AIM = 0.8
 LOWEST_LOGIT = 20.0  # the pressure drives all opacity logits towards minus this
-# smallest divisor in the first part: an opacity of .95 weighs 20 times as much as one near 0
+# smallest divisor in the first part: an opacity of 0.95 weighs 20 times as much as one near 0
 MIN_TRANSPARENCY = 0.05
 HARD_FACTOR = 3.0  # on the pressure after the first part
 # the weight is changed if the opacity is more than BAND from its aim
@@ -250,20 +248,20 @@ SELECTION = ("step", "weight", "aim", "met_at")  # the attributes of `GNS` that 
 class GNS(EdgeAware):
     """Improved-GS, then natural selection (Deng et al., arXiv 2511.16980).
 
-    Improved-GS grows up to ``overgrowth`` times the budget. The pressure lasts ``pressure_length``
-    of the window's length, from the end of the window. Every half interval, a term in the loss
-    lowers all opacity logits l (opacity o): w (mean of (l + 20) / max(.05, 1 - o))^2 in the first
-    eighth of that time, then 3 w (mean l + 20)^2. The photometric loss counteracts it for Gaussians
-    that the pictures need. After the first eighth, Gaussians below ``selected_opacity`` are pruned.
+    Improved-GS grows up to ``overgrowth`` times the budget ``max_gaussians``. Then a pressure on
+    opacities selects Gaussians. It starts at the end of the window and lasts ``pressure_length``
+    times the window's length. Every half interval, a term in the loss lowers all opacity logits l
+    (opacity o): w (mean of (l + 20) / max(0.05, 1 - o))^2 in the first eighth of that time, then 3
+    w (mean l + 20)^2. The photometric loss counteracts it for Gaussians that the pictures need.
+    After the first eighth, Gaussians below ``selected_opacity`` are pruned.
 
     The weight w starts at ``pressure``. It is adjusted so that the opacity of the last Gaussian
-    within the budget follows an aim, which falls from .8 of its initial value to 0 in seven eighths
-    of the time. When the count is within 5 % of the budget, or the time ends, exactly
-    ``max_gaussians`` are kept, drawn by opacity. Meanwhile the learning rate of opacities is four
-    times as high.
+    within the budget follows an aim, which falls from 0.8 of its initial value to 0 in seven
+    eighths of the time. When the count is within 5 % of the budget, or the time ends, exactly
+    ``max_gaussians`` are kept, drawn by opacity. During the pressure, and for an eighth of its time
+    after it, the learning rate of opacities is four times as high.
 
-    ``max_gaussians`` is the final count; before, there are up to ``overgrowth`` times as many. If
-    the training ends before the pressure does, the final count is higher, too.
+    If the training ends before the pressure does, the final count is above ``max_gaussians``.
     """
 
     cap: Literal["root"] = "root"
@@ -320,7 +318,7 @@ class GNS(EdgeAware):
         return HARD_FACTOR * self.weight * logits.mean().square()
 
     def adjust_weight(self, step: int, opacities: Tensor) -> None:
-        """Adjust the pressure by the opacity of the last Gaussian within the budget."""
+        """Adjust the weight so that the last opacity within the budget follows the aim."""
         place = min(self.max_gaussians, len(opacities)) - 1
         last = opacities.sort(descending=True).values[place].item()
         if self.aim is None:

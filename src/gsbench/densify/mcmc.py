@@ -1,4 +1,4 @@
-"""3DGS-MCMC and MRNF: a small growth by draws, and noise on the means."""
+"""3DGS-MCMC and MRNF: small growth by random draws, and noise on the means."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,11 +26,11 @@ GATE_STEEPNESS = 100.0  # of the sigmoid that suppresses noise on opaque Gaussia
 
 @dataclass
 class MCMC(Budgeted):
-    """Each round moves dead Gaussians onto living ones and adds copies, up to ``max_gaussians``.
+    """3DGS-MCMC: each round moves dead Gaussians to living ones and adds copies.
 
     A dead Gaussian has an opacity of at most ``min_opacity``. A Gaussian and its copies get a
     common opacity and scale, so that the picture stays the same (eq. 9 of the paper). After each
-    step, means get noise. The cap is always exact.
+    step, noise is added to the means. The count never exceeds ``max_gaussians``.
     """
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
@@ -63,10 +63,7 @@ class MCMC(Budgeted):
         return [*self.governing(), self.relocate, self.add] if self.due(refinement.step) else []
 
     def forecast(self, refinement: Refinement) -> int:
-        """The count after a round without the cap.
-
-        ``strictness`` divides the share that is added.
-        """
+        """The count after a round without the cap; ``strictness`` divides the growth."""
         return int((1 + self.growth / self.strictness) * len(refinement.gaussians))
 
     def may_cull(self, step: int) -> bool:
@@ -96,10 +93,7 @@ class MCMC(Budgeted):
         refinement.event.relocated = count
 
     def add(self, refinement: Refinement) -> None:
-        """Add copies of living Gaussians, drawn by opacity.
-
-        A share ``growth`` of the count, up to the cap.
-        """
+        """Add copies of living Gaussians, drawn by opacity: a share ``growth``, up to the cap."""
         gaussians, event = refinement.gaussians, refinement.event
         if event.relocated == 0 and (gaussians.values.opacities <= self.min_opacity).all():
             return  # all are dead
@@ -115,7 +109,8 @@ class MCMC(Budgeted):
     ) -> None:
         """Append ``count`` (at least 1) copies of Gaussians drawn by ``weights`` [N].
 
-        They share their opacity. Of the others, keep those at the mask ``keep``.
+        A Gaussian and its copies share its opacity. Gaussians outside the mask ``keep`` [N] are
+        removed (None: none are).
         """
         gaussians, sources = refinement.gaussians, _draw(weights, count, refinement.rng)  # [A]
         copies = torch.bincount(sources, minlength=len(gaussians)) + 1  # [N], the Gaussian included
@@ -135,10 +130,10 @@ class MCMC(Budgeted):
 
 
 def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity o' and factor s'/s for n = ``copies`` that look like one Gaussian of opacity o.
+    """Opacity o' and scale factor s'/s of n ``copies`` that look like one Gaussian of opacity o.
 
     o' = 1 - (1 - o)^(1/n) and s'/s = o / sum_{i=1..n} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) /
-    sqrt(k+1), eq. 9 of the paper; all [M].
+    sqrt(k+1) (eq. 9 of the paper). All tensors are [M].
     """
     new = 1 - (1 - opacities.double()).pow(1 / copies.double())  # [M]
     total = torch.zeros_like(new)
@@ -153,7 +148,7 @@ def shared_opacity(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
     """Draw ``count`` indices with replacement, in proportion to ``weights`` [N].
 
-    On the CPU, so that a seed gives the same draw on every device.
+    The CPU draws, so that a seed gives the same indices on every device.
     """
     cumulative = weights.double().cpu().cumsum(0)
     draws = torch.rand(count, generator=rng, dtype=torch.float64) * cumulative[-1]
@@ -162,7 +157,7 @@ def _draw(weights: Tensor, count: int, rng: torch.Generator) -> Tensor:
 
 
 def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
-    """``gaussians`` with the same ``opacity`` for all, and their scales multiplied by ``scale``."""
+    """Set all opacities to ``opacity``, and multiply all scales by ``scale``."""
     logits = torch.full_like(gaussians.opacity_logits, math.log(opacity / (1 - opacity)))
     changed = {"opacity_logits": logits, "log_scales": gaussians.log_scales + math.log(scale)}
     return Gaussians(**(gaussians.tensors() | changed))
@@ -171,7 +166,7 @@ def spread_out(gaussians: Gaussians, opacity: float, scale: float) -> Gaussians:
 # Constants from LichtFeld-Studio's code (src/training/strategies/mrnf.cpp,
 # kernels/mrnf_kernels.cu).
 EDGE_WEIGHT = 0.25  # weights of draws are multiplied by 1 + this times (edge score / its median)
-REACH = 100.0  # times half the scene's size: Gaussians that are farther or larger are pruned
+REACH = 100.0  # times half the scene's size; Gaussians that are farther or larger are pruned
 MIN_SCALE = 1e-10  # world units; smaller Gaussians are pruned
 BOUNDS = (0.1, 0.9)  # quantiles of the means on each axis that bound the scene
 NOISE_POWER = 150.0  # noise is proportional to (1 - opacity) to this power
@@ -183,7 +178,7 @@ MIN_DECAYED = 1e-12  # of opacities and scales after decay
 
 @dataclass
 class MRNF(Budgeted):
-    """Each round replaces pruned Gaussians and adds a small share by long-axis splits.
+    """MRNF of LichtFeld Studio: long-axis splits replace pruned Gaussians and add a small share.
 
     Opacities and scales decay. The refine weight of a Gaussian is the largest sum over pixels of e
     alpha T in ``score_views`` training views, drawn in each round, where e = max(0, 1 - SSIM)
@@ -277,10 +272,7 @@ class MRNF(Budgeted):
         return largest
 
     def to_prune(self, gaussians: Gaussians) -> Tensor:
-        """Mask [N] of the Gaussians to prune.
-
-        Transparent, too small, too large, or too far away.
-        """
+        """Mask [N] of the Gaussians that are transparent, too small, too large, or too far away."""
         center, half, _ = bounds(gaussians.means.detach())
         limit = REACH * half
         scales = gaussians.log_scales
@@ -289,7 +281,7 @@ class MRNF(Budgeted):
         return (gaussians.opacities < self.prune_opacity) | sizes | far
 
     def decay(self, refinement: Refinement) -> None:
-        """Lower all opacities and scales a little. Adam's moments stay."""
+        """Lower all opacities and scales a little; Adam's moments do not change."""
         values = refinement.gaussians.values
         remaining = max(0.0, 1 - refinement.step / self.decay_until)
         opacities = values.opacities - self.opacity_decay * remaining

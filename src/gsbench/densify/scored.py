@@ -1,4 +1,4 @@
-"""FastGS and Taming 3DGS: scores over several training views decide who grows and who is pruned."""
+"""FastGS and Taming 3DGS: scores over several training views decide about growth and pruning."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -22,7 +22,7 @@ from gsbench.densify.scores import (
 from gsbench.gaussians.model import Gaussians
 from gsbench.settings import Fraction, OpenFraction
 
-# keeps the weights finite by which Gaussians are drawn for pruning (from the authors' code)
+# keeps the weights of the draw for pruning finite (from the authors' code)
 MIN_DIVISOR = 1e-6
 
 
@@ -42,7 +42,7 @@ class FastGS(AbsGS):
     ``final_opacity`` or above ``final_score`` are pruned.
     """
 
-    # within a round
+    # computed and used within one round
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"count": torch.float32, "score": torch.float32}
     needs_footprint = True
 
@@ -59,7 +59,7 @@ class FastGS(AbsGS):
     def rules(self, refinement: Refinement) -> list[Rule]:
         """The rules of ADC, with scores before growth and the ceiling after pruning.
 
-        Then the final prunings.
+        After the window come the final prunings.
         """
         step = refinement.step
         rules = [rule for rule in super().rules(refinement) if rule != self.lower_opacity]
@@ -79,7 +79,7 @@ class FastGS(AbsGS):
         for index in indices:
             render = views.render(index, values, refinement.step)
             bad = error_map(render.image, views.image(index)) > self.error_threshold
-            # [N] bad pixels that each is blended into
+            # [N] number of bad pixels that each Gaussian is blended into
             counts = render.require_footprint(bad.to(render.image)).values
             total += counts
             weighted += views.loss(index, render.image) * counts
@@ -105,7 +105,7 @@ class FastGS(AbsGS):
         self.remove(refinement, faint, self.statistics["score"] > self.final_score)
 
 
-# keeps 1 / score finite, by which Gaussians are drawn for pruning (from the authors' code)
+# keeps 1 / score, the weights of the draw for pruning, finite (from the authors' code)
 MIN_SCORE = 1e-6
 
 
@@ -125,7 +125,7 @@ class Taming(ADC):
     score; faint and huge Gaussians are pruned only if drawn.
     """
 
-    # of this round; 0 for new Gaussians
+    # score of this round; 0 for new Gaussians
     STATISTICS: ClassVar[dict[str, torch.dtype]] = {"score": torch.float32}
     needs_footprint = True
 
@@ -154,7 +154,7 @@ class Taming(ADC):
         return rules
 
     def score(self, refinement: Refinement) -> None:
-        """Compute the score of every Gaussian; edits of the round keep it with its Gaussian."""
+        """Compute the score of every Gaussian, as a statistic that the round's edits maintain."""
         values, rng = refinement.gaussians.values, refinement.rng
         views, total = self.context.training_views, torch.zeros_like(values.opacity_logits)
         for index in draw_views(views, self.score_views, rng):
@@ -162,7 +162,7 @@ class Taming(ADC):
         self.statistics["score"] = (total + MIN_SCORE).float()
 
     def score_in(self, index: int, gaussians: Gaussians, step: int) -> Tensor:
-        """The score [N] that the view at ``index`` adds."""
+        """The score [N] that training view ``index`` adds."""
         views = self.context.training_views
         photograph = views.image(index)
         image = views.render(index, gaussians, step).image

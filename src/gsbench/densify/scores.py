@@ -1,4 +1,4 @@
-"""Scores of Gaussians, sums over pixels of training views; and random draws by score."""
+"""Scores of Gaussians from sums over pixels of training views, and random draws by score."""
 
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -30,7 +30,7 @@ class TrainingViews(Protocol):
         ...
 
     def dissimilarity(self, index: int, image: Tensor) -> Tensor:
-        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and its photograph, [H, W].
+        """max(0, 1 - SSIM) of a rendered ``image`` [H, W, 3] and the photograph, [H, W].
 
         SSIM is the mean over channels.
         """
@@ -52,10 +52,10 @@ def blended_sums(
 ) -> tuple[Tensor, RenderOutput]:
     """The sum over pixels of w alpha T for each Gaussian, [N, 3], and the render of the view.
 
-    There are three weights w [H, W, 3]. alpha T is the derivative of a pixel with respect to the
-    colour of the Gaussian. So the sum is the gradient of ``(image * weights).sum()`` with respect
-    to that colour, which any rasterizer computes. All colours are set to grey, so that no
-    rasterizer clamps them (a clamped colour has no gradient).
+    ``weights`` w [H, W, 3] are three for each pixel. alpha T is the derivative of a pixel with
+    respect to the colour of the Gaussian. So the sum is the gradient of ``(image * weights).sum()``
+    with respect to that colour, which any rasterizer computes. All colours are set to grey, so that
+    no rasterizer clamps them (a clamped colour has no gradient).
     """
     probe = Gaussians(**{name: tensor.detach() for name, tensor in gaussians.tensors().items()})
     probe.sh_dc = torch.zeros_like(probe.sh_dc, requires_grad=True)
@@ -67,11 +67,11 @@ def blended_sums(
 
 
 def edge_map(image: Tensor) -> Tensor:
-    """The strength of edges in ``image`` [H, W, 3] uint8.
+    """The strength of edges in ``image`` [H, W, 3] uint8: [H, W] float32 in [0, 1].
 
-    [H, W] float32 in [0, 1] (all 0 without edges). Eight times the luminance of a pixel minus the
-    sum over its eight neighbours, clipped to 8 bits, then shifted and scaled to [0, 1]. This is
-    Pillow's FIND_EDGES, except that the outermost pixels are 0 here.
+    It is eight times the luminance of a pixel minus the sum over its eight neighbours, clipped to 8
+    bits, then shifted and scaled to [0, 1]; 0 in an image without edges. This is Pillow's
+    FIND_EDGES, except that the outermost pixels are 0 here.
     """
     rgb = image.to(torch.int32)
     red, green, blue = LUMINANCE
@@ -87,9 +87,9 @@ def edge_map(image: Tensor) -> Tensor:
 
 
 def error_map(image: Tensor, photograph: Tensor) -> Tensor:
-    """The absolute error of ``image`` [H, W, 3], mean over channels, [H, W], in [0, 1].
+    """The absolute error of ``image`` [H, W, 3], shifted and scaled to [0, 1], [H, W].
 
-    It is shifted and scaled. ``photograph`` is [H, W, 3] uint8.
+    It is the mean over channels. ``photograph`` is [H, W, 3] uint8.
     """
     return to_unit_range((image - photograph.to(image) / 255).abs().mean(-1))
 
@@ -130,10 +130,10 @@ def edge_scores(
     step: int,
     normalize: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """Scores [N] by the edges in photographs that each Gaussian covers.
+    """Scores [N]: how strong the edges are, in photographs, that each Gaussian covers.
 
-    In a view the score is the sum over pixels of (edge strength) alpha T, passed through
-    ``normalize``; the result is the mean over the views ``indices``.
+    In a view, the sum over pixels of (edge strength) alpha T is passed through ``normalize``. The
+    score is the mean over the views ``indices``.
     """
     total = torch.zeros_like(gaussians.opacity_logits)
     for index in indices:
@@ -144,12 +144,12 @@ def edge_scores(
 
 
 def draw(candidates: Tensor, scores: Tensor, count: int, rng: torch.Generator) -> Tensor:
-    """Draw ``count`` of the ``candidates`` [N] (all, if there are fewer), as a mask [N].
+    """Draw ``count`` of the ``candidates`` [N], or all if there are fewer; return a mask [N].
 
     The draw is without replacement, in proportion to ``scores`` [N]. Candidates with score 0 come
-    last, in order of index. Method: Efraimidis and Spirakis 2006, the smallest values of e / score
-    with e ~ Exp(1). Random numbers are drawn on the CPU, so a seed gives the same draw on every
-    device.
+    last, in order of index. The method is that of Efraimidis and Spirakis (2006): take the smallest
+    values of e / score with e ~ Exp(1). Random numbers are drawn on the CPU, so a seed gives the
+    same draw on every device.
     """
     index = candidates.nonzero().squeeze(-1).cpu()  # [C]
     times = torch.empty(len(index), dtype=torch.float64).exponential_(generator=rng)

@@ -26,17 +26,14 @@ LOG_SPHERE = math.log(4 * math.pi / 3)
 
 
 def log_volume(log_scales: Tensor) -> Tensor:
-    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3].
-
-    World units^3, never underflows.
-    """
+    """log V = log(4 pi / 3) + sum of log s_i (eq. 5), [N] from [N, 3]; V in cubed world units."""
     return LOG_SPHERE + log_scales.sum(-1)
 
 
 def log_condition(log_scales: Tensor) -> Tensor:
-    """log kappa = 2 (log s_max - log s_min) >= 0, [N] from [N, 3].
+    """log kappa = 2 (log s_max - log s_min) >= 0 (eq. 6), [N] from [N, 3].
 
-    Eq. 6: kappa is the ratio of the eigenvalues s^2.
+    kappa is the ratio of the largest to the smallest eigenvalue s^2.
     """
     return 2 * (log_scales.amax(-1) - log_scales.amin(-1))
 
@@ -51,7 +48,7 @@ VANISHING_SIZE = 1e-4
 class Volumetric(ADC):
     """ADC that also splits every Gaussian with V > V_th (eq. 5 to 7, Fig. 4).
 
-    The split comes before the pruning of ADC. ``threshold_mode`` determines V_th:
+    By default, this split comes before the pruning of ADC. ``threshold_mode`` determines V_th:
 
     - ``absolute``: ``volume_threshold``, in cubed units of the COLMAP model (the paper);
     - ``extent_relative``: ``volume_threshold`` times the cubed scene extent;
@@ -84,7 +81,7 @@ class Volumetric(ADC):
     volume_threshold: PositiveFloat = VOLUME_THRESHOLD
     threshold_mode: ThresholdMode = "absolute"
     volume_quantile: OpenFraction = 0.9978  # 99.78 % of the volumes of Mip-NeRF 360 lie below 0.03
-    # kappa divides eigenvalues (eq. 7) or scales; nothing: as ADC
+    # kappa divides eigenvalues (eq. 7), scales, or nothing: then children's scales are those of ADC
     condition_of: Literal["eigenvalues", "scales", "nothing"] = "eigenvalues"
     # limits kappa, so that children of needles do not vanish
     max_condition: Annotated[float, Ge(1)] | None = None
@@ -157,7 +154,7 @@ class Volumetric(ADC):
         return (volumes > threshold) & (children <= threshold)
 
     def grown(self, refinement: Refinement) -> Grown:
-        """Result of growth for each Gaussian if the cap admitted all candidates of both rules."""
+        """Return the result of growth if the cap admitted all candidates of both rules."""
         grown = super().grown(refinement)
         if not self.volume_due(refinement.step):
             return grown
@@ -186,7 +183,7 @@ class Volumetric(ADC):
         children = self.child_log_scales(log_scales)  # [N, 3]
         candidates = self.selected_by_volume(log_scales)
         selected, blocked = admit(candidates, volumes, self.volume_gain, self.allowance(refinement))
-        split_again = log_volume(children) > threshold  # [N] the next round would take them, too
+        split_again = log_volume(children) > threshold  # [N] the next round would split them, too
         vanishing = children.amax(-1) < math.log(VANISHING_SIZE * self.context.extent)  # [N]
         event.volume_threshold = math.exp(threshold)
         event.blocked_by_cap += blocked

@@ -9,7 +9,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.model import NUM_SH_REST, Gaussians, rgb_to_dc
 
 NEIGHBOURS = 3
-# world units^2; lower limit of the mean squared distance to the neighbours, as in 3DGS
+# world units^2; lower limit of the mean squared distance to neighbours, as in 3DGS
 MIN_SQUARED_DISTANCE = 1e-7
 INITIAL_OPACITY = 0.1
 
@@ -31,7 +31,7 @@ def gaussians_from_cloud(
         raise InputError(
             "the initial cloud has points that are not finite; rebuild it or clean the COLMAP model"
         )
-    # [P, 4], the first neighbour is the point itself
+    # [P, 4]; the first neighbour is the point itself
     distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
     squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), MIN_SQUARED_DISTANCE)  # [P]
     n = len(points)

@@ -119,7 +119,7 @@ C3 = (
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics to ``degree`` at unit ``directions`` [N, 3]: [N, (degree + 1)^2]."""
-    # Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2, with the signs of 3DGS's code
+    # Sloan 2008, "Stupid Spherical Harmonics Tricks", appendix A2, with the signs of 3DGS's code.
     x, y, z = directions.unbind(-1)  # each [N]
     terms = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -156,7 +156,7 @@ def colors(sh_dc: Tensor, sh_rest: Tensor, directions: Tensor, degree: int) -> T
 
 
 def rgb_to_dc(rgb: Tensor) -> Tensor:
-    """The constant coefficients that give colour ``rgb`` (0 to 1) in every direction."""
+    """The coefficients of degree 0 that give colour ``rgb`` (0 to 1) in every direction."""
     return (rgb - 0.5) / C0
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 
 from pydantic import PositiveFloat, PositiveInt
 
-VOLUME_THRESHOLD = 0.03  # V_th of the paper, in the units of its COLMAP models, cubed
+VOLUME_THRESHOLD = 0.03  # V_th of arXiv 2508.05187, in cubed units of its COLMAP models
 
 
 @dataclass
@@ -14,7 +14,7 @@ class LearningRates:
 
     position_initial: PositiveFloat = 1.6e-4  # times the scene extent
     position_final: PositiveFloat = 1.6e-6  # times the scene extent
-    # the position rate falls log-linearly over so many iterations
+    # number of iterations over which the position rate falls log-linearly
     position_steps: PositiveInt = 30_000
     sh_dc: PositiveFloat = 2.5e-3
     sh_rest: PositiveFloat = 2.5e-3 / 20

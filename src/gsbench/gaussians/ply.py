@@ -33,16 +33,17 @@ COLUMNS = (
     + [f"rot_{i}" for i in range(4)]
 )
 
-# raised by plyfile and numpy for a damaged file; OverflowError is no ValueError
+# errors that plyfile and numpy raise for a damaged file; OverflowError is not a ValueError
 DAMAGE = (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError)
 REST = "f_rest_"
 REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
-# The logit that stands for an opacity of 1, and with a minus for 0: float32's nearest to 1 that
-# still has a gradient.
-MAX_LOGIT = 23 * math.log(2)  # 1 - 2^-23
-TYPICAL_SCALE = 0.02  # of a model's size: the median of Gaussians trained here is .009 to .035
-MIN_TEXT_BYTES = 2  # bytes of a value in an ASCII file, at least: a digit and a space
-# bytes of PLY's types; all others have 1
+# Replaces an infinite logit; negated for an opacity of 0. Its opacity, 1 - 2^-23, is as close to 1
+# as float32 allows with a gradient.
+MAX_LOGIT = 23 * math.log(2)
+# typical scale of a Gaussian over the size of its model; medians of trained models: 0.009 to 0.035
+TYPICAL_SCALE = 0.02
+MIN_TEXT_BYTES = 2  # minimum bytes of a value in an ASCII file: a digit and a space
+# bytes of PLY's types; all other types have 1
 SIZES = dict.fromkeys(["short", "ushort", "int16", "uint16"], 2)
 SIZES |= dict.fromkeys(["int", "uint", "int32", "uint32", "float", "float32"], 4)
 SIZES |= dict.fromkeys(("double", "float64"), 8)
@@ -82,14 +83,14 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
 
 
 def check_ply(path: Path) -> None:
-    """Raise InputError if header and length say that a file is no PLY of Gaussians."""
+    """Raise InputError if the header or the length of a file shows that it is no readable PLY."""
     with _checked(path):
         pass
 
 
 @contextmanager
 def _checked(path: Path) -> Iterator[None]:
-    """Check a file's length; turn every error from damage into an InputError that names it."""
+    """Check a file's length, and turn any error from damage into an InputError with its path."""
     try:
         _check_length(path)
         yield
@@ -99,7 +100,7 @@ def _checked(path: Path) -> Iterator[None]:
 
 def _check_length(path: Path) -> None:
     """Raise ValueError if the header announces more data than the file can hold."""
-    # plyfile allocates what the header announces before it reads: a false count could fill the
+    # plyfile allocates memory for the announced data before it reads: a wrong count could fill the
     # memory.
     require_regular(path)
     header = read_header(path)
@@ -118,7 +119,10 @@ def _check_length(path: Path) -> None:
 
 
 def _with_finite_opacities(vertices: NDArray[Any], path: Path) -> NDArray[Any]:
-    """Replace infinite logits, other programs' opacities of exactly 0 and 1, by `MAX_LOGIT`."""
+    """Replace infinite logits by plus or minus `MAX_LOGIT`, with a warning.
+
+    Other programs write them for opacities of exactly 0 and 1.
+    """
     logits = vertices["opacity"]
     infinite = np.isinf(logits) if logits.dtype.kind == "f" else np.zeros(len(logits), bool)
     if not infinite.any():
@@ -138,7 +142,7 @@ def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
         raise InputError(
             f"{path}: {name} is not a finite number everywhere: export the model again"
         )
-    with np.errstate(over="ignore"):  # float64 may lie beyond float32
+    with np.errstate(over="ignore"):  # a float64 value may be beyond the range of float32
         (bad,) = np.nonzero(~np.isfinite(column.astype(np.float32)))
     if len(bad):
         raise InputError(
@@ -148,7 +152,7 @@ def _check_finite(column: NDArray[Any], name: str, path: Path) -> None:
 
 
 def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
-    """Warn of values that look as if they were stored after 3DGS's activations, exp and sigmoid."""
+    """Log a warning if values look as if 3DGS's activations, exp and sigmoid, were applied."""
     if _look_like_lengths(vertices):
         log.warning(
             "%s: all scales are positive: they look like lengths, where 3DGS stores their "
@@ -167,7 +171,7 @@ def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
 def _look_like_lengths(vertices: NDArray[Any]) -> bool:
     """Return whether the stored scales are more plausible as lengths than as logarithms of lengths.
 
-    Both can be positive everywhere: the logarithms are in a scene that is measured in millimetres.
+    The sign does not decide: in a scene measured in millimetres, all logarithms can be positive.
     """
     scales = np.stack([vertices[f"scale_{axis}"] for axis in range(3)]).astype(np.float64)  # [3, N]
     if not (scales > 0).all():

@@ -1,4 +1,4 @@
-"""Opening PLY files of other programs, and naming formats of Gaussians that are no plain PLY."""
+"""Read PLY files of other programs, and recognise formats of Gaussians that are not plain PLY."""
 
 import codecs
 import io
@@ -10,16 +10,19 @@ from plyfile import PlyData
 MAX_HEADER = 1 << 16  # bytes
 END = b"end_header"
 NOT_ASCII = re.compile(rb"[^\x00-\x7f]")
-# Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (gzip
-# until version 3, then the magic number itself); PlayCanvas's page on SOG (a ZIP archive, or
-# meta.json beside WebP images).
+# Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (files
+# are compressed by gzip until version 3, later they start with NGSP); PlayCanvas's page on SOG (a
+# ZIP archive, or meta.json next to WebP images).
 MAGIC = {b"\x1f\x8b": "SPZ", b"NGSP": "SPZ", b"PK\x03\x04": "SOG", b"{": "SOG"}
 # the first two have no magic number
 SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": "SPZ", ".sog": "SOG"}
 
 
 def read_header(path: Path) -> bytes:
-    """The header of a PLY without its last line; raises ValueError naming another format."""
+    """Return the header of a PLY without its last line.
+
+    Raises ValueError if there is none; the message names other formats of Gaussians.
+    """
     with path.open("rb") as stream:
         start = stream.read(MAX_HEADER)
     start = start.removeprefix(codecs.BOM_UTF8)
@@ -42,10 +45,10 @@ def _how_to_unpack(path: Path) -> str:
 
 
 def read_ply_data(path: Path) -> PlyData:
-    """The content of a PLY file; raises ValueError as `read_header` does, and plyfile's errors.
+    """Return the content of a PLY file.
 
-    Comments may have characters beyond ASCII, and the file a byte order mark, which plyfile
-    refuses.
+    Unlike plyfile, it accepts a byte order mark and comments with characters beyond ASCII. Raises
+    ValueError as `read_header` does, and plyfile's errors.
     """
     header = read_header(path)
     with path.open("rb") as stream:

@@ -41,7 +41,7 @@ class TrainableGaussians:
     def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
         self.rates = rates
         self.spatial_scale = spatial_scale
-        # The present parameters: each ``edit`` and ``overwrite`` replaces the tensors in it.
+        # the current parameters; ``edit`` and ``overwrite`` replace its tensors
         self.values = gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_(True))
         initial = {
             "means": rates.position(0) * spatial_scale,
@@ -66,7 +66,7 @@ class TrainableGaussians:
 
     @property
     def position_rate(self) -> float:
-        """The present learning rate of the means, world units."""
+        """The current learning rate of the means, world units."""
         return self.adam["means"].rate
 
     def set_step(self, step: float) -> None:
@@ -74,7 +74,7 @@ class TrainableGaussians:
         self.adam["means"].rate = self.rates.position(step) * self.spatial_scale
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Set the learning rate of ``name``. For the means, `set_step` replaces it each time."""
+        """Set the learning rate of parameter ``name``; `set_step` overwrites that of the means."""
         self.adam[name].rate = rate
 
     @torch.no_grad()
@@ -103,7 +103,7 @@ class TrainableGaussians:
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
         """Keep the Gaussians at the mask ``keep`` [N] (None: all), then append new ones.
 
-        The moments of the new ones are zero.
+        The moments of new Gaussians are zero.
         """
         for name, old in self.values.tensors().items():
             added = None if append is None else getattr(append, name).detach()
@@ -111,7 +111,7 @@ class TrainableGaussians:
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor, where: Tensor | None = None) -> None:
-        """Set ``name`` to ``values``, and its moments to zero ``where`` [N] (None: all)."""
+        """Set parameter ``name`` to ``values``; clear its moments at ``where`` [N] (None: all)."""
         parameter = getattr(self.values, name)
         if values.shape != parameter.shape:
             raise ValueError(
@@ -125,7 +125,7 @@ class TrainableGaussians:
     def _replace(
         self, name: str, values: Tensor, keep: Tensor | None = None, added: Tensor | None = None
     ) -> None:
-        """Replace the parameter ``name``, and edit its moments alike; the step count stays."""
+        """Replace parameter ``name`` and edit its moments alike; the step count does not change."""
         state = self.adam[name]
         zeros = None if added is None else torch.zeros_like(added)
         state.first = _edited(state.first, keep, zeros)
@@ -133,7 +133,7 @@ class TrainableGaussians:
         setattr(self.values, name, values.contiguous().requires_grad_(True))
 
     def state_dict(self) -> dict[str, object]:
-        """Return the state for a checkpoint, with shared memory: save it before the next step."""
+        """Return the state for a checkpoint. It shares memory: save it before the next step."""
         return {
             "gaussians": {name: tensor.detach() for name, tensor in self.values.tensors().items()},
             "adam": {name: vars(state).copy() for name, state in self.adam.items()},
@@ -187,7 +187,7 @@ def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
     state.step += 1
     step, gradient = float(state.step), parameter.grad[index]
     # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
-    # m' = m / (1 - b1^step), v' = v / (1 - b2^step); eps outside the root, as torch has it
+    # m' = m / (1 - b1^step) and v' = v / (1 - b2^step). As in torch, eps is outside the root.
     first = state.first[index].lerp_(gradient, 1 - beta1)
     second = state.second[index].mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     state.first[index], state.second[index] = first, second

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def create_rasterizer(name: str, device: torch.device, threads: int | None = None) -> Rasterizer:
-    """Make the rasterizer that ``name``, perhaps ``auto``, selects on ``device``.
+    """Make the rasterizer called ``name``, or for ``auto`` the best one for ``device``.
 
-    ``threads`` limits the CPU threads of ``cpu``.
+    ``threads`` limits the CPU threads of ``cpu``. Raises InputError if it cannot run on ``device``.
     """
     executor = resolve(name, device.type)
     module, _, attribute = executor.target.rpartition(".")

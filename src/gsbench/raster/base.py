@@ -39,9 +39,9 @@ CONSTANTS = RasterConstants()
 
 
 def slope_limits(camera: Camera) -> tuple[float, float, float, float]:
-    """The limits in the Jacobian of a projection (`RasterConstants.fov_margin`): x/z least, most.
+    """The limits of the slopes in the Jacobian of the projection (`RasterConstants.fov_margin`).
 
-    Y/z least, most.
+    Returns the smallest and the largest x/z, then the smallest and the largest y/z.
     """
     margin_x = CONSTANTS.fov_margin * camera.width / (2 * camera.fx)
     margin_y = CONSTANTS.fov_margin * camera.height / (2 * camera.fy)
@@ -101,7 +101,7 @@ class CameraNumbers(NamedTuple):
 
 @dataclass(frozen=True)
 class Footprint:
-    """Facts of the pixels of one view that each Gaussian is blended into.
+    """The depth of each Gaussian, and sums over the pixels of one view that it is blended into.
 
     These are the pixels where its alpha is not skipped and that have not stopped before it. All
     fields are [N] and have no gradient. For a Gaussian without such pixels, all but ``depths`` are

@@ -104,10 +104,10 @@ CASES = (
 def render_with_gradients(
     rasterizer: Rasterizer, case: Case, dtype: torch.dtype, device: str = "cpu"
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
-    """Render ``case``.
+    """Render ``case``; return the output and the gradients, as float64 on the CPU.
 
-    Also return gradients, as float64 on the CPU, of a fixed random weighting of image and alpha.
-    Includes the splitting matrices if the rasterizer offers them.
+    The loss is a sum of image and alpha with fixed random weights. The gradients include the
+    splitting matrices if the rasterizer offers them.
     """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, device=device)
@@ -161,9 +161,9 @@ def departures(
 ) -> list[str]:
     """List where ``rasterizer``, in float32 on ``device``, departs from the contract.
 
-    One line each; [] if nowhere. For all ``cases``, it compares image, alpha, radii, all gradients
-    and, if offered, footprint and splitting matrices with the reference. It also tests a scene
-    without Gaussians. Takes seconds.
+    Returns one line for each departure; [] if there is none. For all ``cases``, image, alpha,
+    radii, all gradients and, if offered, footprint and splitting matrices are compared with the
+    reference. A scene without Gaussians is tested, too. Takes seconds.
     """
     lines = []
     for case in cases:
@@ -178,8 +178,7 @@ def departures(
 def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
     """The largest error of each quantity of ``rasterizer`` against the float64 reference.
 
-    It runs in float32 on ``device``. A shape or dtype that is not the contract's is an infinite
-    error.
+    ``rasterizer`` runs in float32 on ``device``. A wrong shape or dtype is an infinite error.
     """
     expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
     output, gradients = render_with_gradients(rasterizer, case, torch.float32, device)
@@ -217,9 +216,9 @@ def _compare(
     relative: bool = False,
     pixel_size: int = 0,
 ) -> Error:
-    """The largest error of a tensor, perhaps ``relative`` to the largest entry.
+    """The largest error of a tensor, divided by the largest entry if ``relative``.
 
-    An image has ``pixel_size`` numbers for each pixel; other tensors have rows, one per Gaussian.
+    An image has ``pixel_size`` numbers for each pixel; other tensors have one row per Gaussian.
     """
     value, reference = value.detach().cpu().double(), reference.detach().double()
     if value.shape != reference.shape:

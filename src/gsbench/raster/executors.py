@@ -48,10 +48,7 @@ class Executor:
         return not self.devices or device_type in self.devices
 
     def obstacle(self, device_type: str) -> str | None:
-        """The reason why it cannot run here on a device of this type, and the remedy.
-
-        It is None if it can run.
-        """
+        """The reason why it cannot run on this type of device, with a remedy; None if it can."""
         if not self.runs_on(device_type):
             needed = " or ".join(self.devices)
             alternatives = ", ".join(
@@ -84,7 +81,7 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
     Executor(
         "triton",
         "gsbench.raster.triton.executor.TritonRasterizer",
-        # tests
+        # for tests, Triton's interpreter runs the kernels on the CPU
         devices=("cuda", "cpu") if os.environ.get("TRITON_INTERPRET") == "1" else ("cuda",),
         text="Triton kernels, compiled at first use by what torch brings along; the same bits on "
         "every run",
@@ -129,15 +126,15 @@ def find_executor(name: str) -> Executor:
 def offers(name: str, fact: str, own: object = None) -> bool:
     """Return whether the rasterizer called ``name`` offers an optional output.
 
-    ``fact`` is such as ``has_footprint``. If ``name`` is not an executor of gsbench, the attribute
-    ``fact`` of the rasterizer ``own`` decides.
+    ``fact`` is the field of `Executor` to look up, for example ``has_footprint``. If ``name`` is
+    not an executor of gsbench, the attribute ``fact`` of the rasterizer ``own`` decides.
     """
     offered = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
     return offered.get(name, bool(getattr(own, fact, False)))
 
 
 def resolve(name: str, device_type: str) -> Executor:
-    """Return the executor that ``name``, perhaps ``auto``, selects on a device of this type.
+    """Return the executor called ``name``, or for ``auto`` the best one for this type of device.
 
     Raises InputError if it cannot run there. ``auto`` logs a warning if only the slow reference can
     run.
@@ -152,9 +149,9 @@ def resolve(name: str, device_type: str) -> Executor:
 
 
 def automatic(device_type: str) -> list[Executor]:
-    """The executors that ``auto`` takes on a device of this type, the best first.
+    """The executors that ``auto`` may take on a device of this type, the best first.
 
-    The last is the reference. Logs a warning if only the slow reference can run.
+    The last one is the reference. Logs a warning if no other can run.
     """
     candidates = [executor for executor in EXECUTORS if device_type in executor.devices]
     usable = [executor for executor in candidates if executor.obstacle(device_type) is None]
@@ -172,7 +169,7 @@ def automatic(device_type: str) -> list[Executor]:
 def missing_tools() -> list[str]:
     """List what Triton lacks to compile the C code that launches its kernels.
 
-    A C compiler, Python's headers. Each line names the package to install.
+    It needs a C compiler and Python's headers. Each line names the package to install.
     """
     missing = []
     compiler = os.environ.get("CC")
@@ -199,9 +196,9 @@ def missing_tools() -> list[str]:
 
 @cache
 def load_driver() -> None:
-    """Make Triton load its launcher for the GPU, which may compile it.
+    """Make Triton load its launcher for the GPU, which Triton may have to compile first.
 
-    Raises InputError that names what is missing.
+    Raises InputError that says what is missing.
     """
     try:
         from triton import knobs

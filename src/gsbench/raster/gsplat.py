@@ -74,7 +74,7 @@ class GsplatRasterizer:
     ) -> RenderOutput:
         """See `gsbench.raster.base.Rasterizer`.
 
-        Raises ValueError that names a parameter that cannot be used.
+        Raises ValueError, which names the parameter, for an input that cannot be used.
         """
         check_settings(gaussians, camera, sh_degree, background)
         points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
@@ -173,12 +173,11 @@ class _DeviceCamera:
 
 
 class _Composite(torch.autograd.Function):
-    """gsplat's compositing on leaves of its own graph.
+    """gsplat's compositing in a graph of its own, so that ``backward`` gets the means' gradient.
 
-    So ``backward`` here sees the gradient of the means. gsplat stores the absolute gradient as an
-    attribute of the means that it was given. A hook on these means that reads the attribute would
-    be a reference cycle through C++, which the garbage collector cannot free: the memory of every
-    step would leak. This function avoids the cycle.
+    gsplat stores the absolute gradient as an attribute of the means that it was given. A hook on
+    these means that reads the attribute would be a reference cycle through C++, which the garbage
+    collector cannot free: the memory of every step would leak. This function avoids the cycle.
     """
 
     @staticmethod
@@ -237,9 +236,9 @@ def _empty(
 
 
 def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
-    """ceil(3 sqrt(lambda_max)) px, for covariances with the inverses ``conics`` [1, N, 3].
+    """ceil(3 sqrt(lambda_max)) in px, [1, N] int32; 0 where ``seen`` is False.
 
-    It is 0 if not ``seen``.
+    ``conics`` [1, N, 3] are the inverses of the covariances.
     """
     # the inverse of the covariance: yy, -xy, xx over its determinant
     a, b, c = conics.double().unbind(-1)
@@ -251,9 +250,9 @@ def _square_radii(conics: Tensor, seen: Tensor) -> Tensor:
 
 
 def _reaches_image(means: Tensor, radii: Tensor, width: int, height: int) -> Tensor:
-    """Mask [N]: whether the square around the mean touches the image.
+    """Mask [N]: whether the square of side 2 ``radii`` around the mean touches the image.
 
-    Px, with the first pixel centre at 0.5.
+    All lengths are in px. The first pixel centre is at 0.5.
     """
     x, y = means.unbind(-1)
     inside = (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)

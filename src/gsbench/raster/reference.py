@@ -129,10 +129,7 @@ class ReferenceRasterizer:
 
 
 def pixel_centres(tile: Tile, like: Tensor) -> Tensor:
-    """The pixel centres of a rectangle, row by row, [P, 2] (x, y).
-
-    They have the dtype and the device of ``like``.
-    """
+    """The pixel centres of a tile, row by row, [P, 2] (x, y), with ``like``'s dtype and device."""
     rows, columns = (
         torch.arange(side.start, side.stop, dtype=like.dtype, device=like.device) for side in tile
     )
@@ -140,9 +137,9 @@ def pixel_centres(tile: Tile, like: Tensor) -> Tensor:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projection:
-    """Project the Gaussians to the image plane.
+    """Project the Gaussians to the image plane, without those that cannot be rendered.
 
-    Leave out those behind ``near`` or with an unusable covariance. A first pass without a graph
+    These are nearer than ``near`` or have an unusable covariance. A first pass without a graph
     selects the usable ones, so that an overflow in another Gaussian cannot reach their gradients.
     """
     with torch.no_grad():
@@ -165,9 +162,10 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
 def _to_image(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Means [M, 2] px.
+    """Project the Gaussians, which are all in front of the camera.
 
-    Entries xx, xy, yy of the blurred 2D covariances, each [M], px^2; view depths [M].
+    Returns the means [M, 2] px; the entries xx, xy, yy of the blurred 2D covariances, each [M],
+    px^2; and the view depths [M].
     """
     rotation = gaussians.means.new_tensor(camera.rotation)  # [3, 3]
     translation = gaussians.means.new_tensor(camera.translation)  # [3]
@@ -191,7 +189,7 @@ def _to_image(
 def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
     """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3].
 
-    They have no limits on the slopes.
+    Unlike those of the covariances, they have no limits on the slopes.
     """
     rotation = means.new_tensor(camera.rotation)  # [3, 3]
     # each [M, 1]
@@ -204,7 +202,7 @@ def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
 def tile_rectangles(projected: Projection, camera: Camera) -> tuple[Tensor, Tensor]:
     """The tiles that each Gaussian's square of side 2 radius touches.
 
-    First and past-the-last, int64 [M, 2] (x, y).
+    Returns the first and the past-the-last tile, both int64 [M, 2] (x, y).
     """
     tile = CONSTANTS.tile
     means, radii = projected.means.detach(), projected.radii.unsqueeze(-1)
@@ -221,7 +219,8 @@ def bin_gaussians(
 ) -> list[tuple[int, Tensor]]:
     """List all tiles with Gaussians.
 
-    The row-major number, and the Gaussians [K], front to back (ties by index).
+    Each has its row-major number and its Gaussians [K], front to back. Gaussians of equal depth are
+    in the order of their indices.
     """
     order = torch.sort(depths, stable=True).indices  # [M]
     low, size = tile_min[order], (tile_max - tile_min)[order].clamp_min(0)  # [M, 2]
@@ -240,7 +239,7 @@ def bin_gaussians(
 def members_of_tiles(
     depths: Tensor, tile_min: Tensor, tile_max: Tensor, camera: Camera
 ) -> Iterator[tuple[Tensor, Tile]]:
-    """Yield, for each tile with Gaussians, those [K], front to back, and its pixels."""
+    """Yield each tile with Gaussians: the Gaussians [K], front to back, and the pixels."""
     tile, tiles_x = CONSTANTS.tile, -(-camera.width // CONSTANTS.tile)
     for number, members in bin_gaussians(depths, tile_min, tile_max, tiles_x):
         x, y = number % tiles_x * tile, number // tiles_x * tile
@@ -261,7 +260,7 @@ def composite(
 
     ``pixels`` [P, 2], ``means`` [P, K, 2], ``conics`` [K, 3], ``opacities`` [K], ``rgb`` [K, 3].
     Returns colours [P, 3] and opacities [P]. A pixel stops before the Gaussian that would lower its
-    transmittance below ``transmittance_min``. ``image_probe`` as in ``blending_weights``.
+    transmittance below ``transmittance_min``. For ``image_probe`` see ``blending_weights``.
     """
     weight = blending_weights(pixels, means, conics, opacities, image_probe)  # [P, K]
     opacity = weight.sum(1)  # [P]

@@ -1,7 +1,4 @@
-"""Code that executors share.
-
-Checks of inputs, asynchronous reads from a device, and autograd for compiled stages.
-"""
+"""Code that executors share: checks of inputs, asynchronous reads, autograd for compiled stages."""
 
 from abc import ABC, abstractmethod
 from functools import partial
@@ -24,11 +21,11 @@ MAX_PRINCIPAL_OFFSET = 100.0
 
 
 def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, background: Tensor) -> None:
-    """Raise ValueError, with the parameter's name, for what ``Rasterizer.render`` cannot use.
+    """Raise ValueError for inputs that ``Rasterizer.render`` cannot use; it names the parameter.
 
-    Reads every value of ``gaussians`` and waits for a device once. To avoid that, executors call
-    ``check_settings`` first. If their kernels then find a bad value, or ``bad_values``, read later,
-    is True, they call ``raise_for_values``.
+    This function reads every value of ``gaussians`` and waits for the device once. Executors that
+    must not wait call only ``check_settings``. If their kernels then find a bad value, or if
+    ``bad_values``, read later, is True, they call ``raise_for_values``.
     """
     check_settings(gaussians, camera, sh_degree, background)
     if bad_values(gaussians, background):
@@ -38,7 +35,7 @@ def check_inputs(gaussians: Gaussians, camera: Camera, sh_degree: int, backgroun
 def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
     """One bool, still on the device: whether ``raise_for_values`` must search for a bad value.
 
-    It may be True without a bad value, if a sum overflows; it is never False if there is one.
+    It is always True if there is a bad value. It is also True if only a sum overflows.
     """
     tensors = [background, *gaussians.tensors().values()]
     bad = ~torch.stack([tensor.detach().sum() for tensor in tensors]).isfinite().all()
@@ -94,7 +91,7 @@ def _check_background(background: Tensor) -> None:
 
 
 def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> None:
-    """Raise ValueError for the first parameter that is not finite, or a quaternion of length 0."""
+    """Raise ValueError if a parameter is not finite, or if a quaternion has length 0."""
     if background is not None:
         _check_background(background)
     for name, tensor in gaussians.tensors().items():
@@ -143,7 +140,7 @@ class Readback:
         return self._event is None or self._event.query()
 
     def values(self) -> Tensor:
-        """The values as a tensor on the CPU."""
+        """Wait for the copy, if necessary, and return the values as a tensor on the CPU."""
         if not self.arrived:
             Readback.waits += 1
         if self._event is not None:
@@ -160,15 +157,12 @@ class Lifetime:
 
 
 class RenderRequest(NamedTuple):
-    """The inputs of one render besides the Gaussians.
-
-    The backward pass fills ``absolute`` [N, 2].
-    """
+    """The inputs of one render besides the Gaussians, and ``absolute``, a buffer for an output."""
 
     camera: Camera
     degree: int
     background: Tensor
-    absolute: Tensor | None
+    absolute: Tensor | None  # [N, 2] filled by the backward pass
     lifetime: Lifetime  # of the frame's memory: the graph and the footprint refer to this request
 
 
@@ -184,8 +178,8 @@ class StagedRasterizer(ABC, Generic[FrameT]):
     """A rasterizer with separate stages.
 
     Its forward pass leaves a frame for the backward pass and the footprint. This class implements
-    ``render`` of the contract and the connection with autograd. A subclass implements the stages,
-    whose tensors are contiguous.
+    ``render`` of the contract and the connection with autograd. A subclass implements the stages;
+    all tensors that they get are contiguous.
     """
 
     name: str
@@ -200,7 +194,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
     ) -> tuple[Tensor, Tensor, Tensor, FrameT]:
         """Return image [H, W, 3], alpha [H, W], radii [N] and the frame.
 
-        The frame has memory for ``request.lifetime``.
+        The memory of the frame is leased until ``request.lifetime`` is freed.
         """
 
     @abstractmethod
@@ -213,7 +207,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         g_alpha: Tensor | None,
         want_splitting: bool,
     ) -> Gradients:
-        """Compute the gradients, given those by image and alpha."""
+        """Compute the gradients of the loss from those by image and alpha."""
 
     @abstractmethod
     def footprint(
@@ -236,7 +230,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
     ) -> RenderOutput:
         """See `gsbench.raster.base.Rasterizer`.
 
-        Raises ValueError that names a parameter that cannot be used.
+        Raises ValueError, which names the parameter, for an input that cannot be used.
         """
         check_settings(gaussians, camera, sh_degree, background)
         self.check(gaussians)

@@ -1,7 +1,7 @@
-"""Checkpoints of a training. A kill at any moment leaves a readable one, and damage is detected.
+"""Checkpoints of a training. After a kill at any moment, a readable one remains.
 
-A checkpoint file is the output of ``torch.save`` followed by its sha256; ``torch.load`` reads it as
-it is.
+A checkpoint file is the output of ``torch.save`` followed by its sha256, which reveals damage.
+``torch.load`` ignores the sha256.
 """
 
 import hashlib
@@ -22,10 +22,7 @@ DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
-    """Write ``state`` (tensors and plain values) as the checkpoint of ``step``.
-
-    Delete all but the last two.
-    """
+    """Write ``state`` (tensors, plain values) as the checkpoint of ``step``; keep the last two."""
     path = folder / f"checkpoint-{step:08d}.pt"
     with atomic(path) as temporary, temporary.open("wb") as stream:
         torch.save(state, stream)
@@ -40,8 +37,8 @@ class CheckpointWriter:
     """Writes checkpoints into ``folder``; after `finish`, all of them are completely on disk.
 
     With ``background``, `save` copies the state to the CPU, and a thread writes and hashes it while
-    training continues; the next `save` waits for that. This is for models on a GPU. For a model on
-    the CPU, the copy would take longer than the wait.
+    training continues; the next `save` waits for the thread. Use it for models on a GPU. For a
+    model on the CPU, the copy would take longer than the write.
     """
 
     def __init__(self, folder: Path, background: bool) -> None:
@@ -52,10 +49,7 @@ class CheckpointWriter:
         self._pending: Future[None] | None = None
 
     def save(self, step: int, state: dict[str, Any]) -> None:
-        """Save the state of ``step``, perhaps in the background.
-
-        Raises the error of the previous save if it failed.
-        """
+        """Save the state of ``step``. Raises the error of the previous save if it failed."""
         self.finish()
         if self._executor is None:
             save_checkpoint(self.folder, step, state)
@@ -65,13 +59,13 @@ class CheckpointWriter:
             )
 
     def finish(self) -> None:
-        """Wait until the last checkpoint is on disk; raise its error, if it failed."""
+        """Wait until the last checkpoint is on disk. Raises its error if it failed."""
         pending, self._pending = self._pending, None
         if pending is not None:
             pending.result()
 
     def close(self) -> None:
-        """`finish`, then end the thread."""
+        """Call `finish`, then end the thread."""
         try:
             self.finish()
         finally:
@@ -91,7 +85,7 @@ def to_host(state: Any) -> Any:
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
     """Load the newest undamaged checkpoint, all tensors on the CPU; None if there is none.
 
-    Damaged checkpoints are deleted, with a warning. Nothing in a checkpoint runs as code.
+    Damaged checkpoints are deleted with a warning. Loading a checkpoint runs no code from it.
     """
     for path in sorted(folder.glob(PATTERN), reverse=True):
         try:

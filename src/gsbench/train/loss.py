@@ -1,8 +1,8 @@
 """The photometric loss of 3DGS, ``(1 - w) L1 + w (1 - SSIM)`` with w = 0.2.
 
-Its definition in torch, and the choice of the fastest implementation for a device. SSIM is that of
-`gsbench.eval.ssim`: padded with zeros, the mean over the whole map, as in the reference code of
-3DGS.
+This module has its definition in torch, and chooses the fastest implementation for a device. SSIM
+is that of `gsbench.eval.ssim`: images are padded with zeros, and the result is the mean over the
+whole map, as in the reference code of 3DGS.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ Loss = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 def torch_photometric_loss(
     image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The definition of ``photometric_loss`` in torch, for any device and floating dtype."""
+    """Compute ``photometric_loss`` in torch: its definition, for any device and floating dtype."""
     target = as_unit_range(target, image.dtype)
     l1 = (image - target).abs().mean()
     similarity = ssim_map(image, target).mean()
@@ -34,11 +34,11 @@ def torch_photometric_loss(
 def photometric_loss(
     image: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3].
+    """Return the loss, L1 and SSIM of ``image`` [H, W, 3] against ``target`` [H, W, 3].
 
-    ``target`` is floating, or uint8, which is divided by 255. Three scalars; only the loss has a
-    gradient, by ``image``. For many images, a ``PhotometricLoss`` is faster: it has threads and
-    reuses memory.
+    ``target`` is floating, or uint8, which is divided by 255. The results are scalars; only the
+    loss has a gradient, by ``image``. For many images, use a ``PhotometricLoss``, which is faster:
+    it has threads and reuses memory.
     """
     return PhotometricLoss(ssim_weight, threads=1)(image, target)
 
@@ -46,8 +46,8 @@ def photometric_loss(
 class PhotometricLoss:
     """``photometric_loss`` as an object that reuses compiled kernels for float32 images.
 
-    On a CPU, kernels run on ``threads`` threads and give the same bits for any number of threads.
-    On a GPU with Triton, they never wait for the device. Other devices and dtypes use torch.
+    On a CPU, kernels run on ``threads`` threads; results have the same bits for any number of them.
+    On a GPU with Triton, the host never waits for the device. Other devices and dtypes use torch.
     """
 
     def __init__(self, ssim_weight: float = SSIM_WEIGHT, threads: int | None = None) -> None:
@@ -71,7 +71,7 @@ class PhotometricLoss:
         return self._compiled[device_type](image, target)
 
     def _compile(self, device_type: str) -> Loss:
-        """Return the loss for a type of device. Imports only the packages that it needs."""
+        """Return the loss for a type of device; import only the packages that it needs."""
         if device_type == "cpu":
             from gsbench.train.loss_cpu import CompiledLoss
 

@@ -1,10 +1,9 @@
-"""The photometric loss compiled for the CPU.
+"""The photometric loss compiled for the CPU: a fused forward pass and a hand-written gradient.
 
-One fused forward pass over rows, and a hand-written gradient. Images stay interleaved [H, W, 3]: a
-row is 3 W numbers, and horizontal neighbours are 3 numbers apart. So one vector holds 16 adjacent
-numbers of all channels. Each row is filtered horizontally once, into a ring buffer of 11 rows,
-which are then filtered vertically. Statistics of the target are computed again in each step, to
-need no memory per view.
+Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers
+apart. So one vector holds 16 adjacent numbers of all channels. Each row is filtered horizontally
+once, into a ring buffer of 11 rows, which are then filtered vertically. Statistics of the target
+are computed again in each step, so views need no further memory.
 """
 
 from typing import Any
@@ -31,7 +30,7 @@ from gsbench.raster.staged import Lifetime
 from gsbench.system.jit import inlined, kernel
 from gsbench.system.resources import available_cores
 
-SHARDS = 8  # of rows; each shard filters ten rows of its neighbours, too
+SHARDS = 8  # runs of rows; each shard filters ten rows of its neighbours, too
 CHANNELS = 3
 PAD = LANES  # zeros on both sides of a row; at least CHANNELS * WINDOW_RADIUS
 TAPS = 2 * WINDOW_RADIUS + 1
@@ -45,10 +44,7 @@ BYTE_MAX = np.float32(255)
 
 @inlined
 def _blur_row(source, start, target, place, numbers):
-    """Filter the padded row at ``source[start:]`` horizontally into ``target[place:]``.
-
-    The result has no padding.
-    """
+    """Filter the padded row at ``source[start:]`` horizontally; write it to ``target[place:]``."""
     for i in range(0, numbers, LANES):
         center = start + PAD + i
         total = load(source, center) * WEIGHTS[0]
@@ -60,9 +56,9 @@ def _blur_row(source, start, target, place, numbers):
 
 @inlined
 def _blur_column(ring, first, i, row, stride):
-    """Filter vertically around ``row`` at number ``i``.
+    """Filter the ring vertically around ``row``, for 16 numbers from number ``i`` of the row.
 
-    Rows of the ring start at ``first``, ``stride`` apart.
+    The ring starts at ``first``; its rows are ``stride`` apart.
     """
     total = load(ring, first + row % TAPS * stride + i) * WEIGHTS[0]
     for k in range(1, WINDOW_RADIUS + 1):
@@ -82,10 +78,7 @@ def _sum(vector, scratch):
 
 @inlined
 def _read_row(image, row, numbers, divisor, out):
-    """Read a row of a float32 or uint8 image into ``out``, behind its PAD zeros.
-
-    It is divided by ``divisor``.
-    """
+    """Read a row of a float32 or uint8 image, divided by ``divisor``, into ``out[PAD:]``."""
     start = row * numbers
     if numbers < LANES:
         for i in range(numbers):
@@ -99,7 +92,7 @@ def _read_row(image, row, numbers, divisor, out):
 
 @inlined
 def _write_row(line, row, numbers, image):
-    """The inverse of ``_read_row``; ``line`` has no padding."""
+    """Write ``line``, which has no padding, to a row of a float32 image."""
     start = row * numbers
     if numbers < LANES:
         for i in range(numbers):
@@ -112,11 +105,11 @@ def _write_row(line, row, numbers, image):
 
 @kernel
 def similarity_rows(memory, begin, end, height, width, image, target, divisor, derivatives, sums):
-    """Write the sums of SSIM and of |image - target| to ``sums`` [H, 2].
+    """Write the sums of SSIM and of |image - target| of each row to ``sums`` [H, 2].
 
-    The rows are ``begin`` to ``end``. ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if not
-    empty, gets the derivatives of the sum of SSIM by the blurred image, its blurred square and its
-    blurred product with the target, padded with zeros. ``memory`` is scratch.
+    The rows are ``begin`` to before ``end``. ``derivatives`` [3, H, PAD + 3 W rounded up + PAD], if
+    not empty, gets the derivatives of the sum of SSIM by the blurred image, its blurred square and
+    its blurred product with the target, padded with zeros. ``memory`` is scratch.
     """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
@@ -203,9 +196,9 @@ def gradient_rows(
     ssim_factor,
     gradient,
 ):
-    """Compute the rows ``begin`` to ``end`` of ``gradient`` [H * W * 3].
+    """Compute the rows ``begin`` to before ``end`` of ``gradient`` [H * W * 3].
 
-    The symmetric blur is its own adjoint.
+    The symmetric blur is its own adjoint, so the derivatives are blurred, too.
     """
     numbers = width * CHANNELS
     length = (numbers + LANES - 1) // LANES * LANES
@@ -240,7 +233,7 @@ def gradient_rows(
 
 
 class CompiledLoss:
-    """Calls the kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
+    """Calls the CPU kernels with threads and pooled memory; see ``loss.PhotometricLoss``."""
 
     def __init__(self, ssim_weight: float, threads: int | None) -> None:
         self.ssim_weight = ssim_weight
@@ -254,7 +247,7 @@ class CompiledLoss:
     def compute(
         self, image: Tensor, target: Tensor, differentiate: bool
     ) -> tuple[float, float, Tensor | None]:
-        """Return mean SSIM, mean L1 and, if wanted, the gradient of the loss by ``image``."""
+        """Return mean SSIM, mean L1 and, if ``differentiate``, the gradient by ``image``."""
         height, width, _ = image.shape
         numbers = image.numel()
         pixels = image.detach().contiguous().numpy().reshape(-1)
@@ -296,7 +289,7 @@ class CompiledLoss:
 
 
 class _CompiledLossFunction(torch.autograd.Function):
-    """Computes the gradient together with the value; ``backward`` only scales it."""
+    """Computes the gradient in ``forward``; ``backward`` only scales it."""
 
     @staticmethod
     def forward(

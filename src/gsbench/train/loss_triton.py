@@ -1,9 +1,9 @@
 """The photometric loss in Triton kernels. The host never waits for values from the device.
 
 Images stay interleaved [H, W, 3]: a row is 3 W numbers, and horizontal neighbours are 3 numbers
-apart. A program processes a strip of columns from top to bottom, one lane per number of a row. It
+apart. A program processes a strip of numbers from top to bottom, one lane per number of a row. It
 filters each row horizontally and adds it to eleven running vertical sums, of which one is complete
-at each row.
+after each row.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ MIN_ROWS = 8  # rows per program
 MULTIPROCESSORS, PROGRAMS_HELD = 132, 4
 RADIUS = tl.constexpr(WINDOW_RADIUS)
 CHANNELS = tl.constexpr(3)
-# from the centre
+# from the centre outwards
 W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in window()[WINDOW_RADIUS:].tolist())
 F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
 
 
 def rows_of_program(height: int, numbers: int) -> int:
-    """The number of rows per program, for an image of ``height`` rows of ``numbers``.
+    """The number of rows per program, for an image of ``height`` rows of ``numbers`` each.
 
     A program filters ``2 * RADIUS`` rows besides its own. So few programs do less work in all, but
-    leave multiprocessors idle. This chooses the number of programs per multiprocessor, all running
-    at once, for which the busiest multiprocessor filters the fewest rows. A single program counts
-    as two, because nothing else runs while it waits for memory. The result depends only on the size
-    of the image, so sums have the same bits on every GPU.
+    leave multiprocessors idle. The function chooses the number of programs per multiprocessor, all
+    running at once, for which the busiest multiprocessor filters the fewest rows. A single program
+    counts as two, because nothing else runs while it waits for memory. The result depends only on
+    the size of the image, so every GPU adds up in the same order.
     """
     strips = triton.cdiv(numbers, STRIP)
 
@@ -56,7 +56,7 @@ def rows_of_program(height: int, numbers: int) -> int:
 
 @triton.jit
 def _weight(k: tl.constexpr):
-    """The window's weight ``k`` px from its centre."""
+    """The weight of the window at ``k`` px from its centre."""
     return (W0, W1, W2, W3, W4, W5)[k]
 
 
@@ -69,9 +69,9 @@ def _zeros(like):
 
 @triton.jit
 def _push(sums, value):
-    """Advance the running sums by one row, whose blurred ``value`` is added.
+    """Add the horizontally blurred ``value`` of the next row to the running sums.
 
-    The first sum is then complete.
+    The first of the returned sums is complete.
     """
     return (
         tl.fma(value, W5, sums[1]),
@@ -97,7 +97,7 @@ def _load(array, row, number, height, numbers, scale):
 
 @triton.jit
 def _add(sums, x, y, weight):
-    """Add to five weighted sums: of x, y, x^2, y^2 and x y."""
+    """Add x, y, x^2, y^2 and x y, times ``weight``, to five sums."""
     wx, wy = x * weight, y * weight
     return (
         sums[0] + wx,
@@ -121,9 +121,9 @@ def measure_similarity(
     DIFFERENTIATE: tl.constexpr,
     STRIP: tl.constexpr,
 ):
-    """Write the sums of SSIM and of |image - target scale| to ``sums`` [programs, 2].
+    """Write the sums of SSIM and of |image - scale * target| to ``sums`` [programs, 2].
 
-    This program has ``rows`` rows. If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the
+    Each program has ``rows`` rows. If ``DIFFERENTIATE``, ``derivatives`` [3, H, 3 W] gets the
     derivatives of the sum of SSIM by the blurred image, its blurred square and its blurred product
     with the target.
     """
@@ -177,7 +177,7 @@ def measure_similarity(
 def add_up(sums, programs, size, ssim_weight, values, GROUP: tl.constexpr):
     """Write loss, mean L1 and mean SSIM to ``values`` [3].
 
-    ``sums`` [programs, 2] are over ``size`` numbers.
+    ``sums`` [programs, 2] are those of `measure_similarity`, over ``size`` numbers in all.
     """
     similarity, l1 = tl.zeros([GROUP], tl.float32), tl.zeros([GROUP], tl.float32)
     for start in range(0, programs, GROUP):
@@ -204,7 +204,10 @@ def differentiate(
     rows,
     STRIP: tl.constexpr,
 ):
-    """Compute the ``gradient`` [H, 3 W] by the image. The symmetric blur is its own adjoint."""
+    """Compute the ``gradient`` [H, 3 W] by the image.
+
+    The symmetric blur is its own adjoint, so the derivatives are blurred, too.
+    """
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
@@ -241,7 +244,7 @@ def differentiate(
 class TritonLoss:
     """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``.
 
-    Same bits on every run on one GPU.
+    Results have the same bits on every run on one GPU.
     """
 
     def __init__(self, ssim_weight: float) -> None:

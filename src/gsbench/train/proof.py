@@ -1,10 +1,10 @@
-"""The proof of a rasterizer on a GPU before its first training there.
+"""The proof of a rasterizer: on a GPU, it must agree with the reference before it trains.
 
-It must agree with the float64 reference. Kernels are compiled on the user's machine, by its
-versions of driver, torch and Triton, for its GPU. Tests elsewhere say little about that. So the
-first process that would use an executor on such a combination compares it, in some ten seconds, and
-a stamp below the user's cache folder keeps the result. Executors of the CPU are proven by the tests
-of gsbench and only on request, by ``gsbench doctor --prove``.
+Kernels are compiled on the user's machine, by its versions of driver, torch and Triton, for its
+GPU. Tests on other machines say little about that. So the first process that uses an executor with
+such a combination compares it with the float64 reference, which takes about ten seconds, and keeps
+the result in the user's cache folder. Executors on the CPU are tested by gsbench's own tests;
+``gsbench doctor --prove`` proves them on request.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from gsbench.train.loss import Loss, PhotometricLoss, torch_photometric_loss
 log = logging.getLogger(__name__)
 
 PACKAGE = Path(__file__).resolve().parents[1]
-# Files and folders whose change calls for a new proof: kernels, what they share, and the proof
-# itself.
+# A change of these files and folders requires a new proof: kernels, code that they share, and the
+# proof itself.
 SOURCES = (
     "raster",
     "eval/ssim.py",
@@ -56,15 +56,15 @@ SOURCES = (
 )
 SCENES = (
     Case(33, 49, 50, sh_degree=3),  # tiles of one pixel; Gaussians outside the image
-    # large ones, and some behind the camera
+    # large Gaussians, some of them behind the camera
     Case(48, 37, 120, sh_degree=2, log_scale=-1.0, depth=1.0),
     # a block's list has several segments
     Case(20, 17, 700, sh_degree=1, log_scale=-1.5, logit=-3.0, spread=0.3),
     Case(7, 5, 20, sh_degree=0, log_scale=-3.0),  # smaller than a tile; tiny Gaussians
 )
 STEPS = 10
-LOSS_TOLERANCE = 1e-4  # relative, at each step; the CPU's kernels depart by 5e-8
-TRAINED_TOLERANCE = 2e-3  # of the image after the steps; the CPU's kernels depart by 1e-6
+LOSS_TOLERANCE = 1e-4  # relative, at each step; the error of the CPU kernels is 5e-8
+TRAINED_TOLERANCE = 2e-3  # of the image after the steps; the error of the CPU kernels is 1e-6
 
 
 def prove(
@@ -75,10 +75,10 @@ def prove(
 ) -> RasterProof:
     """Compare ``rasterizer`` on ``device`` with the reference.
 
-    Some seconds, and the compilation of its kernels. All ``scenes`` are rendered, with gradients;
-    again, for equal bits; and the first is trained for ten steps. An executor that is known to
-    depart where alpha is clamped, and in radii (gsplat), is compared elsewhere. ``loss`` is by
-    default that of a training on ``device``.
+    All ``scenes`` are rendered, with gradients; rendered again, if the same bits are promised; and
+    the first is trained for ten steps with ``loss``, by default that of a training on ``device``.
+    For an executor that does not keep the contract (gsplat), opacities are so low that no alpha is
+    clamped, and radii are not compared. It takes seconds, besides the compilation of the kernels.
     """
     started = time.perf_counter()
     executor = find_executor(rasterizer.name)
@@ -97,7 +97,7 @@ def prove(
                 largest[error.quantity] = max(largest.get(error.quantity, 0.0), error.off)
                 if error.is_departure:
                     failures.append(str(error))
-            if failures:  # what follows would say no more
+            if failures:  # the next parts would only repeat them
                 break
     except (torch.OutOfMemoryError, InputError):
         raise
@@ -132,7 +132,7 @@ def _repeat_errors(
     rasterizer: Rasterizer, device: torch.device, scenes: tuple[Case, ...]
 ) -> Iterator[Error]:
     first = [_bits(rasterizer, case, str(device)) for case in scenes]
-    # Again after the other scenes, so that memory which was used before is seen.
+    # The second run is after all scenes, so that it reuses memory.
     for case, bits in zip(scenes, first, strict=True):
         again = _bits(rasterizer, case, str(device))
         unequal = [name for name in bits if bits[name] != again[name]]
@@ -159,8 +159,8 @@ def _bits(rasterizer: Rasterizer, case: Case, device: str) -> dict[str, bytes]:
 def _training_errors(
     rasterizer: Rasterizer, device: torch.device, case: Case, loss: Loss
 ) -> Iterator[Error]:
-    """The errors of ten steps with the device's loss and Adam, against torch's in float64."""
-    other = dataclasses.replace(case, count=case.count + 1)  # another random scene, to be learnt
+    """Train ten steps with ``loss`` and Adam; yield the errors against torch in float64."""
+    other = dataclasses.replace(case, count=case.count + 1)  # another random scene, the target
     with torch.no_grad():
         target = (
             ReferenceRasterizer()
@@ -192,9 +192,9 @@ def _training_errors(
 def _train(
     rasterizer: Rasterizer, case: Case, target: Tensor, loss: Loss
 ) -> tuple[list[float], Tensor]:
-    """The losses of ten steps towards ``target`` [H, W, 3], and the last image.
+    """Train ten steps towards ``target`` [H, W, 3]; return the losses and the last image.
 
-    The device and dtype of ``target`` count.
+    The training has the device and dtype of ``target``.
     """
     model = TrainableGaussians(
         case.gaussians().map(lambda tensor: tensor.to(target)), LearningRates(), 1.0
@@ -212,9 +212,9 @@ def _train(
 
 
 def versions_on(device: torch.device) -> dict[str, str]:
-    """Versions and digests of all that makes the kernels on ``device``.
+    """Versions of everything that determines the kernels on ``device``, and a digest of `SOURCES`.
 
-    A change of any calls for a new proof.
+    If one changes, a new proof is needed.
     """
     digest = hashlib.sha256()
     for source in SOURCES:
@@ -228,7 +228,7 @@ def versions_on(device: torch.device) -> dict[str, str]:
 
 
 def _driver() -> str:
-    """The version of NVIDIA's driver; "" where there is none. In WSL only nvidia-smi knows it."""
+    """The version of NVIDIA's driver, "" if there is none. In WSL only nvidia-smi knows it."""
     try:
         return Path("/sys/module/nvidia/version").read_text(encoding="utf-8").strip()
     except OSError:
@@ -242,7 +242,7 @@ def _device_name(device: torch.device) -> str:
     return f"{torch.cuda.get_device_name(device)} ({major}.{minor})"
 
 
-# ---- first contact
+# ---- stamps: the files that keep results
 
 
 def stamp_folder() -> Path:
@@ -255,7 +255,7 @@ def stamp_folder() -> Path:
 
 
 def stamp_of(raster: str, device: torch.device) -> Path:
-    """The file of the last proof of ``raster`` on ``device`` with the versions that are here."""
+    """The file of the last proof of ``raster`` on ``device`` with the installed versions."""
     parts = [
         raster,
         _device_name(device),
@@ -268,7 +268,10 @@ def stamp_of(raster: str, device: torch.device) -> Path:
 
 
 def prove_apart(raster: str, device: str) -> RasterProof:
-    """`prove` the executor ``raster`` in a process of its own, which a fault cannot leave."""
+    """`prove` the executor ``raster`` in a process of its own, so that a crash does no harm here.
+
+    A crash is a failure of the proof. Raises InputError if the device has too little memory.
+    """
     try:
         return run_isolated(_prove_by_name, raster, device, what=f"the proof of raster={raster}")
     except torch.OutOfMemoryError as error:
@@ -294,17 +297,14 @@ def _prove_by_name(raster: str, device: str) -> RasterProof:
 
 
 def known_proof(raster: str, device: torch.device) -> RasterProof | None:
-    """The last proof of ``raster`` on ``device`` with the versions that are here.
-
-    It is None if there is none.
-    """
+    """The last proof of ``raster`` on ``device`` with the installed versions, or None."""
     return read_if_sound(stamp_of(raster, device), RasterProof)
 
 
 def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterProof:
-    """The proof of ``raster`` on ``device``: the one that passed earlier, or a new one.
+    """The proof of ``raster`` on ``device``: one that passed earlier, or a new one.
 
-    Two processes make it once. With ``again``, always a new one.
+    If several processes need it, one makes it. With ``again``, it is always a new one.
     """
     stamp = stamp_of(raster, device)
     with _exclusive(stamp):
@@ -333,10 +333,7 @@ def proof_of(raster: str, device: torch.device, again: bool = False) -> RasterPr
 
 @contextmanager
 def _exclusive(stamp: Path) -> Iterator[None]:
-    """Hold the lock of ``stamp``.
-
-    Without a folder to write to there is nothing to share, so nothing is locked.
-    """
+    """Hold the lock of ``stamp``; if its folder is not writable, lock nothing."""
     try:
         stamp.parent.mkdir(parents=True, exist_ok=True)
         writable = os.access(stamp.parent, os.W_OK)
@@ -350,20 +347,18 @@ def _exclusive(stamp: Path) -> Iterator[None]:
 
 
 class Proven(NamedTuple):
-    """A rasterizer and its proof (None on a CPU).
-
-    And a line for each better one that ``raster=auto`` passed over.
-    """
+    """A rasterizer, its proof, and the better ones that ``raster=auto`` could not use."""
 
     rasterizer: Rasterizer
-    proof: RasterProof | None = None
-    passed_over: tuple[str, ...] = ()
+    proof: RasterProof | None = None  # None on a CPU
+    passed_over: tuple[str, ...] = ()  # a line for each better one, with the reason
 
 
 def create_proven(name: str, device: torch.device, threads: int | None = None) -> Proven:
-    """Make the rasterizer ``name``, proven if ``device`` is a GPU.
+    """Make the rasterizer ``name``; on a GPU, its proof must pass.
 
-    Raises InputError if the proof of the named executor fails or, for ``auto``, that of all.
+    Raises InputError if the named executor cannot run or fails its proof or, for ``auto``, if all
+    do.
     """
     if device.type != "cuda":
         return Proven(create_rasterizer(name, device, threads))
@@ -373,7 +368,7 @@ def create_proven(name: str, device: torch.device, threads: int | None = None) -
         try:
             proof = proof_of(executor.name, device)
             reason = "" if proof.passed else _describe(proof, stamp_of(executor.name, device))
-        except InputError as error:  # it cannot run here
+        except InputError as error:  # the executor cannot run on this device
             proof, reason = None, str(error)
         if not reason:
             return Proven(

@@ -1,6 +1,6 @@
-"""Training on small pictures first (DashGaussian, arXiv 2503.18402).
+"""Training that starts on small pictures (DashGaussian, arXiv 2503.18402).
 
-It has as many Gaussians as the pictures can show.
+The number of Gaussians can be limited to what the pictures can show.
 """
 
 import math
@@ -19,23 +19,20 @@ from gsbench.train.options import TrainConfig
 from gsbench.train.views import Targets
 
 # From the authors' code (utils/schedule_utils.py).
-MAX_SCALE = 8.0  # picture sides are never divided by more
-FIRST_SHARE = 1 / 4  # of each picture's spectrum is within the first size, at least
-NUM_POINTS = 32  # of the schedule, equally spaced in the spectrum that they show
+MAX_SCALE = 8.0  # the largest divisor of picture sides
+FIRST_SHARE = 1 / 4  # minimum share of each picture's energy at the first size
+NUM_POINTS = 32  # number of points of the schedule, equally spaced in energy
 
 
 @dataclass(frozen=True)
 class ScaleSchedule:
-    """The sides of pictures are divided by ``scales[i]`` from iteration ``begins[i]`` on.
-
-    The scales fall to 1.
-    """
+    """Divisors of picture sides: ``scales[i]`` at iteration ``begins[i]``, falling to 1."""
 
     begins: tuple[int, ...]
     scales: tuple[float, ...]
 
     def at(self, step: int) -> int:
-        """The whole number by which iteration ``step`` divides sides.
+        """The divisor of picture sides at iteration ``step``, rounded down to a whole number.
 
         Between two points, the area of pictures grows linearly.
         """
@@ -44,7 +41,7 @@ class ScaleSchedule:
 
     @property
     def full_from(self) -> int:
-        """The iteration from which sides are divided by less than two."""
+        """The iteration after which the divisor of picture sides falls below two."""
         first = next(i for i, scale in enumerate(self.scales) if scale < 2)
         return self.begins[max(first - 1, 0)]
 
@@ -52,14 +49,15 @@ class ScaleSchedule:
 def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSchedule:
     """The schedule for ``images`` [H, W, 3] from iteration 0 to ``until`` (arXiv 2503.18402).
 
-    A picture reduced to a fraction of its size keeps the central window of that fraction of its
-    spectrum; the energy of a size is the sum of the moduli of the Fourier transform over this
-    window. The first size has at least a quarter of the energy of every picture, but divides sides
-    by at most 8. The points of the schedule are equally spaced in the energy of the mean picture.
-    Their iterations are proportional to the logarithm of energy / first energy.
+    A picture whose sides are reduced to a fraction keeps the central window of its spectrum with
+    this fraction of the sides. The energy of a size is the sum of the moduli of the Fourier
+    transform over this window. The first size has at least a quarter of the energy of every
+    picture, but divides sides by at most 8. The points of the schedule are equally spaced in the
+    energy averaged over pictures. Their iterations are proportional to the logarithm of energy /
+    first energy.
     """
     sides = {side for image in images for side in image.shape[:2]}
-    # From 0 to 1, the fractions at which a central window over a spectrum gains pixels.
+    # all fractions from 0 to 1 at which the central window of a spectrum grows by pixels
     gains = [2 * np.arange(side // 2 + 1) / side for side in sides]
     fractions = np.unique(np.concatenate([[0.0, 1.0], *gains]))  # [F]
     curves = np.stack([_window_energies(image, fractions) for image in images])  # [V, F]
@@ -81,7 +79,7 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
     if whole > first:
         begins = [int(until * math.log(e / first) / math.log(whole / first)) for e in energies]
     begins[-1] = until
-    # of several points at one iteration, the last
+    # If several points have the same iteration, the last is kept.
     points = dict(zip(begins, map(float, scales), strict=True))
     return ScaleSchedule(tuple(points), tuple(points.values()))
 
@@ -89,7 +87,7 @@ def scale_schedule(images: Sequence[NDArray[np.uint8]], until: int) -> ScaleSche
 def _window_energies(
     image: NDArray[np.uint8], fractions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The energy of an image's spectrum within central windows of the sizes ``fractions`` [F], [F].
+    """The energies [F] of an image's spectrum within central windows of the sizes ``fractions``.
 
     The last window is the whole spectrum.
     """
@@ -110,28 +108,28 @@ def _window_energies(
 def _first_reaching(
     fractions: NDArray[np.float64], curve: NDArray[np.float64], value: float
 ) -> float:
-    """The least of ``fractions`` at which a rising ``curve`` [F] reaches ``value``."""
+    """The smallest of ``fractions`` [F] at which a rising ``curve`` [F] reaches ``value``."""
     return float(fractions[np.argmax(curve >= value * (1 - 1e-12))])
 
 
 # From the authors' code (utils/schedule_utils.py).
-FIRST_MOMENTUM = 5  # times the initial count: the momentum before any growth was seen
-KEPT_MOMENTUM = 0.98  # factor on the momentum in each round
-MAX_CANDIDATES = 1_000_000  # of one round that are added to the momentum
-MAX_GROWTH = 0.2  # of the count, in one round
+FIRST_MOMENTUM = 5  # times the initial count: the momentum before the first round
+KEPT_MOMENTUM = 0.98  # factor of the momentum in each round
+MAX_CANDIDATES = 1_000_000  # candidates of one round that are added to the momentum, at most
+MAX_GROWTH = 0.2  # share of the count that one round may add
 
 
 class Resolution:
-    """The size of the pictures at each iteration, and the limit on the count that goes with it.
+    """The size of the pictures at each iteration, and the limit on the count for this size.
 
     Sizes depend only on the pictures and on the densification window of ``options``; they change
-    after rounds.
+    only after rounds of densification.
     """
 
     def __init__(self, options: TrainConfig, views: Sequence[View], initial: int) -> None:
         self.options, self.initial = options, initial
         self.schedule = scale_schedule([view.image for view in views], options.densify_stop)
-        # Gaussians beyond ``initial`` that pictures of full size may have
+        # number of Gaussians that pictures of full size may add to ``initial``
         self.momentum = FIRST_MOMENTUM * initial
 
     def scale(self, step: int) -> int:
@@ -145,7 +143,7 @@ class Resolution:
     def position_step(self, step: int) -> float:
         """The iteration of the means' learning-rate schedule to use at iteration ``step``.
 
-        The schedule starts when the sides are divided by less than two.
+        The schedule starts at `ScaleSchedule.full_from`.
         """
         end, wait = self.options.position_steps, self.schedule.full_from
         return end * max(0, step - wait) / max(end - wait, 1)
@@ -154,8 +152,8 @@ class Resolution:
         """The limit on the count after a round: n0 + (n - n0) / s^(2 - x), and n in the last round.
 
         n0 is the initial count, n the limit ``most`` for pictures of full size (None: n0 plus the
-        momentum), s the number that divides the sides, x the progress of the window. A round adds
-        at most a fifth of the count.
+        momentum), s the divisor of the sides, and x is ``step / densify_stop``. A round adds at
+        most a fifth of the count.
         """
         options, step = self.options, refinement.step
         added = self.momentum if most is None else most - self.initial
@@ -164,10 +162,7 @@ class Resolution:
         return min(self.initial + added, int((1 + MAX_GROWTH) * refinement.event.before))
 
     def observe(self, event: RefineEvent) -> None:
-        """Update the momentum by the number of candidates of a round.
-
-        Those that grew and those that were refused.
-        """
+        """Update the momentum by the candidates of a round, added to the model or refused."""
         candidates = sum(getattr(event, name) for name in RefineEvent.GROWN) + event.blocked_by_cap
         self.momentum = max(
             self.momentum, int(KEPT_MOMENTUM * self.momentum + min(MAX_CANDIDATES, candidates))
@@ -175,7 +170,7 @@ class Resolution:
 
 
 class ScaledViews:
-    """The cameras and images of the training views, reduced.
+    """The cameras and images of the training views at reduced sizes.
 
     The full size and the last other size are cached.
     """
@@ -197,9 +192,9 @@ class ScaledViews:
 
 
 def _reduced(view: View, scale: int) -> View:
-    """``view`` with sides divided by ``scale``, by the authors' filter.
+    """``view`` with sides divided by ``scale``.
 
-    `scene.images.resize_image` has another.
+    The filter is that of the authors of DashGaussian, not that of `scene.images.resize_image`.
     """
     width, height = max(1, view.camera.width // scale), max(1, view.camera.height // scale)
     image = torch.from_numpy(view.image).permute(2, 0, 1).unsqueeze(0).float()  # [1, 3, H, W]

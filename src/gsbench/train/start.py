@@ -1,8 +1,8 @@
-"""Checks of what a training starts from.
+"""Checks of the initial points and the cameras before the first iteration of a training.
 
-Can its views show the initial points, and do the colours agree? A cloud in other coordinates, a
-point far outside, or a camera far from the others still gives a number. Each of these is an error
-or a warning here, before the first iteration. The measured facts are kept with the results.
+A cloud in other coordinates, a point far outside, or a camera far from the others would not stop a
+training, but its results would mean nothing. Each of these is an error or a warning here. The
+measured facts are kept with the results.
 """
 
 from __future__ import annotations
@@ -24,21 +24,23 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-MAX_POINTS = 20_000  # measured, evenly spaced in the cloud's order: the check takes about a second
-# Lengths are in sizes of the ring of cameras (`camera_size`).
-FAR = 1e4  # no photograph tells the depth of a point so far away
-MAX_DISTANCE = 1e7  # squares of such lengths leave the range in which float32 can train
-# Limits of the warnings. Clouds by structure from motion have .97 or more in view and an agreement
-# of .6 to .9; one of another scene or with turned axes has an agreement of -.1 to .2.
+# Points that are measured, evenly spaced in the cloud's order; the check takes about a second.
+MAX_POINTS = 20_000
+# Lengths are over the median distance of the training cameras from their median place.
+FAR = 1e4  # photographs do not determine the depth of a point so far away
+MAX_DISTANCE = 1e7  # squares of larger lengths leave the range in which float32 can train
+# Limits of the warnings. Clouds by structure from motion have a share of 0.97 or more in view and a
+# colour agreement of 0.6 to 0.9; a cloud of another scene or with turned axes has an agreement of
+# -0.1 to 0.2.
 MIN_SEEN = 0.1
 MIN_AGREEMENT = 0.25
 MAX_IDENTICAL = 0.5
 MIN_SPREAD = 0.02
-MIN_COLOR_SPREAD = 1.0  # levels of 255; a cloud of one colour has nothing to agree with
+MIN_COLOR_SPREAD = 1.0  # levels of 255; the colours of a cloud of one colour say nothing
 MAX_FIELD_OF_VIEW = 150.0  # degrees; the widest pinhole lenses have 130
 MIN_FIELD_OF_VIEW = 0.2  # degrees; satellites have 1 or 2
 MAX_PIXEL_RATIO = 1.25  # of the focal lengths in x and y; unequal scaling of photographs gives 1.01
-CENTRAL = (0.1, 0.9)  # of a side, where the principal point of an uncropped photograph lies
+CENTRAL = (0.1, 0.9)  # range of the principal point of an uncropped photograph, as shares of a side
 FAR_CAMERA = 20.0  # times the median distance of the training cameras from their median place
 
 
@@ -49,13 +51,13 @@ def check_start(
     random_points: bool = False,
     normalization: Normalization = IDENTITY,
 ) -> InitialCloud:
-    """Measure the initial ``points`` [P, 3] with ``colors`` [P, 3] against the training views.
+    """Compare the initial ``points`` [P, 3] and ``colors`` [P, 3] with the training views.
 
-    Warn below the limits. Positions are those of the training; messages undo ``normalization``.
-    ``random_points`` says that points and colours were drawn at random, so they need not fit the
-    photographs.
+    Logs warnings for values beyond the limits above. Positions are those of the training; messages
+    undo ``normalization``. If ``random_points``, points and colours were drawn at random and need
+    not fit the photographs.
 
-    Raises InputError for a start from which nothing can be learnt.
+    Raises InputError if nothing can be learnt from such a start.
     """
     if scene.extent == 0:
         raise InputError(
@@ -64,10 +66,10 @@ def check_start(
             "from several places"
         )
     warnings = far_cameras(scene) + odd_lenses(scene)
-    _warn(scene, warnings)  # before the errors below, which they may explain
+    _warn(scene, warnings)  # before the errors below, because they may explain an error
     middle, from_middle = camera_distances(scene)
-    # A camera far off sets the extent, but not the median distance. That is 0 if most cameras stand
-    # at one place.
+    # A single far camera changes the extent, but not the median distance. The median is 0 if most
+    # cameras are at one place.
     size = float(np.median(from_middle)) or scene.extent
     distances = np.linalg.norm(points - middle, axis=1) / size  # [P]
     farthest = int(distances.argmax())
@@ -114,7 +116,7 @@ def _warn(scene: Scene, lines: list[str]) -> None:
 
 
 def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
-    """The lines that warn of a cloud with these facts."""
+    """The warnings about a cloud with these facts."""
     lines = []
     if facts.far:
         far = counted(facts.far, "initial point")
@@ -146,10 +148,10 @@ def _doubts(facts: InitialCloud, random_points: bool) -> list[str]:
 
 
 def far_cameras(scene: Scene) -> list[str]:
-    """A line for each training camera far from the others.
+    """A warning for each training camera far from the others.
 
-    It sets the scene extent, and with it all rates and sizes. 3DGS takes the extent from the
-    farthest camera. Global structure from motion sometimes leaves such a camera.
+    3DGS takes the scene extent, and with it rates and sizes, from the farthest camera. Global
+    structure from motion sometimes leaves a camera far off.
     """
     _, distances = camera_distances(scene)
     typical = float(np.median(distances))
@@ -163,9 +165,9 @@ def far_cameras(scene: Scene) -> list[str]:
 
 
 def odd_lenses(scene: Scene) -> list[str]:
-    """A line for each way in which intrinsics differ from those of common lenses.
+    """A warning for each way in which intrinsics differ from those of common lenses.
 
-    Often they are values in other units.
+    The usual cause is a value in another unit.
     """
     names: dict[str, list[str]] = defaultdict(list)
     lines: dict[str, str] = {}
@@ -177,7 +179,7 @@ def odd_lenses(scene: Scene) -> list[str]:
 
 
 def _odd_about(camera: Camera) -> dict[str, str]:
-    """What is odd about the intrinsics of ``camera``: a text for each kind of oddity."""
+    """Texts about unusual intrinsics of ``camera``, by kind."""
     width, height = camera.width, camera.height
     field = math.degrees(2 * math.atan(width / (2 * camera.fx)))
     odd = {}
@@ -201,19 +203,19 @@ def _odd_about(camera: Camera) -> dict[str, str]:
 
 
 def camera_distances(scene: Scene) -> tuple[Array, Array]:
-    """The median place [3] of the training cameras, and the distance of each from it [V]."""
+    """The median position [3] of the training cameras, and the distance of each from it [V]."""
     centers = np.stack([view.camera.center for view in scene.train])  # [V, 3]
     middle = np.median(centers, axis=0)
     return middle, np.linalg.norm(centers - middle, axis=1)
 
 
 def _place(point: Array, normalization: Normalization) -> str:
-    """The position of a point of the training, in the scene's own coordinates, for a message."""
+    """The position of ``point`` in the scene's own coordinates, as text for a message."""
     return f"({', '.join(f'{value:.9g}' for value in normalization.undo(point))})"
 
 
 def _identical_share(points: Array) -> float:
-    """The share of ``points`` [P, 3] whose place, as float32, another point has too."""
+    """The share of ``points`` [P, 3] that have the same float32 position as another point."""
     places = np.ascontiguousarray(points.astype(np.float32)).view("V12").ravel()
     _, counts = np.unique(places, return_counts=True)
     return float(counts[counts > 1].sum() / len(points))
@@ -222,10 +224,11 @@ def _identical_share(points: Array) -> float:
 def _views_of(
     points: Array, views: tuple[View, ...]
 ) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
-    """The number of views of each point, [P], and its colour in the nearest, [P, 3], or -1.
+    """The number of views of each point, [P], and its colour in the nearest view, [P, 3].
 
-    A point is in view if it lies beyond the near plane and within the image. Occlusion is ignored;
-    the nearest view is the least likely to be occluded. Pixels that a mask ignores have no colour.
+    A point is in view if it is beyond the near plane and within the image. Occlusion is ignored; in
+    the nearest view it is least likely. The colour is -1 for points that no view shows; pixels that
+    a mask ignores have no colour.
     """
     seen_by = np.zeros(len(points), dtype=np.int64)
     shown = np.full((len(points), 3), -1, dtype=np.int16)
@@ -251,11 +254,12 @@ def _views_of(
 
 
 def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | None:
-    """Compare the points' ``colors`` [P, 3] with those ``shown`` in the photographs.
+    """The agreement of the points' ``colors`` [P, 3] with those ``shown`` in the photographs.
 
-    ``shown`` [P, 3] is -1 where there is none. 1 minus the mean difference over the mean difference
-    to the colours shown for all points: 1 is equal, 0 is chance. None if the points or the
-    photographs have one colour, or fewer than two points are shown.
+    ``shown`` [P, 3] is -1 for points without such a colour. The agreement is 1 minus the mean
+    difference of both colours, divided by the mean difference over all pairs of points: 1 is equal,
+    0 is chance. It is None if the points or the photographs have only one colour, or if fewer than
+    two points are shown.
     """
     is_shown = shown[:, 0] >= 0
     own, photograph = colors[is_shown].astype(np.int64), shown[is_shown].astype(np.int64)  # [S, 3]
@@ -263,7 +267,7 @@ def _agreement(colors: NDArray[np.uint8], shown: NDArray[np.int16]) -> float | N
         return None
     levels = np.arange(256)
     apart = np.abs(levels[:, None] - levels)  # [256, 256]
-    # the mean over all pairs of a point and a shown colour, by histograms of the channels
+    # the mean difference over all pairs of a point and a shown colour, from histograms of channels
     chance = 0.0
     for channel in range(3):
         counts, counts_shown = (

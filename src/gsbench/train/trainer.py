@@ -1,4 +1,4 @@
-"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier; and its log."""
+"""The training loop: the schedule of 3DGS, with any rasterizer and any densifier, and its logs."""
 
 import json
 import logging
@@ -42,13 +42,13 @@ from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
 log = logging.getLogger(__name__)
 
 SHARE_FOR_IMAGES = 0.5  # of a GPU's free memory; the rest is for the model and its renders
-SMOOTHING = 0.9  # weight of the previous mean in the loss that is shown
+SMOOTHING = 0.9  # weight of the previous mean in the smoothed loss
 
 
 class LossLog:
     """The losses of a training, in order of iterations. Losses from a GPU arrive with a delay.
 
-    ``smoothed`` is the exponential mean of the losses that have arrived, NaN before the first.
+    ``smoothed`` is the exponential mean of the losses that have arrived; NaN before the first.
     """
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class LossLog:
     def add(self, step: int, loss: Tensor, l1: Tensor, ssim: Tensor, total: Tensor) -> None:
         """Add the scalars of iteration ``step``; ``total`` is the loss plus a regulariser.
 
-        Raises FloatingPointError if a total that has arrived meanwhile is not finite.
+        Raises FloatingPointError if a total that has arrived by now is not finite.
         """
         scalars = [scalar.detach().to(loss) for scalar in (loss, l1, ssim, total)]
         self._pending.append((step, Readback(torch.stack(scalars))))
@@ -67,10 +67,9 @@ class LossLog:
             self._take()
 
     def wait(self) -> dict[str, float]:
-        """Wait for all losses.
+        """Wait for all losses; return ``step``, ``loss``, ``l1``, ``ssim`` of the last iteration.
 
-        Return ``step``, ``loss``, ``l1`` and ``ssim`` of the latest iteration. Raises
-        FloatingPointError, which names the first iteration whose total was not finite.
+        Raises FloatingPointError, which names the first iteration whose total was not finite.
         """
         while self._pending:
             self._take()
@@ -104,7 +103,7 @@ class Trainer:
     checkpoints into a folder and resumes from the newest checkpoint there. On the CPU, a resumed
     run gives the same bits as an uninterrupted one. A signal to stop (see
     `gsbench.system.stopping`) ends the run after the current iteration, with a checkpoint. At the
-    iterations ``snapshot_at`` the model is saved, too (see `snapshot_file`).
+    iterations ``snapshot_at``, the model is also written to `snapshot_file`.
     """
 
     def __init__(
@@ -156,9 +155,10 @@ class Trainer:
     def run(
         self, folder: Path, on_status: Callable[[Status], None] = lambda status: None
     ) -> Gaussians:
-        """Train to the last iteration or the end of the time budget.
+        """Train to the last iteration or the end of the time budget; return detached Gaussians.
 
-        Return the Gaussians, detached.
+        Raises TrainingError if a parameter or the loss is out of range, if no Gaussian is left, or
+        if the device's memory is full.
         """
         self._resume(folder)
         if self.snapshot_at:
@@ -182,10 +182,7 @@ class Trainer:
     def _loop(
         self, folder: Path, writer: CheckpointWriter, on_status: Callable[[Status], None]
     ) -> None:
-        """Iterate until the end, a signal to stop or the end of the time budget.
-
-        Write metrics, events, checkpoints.
-        """
+        """Iterate to the end, a signal to stop or the end of the time budget; write all files."""
         options = self.options
         first_step, started, earlier_seconds = self.step, time.perf_counter(), self.seconds
         last_checkpoint = time.monotonic()
@@ -210,7 +207,7 @@ class Trainer:
                     record = self.losses.wait() | counts | {"sh_degree": self.sh_degree}
                     if self.resolution is not None:
                         record["scale"] = self.scale
-                    # Measured again: on a GPU, `wait` waited for the work that was still queued.
+                    # Measure again: on a GPU, `wait` has waited for queued work.
                     self.seconds = earlier_seconds + time.perf_counter() - started
                     rate = (self.step - first_step) / max(self.seconds - earlier_seconds, 1e-9)
                     append(metrics, record | {"seconds": round(self.seconds, 3)})
@@ -231,10 +228,10 @@ class Trainer:
                     break
 
     def iterate(self, folder: Path) -> RefineEvent | None:
-        """Run one iteration in 3DGS's order.
+        """Run one iteration; return the event of its refinement, if there was one.
 
-        Rates, SH degree, render, backward, statistics, refinement, Adam. Its losses reach
-        ``losses``, on a GPU with a delay. Snapshots are written below ``folder``. Raises
+        The order is that of 3DGS: rates, SH degree, render, backward, statistics, refinement, Adam.
+        The losses are added to ``losses``. Snapshots are written below ``folder``. Raises
         TrainingError if a parameter is out of range or no Gaussian is left.
         """
         self.step += 1
@@ -256,7 +253,7 @@ class Trainer:
         total = loss if regularizer is None else loss + regularizer
         self.losses.add(step, loss, l1, ssim, total)
         total.backward()
-        # as in 3DGS, which saves its model before it refines and steps
+        # The last iteration ends here: 3DGS saves its model before it refines and steps.
         if step == options.iterations:
             return None
         if step in self.snapshot_at:
@@ -278,7 +275,7 @@ class Trainer:
         return event
 
     def render(self, index: int) -> RenderOutput:
-        """Render the training view ``index`` as in the present iteration, with gradients."""
+        """Render the training view ``index`` as in the current iteration, with gradients."""
         camera = self.scaled_views.at(self.scale)[0][index]
         # Passed only if needed: a user's rasterizer may not have this argument.
         wants = self.densifier.needs_splitting_matrix
@@ -294,9 +291,9 @@ class Trainer:
 
     @contextmanager
     def _explained(self, folder: Path) -> Iterator[None]:
-        """Raise TrainingError if the loss is not finite or the device's memory is full.
+        """Turn errors of a loss that is not finite and of full memory into TrainingError.
 
-        It names the last good state.
+        The message names the last good state.
         """
         try:
             yield
@@ -317,7 +314,7 @@ class Trainer:
 
     @property
     def scale(self) -> int:
-        """The number by which the sides of pictures are divided in the present iteration."""
+        """The divisor of the sides of pictures in the current iteration."""
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
     def _optimize(self, visible: Tensor) -> None:
@@ -365,7 +362,7 @@ def _last_state(folder: Path) -> str:
 def snapshot_file(step: int) -> str:
     """The path, below a training's folder, of the model at iteration ``step``.
 
-    It is the model before it refines, as 3DGS saves it.
+    As in 3DGS, the model is saved before the refinement and the optimiser step.
     """
     return f"snapshots/iteration_{step}.ply"
 
@@ -375,14 +372,11 @@ def sh_degree_at(options: TrainConfig, step: int) -> int:
     return min(MAX_SH_DEGREE, step // options.sh_interval)
 
 
-LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of a quarter
+LOG_VOLUME_BINS = np.linspace(-18, 3, 85)  # log10 of world units^3, in steps of 0.25
 
 
 def volume_histogram(step: int, log_scales: Tensor) -> dict[str, Any]:
-    """The record of iteration ``step`` with a histogram of the volumes.
-
-    The Gaussians have ``log_scales`` [N, 3].
-    """
+    """The record of iteration ``step`` with a histogram of volumes, from ``log_scales`` [N, 3]."""
     volumes = (log_volume(log_scales) / math.log(10)).cpu().numpy()
     clipped = np.clip(volumes, LOG_VOLUME_BINS[0], LOG_VOLUME_BINS[-1])
     counts, edges = np.histogram(clipped, LOG_VOLUME_BINS)
@@ -398,8 +392,8 @@ def append(stream: TextIO, record: dict[str, Any]) -> None:
 def drop_after(path: Path, step: int) -> None:
     """Remove records later than ``step`` from a JSON-lines file, if it exists.
 
-    An incomplete last line goes, too. A resumed training writes the removed records again. A kill
-    leaves the old or the new file, never a part of one.
+    An incomplete last line is removed, too. A resumed training writes the removed records again. A
+    kill leaves the old or the new file, never a part of one.
     """
     if path.exists():
         write_text(path, "".join(f"{line}\n" for line, at in whole_lines(path) if at <= step))

@@ -1,7 +1,4 @@
-"""The training views.
-
-Their random order, their images on the device, and renders of them for densifiers.
-"""
+"""The training views: their random order, their images on the device, renders for densifiers."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -24,7 +21,7 @@ STREAMS = ("cameras", "densify")
 
 
 def generators(seed: int) -> dict[str, torch.Generator]:
-    """A CPU generator for each of `STREAMS`. Streams, also of different seeds, are independent."""
+    """A CPU generator for each of `STREAMS`, independent of each other and of other seeds."""
     states = [
         np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)[0]
         for stream in range(len(STREAMS))
@@ -37,7 +34,7 @@ def generators(seed: int) -> dict[str, torch.Generator]:
 
 
 class CameraOrder:
-    """Training views in random order without replacement; a new order when all were used."""
+    """Draws training views at random without replacement; when all were drawn, it starts again."""
 
     def __init__(self, num_views: int, rng: torch.Generator) -> None:
         self.num_views = num_views
@@ -58,7 +55,7 @@ class Targets:
 
     If all images fit into ``budget`` bytes (None: no limit), they stay on the device; otherwise
     `get` copies each. On a CPU they share memory with the views. Masks, which need a third of the
-    memory, always stay on the device.
+    memory of images, always stay on the device.
     """
 
     def __init__(
@@ -84,21 +81,21 @@ class Targets:
             )
 
     def mask(self, index: int) -> Tensor | None:
-        """The mask of view ``index``, True where a pixel counts, [H, W, 1] on the device.
+        """The mask of view ``index``, [H, W, 1] on the device, True where a pixel counts.
 
-        It is None if all pixels count.
+        None if all pixels count.
         """
         return self._masks[index]
 
     def get(self, index: int) -> Tensor:
-        """The image of view ``index``, perhaps still being copied.
+        """The image of view ``index`` on the device.
 
-        Use it only in work queued after this call.
+        The copy may not be complete: use the image only in work that is queued after this call.
         """
         image = self._images[index]
         if self.resident or self._device.type != "cuda":
             return image
-        # Only from page-locked memory is a copy asynchronous.
+        # A copy is asynchronous only from page-locked memory.
         return image.pin_memory().to(self._device, non_blocking=True)
 
 
@@ -106,8 +103,8 @@ class Targets:
 class SceneViews:
     """Training views for densifiers, rendered and measured as in training.
 
-    They are `gsbench.densify.scores.TrainingViews`. Pixels that a mask ignores are replaced by
-    those of the photograph, so that they have no error and no gradient.
+    This class implements `gsbench.densify.scores.TrainingViews`. Pixels that a mask ignores are
+    replaced by those of the photograph, so they have no error and no gradient.
     """
 
     views: Sequence[View]
@@ -115,7 +112,7 @@ class SceneViews:
     rasterizer: Rasterizer
     background: Tensor
     photometric_loss: PhotometricLoss
-    sh_degree: Callable[[int], int]  # at an iteration
+    sh_degree: Callable[[int], int]  # degree of spherical harmonics at an iteration
 
     def __len__(self) -> int:
         return len(self.views)

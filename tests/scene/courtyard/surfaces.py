@@ -1,4 +1,4 @@
-"""The distance of points from the courtyard's surfaces, for tests of geometry; and a digest."""
+"""Distances of points to the courtyard's surfaces, and a digest of arrays."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def surface_distance(
 ) -> NDArray[np.float64]:
     """The distance in m from points [P, 3] to the nearest true surface, at most ``limit``; [P].
 
-    Exact outside all solids; inside, the distance to the nearest surface of any primitive, hidden
-    ones included.
+    It is exact outside all solids. Inside, it is the distance to the nearest surface of any
+    primitive, including hidden surfaces.
     """
     layout = build_layout(seed)
     result = np.empty(len(points))
@@ -27,7 +27,7 @@ def surface_distance(
 
 
 def fingerprint(values: NDArray[Any]) -> float:
-    """One number that changes with ``values`` and their order, hardly with their last digits."""
+    """One number that depends on ``values`` and their order, but hardly on their last digits."""
     flat = np.asarray(values, dtype=np.float64).ravel()
     return float(flat @ (1 + np.arange(len(flat)) % 7) / len(flat))
 

@@ -46,7 +46,7 @@ def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
     assert len(same) == len(names) >= 7
 
 
-def test_the_model_holds_the_exact_cameras(capture_dir: Path, tmp_path: Path):
+def test_the_colmap_model_has_the_exact_cameras(capture_dir: Path, tmp_path: Path):
     written = cameras_of(read_model(capture_dir / "sparse/0"))
     for name, camera in courtyard_cameras(4, 160, 120).items():
         np.testing.assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
@@ -63,23 +63,23 @@ def test_neighbouring_views_are_close(views: int):
     assert np.abs(np.diff(azimuth)).max() <= 7.5 + 1e-9
     radii = np.linalg.norm(centers[:, :2], axis=1)
     assert 4.0 < radii.min() < radii.max() < 5.0
-    assert surface_distance(centers).min() > 0.5  # no camera in or at a thing
+    assert surface_distance(centers).min() > 0.5  # no camera is in or near an object
 
 
 def test_a_surface_point_looks_alike_from_two_views():
-    """Project lawn points by the pinhole formula alone into two views: the colours agree."""
+    """Points of the lawn, projected into two views by the pinhole formula, have similar colours."""
     layout = build_layout(0)
     a, b = list(courtyard_cameras(48, 400, 300).values())[10:12]
     images = [render_view(layout, camera, 0).astype(float) for camera in (a, b)]
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.zeros(4000)])
-    points = points[surface_distance(points + np.array([0, 0, 0.3])) > 0.299]  # far from all things
+    points = points[surface_distance(points + np.array([0, 0, 0.3])) > 0.299]  # far from objects
     samples, kept = [], np.ones(len(points), dtype=bool)
     for camera, image in zip((a, b), images, strict=True):
         local = points @ camera.rotation.T + camera.translation
         pixel = local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]
         inside = (pixel > 2).all(1) & (pixel < [397, 297]).all(1) & (local[:, 2] > 0)
-        # seen, not hidden: the way to the camera is free of things
+        # a point is visible if no object is between it and the camera
         for share in np.linspace(0.05, 0.9, 30):
             way = points + share * (camera.center - points)
             inside &= surface_distance(way) > 0.02
@@ -117,7 +117,7 @@ SOLIDS = {  # by seed: `fingerprint` of each array
         "group_high": 4.68710385441,
     },
 }
-PICTURES = [  # of each view: `fingerprint` of red, green and blue, about four times their means
+PICTURES = [  # for each view: `fingerprint` of red, green and blue, about four times their means
     [485.889, 471.442, 398.571],
     [503.88, 484.926, 420.694],
     [525.847, 486.092, 373.444],
@@ -130,14 +130,14 @@ PICTURES = [  # of each view: `fingerprint` of red, green and blue, about four t
 
 
 @pytest.mark.parametrize("seed", SOLIDS)
-def test_the_things_are_those_of_this_version(seed: int):
-    """Raise the courtyard's VERSION where they change."""
+def test_the_solids_change_only_with_the_version(seed: int):
+    """If this test fails, raise the courtyard's VERSION."""
     made = {name: fingerprint(values) for name, values in build_layout(seed)._asdict().items()}
     assert made == pytest.approx(SOLIDS[seed], rel=1e-9), made
 
 
-def test_the_pictures_are_those_of_this_version():
-    """Eight views around, of another seed: raise the courtyard's VERSION where they change."""
+def test_the_images_change_only_with_the_version():
+    """Eight views around the centre; if this test fails, raise the courtyard's VERSION."""
     made = []
     for angle in np.arange(8) * np.pi / 4:
         picture = render_view(build_layout(1), ring_camera(angle, 80, 60), 1)
@@ -145,7 +145,7 @@ def test_the_pictures_are_those_of_this_version():
     np.testing.assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
 
 
-def test_surface_distance_against_dense_samples_of_the_surfaces():
+def test_surface_distance_is_zero_on_surfaces_and_correct_above_the_lawn():
     layout = build_layout(0)
     rng = np.random.default_rng(1)
     spheres, boxes = np.flatnonzero(layout.kind == SPHERE), np.flatnonzero(layout.kind == BOX)
@@ -165,7 +165,7 @@ def test_surface_distance_against_dense_samples_of_the_surfaces():
         surface_distance(np.concatenate([on_spheres, on_boxes, on_tube, [[3.1, 3.1, 0.0]]])).max()
         < 1e-9
     )
-    # on open lawn the ground is nearest; high above everything the roof tops are
+    # The ground is nearest to points of the open lawn, roofs to a point high above.
     np.testing.assert_allclose(
         surface_distance(np.array([[-2.5, 3.6, 0.2], [-2.5, 3.6, -0.1]])), [0.2, 0.1], atol=1e-9
     )
@@ -173,7 +173,7 @@ def test_surface_distance_against_dense_samples_of_the_surfaces():
     assert surface_distance(np.array([[0.0, 0.0, 8.0]]), limit=0.5)[0] == 0.5
 
 
-def test_too_few_views_and_too_small_ones_are_refused():
+def test_too_few_views_and_too_small_images_are_refused():
     with pytest.raises(InputError, match=r"scene\.views"):
         courtyard_cameras(2, 40, 30)
     with pytest.raises(InputError, match=r"scene\.width"):

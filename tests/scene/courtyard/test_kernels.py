@@ -1,7 +1,7 @@
-"""What a ray meets, against samples and against trying every primitive; pinned textures.
+"""Ray casting compared with samples and with a search over all primitives; pinned textures.
 
-The functions run as plain Python here: nothing is compiled, and the pinned values are the same on
-every processor.
+The functions run as plain Python here, not compiled, so the pinned values are the same on every
+processor.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.scene.courtyard.surfaces import fingerprint
 
 
 def uncompiled(*modules: ModuleType) -> SimpleNamespace:
-    """The functions of ``modules``, which call one another, as Python runs them."""
+    """The functions of ``modules`` as plain Python, which call one another uncompiled."""
     names = {name: value for module in modules for name, value in vars(module).items()}
     for name, value in list(names.items()):
         if hasattr(value, "py_func"):
@@ -43,7 +43,7 @@ SHAPES = {
 def is_inside(
     kind: int, size: tuple[float, float, float], points: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Which of ``points`` [P, 3] lie in the solid; [P]."""
+    """Mask [P] of the ``points`` [P, 3] in the solid."""
     if kind == BOX:
         return (np.abs(points) < size).all(axis=-1)
     if kind == SPHERE:
@@ -55,7 +55,10 @@ def is_inside(
 def rays(
     seed: int, count: int, reach: float
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Origins and unit directions: from around a place towards it, some of them along an axis."""
+    """Origins and unit directions of rays towards the middle, some of them along an axis.
+
+    Origins are about ``reach`` from the middle.
+    """
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions[: count // 4] = np.eye(3)[rng.integers(0, 3, count // 4)]
@@ -66,14 +69,14 @@ def rays(
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_ray_meets_a_solid_where_its_samples_enter_it(name: str) -> None:
+def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name: str) -> None:
     kind, size = SHAPES[name]
     starts = [*rays(0, 120, 2.0), *(rays(1, 40, 0.0) if size[2] == 0.5 else [])]
     steps, hits = np.linspace(1e-4, 4.0, 8001), 0
     for origin, direction in starts:
         inside = is_inside(kind, size, origin + steps[:, None] * direction)
         if inside[0] or 0 < inside.sum() < 5:
-            continue  # starts within, or grazes
+            continue  # the ray starts inside the solid, or only grazes it
         found = PLAIN.hit_primitive(kind, size, *origin, *direction)
         if inside.any():
             hits += 1
@@ -113,8 +116,8 @@ def test_normals_are_the_gradient_of_the_distance(name: str) -> None:
     assert tried > 20
 
 
-def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
-    """Groups and bounding spheres leave out only what a ray misses."""
+def test_the_first_hit_equals_that_of_a_search_over_all_primitives() -> None:
+    """The boxes of groups and the bounding spheres exclude only what a ray misses."""
     found = set()
     for origin, direction in rays(4, 60, 4.0):
         origin = origin * [1, 1, 0.2] + [0, 0, 1.5]
@@ -136,7 +139,7 @@ def test_the_first_hit_is_that_of_trying_every_primitive() -> None:
     assert len(found) > 10
 
 
-def test_the_nearest_surface_is_that_of_trying_every_primitive() -> None:
+def test_the_nearest_surface_equals_that_of_a_search_over_all_primitives() -> None:
     rng = np.random.default_rng(5)
     for point in np.concatenate(
         [rng.uniform([-7, -7, 0], [7, 7, 3], (40, 3)), LAYOUT.center[::6] + 0.1]
@@ -169,8 +172,8 @@ PINNED = {
 
 
 @pytest.mark.parametrize("name", PINNED)
-def test_textures_are_those_of_this_version(name: str) -> None:
-    """Lightness and warmth, near and far: raise the courtyard's VERSION where they change."""
+def test_textures_change_only_with_the_version(name: str) -> None:
+    """Values near and far from the camera; if this test fails, raise the courtyard's VERSION."""
     rng = np.random.default_rng(6)
     values = []
     for footprint in (0.0005, 0.004, 0.015, 0.05, 0.2):
@@ -188,7 +191,7 @@ def test_textures_are_those_of_this_version(name: str) -> None:
     assert found == pytest.approx(PINNED[name], rel=1e-9), found
 
 
-def test_noise_is_its_cells_at_their_corners_and_smooth_between() -> None:
+def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there() -> None:
     for i in range(-3, 3):
         corner = 2 * PLAIN.random_cell(i, 4 - i, 0, 7) - 1
         assert PLAIN.noise2(i, 4 - i, 7) == pytest.approx(corner)

@@ -1,8 +1,9 @@
 """Lists of the records that each tile composites, front to back.
 
-The records are sorted once by depth. Then shards of the sorted order are counted and written to the
-lists in that order, so the list of each tile is sorted, too. Tiles that the contour alpha = 1/255
-does not reach are left out, because the Gaussian is invisible there.
+The records are sorted once by depth. The sorted order is divided into shards; the records of each
+shard are counted and written to the lists in that order, so the list of each tile is sorted, too.
+Tiles that the contour alpha = 1/255 does not reach are left out, because the Gaussian is invisible
+there.
 """
 
 import math
@@ -65,10 +66,10 @@ def _put(key, digit, counts, target):
 
 @inlined
 def _columns(records, base, tile_y, first, past, reach, flatness):
-    """The tiles of row ``tile_y``, within ``first`` to ``past``, that the contour reaches.
+    """The first and the past-the-last tile of row ``tile_y`` that the contour reaches.
 
-    First, past-the-last. The contour is t^2 = ``reach`` - ``flatness`` dy^2, with t = dx + shear
-    dy.
+    Both are within ``first`` to ``past``. The contour is t^2 = ``reach`` - ``flatness`` dy^2, with
+    t = dx + shear dy.
     """
     shear, mean_y = np.float64(records[base + at.SHEAR]), np.float64(records[base + at.MEAN_Y])
     top = tile_y * at.TILE - mean_y - PIXEL_MARGIN
@@ -90,11 +91,12 @@ def _columns(records, base, tile_y, first, past, reach, flatness):
 def pair_shards(
     first, past, edges, keys, records, record_ints, tiles_x, cutoff, counts, pairs, made
 ):
-    """Write all pairs of tile (high word) and record of the shards ``first`` to ``past``.
+    """Write the pairs of tile and record of the shards ``first`` to ``past``.
 
-    The shards are of the sorted ``keys``. Shard s has the keys from ``edges[s]`` to ``edges[s +
-    1]`` and writes to ``pairs[s]``. ``counts[s]`` [tiles] gets the number of pairs of each tile,
-    ``made[s]`` the total. Pairs for which ``pairs`` has no room are only counted.
+    A pair has the tile in its high word and the record in its low word. The sorted ``keys`` are
+    divided into shards: shard s has those from ``edges[s]`` to before ``edges[s + 1]`` and writes
+    to ``pairs[s]``. ``counts[s]`` [tiles] gets the number of pairs of each tile, ``made[s]`` the
+    total. Pairs for which ``pairs`` has no room are only counted.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -134,9 +136,10 @@ def _pair(begin, end, keys, records, record_ints, tiles_x, cutoff, counts, pairs
 
 @kernel
 def start_tiles(counts, starts):
-    """Replace ``counts`` [shards, tiles] by places of first entries.
+    """Turn ``counts`` into the places where the lists begin.
 
-    Fill ``starts`` [tiles + 1], those of tiles.
+    ``counts`` [shards, tiles] gets the place of each shard's first entry in the list of each tile;
+    ``starts`` [tiles + 1] the place of each tile's first entry, and the end of the last list.
     """
     shards, tiles = counts.shape
     place = 0
@@ -153,8 +156,8 @@ def start_tiles(counts, starts):
 def fill_shards(first, past, made, pairs, places, entries):
     """Write the records of the shards ``first`` to ``past`` to the lists of their tiles.
 
-    Shard s has ``made[s]`` of ``pairs[s]``; ``places[s]`` [tiles] is where its next entry of each
-    tile goes.
+    Shard s has the first ``made[s]`` of ``pairs[s]``. ``places[s]`` [tiles] is the place of its
+    next entry in the list of each tile.
     """
     for shard in range(first, past):
         own_pairs, own_places = pairs[shard], places[shard]
@@ -168,7 +171,7 @@ def fill_shards(first, past, made, pairs, places, entries):
 def balance_tiles(starts, shards, bounds, tile_shard):
     """Divide the tiles into ``shards`` runs of similar work.
 
-    Fill ``bounds`` [shards + 1] and ``tile_shard``.
+    Fills ``bounds`` [shards + 1], the first tile of each shard, and ``tile_shard`` [tiles].
     """
     tiles = len(tile_shard)
     total = starts[tiles] + TILE_WORK * tiles

@@ -1,7 +1,8 @@
 """Compositing of tiles, forward and backward, 4x4 pixels at a time; and footprints.
 
-A tile is 16 blocks of 4x4 pixels. The state of a block is one vector per quantity. A bit mask has
-the blocks that a record may touch; the forward pass stores it in ``masks`` for the backward pass.
+A tile is 16 blocks of 4x4 pixels. The state of a block is one vector per quantity. For each entry
+of a tile's list, a bit mask says which blocks the record may touch; the forward pass stores it in
+``masks`` for the backward pass.
 
 The formulas are those of 3DGS (Kerbl et al. 2023, eq. 2 to 4; renderCUDA in its code). With the
 density G, the opacity o and the colour c of each record, front to back,
@@ -110,11 +111,12 @@ def _log2_alpha(dx, dy, shear, curve_t, curve_y, log2_opacity):
 
 @inlined
 def _touched_blocks(records, base, tile_x, tile_y, column, row):
-    """Bit b: block b of the tile at pixel (tile_x, tile_y) may have a pixel with alpha >= 1/255.
+    """The blocks of the tile at pixel (tile_x, tile_y) that may have a pixel with alpha >= 1/255.
 
-    Within a block, alpha is largest at the mean or, if the mean is outside, on an edge that faces
-    the mean. The maximum on a vertical or horizontal line has a closed form, which is clamped to
-    the block. Lane b is block b.
+    Returns block b in bit b. Within a block, alpha is largest at the mean or, if the mean is
+    outside, on an edge that faces the mean. The maximum on a vertical or horizontal line has a
+    closed form, which is clamped to the block. The function computes all blocks at once: lane b is
+    block b.
     """
     # [16] dx of the first column of each block, dy of its first row
     left = column + (tile_x - records[base + at.MEAN_X])
@@ -200,7 +202,7 @@ def _start_blocks(left, top, state, frame, planes, live):
 def _gather_batch(entry, count, end, left, top, alive, frame, batch, touched):
     """Copy the records of ``count`` entries from ``entry``; fill ``touched`` and ``frame.masks``.
 
-    The mean of a copied record is the vector from the mean to the tile.
+    In a copied record, the vector from the mean to the tile's first pixel replaces the mean.
     """
     entries, records = frame.entries, frame.records
     tile_x, tile_y = np.float32(left), np.float32(top)
@@ -313,8 +315,9 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
     of weighted means that starts with the background: nothing cancels, and the only division per
     record is that for T.
 
-    Each shard of tiles has its rows in ``all_rows`` [shards, N * 16]. An empty ``g_alpha`` stands
-    for zero. ``want_absolute`` is True or None, so that numba removes its branch at compilation.
+    Each shard of tiles has its rows in ``all_rows`` [shards, N * 16]. If ``g_alpha`` is empty, the
+    gradient by alpha is 0. ``want_absolute`` is True or None, so that numba removes its branch at
+    compilation.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     floats, _ = memory
@@ -443,10 +446,10 @@ def _place_image(image, left, top, width, height, out):
 
 @kernel
 def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
-    """Add the footprints of the tiles ``first`` to ``past``.
+    """Add the footprints of the tiles ``first`` to ``past`` to the sums of their shards.
 
-    Their shards have ``covered`` [N] int32, ``sums`` and ``distances`` [N]. An empty ``values``
-    [H * W] stands for zero.
+    The sums are ``covered`` [shards, N] int32, ``sums`` and ``distances`` [shards, N]. ``values``
+    is [H * W]; if it is empty, all values are 0.
     """
     entries, masks, records = frame.entries, frame.masks, frame.records
     floats, _ = memory

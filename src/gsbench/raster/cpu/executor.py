@@ -1,7 +1,4 @@
-"""The compiled CPU rasterizer.
-
-The stages of the forward and the backward pass, run on several threads.
-"""
+"""The compiled CPU rasterizer: runs the stages of both passes on several threads."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -57,11 +54,11 @@ class ForwardPass:
 
 
 class CpuRasterizer(StagedRasterizer[ForwardPass]):
-    """float32 on the CPU, compiled by numba at first use.
+    """A rasterizer in float32 on the CPU, compiled by numba at first use.
 
-    Same bits on every run and for any number of ``threads``. Each render keeps its intermediate
-    results until its graph is freed; then their memory is reused. Several threads may call it at
-    once.
+    Results have the same bits on every run and for any number of ``threads``. Each render keeps its
+    intermediate results until its graph is freed; then their memory is reused. Several threads may
+    call it at once.
     """
 
     name = "cpu"
@@ -154,7 +151,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         order: NDArray[np.uint64],
         records: NDArray[np.float32],
     ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Starts of the lists of tiles, [tiles + 1], and the records of all, front to back."""
+        """Return the starts of the tiles' lists, [tiles + 1], and the records in the lists."""
         tiles = view.tiles_x * view.tiles_y
         counts = arena.take("counts", (GAUSSIAN_SHARDS, tiles), np.int64)
         starts = arena.take("starts", (tiles + 1,), np.int64)
@@ -206,7 +203,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             self._runner.run(TILE_SHARDS, composite_backward)
             return self._backproject(passed, gaussians, request, rows, want_splitting)
         except BaseException:
-            # kernels expect zeros and clear what they add; an interrupt may have left sums
+            # The kernels need rows of zeros and clear them after use; an interrupt may have left
+            # sums in them.
             arena.drop("rows")
             raise
 
@@ -218,10 +216,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         rows: NDArray[np.float32],
         want_splitting: bool,
     ) -> Gradients:
-        """Compute all gradients from the gradient sums in ``rows``.
-
-        Fill ``request.absolute``, if given.
-        """
+        """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``."""
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
@@ -286,7 +281,7 @@ def _tiles(frame: at.CpuFrame, first: int, past: int) -> tuple[Any, ...]:
 
 
 def _rows_or_none(tensor: Tensor | None, columns: int) -> NDArray[np.float32]:
-    """``tensor`` as rows of ``columns``; no rows for None, which kernels cannot take."""
+    """``tensor`` as rows of ``columns`` numbers; for None, which kernels cannot take, no rows."""
     return np.empty((0, columns), np.float32) if tensor is None else _flat(tensor, columns)
 
 

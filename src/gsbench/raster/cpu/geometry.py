@@ -28,7 +28,8 @@ from gsbench.system.jit import inlined
 
 LOG2_E = 1.0 / math.log(2.0)
 BLUR = CONSTANTS.blur
-# Beyond, exp2 is undefined. The variance of a scale of 2^126 is not finite, so it is culled.
+# Beyond this, exp2 is undefined. The variance of a scale of 2^126 is not finite, so such a Gaussian
+# is culled.
 MAX_LOG2 = 126.0
 F0, F1 = np.float32(C0), np.float32(C1)
 D0, D1, D2, D3, D4 = (np.float32(value) for value in C2)
@@ -107,8 +108,8 @@ def view_axes(v):
 def from_camera(mean, v):
     """The vector from the camera centre to the mean, in world axes.
 
-    It is computed first: rotating the difference loses no digits, even if the scene is far from the
-    origin.
+    The difference is computed before the rotation, so no digits are lost even if the scene is far
+    from the origin.
     """
     return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
@@ -223,8 +224,8 @@ def fill_basis(degree, direction, matrix):
 def direction_gradient(degree, direction, matrix):
     """The gradient of ``sum_k g[k] basis[k + 1]`` by the direction (x, y, z).
 
-    It is not yet projected to the tangent of the unit sphere. ``matrix`` [16 * 16] has g of one
-    Gaussian in each row; this function transposes it.
+    It is not yet projected to the tangent plane of the unit sphere. ``matrix`` [16 * 16] has g of
+    one Gaussian in each row; this function transposes it.
     """
     x, y, z = direction
     gx, gy, gz = splat(ZERO), splat(ZERO), splat(ZERO)

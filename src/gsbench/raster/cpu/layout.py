@@ -1,4 +1,4 @@
-"""Memory layout of the data that kernels exchange: records, gradient rows."""
+"""Memory layout of the data that kernels exchange: records and gradient rows."""
 
 from typing import NamedTuple
 
@@ -12,9 +12,10 @@ from gsbench.raster.cpu.simd import LANES, SUM_LANES
 TILE = 16
 TILE_PIXELS = TILE * TILE
 
-# A record has what compositing needs of one visible Gaussian: 16 float32, one cache line. With d =
-# pixel - mean and t = dx + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The
-# conic is a sum of squares here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for
+# A record has what compositing needs of one visible Gaussian: 16 float32, one cache line. With
+# (dx, dy) = pixel - mean and t = dx + SHEAR dy,
+#     log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2.
+# The conic is a sum of squares here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for
 # needles, and the exponent is never positive.
 RECORD = LANES
 MEAN_X, MEAN_Y = 0, 1  # px, integer pixel centres
@@ -58,16 +59,13 @@ class Parameters(NamedTuple):
 
 
 class CpuFrame(NamedTuple):
-    """Arrays of one render.
-
-    Kernels of the forward pass fill them, kernels of the backward pass read them.
-    """
+    """Arrays of one render: the forward pass fills them, the backward pass reads them."""
 
     camera: CameraNumbers
     background: NDArray[np.float32]  # [3]
     records: NDArray[np.float32]  # [N * RECORD]
     record_ints: NDArray[np.int32]  # the same memory as ``records``
-    starts: NDArray[np.int64]  # [tiles + 1] first entry of each tile
+    starts: NDArray[np.int64]  # [tiles + 1] first entry of each tile's list
     entries: NDArray[np.int32]  # [pairs] records, by tile, front to back
     masks: NDArray[np.uint16]  # [pairs] bit b: the record may touch block b of the tile
     processed: NDArray[np.int64]  # [tiles] end of the entries that compositing has read

@@ -108,9 +108,9 @@ def project_shards(
 ):
     """Project the shards ``first`` to ``past``.
 
-    Shard s has the Gaussians from ``edges[s]`` to ``edges[s + 1]``. Fills ``records`` [N * 16],
-    ``keys`` [N] (depth in the high word, record in the low word), ``radii`` [N] and ``flags``
-    [shards, 2].
+    Shard s has the Gaussians from ``edges[s]`` to before ``edges[s + 1]``. Fills ``records``
+    [N * 16], ``keys`` [N] (depth in the high word, record in the low word), ``radii`` [N] and
+    ``flags`` [shards, 2].
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -239,8 +239,8 @@ def _zero_if_finite(vector):
 def _harmonics(degree, offset, todo, start, sh_rest, memory):
     """Red, green and blue of the harmonics above degree 0, for the lanes ``todo`` from ``start``.
 
-    A Gaussian's coefficients are adjacent, so each is a row of three 16x16 matrices, one of a
-    channel, times the row of its basis. The sums of all rows are taken at once.
+    The coefficients of one Gaussian are adjacent in memory. So each Gaussian is one row: its basis
+    times its coefficients, in one 16x16 matrix for each channel. All rows are summed at once.
     """
     basis, red, green = memory[:MATRIX], memory[MATRIX:], memory[2 * MATRIX :]
     blue = memory[3 * MATRIX :]
@@ -328,7 +328,7 @@ def backproject_shards(
 
 @inlined
 def _clear_unseen(begin, end, visible, record_ints, outputs):
-    """Set the gradients of the Gaussians without a record to 0, those of a shard."""
+    """Set the gradients of a shard's Gaussians without a record to 0."""
     gradients, g_screen, g_absolute, g_splitting = outputs
     unseen = begin  # the first Gaussian whose gradients are not written yet
     for record in range(begin, begin + visible + 1):
@@ -350,7 +350,7 @@ def _clear_unseen(begin, end, visible, record_ints, outputs):
 
 @inlined
 def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
-    """Write the gradients of the Gaussians of up to 16 records from ``record``, before ``past``."""
+    """Write the gradients of up to 16 Gaussians: those of the records ``record`` to ``past``."""
     gradients, g_screen, g_absolute, g_splitting = outputs
     v, record_ints = frame.camera, frame.record_ints
     floats, indices = memory
@@ -443,10 +443,10 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
 
 @inlined
 def _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v):
-    """The gradient by the mean in world axes, of its covariance and its position on the image.
+    """The gradient by the mean, in world axes, through the covariance and the place on the image.
 
-    ``a0`` and ``a1`` are the gradients by the rows of A = J W. They go on to the entries of J, then
-    to the position in view space, then to the world.
+    ``a0`` and ``a1`` are the gradients by the rows of A = J W. From them follow those by the
+    entries of J, then by the position in view space, then by the position in the world.
     """
     right, down, ahead = view_axes(v)
     slope_x, slope_y = clamped_slopes(free_x, free_y, v)
@@ -464,7 +464,7 @@ def _position_gradient(a0, a1, g_column, g_row, free_x, free_y, inverse_z, v):
 
 @inlined
 def _backproject_harmonics(degree, to, indices, sh_rest, g_sh_rest, memory):
-    """Write the gradients by ``sh_rest``; return that of the colours by the direction ``to``.
+    """Write the gradients by ``sh_rest``; return the gradient by the direction ``to``.
 
     ``memory`` has two 16x16 matrices for scratch, then the gradients by red, green and blue.
     """
@@ -518,9 +518,9 @@ def _difference(a, b):
 
 @inlined
 def _unclamped(record, count, record_ints, sums, colors):
-    """The gradients by red, green and blue, 0 if the channel was clamped.
+    """Return the gradients by red, green and blue; write them to ``colors`` [3 * 16], too.
 
-    Also written to ``colors`` [3 * 16].
+    The gradient by a clamped channel is 0.
     """
     for lane in range(LANES):
         clamped = record_ints[(record + min(lane, count - 1)) * at.RECORD + at.CLAMPED]

@@ -1,8 +1,7 @@
-"""Rearrangement of vectors.
+"""Rearrangement of vectors: transposition, blocks of pixels, integers in lanes, harmonics.
 
-16x16 transposition, blocks of pixels, integers in the bits of lanes, harmonics. Kernels hold one
-quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian (record, gradient
-row, coefficients) are adjacent. These functions convert between the two layouts.
+Kernels hold one quantity of 16 Gaussians in a vector, but in memory the values of one Gaussian
+(record, gradient row, coefficients) are adjacent. These functions convert between the two layouts.
 """
 
 from typing import Any
@@ -55,9 +54,10 @@ def transpose(typing_context, array, index):
 
 
 def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int) -> list[Any]:
-    """Pointers to the four rows of a block.
+    """Pointers to the four rows of a block in the array ``args[0]``.
 
-    ``numbers`` float32 each, the first at ``args[1]``, ``args[2]`` apart.
+    Each row has ``numbers`` float32. The first starts at index ``args[1]``; rows are ``args[2]``
+    numbers apart.
     """
     first = address(context, builder, sig, args)
     stride = context.cast(builder, args[2], sig.args[2], types.intp)
@@ -72,7 +72,7 @@ def _row_pointers(context: Any, builder: Any, sig: Any, args: Any, numbers: int)
 def store_block(typing_context, array, index, stride, values):
     """Write the 16 pixels of a block to an image with one number per pixel.
 
-    Its rows are ``stride`` apart.
+    The rows of the image are ``stride`` numbers apart.
     """
 
     def codegen(context, builder, sig, args):
@@ -88,7 +88,7 @@ def store_block(typing_context, array, index, stride, values):
 def store_colors(typing_context, array, index, stride, red, green, blue):
     """Write the 16 pixels of a block to an image with three numbers per pixel.
 
-    Its rows are ``stride`` numbers apart.
+    The rows of the image are ``stride`` numbers apart.
     """
 
     def codegen(context, builder, sig, args):
@@ -117,7 +117,7 @@ def load_colors(typing_context, array, index, stride):
         rows = [builder.load(pointer, align=4) for pointer in pointers]
         channels = []
         for channel in range(CHANNELS):
-            # of two rows side by side
+            # places of this channel in two rows side by side
             places = lane_indices([CHANNELS * k + channel for k in range(2 * BLOCK)])
             upper, lower = (builder.shuffle_vector(rows[k], rows[k + 1], places) for k in (0, 2))
             channels.append(builder.shuffle_vector(upper, lower, lane_indices(range(LANES))))
@@ -166,10 +166,7 @@ def index_bits(typing_context, start):
 
 @intrinsic
 def load_rest(typing_context, array, index):
-    """Load the 45 numbers ``array.flat[index .
-
-    Index + 45]`` as three vectors that start at ``REST_STARTS``.
-    """
+    """Load ``array.flat[index : index + 45]`` as three vectors that start at ``REST_STARTS``."""
 
     def codegen(context, builder, sig, args):
         pointer = address(context, builder, sig, args)
@@ -195,7 +192,7 @@ def store_rest(typing_context, array, index, values):
 
 @intrinsic
 def by_channel(typing_context, rest):
-    """Red, green and blue of the result of ``load_rest``: coefficient k in lane k.
+    """Split the result of ``load_rest`` into red, green and blue, with coefficient k in lane k.
 
     Lane 15 repeats lane 14.
     """

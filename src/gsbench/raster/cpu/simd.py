@@ -21,7 +21,7 @@ from numba.core import extending as numba_extending
 from numba.core.extending import lower_builtin, models, register_model
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-# kernels call its functions without the first argument, typing_context
+# Kernels call an intrinsic without its first argument, typing_context.
 intrinsic: Any = numba_extending.intrinsic
 
 LANES = 16  # of float32
@@ -80,7 +80,7 @@ def broadcast(builder: Any, scalar: Any, kind: ir.VectorType) -> Any:
 def as_vectors(
     context: Any, builder: Any, values: Sequence[Any], kinds: Sequence[Any]
 ) -> list[Any]:
-    """The operands ``values`` of the numba types ``kinds``; numbers are broadcast to all lanes."""
+    """``values``, of the numba types ``kinds``, as vectors; numbers are broadcast to all lanes."""
     return [
         broadcast(builder, context.cast(builder, value, kind, types.float32), VECTOR.ir)
         if isinstance(kind, types.Number)
@@ -102,7 +102,8 @@ def _register_operator(
 ) -> None:
     """Make numba compile ``functions`` to ``emit(builder, *operands)``.
 
-    They take any of the combinations ``operands``.
+    ``operands`` lists the combinations of types that they take, ``gives`` is the type of the
+    result.
     """
 
     class _Template(AbstractTemplate):
@@ -177,7 +178,7 @@ def load(typing_context, array, index):
 
 @intrinsic
 def load_numbers(typing_context, array, index):
-    """``load``, also from a uint8 array."""
+    """Like ``load``, but the array may also be uint8."""
     is_bytes = isinstance(array, types.Array) and array.layout == "C" and array.dtype == types.uint8
     if not is_bytes:
         _check_array(array)
@@ -204,9 +205,9 @@ def store(typing_context, array, index, value):
 
 
 def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
-    """The addresses of ``array.flat[indices[k] * stride + offset]`` for each lane k.
+    """The address of ``array.flat[indices[k] * stride + offset]`` for each lane k.
 
-    ``args[:4]`` are these four.
+    ``args`` starts with ``array``, ``indices``, ``stride`` and ``offset``.
     """
     data = context.make_array(sig.args[0])(context, builder, args[0]).data
     indices = context.make_array(sig.args[1])(context, builder, args[1]).data
@@ -218,10 +219,7 @@ def _places(context: Any, builder: Any, sig: Any, args: Any) -> Iterator[Any]:
 
 @intrinsic
 def gather(typing_context, array, indices, stride, offset):
-    """``array.flat[indices[k] * stride + offset]`` in lane k.
-
-    ``indices`` is an int64 array [16].
-    """
+    """Load ``array.flat[indices[k] * stride + offset]`` into lane k; ``indices`` is int64 [16]."""
     _check_array(array)
 
     def codegen(context, builder, sig, args):
@@ -239,7 +237,7 @@ def gather(typing_context, array, indices, stride, offset):
 def scatter(typing_context, array, indices, stride, offset, value):
     """Write lane k of ``value`` to ``array.flat[indices[k] * stride + offset]``.
 
-    Of equal indices the last wins.
+    If indices are equal, the last lane is kept.
     """
     _check_array(array)
 
@@ -315,13 +313,13 @@ def fma(typing_context, a, b, c):
 
 @intrinsic
 def minimum(typing_context, a, b):
-    """``a if a < b else b``; so b if either is NaN."""
+    """``a if a < b else b``, which is b if either is NaN."""
     return _choice("<", a, b)
 
 
 @intrinsic
 def maximum(typing_context, a, b):
-    """``a if a > b else b``; so b if either is NaN."""
+    """``a if a > b else b``, which is b if either is NaN."""
     return _choice(">", a, b)
 
 
@@ -451,7 +449,7 @@ def exp2(typing_context, a):
 def log2(typing_context, a):
     """``log2(a)`` of positive normal numbers, with an error of at most 2e-7 max(1, |log2(a)|).
 
-    Undefined elsewhere.
+    The result for other numbers is undefined.
     """
 
     def emit(builder, x):
@@ -482,9 +480,9 @@ SUM_LANES = tuple(int(f"{k:04b}"[::-1], 2) for k in range(LANES))
 def lane_sums(typing_context, vectors):
     """Sum the 16 lanes of each of up to 16 vectors.
 
-    The k-th sum is in lane ``SUM_LANES[k]``, other lanes are 0. It is a tree of shuffles and
-    additions in which each level merges pairs of vectors. So the sums of eleven vectors take about
-    as long as three single sums.
+    Returns a vector with the k-th sum in lane ``SUM_LANES[k]`` and 0 in the other lanes. A tree of
+    shuffles and additions merges pairs of vectors at each level, so the sums of eleven vectors take
+    about as long as three single sums.
     """
     if not (isinstance(vectors, types.UniTuple) and vectors.dtype is VECTOR):
         return None

@@ -1,4 +1,4 @@
-"""Pools of memory.
+"""Pools that reuse memory, and threads that run the shards of a stage.
 
 Page faults of newly allocated arrays would take longer than the kernels that fill the arrays.
 """
@@ -27,10 +27,7 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
 
 
 class Arena:
-    """Named scratch arrays that only grow.
-
-    ``take`` returns a view with the contents of its previous use.
-    """
+    """Named scratch arrays that only grow; until it grows, an array keeps its contents."""
 
     def __init__(self) -> None:
         self._blocks: dict[str, NDArray[np.uint8]] = {}
@@ -38,9 +35,9 @@ class Arena:
     def take(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike, zero: bool = False
     ) -> NDArray[Any]:
-        """Return an array of ``shape``.
+        """Return the array ``name`` with this shape.
 
-        With ``zero`` it is cleared when newly allocated, and only then.
+        With ``zero``, it is set to 0 only if its memory is newly allocated.
         """
         size = prod(shape) * np.dtype(dtype).itemsize
         block = self._blocks.get(name)
@@ -99,8 +96,8 @@ class TensorPool:
             ]
             if fitting:
                 return self._free.pop(min(fitting, key=lambda k: self._free[k].size))
-            # drop what was unused for longest: the pool never has more blocks than were in use at
-            # once
+            # Drop the block that was unused for longest, so that the pool never has more blocks
+            # than were in use at once.
             if self._free:
                 self._free.pop(0)
         return aligned_bytes(int(size * HEADROOM))

@@ -115,10 +115,11 @@ def log2_alpha(record, x, y):
 
 @triton.jit
 def _leave_light_behind(first_border, crossed, red, green, blue):
-    """Replace the light of segments in ``crossed`` borders by that behind each; return all light.
+    """Replace the light in each of the ``crossed`` borders; return the light of all segments.
 
-    The colours given are those of the last segment. Adding segment by segment, back to front, gives
-    the light behind each border without a subtraction.
+    A border has the light of the segment before it, and gets the light of all segments behind it.
+    ``red``, ``green`` and ``blue`` are the light of the last segment. Segments are added back to
+    front, so no subtraction is needed.
     """
     for k in range(0, crossed):
         place = first_border + (crossed - 1 - k) * BORDER
@@ -154,7 +155,7 @@ def composite(
     slots,
     last_slots,
 ):
-    """Blend the block ``order[program]``.
+    """Composite the block ``order[program]``.
 
     In:
 
@@ -165,11 +166,11 @@ def composite(
     Out:
 
     - ``image`` [H, W, 3], ``alpha`` [H, W];
-    - ``transmittance``, final, and ``last``, past the last entry that was read before the pixel
-      stopped; both by block, lane and step;
+    - ``transmittance``, the final one, and ``last``, the end of the entries that were read before
+      the pixel stopped; both by block, lane and step;
     - ``past`` [blocks], the maximum of ``last``; ``last_slots`` [blocks], the slot of the entry
       before it, -1 if none;
-    - ``borders`` that compositing crossed.
+    - ``borders``, those that compositing crossed.
     """
     block = tl.load(order + tl.program_id(0)).to(tl.int32)
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
@@ -238,10 +239,10 @@ def composite(
 
 @triton.jit
 def _fold(a, b, lane, BIT: tl.constexpr):
-    """Sums over pairs of lanes that differ in ``BIT``.
+    """Sums over pairs of lanes that differ in ``BIT``, for ``a`` and ``b`` [LANES] at once.
 
-    Of ``a`` in the lanes without it, of ``b`` in those with it. All are [LANES]. One exchange
-    between lanes gives both sums, where two separate sums would take two.
+    Lanes without the bit get the sum of ``a``, lanes with it the sum of ``b``. This takes one
+    exchange between lanes; two separate sums would take two.
     """
     low = (lane & BIT) == 0
     return tl.where(low, a, b) + tl.gather(tl.where(low, b, a), lane ^ BIT, 0)
@@ -255,9 +256,9 @@ def _sum_over(a, lane, BIT: tl.constexpr):
 
 @triton.jit
 def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
-    """The number of the sum that each lane has, and a mask of the lanes that store it.
+    """The number of the sum that ``_sums_over_lanes`` leaves in each lane.
 
-    They are those that ``_sums_over_lanes`` leaves.
+    Also returns a mask of the lanes that store their sum, one lane for each sum.
     """
     four, three, two, one = (lane >> 4) & 1, (lane >> 3) & 1, (lane >> 2) & 1, (lane >> 1) & 1
     if ABSOLUTE:
@@ -271,9 +272,9 @@ def _number_of_sum(lane, ABSOLUTE: tl.constexpr):
 
 @triton.jit
 def _sums_over_lanes(sums, lane, ABSOLUTE: tl.constexpr):
-    """The sums over all lanes of the nine (or eleven) ``sums``.
+    """The sums over all lanes of the nine (or eleven) ``sums``, one in each lane.
 
-    ``_number_of_sum`` says which lane has which.
+    ``_number_of_sum`` says which lane has which sum.
     """
     first = _fold(_fold(sums[0], sums[1], lane, 16), _fold(sums[2], sums[3], lane, 16), lane, 8)
     second = _fold(_fold(sums[4], sums[5], lane, 16), _fold(sums[6], sums[7], lane, 16), lane, 8)
@@ -304,11 +305,12 @@ def _lane_sums(h, weight, t, dy, g, record, ABSOLUTE: tl.constexpr):
 
 @triton.jit
 def _segment(order, starts, blocks, inner):
-    """The block and the first entry of this program's segment, which may not exist.
+    """The block and the first entry of this program's segment.
 
     Program p of the first ``inner`` has the segment behind border p. Only the list with the entry
-    before (p + 1) * SEGMENT can have this border; bisection finds it. The other programs have the
-    first segments of the blocks in ``order``.
+    before (p + 1) * SEGMENT can have this border; bisection finds it. If it has no such border, the
+    first entry is not before its end. The other programs have the first segments of the blocks in
+    ``order``.
     """
     program = tl.program_id(0)
     if program >= inner:
@@ -350,14 +352,14 @@ def composite_backward(
     HAS_ALPHA: tl.constexpr,
     ABSOLUTE: tl.constexpr,
 ):
-    """Write the gradient sums of one segment's pairs to ``rows_out`` [pairs, 16].
+    """Write the gradient sums of one segment's pairs, back to front, to ``rows_out`` [pairs, 16].
 
-    It goes back to front. c is the colour of a Gaussian, g the gradient of the pixel, T the
-    transmittance before the Gaussian, and S the sum of (c . g) alpha T over the later Gaussians and
-    the background. The derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to
-    front, S is a sum that starts with the background and the light behind the segment, so nothing
-    cancels. ``slots`` [pairs] has the row of each entry. Rows of entries that compositing did not
-    reach are not written. ``g_alpha`` is read only if ``HAS_ALPHA``.
+    c is the colour of a Gaussian, g the gradient of the pixel, T the transmittance before the
+    Gaussian, and S the sum of (c . g) alpha T over the later Gaussians and the background. The
+    derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to front, S is a sum that
+    starts with the background and the light behind the segment, so nothing cancels. ``slots``
+    [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
+    written. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
     block, begin = _segment(order, starts, blocks, inner)
     end = tl.load(past + block)
@@ -458,9 +460,10 @@ def cover(
 
 @triton.jit
 def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
-    """The first ``NUMBERS`` of the rows of each Gaussian, summed over its ``own_rows`` units.
+    """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
 
-    ``sum_units`` has summed the pairs of a unit, into the row of its first pair.
+    ``own_rows`` is the number of units of each Gaussian. ``sum_units`` has already summed the pairs
+    of each unit into the row of its first pair.
     """
     unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
     zero = tl.zeros_like(own_rows).to(tl.float32)

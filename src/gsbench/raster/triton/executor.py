@@ -46,10 +46,11 @@ class TritonFrame:
 
 
 class TritonRasterizer(StagedRasterizer[TritonFrame]):
-    """float32 on a GPU, compiled by Triton at first use. Same bits on every run on one GPU.
+    """A rasterizer in float32 on a GPU, compiled by Triton at first use.
 
-    Each render keeps its intermediate results until its graph is freed; then their memory is
-    reused. A render waits for the device once, for the sizes of the lists.
+    Results have the same bits on every run on one GPU. Each render keeps its intermediate results
+    until its graph is freed; then their memory is reused. A render waits for the device once, for
+    the sizes of the lists.
     """
 
     name = "triton"
@@ -261,9 +262,9 @@ def _project(
     radii: Tensor,
     flags: Tensor,
 ) -> Projected:
-    """Project all Gaussians.
+    """Project all Gaussians; fill ``keys``, ``radii`` and ``flags``.
 
-    Fill ``keys``, by which depth is sorted, ``radii`` and ``flags``, 1 for bad values.
+    Gaussians are sorted by ``keys``. ``flags`` is 1 if a value is bad.
     """
     count = len(gaussians)
     projected = Projected(

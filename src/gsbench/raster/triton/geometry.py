@@ -1,8 +1,8 @@
 """Projection geometry and spherical harmonics for both passes, float32, one lane per Gaussian.
 
 Matrices are tuples of rows, and vectors are tuples. No formula subtracts large numbers (see
-``spread``). The functions of vectors are those of `raster.cpu.geometry` once more: Triton's
-interpreter takes no function of a module that does not import Triton.
+``spread``). Some functions repeat those of `raster.cpu.geometry`, because Triton's interpreter
+takes no function of a module that does not import Triton.
 """
 
 from __future__ import annotations
@@ -122,8 +122,8 @@ def view_axes(v):
 def from_camera(mean, v):
     """The vector from the camera centre to the mean, in world axes.
 
-    It is computed first: rotating the difference loses no digits, even if the scene is far from the
-    origin.
+    The difference is computed before the rotation, so no digits are lost even if the scene is far
+    from the origin.
     """
     return mean[0] - v.center_x, mean[1] - v.center_y, mean[2] - v.center_z
 
@@ -168,7 +168,7 @@ def spread(m0, m1):
 
 @triton.jit
 def normalized(offset):
-    """``offset`` scaled to length 1, and the inverse of its length; 0 and 1 for length 0."""
+    """``offset`` scaled to length 1, and the inverse of its length. Length 0 gives 0 and 1."""
     distance = tl.sqrt(dot(offset, offset))
     inverse = 1.0 / tl.where(distance > 0, distance, 1.0)
     return stretched(offset, inverse), inverse
@@ -207,10 +207,10 @@ def _coefficients(sh_rest, index, k: tl.constexpr, mask):
 def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
     """The colours SH + 0.5, not clamped, of the Gaussians ``index`` at unit directions.
 
-    Also returns their derivatives by x, y and z of the direction, not yet projected to the tangent
-    of the unit sphere; each for red, green and blue. ``dc`` are the coefficients of degree 0. Each
-    basis function k adds c_k times its value and its derivatives, which stand beside it: as in
-    computeColorFromSH of 3DGS, with the constants of `gaussians.model`.
+    Also returns their derivatives by x, y and z of the direction, each for red, green and blue, not
+    yet projected to the tangent plane of the unit sphere. ``dc`` are the coefficients of degree 0.
+    The formulas are those of computeColorFromSH of 3DGS, with the constants of `gaussians.model`.
+    Each basis function k adds c_k times its value and its derivatives, which are written together.
     """
     x, y, z = direction
     rgb = (dc[0] * F0 + 0.5, dc[1] * F0 + 0.5, dc[2] * F0 + 0.5)

@@ -10,14 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Contract products and sums to fma: the present default of Triton, but not from 3.10 on.
+# Fuse products and sums to fma. It is the default of Triton only before 3.10.
 OPTIONS = {"enable_fp_fusion": True}
 
 
 def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
     """Return a launcher of ``kernel`` for ``count`` items, one per lane and ``group`` per program.
 
-    No launch for 0.
+    It launches nothing if ``count`` is 0.
     """
 
     def run(*arguments: Any, **constants: Any) -> None:
@@ -30,7 +30,7 @@ def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
 def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
     """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis.
 
-    Also takes ``num_warps``.
+    The launcher also takes options of Triton, for example ``num_warps``.
     """
 
     def run(*arguments: Any, **constants: Any) -> None:
@@ -40,10 +40,7 @@ def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
 
 
 class Workspace:
-    """Named 1D tensors that grow by doubling.
-
-    ``take`` returns a view with the contents of the last use.
-    """
+    """Named 1D tensors that grow by doubling; until it grows, a tensor keeps its contents."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -53,9 +50,9 @@ class Workspace:
         """Return ``count`` numbers of ``dtype``. A name must always have the same dtype."""
         if name not in self._buffers or count > self.capacity(name):
             grown = max(count, 2 * self.capacity(name))
-            # free the old one first, so that both never exist at once
+            # Free the old buffer first, so that both never exist at once.
             self._buffers.pop(name, None)
-            # an inference tensor could not be written to outside that mode
+            # A tensor made in inference mode could not be written to outside that mode.
             with torch.inference_mode(False):
                 self._buffers[name] = torch.empty(grown, dtype=dtype, device=self.device)
         return self._buffers[name][:count]
@@ -69,8 +66,8 @@ class Workspace:
 class WorkspacePool:
     """A pool of workspaces. A workspace returns to the pool when its ``holder`` is freed.
 
-    It is then leased only for the same stream, because work that still reads it is queued there
-    first.
+    It is leased again only for the same stream: work that still reads it is queued there, before
+    the work of the next holder.
     """
 
     def __init__(self) -> None:

@@ -28,13 +28,14 @@ SEGMENT = tl.constexpr(256)  # entries; a multiple of UNROLL and UNROLL_BACK
 # float32 numbers: the four quantities below of each pixel, by lane and step
 BORDER = tl.constexpr(4 * 128)
 TRANSMITTANCE = tl.constexpr(0)
-# light blended behind it
+# light that was blended behind the border
 BEHIND_RED, BEHIND_GREEN, BEHIND_BLUE = tl.constexpr(128), tl.constexpr(256), tl.constexpr(384)
 
-# A record has what compositing needs of one Gaussian: 16 float32. With d = pixel - mean and t = dx
-# + SHEAR dy, log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2. The conic is a sum of squares
-# here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for needles, and the exponent is
-# never positive.
+# A record has what compositing needs of one Gaussian: 16 float32. With (dx, dy) = pixel - mean and
+# t = dx + SHEAR dy,
+#     log2(alpha) = LOG2_OPACITY + CURVE_T t^2 + CURVE_Y dy^2.
+# The conic is a sum of squares here: unlike a dx^2 + 2b dx dy + c dy^2, it has no cancellation for
+# needles, and the exponent is never positive.
 RECORD = tl.constexpr(16)
 MEAN_X, MEAN_Y = tl.constexpr(0), tl.constexpr(1)  # px, integer pixel centres
 SHEAR = tl.constexpr(2)  # b / a
@@ -47,10 +48,10 @@ COLUMNS = tl.constexpr(10)  # of blocks that the contour can touch: first + 6553
 FIRST_ROW = tl.constexpr(11)  # of blocks that the contour can touch
 CLAMPED = tl.constexpr(12)  # bit c: colour channel c was below 0
 
-# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32. With h = d
-# loss / d log(alpha) these are h, h t, h dy, h t^2, h t dy, h dy^2, red, green, blue; and if they
-# are asked for, |h t| and |h (d power / d dy)|. Or a row has a footprint: number of pixels, sum of
-# values, sum of distances.
+# A row has the gradient sums of one Gaussian over the pixels of one block: 16 float32. With
+# h = d loss / d log(alpha), these are the sums of h, h t, h dy, h t^2, h t dy, h dy^2, red, green
+# and blue; and, if requested, of |h t| and |h (d power / d dy)|. Or a row has a footprint: number
+# of pixels, sum of values, sum of distances.
 ROW = tl.constexpr(16)
 
 # derivatives of red by x, y, z of the direction; then of green; then of blue

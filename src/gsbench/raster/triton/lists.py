@@ -43,9 +43,9 @@ MAX_COLUMN = tl.constexpr(1e6)  # px; beyond every image, but within int32
 
 @triton.jit
 def _span(records, place, row, first, past, mask):
-    """The block columns, within ``first`` to ``past``, that the contour reaches in ``row``.
+    """The first and the past-the-last block column that the contour reaches in ``row``.
 
-    First, past-the-last.
+    Both are within ``first`` to ``past``.
     """
     mean_x = tl.load(records + place + MEAN_X, mask=mask, other=0.0)
     mean_y = tl.load(records + place + MEAN_Y, mask=mask, other=0.0)
@@ -124,9 +124,9 @@ def find_units(
 
 @triton.jit(do_not_specialize=["count", "capacity"])
 def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
-    """Fill ``status`` [3] int64: number of units.
+    """Fill ``status`` [3] int64: number of units, number of pairs, and 1 if a value is bad.
 
-    Number of pairs (if the units fit); 1 if a value is bad.
+    The number of pairs is correct only if there are at most ``capacity`` units.
     """
     units = tl.load(unit_ends + count - 1, mask=count > 0, other=0)
     pairs = tl.load(pair_ends + capacity - 1)
@@ -144,7 +144,7 @@ def write_pairs(
 ):
     """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs].
 
-    One lane per unit.
+    Each lane handles one unit.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = unit < units
@@ -201,8 +201,8 @@ def find_all_units(
 ) -> tuple[Units, Tensor]:
     """Find the units of all Gaussians, front to back, and the Gaussian of each unit, [units].
 
-    Repeats with more memory if the first attempt has too little. Here the host waits for the
-    device.
+    If there is too little memory, allocate more and repeat. The host waits for the device here.
+    Raises ValueError for bad values and for too many pairs.
     """
     count = len(gaussians)
     depth_order = scratch.take("depth_order", count, torch.int64)

@@ -90,7 +90,7 @@ def _contour_range(center, half, blocks, SIZE: tl.constexpr):
 
 @triton.jit
 def _ellipse(quaternion, log_scale, axis_x, axis_y):
-    """R, the scales S, and the rows of N = A R; M = N S has the covariance M M^T (3DGS eq. 6)."""
+    """R, the scales S, and the rows of N = A R. The covariance is M M^T, M = N S (3DGS eq. 6)."""
     matrix = rotation_matrix(quaternion)
     scales = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
     return matrix, scales, times(axis_x, matrix), times(axis_y, matrix)
@@ -123,7 +123,7 @@ def project(
       at N; ``record_ints`` is the same memory;
     - ``color_slopes`` [N, 9] of visible Gaussians, the derivatives of colour by the direction,
       unless ``DEGREE`` is 0;
-    - ``keys`` [N], by which depth is sorted;
+    - ``keys`` [N], which sort Gaussians by depth, those that are not seen last;
     - ``row_counts`` [N], the number of rows of blocks that the contour can touch;
     - ``flags`` [1], set to 1 if a value is not finite or a quaternion has length 0.
     """
@@ -264,7 +264,7 @@ def _color_gradients(offset, g_rgb, color_slopes, g_sh_rest, index, mask, DEGREE
         for c in tl.static_range(3):
             turned = plus(turned, g_rgb[c], load_vector(color_slopes + 3 * c, 3 * index, mask))
     store_gradients(to, g_rgb, g_sh_rest, index, mask, DEGREE)
-    # Only what is tangent to the unit sphere turns the direction.
+    # Only the part of the gradient that is tangent to the unit sphere turns the direction.
     return stretched(minus(turned, dot(turned, to), to), inverse_distance)
 
 
@@ -284,10 +284,10 @@ def _store_turn(place, quaternion, turn, twice, mask):
 
 @triton.jit
 def _position_gradient(a0, a1, g_column, g_row, x, y, inverse_z, v):
-    """The gradient by the mean in world axes, of its covariance and its position on the image.
+    """The gradient by the mean, in world axes, through the covariance and the place on the image.
 
-    ``a0`` and ``a1`` are the gradients by the rows of A = J W. They go on to the entries of J, then
-    to the position in view space, then to the world.
+    ``a0`` and ``a1`` are the gradients by the rows of A = J W. From them follow those by the
+    entries of J, then by the position in view space, then by the position in the world.
     """
     right, down, ahead = view_axes(v)
     free_x, free_y = x * inverse_z, y * inverse_z
@@ -333,7 +333,7 @@ def backproject(
     SPLITTING: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the gradients of visible Gaussians; those of the others are not written."""
+    """Write the gradients of visible Gaussians. Other gradients are not changed."""
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     row_count = tl.load(row_counts + index, mask=index < count, other=0)
     seen = row_count > 0

@@ -38,8 +38,10 @@ def inverse(value):
 
 @inlined
 def enter_box(lx, ly, lz, hx, hy, hz, ox, oy, oz, ix, iy, iz):
-    """(entry, exit) of a ray with inverse direction i through the box from l to h; entry > exit if
-    it misses."""
+    """(entry, exit) of a ray with inverse direction i and the box from l to h.
+
+    If the ray misses the box, entry > exit.
+    """
     # Kay and Kajiya 1986: the ray is in the box where it is between all three pairs of planes.
     ax, bx = (lx - ox) * ix, (hx - ox) * ix
     ay, by = (ly - oy) * iy, (hy - oy) * iy
@@ -105,7 +107,7 @@ def hit_primitive(kind, size, ox, oy, oz, dx, dy, dz):
 
 @inlined
 def cast(layout, ox, oy, oz, dx, dy, dz, any_hit):
-    """(distance, primitive) of the nearest hit, GROUND or SKY included.
+    """(distance, primitive) of the nearest hit; the primitive may be GROUND or SKY.
 
     With ``any_hit``, for shadow rays, the first primitive found ends the search, and the ground is
     ignored.
@@ -147,8 +149,8 @@ def signed_distance(kind, size, x, y, z):
     else:
         middle = 0.5 * (size[0] + size[2]) if size[2] > 0.0 else 0.0
         qx, qy, qz = abs(sqrt(x * x + y * y) - middle) - (size[0] - middle), -inf, abs(z) - size[1]
-    # Of a box, and of a ring's section, which is a box in (radius, z): the distance to its nearest
-    # corner or edge outside, and to its nearest face, negative, inside.
+    # A box, or the section of a tube, which is a box in (radius, z). Outside, this is the distance
+    # to the nearest face, edge or corner; inside, minus the distance to the nearest face.
     outside = sqrt(max(qx, 0.0) ** 2 + max(qy, 0.0) ** 2 + max(qz, 0.0) ** 2)
     return outside + min(max(qx, qy, qz), 0.0)
 
@@ -164,7 +166,7 @@ def nearest_surface(layout, x, y, z, limit):
             max(low[1] - y, 0.0, y - high[1]),
             max(low[2] - z, 0.0, z - high[2]),
         )
-        # nothing in the group's box can be nearer than the box itself
+        # no primitive in the group's box can be nearer than the box itself
         if qx * qx + qy * qy + qz * qz >= best * best:
             continue
         for i in range(layout.group_start[g], layout.group_start[g + 1]):
@@ -184,7 +186,7 @@ def sign(value):
 
 @inlined
 def longer_first(a, b, size_a, size_b):
-    """The coordinates of a face in order: grain and planks run along its longer side."""
+    """The coordinates of a face, that of its longer side first: grain and planks run along it."""
     return (a, b) if size_a > size_b else (b, a)
 
 
@@ -224,7 +226,7 @@ def sky(dx, dy, dz, seed):
 
 @inlined
 def received(channel, sun, occlusion, up):
-    """The light on a surface: the sun's, and ambient light from above (share ``up``) and below."""
+    """The light on a surface: sunlight, and ambient light from above (share ``up``) and below."""
     ambient = up * SKY_LIGHT[channel] + (1 - up) * BOUNCE_LIGHT[channel]
     return sun * SUN_LIGHT[channel] + occlusion * ambient
 
@@ -255,14 +257,15 @@ def shade(layout, ox, oy, oz, dx, dy, dz, pixel, seed):
         red = tint[0] * light * (1.0 + 0.30 * warmth)
         green = tint[1] * light
         blue = tint[2] * light * (1.0 - 0.30 * warmth)
-    # Ambient occlusion: less free space along the normal than the step means something is near.
+    # Ambient occlusion: if there is less free space along the normal than the step, a surface is
+    # near.
     occlusion = 1.0
     for step in OCCLUSION_STEPS:
         free = nearest_surface(layout, x + step * nx, y + step * ny, z + step * nz, step)
         occlusion -= 0.38 * (1.0 - free / step)
     sun = nx * SUN[0] + ny * SUN[1] + nz * SUN[2]
     if sun > 0.0:
-        # from a little above the surface, which would otherwise shade itself
+        # The ray starts a little above the surface, which would otherwise shade itself.
         sx, sy, sz = x + _EPSILON * nx, y + _EPSILON * ny, z + _EPSILON * nz
         _, blocker = cast(layout, sx, sy, sz, SUN[0], SUN[1], SUN[2], True)
         sun = sun if blocker == SKY else 0.0

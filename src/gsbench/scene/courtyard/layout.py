@@ -63,7 +63,7 @@ class _Builder:
         self.rows.append((kind, center, self.turn @ _rotation(**angles), size, material, tint))
 
     def box(self, at, size, material, tint, **angles: float) -> None:
-        """A box given by its whole side lengths."""
+        """Add a box with side lengths ``size``, not half extents."""
         self.add(BOX, at, tuple(side / 2 for side in size), material, tint, **angles)
 
     def sphere(self, at, radius: float, material: int, tint) -> None:
@@ -96,7 +96,7 @@ class _Builder:
 
 
 def build_layout(seed: int) -> Layout:
-    """The courtyard. The plan is fixed; the seed varies small objects and shrubs."""
+    """Build the courtyard. The plan is fixed; the seed varies small objects and shrubs."""
     build = _Builder(np.random.default_rng(seed))
     # Objects near the cameras come first: a ray that hits one skips the groups behind it.
     _well(build)

@@ -21,12 +21,12 @@ from gsbench.scene.options import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
 from gsbench.system.resources import available_threads
 
-VERSION = 1  # to be raised when the images change
-# between neighbouring views; wider steps gave wrong SfM models on scenes like this one
+VERSION = 1  # raise it when the images change
+# azimuth between neighbouring views; larger steps gave wrong SfM models of scenes like this one
 MAX_STEP = radians(7.5)
 RING_RADIUS = 4.55  # m
 FIELD_OF_VIEW = radians(56.0)  # horizontal
-TARGET = (0.0, 0.0, 0.72)  # m, what all cameras look at
+TARGET = (0.0, 0.0, 0.72)  # m, the point that all cameras look at
 
 
 def render_courtyard(
@@ -42,7 +42,7 @@ def render_courtyard(
     ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts
     views. Raises `InputError` for fewer than 3 views or images below 16 px.
     """
-    # loads pycolmap, which is slow and only needed here
+    # This module loads pycolmap, which is slow and needed only here.
     from gsbench.scene.colmap import write_model
 
     cameras = courtyard_cameras(views, width, height)
@@ -61,7 +61,11 @@ def render_courtyard(
 
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
-    """The cameras by file name, on a wavy ring in steps of 7.5 degrees, or of less for over 48."""
+    """The cameras by file name, on a wavy ring around the courtyard's centre.
+
+    Steps are 7.5 degrees, or less for more than 48 views, which fill the ring. Raises InputError as
+    `render_courtyard` does.
+    """
     if views < MIN_IMAGES:
         raise InputError(f"scene.views must be at least {MIN_IMAGES}, got {views}")
     if min(width, height) < MIN_SIZE:
@@ -74,7 +78,7 @@ def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
 
 
 def ring_camera(angle: float, width: int, height: int) -> Camera:
-    """The camera at an azimuth (rad), of which its height and distance are smooth functions."""
+    """The camera at azimuth ``angle`` (rad); its height and distance vary smoothly with it."""
     radius = RING_RADIUS + 0.2 * cos(2 * angle)
     center = np.array([radius * cos(angle), radius * sin(angle), 1.95 + 0.40 * sin(5 * angle)])
     forward = np.array(TARGET) - center
@@ -87,7 +91,7 @@ def ring_camera(angle: float, width: int, height: int) -> Camera:
 
 
 def render_view(layout: Layout, camera: Camera, seed: int) -> NDArray[np.uint8]:
-    """Render one photograph, [H, W, 3] uint8 sRGB; surfaces are matt: one colour in all views."""
+    """Render one photograph, [H, W, 3] uint8 sRGB; a matt surface has one colour in all views."""
     image = np.empty((camera.height, camera.width, 3), dtype=np.uint8)
     pose = np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.center)
     render(layout, *pose, (camera.fx, camera.fy, camera.cx, camera.cy), image, seed)

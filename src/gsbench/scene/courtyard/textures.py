@@ -27,6 +27,7 @@ from gsbench.system.jit import inlined
 def random_cell(x, y, z, seed):
     """A hash of a lattice cell, uniform in [0, 1)."""
     h = (x * 374761393 + y * 668265263 + z * 1274126177 + seed * 974634777) & 0xFFFFFFFF
+    # the final mix of xxHash32
     h = ((h ^ (h >> 15)) * 2246822519) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 3266489917) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFFFFFF) / 4294967296.0
@@ -38,7 +39,7 @@ def noise2(x, y, seed):
     fx, fy = floor(x), floor(y)
     ix, iy = int(fx), int(fy)
     u, v = x - fx, y - fy
-    # Perlin 2002: 6 t^5 - 15 t^4 + 10 t^3 has no slope and no curvature at the lattice
+    # Perlin 2002: 6 t^5 - 15 t^4 + 10 t^3 has no slope and no curvature at lattice points
     u, v = u * u * u * (u * (6 * u - 15) + 10), v * v * v * (v * (6 * v - 15) + 10)
     low = random_cell(ix, iy, 0, seed) * (1 - u) + random_cell(ix + 1, iy, 0, seed) * u
     high = random_cell(ix, iy + 1, 0, seed) * (1 - u) + random_cell(ix + 1, iy + 1, 0, seed) * u
@@ -63,7 +64,7 @@ def visible(cell, footprint):
 
 @inlined
 def octaves2(x, y, cell, count, gain, footprint, seed):
-    """Noise octaves over the plane, about [-1, 1]; cells of ``cell`` m, each next half as large."""
+    """Noise octaves over the plane, about [-1, 1]; cells of ``cell`` m, halved for each octave."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -77,7 +78,7 @@ def octaves2(x, y, cell, count, gain, footprint, seed):
 
 @inlined
 def octaves3(x, y, z, cell, count, gain, footprint, seed):
-    """Noise octaves in space, about [-1, 1]; cells of ``cell`` m, each next half as large."""
+    """Noise octaves in space, about [-1, 1]; cells of ``cell`` m, halved for each octave."""
     total, amplitude = 0.0, 1.0
     for k in range(count):
         weight = visible(cell, footprint)
@@ -91,8 +92,12 @@ def octaves3(x, y, z, cell, count, gain, footprint, seed):
 
 @inlined
 def pebbles(x, y, cell, seed):
-    """Cellular noise: distances to the nearest feature point and the border, shade of the cell."""
-    # Worley 1996: one feature point in each cell, so the nearest lies in the cell or beside it
+    """Cellular noise at (x, y), with one random feature point in each cell.
+
+    Returns the distance to the nearest point, how much farther the second is, both in cells, and a
+    random shade of the nearest point in [0, 1).
+    """
+    # Worley 1996; only the point's own cell and the cells beside it are searched
     gx, gy = floor(x / cell), floor(y / cell)
     first, second, shade = 9.0, 9.0, 0.0
     for i in range(gx - 1, gx + 2):
@@ -123,7 +128,7 @@ def clamp(value, low, high):
 
 @inlined
 def ground(x, y, footprint, seed):
-    """The lawn with its gravel path and the bare soil along the walls."""
+    """Colour of the ground at (x, y) m: lawn, a gravel path, and bare soil along the walls."""
     wobble = 0.10 * octaves2(x, y, 0.7, 4, 0.6, footprint, seed + 11)
     radius = sqrt(x * x + y * y)
     to_door = max(abs(x + 0.12 * y * (y - 7.2) / 7.2) - 0.55, -y)
@@ -164,7 +169,10 @@ def ground(x, y, footprint, seed):
 
 @inlined
 def shade_factors(material, px, py, pz, u, v, footprint, seed):
-    """(lightness, warmth) of a material at a local point in m, with (u, v) along the face."""
+    """(lightness, warmth) of a material at a local point in m; (u, v) are m along the face.
+
+    Lightness is a factor of the tint; warmth above 0 makes it redder, below 0 bluer.
+    """
     light, warmth = 1.0, 0.0
     if material == STONE:
         row = floor(v / 0.24)
