@@ -19,6 +19,7 @@ from gsbench.errors import InputError
 from gsbench.weights import (
     MissingWeightsError,
     WeightsFile,
+    digests_of_unpinned,
     find_all_weights,
     find_weights,
     load_state,
@@ -58,6 +59,18 @@ def test_search_order_is_argument_environment_cache(
     assert find_weights(spec(b"x")) == places[1] / "net.pth"
     monkeypatch.delenv("GSBENCH_WEIGHTS")
     assert find_weights(spec(b"x")) == places[2] / "net.pth"
+
+
+def test_users_files_without_a_published_checksum_are_known_by_their_digest(
+    tmp_path: Path, empty_caches: Path
+):
+    """Such a file may be any, so that it belongs into the keys of results; a download may not."""
+    empty_caches.mkdir(parents=True)
+    (empty_caches / "net.pth").write_bytes(b"downloaded")
+    assert digests_of_unpinned([spec()]) == []
+    (tmp_path / "net.pth").write_bytes(b"mine")
+    digest = hashlib.sha256(b"mine").hexdigest()
+    assert digests_of_unpinned([spec(), spec(b"x", name="other.pth")], tmp_path) == [digest]
 
 
 @pytest.mark.parametrize("digits", [16, 64])

@@ -31,5 +31,7 @@ def test_scenes_have_the_wanted_count_in_front_of_the_camera(kind: str) -> None:
     assert (z > 0).all()
     within = np.abs(x * camera.fx / z) < camera.width
     assert (within & (np.abs(y * camera.fy / z) < camera.height)).all()
+    assert abs((x / z).mean()) < 0.25  # around the middle of the picture
+    assert abs((y / z).mean()) < 0.25
     with pytest.raises(InputError, match="count must be at least 1, got 0"):
         SCENES[kind](0)

@@ -125,7 +125,7 @@ def test_a_header_that_promises_more_than_the_file_has_is_refused(
     with pytest.raises(InputError, match=said):
         check_ply(path)
     check_ply(rewritten(path, b"element vertex 1000000", b"element vertex 2"))
-    with pytest.raises(InputError, match="counts below zero"):
+    with pytest.raises(InputError, match="count of an element is negative"):
         check_ply(rewritten(path, b"element vertex 2", b"element vertex -1"))
 
 

@@ -309,7 +309,7 @@ def test_finished_trial_is_recognised_until_something_changes(runs):
     [
         ("photo", "photos/a.jpg has changed"),
         ("photo gone", "photos/a.jpg cannot be read (No such file"),
-        ("new photo", "files have come to .*photos, or gone"),
+        ("new photo", "files were added to .*photos, or removed"),
         ("published", "table.csv cannot be read"),
         ("a flipped bit", "table.csv has changed"),
         ("store", r"stage train in the store is damaged or gone \(model differs"),

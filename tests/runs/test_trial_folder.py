@@ -231,7 +231,7 @@ def test_pictures_are_sorted_by_name(trial):
         (("made_of", "stages", "gone"), 3, "by version 3 of the stage gone, which is now at None"),
         (("made_of", "pycolmap"), "0.1", r"with pycolmap 0\.1, and .* is installed"),
         (("made_of", "sources"), {"/nowhere/a.png": [1, 2, 3]}, r"/nowhere/a\.png cannot be read"),
-        (("made_of", "folders"), {"/nowhere": 1}, "files have come to /nowhere, or gone"),
+        (("made_of", "folders"), {"/nowhere": 1}, "files were added to /nowhere, or removed"),
         (("made_of", "published", "per_view.csv"), [1, 2], r"per_view\.csv has changed"),
         (("made_of", "digests", "per_view.csv"), "0", r"per_view\.csv has changed"),
         (

@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.normalization import Normalization
 from gsbench.runs.trial_record import InitialCloud
 from gsbench.scene.types import Scene, View
-from gsbench.train.start import check_start, odd_lenses
+from gsbench.train.start import _agreement, check_start, odd_lenses
 from tests.train.conftest import orbit_camera
 
 WALL_Z = 4.0
@@ -236,3 +236,11 @@ def test_ignored_pixels_have_no_effect_on_the_agreement(
     ]
     facts = check_start(*cloud, Scene("masked", tuple(masked), ()))
     assert facts.color_agreement > 0.8
+
+
+def test_black_pixels_count_in_the_agreement_and_points_that_no_photograph_shows_do_not() -> None:
+    colors = np.array([[0, 0, 0]] * 10 + [[200, 100, 50]] * 10 + [[90, 90, 90]] * 5, dtype=np.uint8)
+    shown = colors.astype(np.int16)
+    shown[20:] = -1
+    assert _agreement(colors, shown) == pytest.approx(1.0)
+    assert _agreement(colors, np.full_like(shown, -1)) is None

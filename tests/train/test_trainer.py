@@ -147,7 +147,7 @@ def test_a_densifier_that_was_never_due_causes_a_warning(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab.train(ADC(start=500), "adc", iterations=15)
-    assert "not one refinement was due in 15 iterations" in caplog.text
+    assert "no refinement was due in 15 iterations" in caplog.text
     caplog.clear()
     lab.train(NoDensifier(), "none", iterations=15)
     assert "refinement" not in caplog.text

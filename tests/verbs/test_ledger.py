@@ -195,7 +195,7 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(
         ([f"{SPLIT}=0.02", "--least", "0.01"], "ledger try takes no --least"),
         ([f"{SPLIT}=0.02", "--fdr", "0.2"], "ledger try takes no --fdr"),
         (["densify=adc"], "the idea is baseline itself"),
-        ([f"{SPLIT}=0.02", "--against", "nobody"], "--against nobody: there is baseline"),
+        ([f"{SPLIT}=0.02", "--against", "nobody"], "--against nobody: it must be one of baseline"),
         ([f"{SPLIT}=0.02,0.03"], "compares one arm at a time"),
         (["densify=nothing_like_it"], "nothing_like_it"),
     ],

@@ -108,7 +108,7 @@ def judge_pairs(
             notes.append(f"{metric.name}: {reason}")
             missing = reason if metric == primary else missing
         if primary is not None and not primary.direction:
-            missing = "nobody said whether more or less of it is better"
+            missing = "no file says whether higher or lower is better"
             notes.append(f"{primary.name}: {missing}")
         judged.append(PairVerdicts(*pair, tuple(own), tuple(notes), primary, beforehand, missing))
     return judged

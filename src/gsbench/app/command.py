@@ -89,7 +89,7 @@ def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict
     if len(by_scene) < len(trials):
         raise InputError(f"{verb} is about one arm: only scene may list values")
     if not trials[0].values["launch"]["wait"]:
-        raise InputError(f"{verb} needs results to go on: leave launch.wait=false out")
+        raise InputError(f"{verb} waits for its trials: leave out launch.wait=false")
     if metric not in COSTS:
         EvalConfig(**trials[0].values["eval"] | {"primary": metric})
     return by_scene

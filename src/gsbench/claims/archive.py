@@ -286,7 +286,7 @@ def _read(file: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     for name, content in contents.items():
         if hashlib.sha256(content).hexdigest() != manifest["sha256"][name]:
             raise InputError(
-                f"{name} was changed after the export (its sha256 is another): export it again"
+                f"{name} was changed after the export (another sha256): export it again"
             )
     return manifest, contents
 
@@ -308,7 +308,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
         ) from None
     if info.file_size > MAX_BYTES:
         raise InputError(
-            f"{name} would be {info.file_size} bytes: no archive of gsbench's has so many"
+            f"{name} would be {info.file_size} bytes: an archive of gsbench never has that many"
         )
     with archive.open(info) as stream:
         return stream.read(MAX_BYTES)

@@ -46,7 +46,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the check sets itself
 MAX_ALPHA = 0.2
-NO_SIZE = "the whole claim depends on it: 0.005, or 10% of the baseline's value"
+NO_SIZE = "give a difference such as 0.005, or 10% (of the baseline's value)"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
 Name = Annotated[

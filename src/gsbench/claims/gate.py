@@ -109,7 +109,7 @@ def asked_difference(
         facts = facts_for(metric, values)
         sign, usual = facts.direction, facts.worthwhile
     if not sign:
-        raise InputError(f"--metric {metric}: nobody said whether more or less of it is better")
+        raise InputError(f"--metric {metric}: no file says whether higher or lower is better")
     if least is None and usual is None:
         raise InputError(
             f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"

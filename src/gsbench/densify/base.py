@@ -100,9 +100,7 @@ class DensifyContext:
     def training_views(self) -> TrainingViews:
         """Return ``views``, which the trainer always sets. Raises RuntimeError if they are None."""
         if self.views is None:
-            raise RuntimeError(
-                "this densifier looks at training views: give them as DensifyContext.views"
-            )
+            raise RuntimeError("this densifier needs training views: set DensifyContext.views")
         return self.views
 
 

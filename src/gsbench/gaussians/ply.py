@@ -111,7 +111,7 @@ def _check_length(path: Path) -> None:
         if words[:1] == ["element"]:
             count = int(words[2])
             if count < 0:
-                raise ValueError("it counts below zero")
+                raise ValueError("the count of an element is negative")
         elif words[:1] == ["property"]:
             announced += count * (MIN_TEXT_BYTES if is_text else SIZES.get(words[1], 1))
     if announced > path.stat().st_size:

@@ -106,10 +106,7 @@ def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> 
     short = gaussians.quaternions.detach().norm(dim=-1) < MIN_QUATERNION_NORM  # [N]
     if short.any():
         index = int(short.nonzero()[0])
-        raise ValueError(
-            f"quaternions: no length, so no rotation, at Gaussian {index} ({int(short.sum())} in "
-            "all)"
-        )
+        raise ValueError(f"quaternions: length 0 at Gaussian {index} ({int(short.sum())} in all)")
 
 
 class Readback:

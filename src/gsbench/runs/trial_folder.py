@@ -385,7 +385,7 @@ def find_changes(
         yield from _change_of(Path(source), stamp, source_stamp_of)
     for source_folder, changed in made_of.folders.items():
         if _changed_at(Path(source_folder)) != changed:
-            yield f"files have come to {source_folder}, or gone from there"
+            yield f"files were added to {source_folder}, or removed"
     for name, stamp in made_of.published.items():
         yield from _change_of(folder / name, stamp, stamp_of)
         if name in made_of.digests and _digest(folder / name) != made_of.digests[name]:

@@ -93,7 +93,7 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
             return torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # noqa: BLE001 - torch.load raises many kinds on damaged files
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            log.warning("checkpoint %s is damaged (%s) and is passed over", path, reason)
+            log.warning("checkpoint %s is damaged (%s) and is deleted", path, reason)
             path.unlink()
     return None
 

@@ -171,7 +171,7 @@ class Trainer:
             writer.close()
         if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
             log.warning(
-                "not one refinement was due in %d iterations: the densifier changed nothing (see "
+                "no refinement was due in %d iterations, so the densifier changed nothing (see "
                 "train.densify_start, "
                 "now %d)",
                 self.step,

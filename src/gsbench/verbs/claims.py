@@ -324,8 +324,7 @@ def _only_densifier(trials: Sequence[Trial]) -> str:
     arms = {(trial.values["init"]["name"], trial.values["densify"]["name"]) for trial in trials}
     if len(arms) > 1 or len({trial.files.home for trial in trials}) > 1:
         raise InputError(
-            "ablate takes one initialiser and one densifier apart: only scene and seed may list "
-            "values"
+            "ablate needs one initialiser and one densifier: only scene and seed may list values"
         )
     if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(
         trials

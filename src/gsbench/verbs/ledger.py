@@ -119,7 +119,9 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
     against = options.against or BASELINE
     if against != BASELINE and against not in book.kept:
         kept = listed([BASELINE, *book.kept])
-        raise InputError(f"--against {against}: there is {kept}{did_you_mean(against, book.kept)}")
+        raise InputError(
+            f"--against {against}: it must be one of {kept}{did_you_mean(against, book.kept)}"
+        )
     _check_words(options.settings)
     start = _permitted(book, against, options.settings)
     trials = _compose(home.name, start)
@@ -316,7 +318,7 @@ def _compose(name: str, words: Sequence[str]) -> Trials:
             raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
     trials = compose_trials([*words, f"name={name}"], multirun=True)
     if not trials[0].values["launch"]["wait"]:
-        raise InputError("ledger needs results to go on: leave launch.wait=false out")
+        raise InputError("ledger waits for its trials: leave out launch.wait=false")
     return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
 
 

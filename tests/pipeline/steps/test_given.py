@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from gsbench.densify import ADC
+from gsbench.densify import ADC, Volumetric
 from gsbench.errors import InputError, TrainingError
 from gsbench.external.settings import External
 from gsbench.gaussians.ply import read_ply, write_ply
@@ -24,7 +24,7 @@ from gsbench.normalization import Normalization
 from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps import train as train_steps
 from gsbench.pipeline.steps.scene import init_step
-from gsbench.pipeline.steps.train import external_step, train_step
+from gsbench.pipeline.steps.train import _log_normalization, external_step, train_step
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.keys import INIT, Step, UserCode
 from gsbench.runs.store import Store
@@ -337,3 +337,14 @@ def test_an_initialiser_gets_the_reference_cameras_and_they_are_in_its_key(
     (tmp_path / "a.png").write_bytes(b"torn")
     with pytest.raises(InputError, match=r"a\.png"):
         step.build(tmp_path)
+
+
+def test_the_volume_threshold_is_logged_in_units_of_the_scene(views, caplog):
+    """Twice as large in the training, a volume is eight times as large there."""
+    caplog.set_level("INFO", "gsbench")
+    moved = replace(views.capture, normalization=Normalization((1.0, 2.0, 3.0), 2.0))
+    _log_normalization(moved, Volumetric(volume_threshold=0.004))
+    assert "densify.volume_threshold=0.004 is 0.0005 cubed units of the scene" in caplog.text
+    caplog.clear()
+    _log_normalization(views.capture, Volumetric())
+    assert not caplog.text
