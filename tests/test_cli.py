@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from gsbench import cli
+from gsbench import __version__, cli
 from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
@@ -304,3 +304,8 @@ def test_ctrl_c_while_the_first_modules_load_is_one_line(module: str, tmp_path: 
     )
     assert done.returncode == 130
     assert done.stderr == "gsbench: stopped before it began\n"
+
+
+def test_the_version_is_printed(capsys):
+    assert cli.run(["--version"]) == 0
+    assert capsys.readouterr().out == f"gsbench {__version__}\n"

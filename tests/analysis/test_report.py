@@ -565,6 +565,13 @@ def test_no_scene_is_named_where_none_is_decided(tmp_path):
     assert by_scene_lines(judged.verdicts) == []
 
 
+def test_the_one_scene_of_an_experiment_has_no_line_of_its_own(tmp_path):
+    write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": 5.0}, trial_noise=0.01, views=3))
+    (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
+    assert any(scene.p < 0.05 for one in judged.verdicts for scene in one.scenes if scene.p)
+    assert by_scene_lines(judged.verdicts) == []
+
+
 def test_points_of_a_search_are_not_compared(tmp_path):
     write_runs(tmp_path, Plan())
     assert "Verdicts, " in build_report(load_experiment(tmp_path, "exp"))

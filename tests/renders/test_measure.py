@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from gsbench.errors import InputError
+from gsbench.eval.pictures import Matching
 from gsbench.renders.measure import (
     Destination,
     ReferenceImages,
+    _lines,
     check_destination,
     find_destination,
 )
@@ -66,3 +70,27 @@ def test_renders_of_other_photographs_than_the_experiments_are_refused(
             check_destination(destination, truth, tmp_path)
     else:
         check_destination(destination, truth, tmp_path)
+
+
+def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metrics() -> None:
+    evaluator: Any = SimpleNamespace(
+        protocol=SimpleNamespace(id="paper-1"),
+        unavailable={"lpips_vgg_raw": "no weights", "fps": "renders alone"},
+        awaited={"lpips_vgg_raw"},
+        own={},
+    )
+    matching = Matching({}, "by their order", ("x", "y"))
+    lines = _lines(
+        FOLDER, evaluator, matching, {"a": {"psnr": 20.0}, "b": {"psnr": 21.0}}, Path("runs/x")
+    )
+    assert lines[0] == "2 views: the pictures in a folder; protocol paper-1"
+    assert lines[1:3] == [
+        "names matched by their order",
+        "left out, without a photograph: x, y",
+    ]
+    assert [line.split() for line in lines[4:7]] == [
+        ["a", "20.000"],
+        ["b", "21.000"],
+        ["mean", "20.500"],
+    ]
+    assert lines[7:] == ["lpips_vgg_raw: n/a, no weights", "entered as runs/x"]
