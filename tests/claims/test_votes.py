@@ -203,6 +203,17 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
             assert key.showings.index(showing) > key.showings.index(first)
 
 
+def test_a_repeated_pair_does_not_follow_its_first_showing_soon(runs, tmp_path):
+    trials = load_experiment(runs, "exp").trials
+    for seed in range(8):
+        arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
+        key = make_round(trials, arms, 12, 1, tmp_path / str(seed), random.Random(seed))
+        places = {showing.id: place for place, showing in enumerate(key.showings)}
+        gaps = [places[one.id] - places[one.of] for one in key.showings if one.kind == "again"]
+        assert len(gaps) == 1
+        assert gaps[0] >= 4
+
+
 def test_a_lack_of_views_or_people_is_reported(made, capsys):
     key = made("--people", "9", pairs="40")
     out = capsys.readouterr().out

@@ -27,6 +27,7 @@ from gsbench.runs.votes import BLURRED, PHOTOGRAPH, Chosen, Kind, RoundKey, Show
 
 PAGE, PICTURES = "index.html", "pictures"
 SHOWN_AGAIN = 10  # every tenth pair is shown a second time, with its sides swapped
+APART = 4  # places between a pair and its second showing, where the round is long enough
 MIN_TRAPS, PAIRS_PER_TRAP = 4, 8
 # One of six traps may fail. Of four or five none may fail; one guesser in sixteen passes four.
 TRAPS_PER_MISTAKE = 6
@@ -122,22 +123,24 @@ def make_round(
                 (_showing("pair", candidate, str(sides[0]), str(sides[1]), how), candidate)
             )
     traps = max(MIN_TRAPS, len(shown) // PAIRS_PER_TRAP)
-    again = rng.sample(shown, max(1, len(shown) // SHOWN_AGAIN))
+    repeats = max(1, len(shown) // SHOWN_AGAIN)
     views = [rng.choice(shown)[1] for _ in range(traps)]
     for place, candidate in enumerate(views):
         # Sides take turns, so a person who always presses the same key fails.
         left, right = (PHOTOGRAPH, BLURRED) if place % 2 else (BLURRED, PHOTOGRAPH)
         shown.append((_showing("trap", candidate, left, right), candidate))
     rng.shuffle(shown)
+    # People remember a pair that comes again soon, so only pairs of the first half come again, in
+    # the last third.
+    pairs_shown = [one for one in shown if one[0].kind == "pair"]
+    again = rng.sample(pairs_shown[: max(repeats, len(pairs_shown) // 2)], repeats)
     for first, candidate in again:
         swapped_showing = replace(
             first, id=_new_id(), kind="again", left=first.right, right=first.left, of=first.id
         )
-        # At a random place in the last third, after its first showing.
-        before = next(place for place, (one, _) in enumerate(shown) if one is first) + 1
-        shown.insert(
-            rng.randint(max(before, 2 * len(shown) // 3), len(shown)), (swapped_showing, candidate)
-        )
+        place = next(place for place, (one, _) in enumerate(shown) if one is first)
+        earliest = min(len(shown), max(place + APART, 2 * len(shown) // 3))
+        shown.insert(rng.randint(earliest, len(shown)), (swapped_showing, candidate))
     key = RoundKey(
         salt=secrets.token_hex(32),
         time=stamp_now(),
