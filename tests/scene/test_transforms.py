@@ -122,6 +122,17 @@ def test_the_applied_transform_is_undone_for_cameras_and_points(tmp_path: Path) 
         assert cloud.colors.tolist() == [[10, 20, k] for k in range(5)]
 
 
+def test_two_files_of_a_scene_must_not_name_different_points(tmp_path: Path) -> None:
+    folder = in_blenders_files(write(tmp_path / "in", ply_file_path="a.ply"))
+    for name in ("a.ply", "b.ply"):
+        (folder / name).write_text("ply")
+    assert read_transforms(folder).points == folder / "a.ply"
+    other = json.loads((folder / "transforms_test.json").read_text()) | {"ply_file_path": "b.ply"}
+    (folder / "transforms_test.json").write_text(json.dumps(other))
+    with pytest.raises(InputError, match="names other points than another file"):
+        read_transforms(folder)
+
+
 def in_blenders_files(folder: Path) -> Path:
     """The same folder with a file of training views, and one of test views without a transform."""
     document = json.loads((folder / "transforms.json").read_text())

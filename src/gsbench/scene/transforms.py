@@ -193,8 +193,10 @@ def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
             share = f"{len(missing)} of {len(record.frames)}"
             log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
         if record.ply_file_path is not None:
-            points = folder / _relative_path(path, record.ply_file_path)
-            applied_to_points = applied
+            named = folder / _relative_path(path, record.ply_file_path)
+            if points not in (None, named):
+                raise InputError(f"{path} names other points than another file: keep one of them")
+            points, applied_to_points = named, applied
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
     own_lists = _named_split(files[""], records[""], images) if "" in files else None
