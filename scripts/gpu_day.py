@@ -80,7 +80,7 @@ def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
 def plan(seed: int = 0) -> list[Row]:
     """All parts, the most telling first; the trainings with ``seed``."""
     contract, bits = "tests/raster/test_contract.py;-k;", "tests/raster/test_same_bits.py"
-    some = " and nothing_to_see" if TINY else ""
+    some = " and without_visible" if TINY else ""  # part of the name of one quick test
     of_peer = f"tests/raster/test_gsplat.py;{contract}on_a_gpu or {PEER}{some}"
     peer = [gsbench(f"proof-{PEER}", f"doctor --json --prove --raster {PEER}", COMPILATION)]
     peer += [check(f"contract-{PEER}", of_peer, COMPILATION)]
