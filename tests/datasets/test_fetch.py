@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.cli import run
-from gsbench.datasets.catalog import read_catalog, wanted_files
+from gsbench.datasets.catalog import how_to_get, read_catalog, wanted_files
 from gsbench.downloads import RetryPolicy
 from gsbench.system.install import conf_dir
 from tests.datasets.conftest import archive_content, write_archive
@@ -236,3 +236,12 @@ def test_a_file_that_is_no_zip_archive_is_refused(
     (server.folder / "360_v2.zip").write_text("<html>this file has moved</html>")
     assert fetch("mipnerf360", "garden") == BAD_INPUT
     assert "360_v2.zip is not a complete zip archive" in capsys.readouterr().err
+
+
+def test_the_command_is_given_for_scenes_that_it_would_bring_to_the_missing_folder(
+    data: Path, tmp_path: Path
+) -> None:
+    missing = [("stump", data / "stump"), ("garden", data / "garden"), ("mine", data / "mine")]
+    assert "`gsbench fetch mipnerf360 garden stump`" in how_to_get(missing)
+    assert "mine" not in how_to_get(missing)
+    assert "gsbench fetch mipnerf360 garden" not in how_to_get([("garden", tmp_path / "garden")])
