@@ -351,14 +351,18 @@ def is_caught(fault: Fault, place: Path, reached: Reached) -> bool:
         shutil.copystat(ROOT / fault.file, place / fault.file)
 
 
-def plant(faults: list[Fault], workers: int, record: Path) -> Iterator[tuple[Fault, bool]]:
-    """Plant the faults, each in a copy of its worker; yields each with whether a test noticed."""
+def plant(faults: list[Fault], workers: int, kept: Path | None) -> Iterator[tuple[Fault, bool]]:
+    """Plant the faults, each in a copy of its worker; yields each with whether a test noticed.
+
+    ``kept`` is a file for the record of coverage, which is made if it is missing.
+    """
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(workers) as pool:
         places: Queue[Path] = Queue()
         for worker in range(workers):
             places.put(copy_checkout(Path(folder) / str(worker)))
+        record = (kept or Path(folder) / "lines.db").absolute()
         if not record.exists():
-            record_coverage(Path(folder) / "0/checkout", record.absolute())
+            record_coverage(Path(folder) / "0/checkout", record)
         reached = Reached(record)
 
         def tried(fault: Fault) -> tuple[Fault, bool]:
@@ -383,11 +387,9 @@ def main() -> int:
     faults = choose_faults(arguments.rooms, arguments.count, arguments.seed)
     random.Random(arguments.seed).shuffle(faults)
     results = {}
-    with tempfile.TemporaryDirectory() as folder:
-        record = arguments.coverage or Path(folder) / "lines.db"
-        for fault, caught in plant(faults, arguments.workers, record):
-            results[fault] = caught
-            print("caught  " if caught else "SURVIVED", describe(fault), flush=True)
+    for fault, caught in plant(faults, arguments.workers, arguments.coverage):
+        results[fault] = caught
+        print("caught  " if caught else "SURVIVED", describe(fault), flush=True)
     planted = Counter(fault.room for fault in results)
     seen = Counter(fault.room for fault in results if results[fault])
     print("\n| room | planted | caught |\n|---|---|---|")

@@ -19,7 +19,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.errors import InputError
-from gsbench.runs.keys import NOT_HASHED
+from gsbench.runs.keys import is_hashed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,8 +79,7 @@ def _settings_with(trial: TrialResult, name: str) -> Mapping[str, Any]:
 
     Settings that change no result are only in the trial's own file.
     """
-    is_hashed = name in trial.config or name.partition(".")[0] not in NOT_HASHED
-    return trial.config if is_hashed else trial.whole_config
+    return trial.config if name in trial.config or is_hashed(name) else trial.whole_config
 
 
 def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:

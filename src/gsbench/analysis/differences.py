@@ -19,7 +19,7 @@ import yaml
 from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, seeds_words
 from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
-from gsbench.runs.keys import SHOWN
+from gsbench.runs.keys import DECLARED, NOT_HASHED, SHOWN
 from gsbench.system.install import conf_dir
 from gsbench.words import counted, listed
 
@@ -28,18 +28,11 @@ Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).
 IGNORED_SETTINGS = (
-    "seed",
-    "name",
-    "device",
-    "threads",
-    "tracking",
-    "launch",
+    *NOT_HASHED,
+    *(f"{group}.{name}" for group, names in DECLARED.items() for name in names),
     "hydra",
     "experiment",
     "scene.path",
-    "eval.primary",
-    "eval.controls",
-    "densify.switches",
 )
 MAX_NAMED = 6  # the most ingredients that a sentence names; it counts the rest
 NO_RECORD = "settings that are not recorded (a trial has no readable config.yaml)"
@@ -75,8 +68,6 @@ INGREDIENT_NAMES = {
 WITHOUT_EFFECT = (
     *IGNORED_SETTINGS,
     "eval",
-    "runs",
-    "allow_targets",
     "scene.name",
     "raster.name",
     "init.name",
@@ -183,7 +174,7 @@ def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
-    """When the trials were finished, to the minute: one time, or the first and the last."""
+    """The time at which trials were finished, to the minute, or the first and the last time."""
     times = sorted(trial.finished for trial in trials)
     minutes = [time.strftime("%Y-%m-%d %H:%M", time.localtime(finished)) for finished in times]
     return minutes[0] if minutes[0] == minutes[-1] else f"{minutes[0]} to {minutes[-1]}"

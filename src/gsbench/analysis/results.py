@@ -19,7 +19,7 @@ from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.keys import NOT_HASHED, flatten
+from gsbench.runs.keys import flatten, is_hashed
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
@@ -62,12 +62,7 @@ class Configurations:
             except DamagedError as error:
                 fault = f"{error.path.name} {error.reason}"
             else:
-                hashed = {
-                    key: value
-                    for key, value in config.items()
-                    if key.split(".")[0] not in NOT_HASHED
-                }
-                self._known[trial] = hashed
+                self._known[trial] = {key: value for key, value in config.items() if is_hashed(key)}
                 return ""
         self._known.setdefault(trial, {})
         return fault

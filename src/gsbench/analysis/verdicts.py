@@ -17,7 +17,12 @@ from dataclasses import dataclass, replace
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration
 from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.quantities import Quantity, asked_quantity, choose_quantities
+from gsbench.analysis.quantities import (
+    NO_DIRECTION,
+    Quantity,
+    asked_quantity,
+    choose_quantities,
+)
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, seeds_needed
 from gsbench.runs.experiments import Declaration, Question
@@ -108,7 +113,7 @@ def judge_pairs(
             notes.append(f"{metric.name}: {reason}")
             missing = reason if metric == primary else missing
         if primary is not None and not primary.direction:
-            missing = "no file says whether higher or lower is better"
+            missing = NO_DIRECTION
             notes.append(f"{primary.name}: {missing}")
         judged.append(PairVerdicts(*pair, tuple(own), tuple(notes), primary, beforehand, missing))
     return judged

@@ -88,11 +88,16 @@ def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict
     by_scene = {trial.values["scene"]["name"]: trial for trial in trials}
     if len(by_scene) < len(trials):
         raise InputError(f"{verb} is about one arm: only scene may list values")
-    if not trials[0].values["launch"]["wait"]:
-        raise InputError(f"{verb} waits for its trials: leave out launch.wait=false")
+    require_waiting(verb, trials)
     if metric not in COSTS:
         EvalConfig(**trials[0].values["eval"] | {"primary": metric})
     return by_scene
+
+
+def require_waiting(verb: str, trials: Sequence[Trial]) -> None:
+    """Raise InputError if ``trials``, whose results the verb needs, would only be submitted."""
+    if not trials[0].values["launch"]["wait"]:
+        raise InputError(f"{verb} waits for its trials: leave out launch.wait=false")
 
 
 def run_trials(trials: Sequence[Trial]) -> int:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.quantities import COSTS
+from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import FIRST_LOOK, REFUTED, SUPPORTED, TOO_SMALL, plan_looks
 from gsbench.claims.file import LeastEffect, read_least
@@ -109,7 +109,7 @@ def asked_difference(
         facts = facts_for(metric, values)
         sign, usual = facts.direction, facts.worthwhile
     if not sign:
-        raise InputError(f"--metric {metric}: no file says whether higher or lower is better")
+        raise InputError(f"--metric {metric}: {NO_DIRECTION}")
     if least is None and usual is None:
         raise InputError(
             f"{metric} has no usual least difference that matters: give --least, such as 0.1 or 10%"

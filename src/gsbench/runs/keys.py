@@ -38,6 +38,14 @@ DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
+def is_hashed(key: str) -> bool:
+    """Return whether the setting of a dotted key, or its group, counts in the configuration's hash.
+
+    `determining_settings` then leaves out some settings within groups.
+    """
+    return key.partition(".")[0] not in NOT_HASHED
+
+
 def config_hash(values: dict[str, Any]) -> str:
     """sha256 of the settings and the user's code that determine a result, without the seed.
 
@@ -49,7 +57,7 @@ def config_hash(values: dict[str, Any]) -> str:
 
 def determining_settings(values: Mapping[str, Any]) -> dict[str, Any]:
     """The settings among ``values`` that determine a result, without the seed."""
-    kept = {key: value for key, value in values.items() if key not in NOT_HASHED}
+    kept = {key: value for key, value in values.items() if is_hashed(key)}
     for key, group in kept.items():
         if isinstance(group, dict):
             dropped = set(DECLARED.get(key, ()))

@@ -11,7 +11,7 @@ from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledg
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.app.command import compose_trials, run_trials
+from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
@@ -317,8 +317,7 @@ def _compose(name: str, words: Sequence[str]) -> Trials:
         if key_of(word) in OWN:
             raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
     trials = compose_trials([*words, f"name={name}"], multirun=True)
-    if not trials[0].values["launch"]["wait"]:
-        raise InputError("ledger waits for its trials: leave out launch.wait=false")
+    require_waiting("ledger", trials)
     return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
 
 
