@@ -133,6 +133,32 @@ def test_two_files_of_a_scene_must_not_name_different_points(tmp_path: Path) -> 
         read_transforms(folder)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"applied_transform": [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]]},
+        {"applied_transform": [[1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 1, 0]]},
+        {"applied_scale": 2.0},
+    ],
+    ids=["rotated", "moved", "scaled"],
+)
+def test_the_same_points_under_two_transforms_are_refused(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    folder = in_blenders_files(write(tmp_path / "in", ply_file_path="a.ply"))
+    (folder / "a.ply").write_text("ply")
+    file = folder / "transforms_test.json"
+    identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    same = {"ply_file_path": "a.ply", "applied_transform": identity}
+    same = json.loads(file.read_text()) | same
+    file.write_text(json.dumps(same))
+    # the other file has no transform, which means the identity
+    assert read_transforms(folder).points == folder / "a.ply"
+    file.write_text(json.dumps(same | change))
+    with pytest.raises(InputError, match=r"same points .* applied_transform or applied_scale"):
+        read_transforms(folder)
+
+
 def in_blenders_files(folder: Path) -> Path:
     """The same folder with a file of training views, and one of test views without a transform."""
     document = json.loads((folder / "transforms.json").read_text())

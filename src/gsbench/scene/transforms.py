@@ -139,6 +139,14 @@ class AppliedTransform:
     translation: Array = field(default_factory=lambda: np.zeros(3))  # [3]
     scale: float = 1.0
 
+    def equals(self, other: AppliedTransform) -> bool:
+        """Return whether both are the same, to the last bit."""
+        return (
+            np.array_equal(self.rotation, other.rotation)
+            and np.array_equal(self.translation, other.translation)
+            and self.scale == other.scale
+        )
+
     def undo(self, saved: Array) -> Array:
         """Convert saved points [P, 3] to the coordinates of the original data."""
         original: Array = (saved / self.scale - self.translation) @ self.rotation
@@ -196,6 +204,12 @@ def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
             named = folder / _relative_path(path, record.ply_file_path)
             if points not in (None, named):
                 raise InputError(f"{path} names other points than another file: keep one of them")
+            # They lie in one place, so only one of two transforms can be theirs.
+            if points is not None and not applied.equals(applied_to_points):
+                raise InputError(
+                    f"{path} names the same points as another file, whose applied_transform or "
+                    "applied_scale differs: keep ply_file_path in the file that they belong to"
+                )
             points, applied_to_points = named, applied
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
