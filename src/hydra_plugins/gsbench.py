@@ -25,14 +25,15 @@ class GsbenchLauncher(Launcher):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        self.context, self.task, self.config = hydra_context, task_function, config
+        self.loader = hydra_context.config_loader
+        self.task, self.config = task_function, config
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
         from gsbench.app.sweep import Sweep
 
-        return Sweep(self.config, self.task, self.context).run_jobs(job_overrides)
+        return Sweep(self.config, self.task, self.loader).run_jobs(job_overrides)
 
 
 class GsbenchSweeper(Sweeper):
@@ -55,7 +56,7 @@ class GsbenchSweeper(Sweeper):
         self.started = Sweep.begin(hydra_context, task_function, config)
 
     def sweep(self, arguments: list[str]) -> None:
-        from gsbench.app.command import run_sweep
+        from gsbench.app.grids import run_sweep
 
         run_sweep(self.started, self.params, self.tune, arguments)
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from gsbench import cli
-from gsbench.app.command import compose_trials, words_of_grids
+from gsbench.app.command import compose_trials
+from gsbench.app.grids import words_of_grids
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan, read_plan

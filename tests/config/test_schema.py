@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,9 @@ def options(group: str) -> list[str]:
     return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
 
 
+@cache
 def composed(*overrides: str) -> dict[str, Any]:
+    """The values of a configuration, which tests share and do not change."""
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose("config", overrides=list(overrides))
@@ -66,7 +69,7 @@ def test_every_option_composes(group, option):
     extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
     extra += PLACES.get(option, [])
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
-    extra += needs(option) if group == "densify" else []
+    extra += ["train=paper", *needs(option)] if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
     own = {
         "external/program": "external",

@@ -148,6 +148,7 @@ def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
     assert counts[0] < counts[1]
 
 
+@pytest.mark.slow
 def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
     settings = {word.split("=", 1)[0]: yaml.safe_load(word.split("=", 1)[1]) for word in TINY[1:]}
     claim = {
@@ -229,6 +230,7 @@ def test_a_mirror_in_mlflow(gsbench, runs):
     assert sorted(sent) == pytest.approx(sorted(wanted))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="Slurm's commands are scripts of a shell here")
 def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
     """A stand-in for ``sbatch`` keeps the script, whose command is run as one task of the array."""
@@ -277,6 +279,7 @@ def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
     assert list(trials_of(runs, "x")) == ["none-1"]
 
 
+@pytest.mark.slow
 def test_hydra_multirun_with_another_launcher(gsbench, runs):
     words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
     done = gsbench(*words, GSBENCH_RUNS=str(runs))

@@ -1,54 +1,39 @@
 """gsbench as a Hydra app: a command line becomes trials and an exit code.
 
 Before Hydra runs, the whole configuration is composed and checked (`gsbench.config.compose`). Then
-``hydra.main`` runs the task once, or hands it to gsbench's sweeper. A sweep may first tune its arms
-(`gsbench.app.tuning`). Its trials run as one batch, or seed by seed until their question is
-decided.
+``hydra.main`` runs the task once, or hands it to a sweeper: gsbench's (`gsbench.app.grids`) or
+another (`gsbench.app.other_sweepers`).
 """
 
-import itertools
 import logging
+import os
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import product
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.analysis.quantities import COSTS
-from gsbench.app.sweep import OWN, Objective, Sweep, TrialTask, metric_of
-from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
+from gsbench.app.grids import GRIDS, run_sweep
+from gsbench.app.other_sweepers import other_sweeper, prepare_other_sweeper, words_without_sweeper
+from gsbench.app.sweep import OWN, Sweep, TrialTask
 from gsbench.config import compose
-from gsbench.config.command_words import (
-    bare_key,
-    check_words,
-    grid_points,
-    is_interval,
-    is_sweep,
-    key_of,
-    parse,
-    parse_word,
-    value_text,
-)
+from gsbench.config.command_words import check_words, is_sweep, key_of, parse, parse_word
 from gsbench.config.compose import Trial
 from gsbench.config.trust import PERMISSIONS, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
-from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import declare_questions
 from gsbench.launch.states import describe_plan
-from gsbench.runs.layout import RESULTS
+from gsbench.logs import set_up_logging
 
-GRIDS = "hydra.sweeper.grids"
+# what Hydra raises for a user's words and files
+HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
+HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
 
 log = logging.getLogger(__name__)
 
@@ -111,41 +96,34 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
     Raises InputError with one line for a wrong configuration.
     """
     check_words(words)
-    swept = [word for word in words if is_sweep(word)]
     with compose.hydra_ready():
-        config = compose.compose_whole([*words, "hydra.mode=MULTIRUN"] if multirun else words)
-    multirun = config.hydra.mode == RunMode.MULTIRUN
-    if swept and not multirun:
-        raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
-    with compose.explained(words):
-        check_sweep_settings(config, multirun)
-    task.allowed = tuple(config[PERMISSIONS])
-    other = other_sweeper(config) if multirun else ""
-    if other and task.look_only:
-        words, multirun = words_without_sweeper(config, words, other)
-        if not multirun:
-            task.handle = lambda trials: []  # trials with other values are not listed
-        other = ""
-    sweeper = config.hydra.sweeper
-    task.grids = None if other else OmegaConf.to_container(sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
+        config, multirun = _checked_config(words, multirun)
+        task.allowed = tuple(config[PERMISSIONS])
+        other = other_sweeper(config) if multirun else ""
+        if task.look_only:
+            if other:
+                words, multirun = words_without_sweeper(config, words, other)
+                if not multirun:
+                    task.handle = lambda trials: []  # trials with other values are not listed
+                mode = f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"
+                config = compose.compose_whole([*words, mode])
+            with compose.explained(words, HYDRA_ERRORS):
+                _look(config, words, multirun, task)
+            return
+    task.grids = None if other else _grids(config)
     # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each
     # trial's values.
     argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
     if other:
         argv = prepare_other_sweeper(config, argv, task, other)
-    if task.look_only:  # nothing runs, so no callback is called, and Hydra writes nothing
-        argv = [word for word in argv if not key_of(word).startswith(LOGGING)] + NO_FILES
-        argv += [f"~hydra.callbacks.{name}" for name in config.hydra.callbacks]
-    else:
-        load_callbacks(config.hydra.callbacks, task.allowed)
-        argv += words_for_hydras_files(config, words, multirun)
-        if config.hydra.job.chdir:
-            log.info(
-                "hydra.job.chdir: paths still start in %s, where the command was given", task.folder
-            )
+    load_callbacks(config.hydra.callbacks, task.allowed)
+    argv += words_for_hydras_files(config, words, multirun)
+    if config.hydra.job.chdir:
+        log.info(
+            "hydra.job.chdir: paths still start in %s, where the command was given", task.folder
+        )
     # Another sweeper may raise any error for its settings.
-    errors = Exception if other else (HydraException, OmegaConfBaseException, OSError)
-    with compose.explained(words, errors):
+    with compose.explained(words, Exception if other else HYDRA_ERRORS):
         compose.run_main(task, [*argv, f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"], config)
     if other and not task.trials:
         name = config.name
@@ -157,101 +135,41 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         )
 
 
-# ---- Hydra's other sweepers, and its own files
-
-GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
-LOGGING = ("hydra/job_logging", "hydra/hydra_logging", "hydra.job_logging", "hydra.hydra_logging")
-NO_FILES = [
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-    "hydra.run.dir=.",
-    "hydra.output_subdir=null",
-]
-HYDRAS_FILES = ("run", "sweep", "output_subdir")
-MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
+def _checked_config(words: Sequence[str], multirun: bool) -> tuple[DictConfig, bool]:
+    """The whole configuration of ``words``, and whether it is a sweep, which a file may say."""
+    config = compose.compose_whole([*words, "hydra.mode=MULTIRUN"] if multirun else words)
+    multirun = config.hydra.mode == RunMode.MULTIRUN
+    swept = [word for word in words if is_sweep(word)]
+    if swept and not multirun:
+        raise InputError(f"{swept[0]} lists several values: add -m to run one trial for each")
+    with compose.explained(words):
+        check_sweep_settings(config, multirun)
+    return config, multirun
 
 
-def other_sweeper(config: DictConfig) -> str:
-    """The name of the chosen sweeper; empty if it is gsbench's."""
-    name = str(config.hydra.runtime.choices["hydra/sweeper"])
-    return "" if name == OWN else name
+def _look(config: DictConfig, words: Sequence[str], multirun: bool, task: TrialTask) -> None:
+    """Hand the trials of a composed configuration to a ``task`` that only looks.
 
-
-def words_without_sweeper(
-    config: DictConfig, words: Sequence[str], name: str
-) -> tuple[list[str], bool]:
-    """The words of a dry run of another sweeper, and whether they are a sweep."""
-    kept = [
-        word for word in words if not key_of(word).startswith(("hydra/sweeper", "hydra.sweeper."))
-    ]
-    if name == GRID_SWEEPER:
-        return [*kept, f"hydra/sweeper={OWN}"], True
-    points = config.hydra.sweeper.get("n_trials")
-    count = "trials" if points is None else f"{points} trials (hydra.sweeper.n_trials)"
-    print(
-        f"hydra/sweeper={name} searches: it proposes {count} from the results, so they are not "
-        "known yet"
-    )
-    return [*(word for word in kept if not is_sweep(word)), f"hydra/sweeper={OWN}"], False
-
-
-def prepare_other_sweeper(
-    config: DictConfig, words: Sequence[str], task: TrialTask, name: str
-) -> list[str]:
-    """Set the objective of the ``task`` for another sweeper; returns the words for Hydra.
-
-    Raises InputError for a choice among the words that would run what is not allowed: Hydra reads a
-    job's logging before the job can be checked.
+    Nothing runs, so no callback is called and Hydra writes nothing. That leaves nothing for
+    `hydra.main` to do, which would compose the same configuration twice more.
     """
-    params = config.hydra.sweeper.get("params") or {}
-    lists = {bare_key(str(key)): f"{key}={value}" for key, value in params.items()}
-    lists |= {key_of(word): word for word in words if is_sweep(word)}
-    choices = [
-        grid_points([parse_word(word)])
-        for key, word in lists.items()
-        if "." not in key and key != "seed"
-    ]
-    for number, point in enumerate(product(*choices)):
-        if number == MAX_CHOICES:
-            raise InputError(
-                f"hydra/sweeper={name}: more than {MAX_CHOICES} combinations of choices"
-            )
-        with compose.hydra_ready():
-            compose.compose_whole(
-                [*(w for w in words if not is_sweep(w)), *(word for (word,) in point)]
-            )
-    if name == GRID_SWEEPER:
-        task.objective = Objective(-1)
-        return list(words)
-    with compose.hydra_ready():
-        metric, direction = metric_of(compose.resolve_trial(config, words).values)
-    sign = 1 if _maximizes(config.hydra.sweeper) else -1
-    # A search must not choose among seeds: each job has them all.
-    seeds = (
-        [word for (word,) in grid_points([parse_word(lists["seed"])])] if "seed" in lists else []
-    )
-    task.objective = Objective(sign, tuple(seeds))
-    log.info(
-        "hydra/sweeper=%s gets %s%s of test views, %s; gsbench's own sweeper would tune on "
-        "validation views and can stop by looks",
-        name,
-        "-" if sign != direction else "",
-        metric,
-        "maximized" if sign > 0 else "minimized",
-    )
-    kept = [word for word in words if key_of(word) != "seed" or not is_sweep(word)]
-    return kept + ["~hydra.sweeper.params.seed"] * ("seed" in params)
+    set_up_logging(config.hydra.verbose)
+    if not multirun:
+        config.hydra.mode = RunMode.RUN  # as `hydra.main` sets these two
+        config.hydra.runtime.output_dir = os.path.abspath(config.hydra.run.dir)
+        task.launch([compose.resolve_trial(config, words)])
+        return
+    task.grids = _grids(config)
+    config.hydra.sweeper.grids = []
+    sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=True)
+    own_words = [word for word in words if not parse_word(word).is_hydra_override()]
+    sweep = Sweep.plan(compose.config_loader(), task, config)
+    run_sweep(sweep, sweeper["params"] or {}, sweeper["tune"] or {}, own_words)
 
 
-def _maximizes(sweeper: DictConfig) -> bool:
-    """Return whether a sweeper (Optuna, Nevergrad, Ax) was told to look for the largest value."""
-    direction = sweeper.get("direction")
-    name = str(getattr(direction, "name", direction)).lower()
-    nevergrad, ax = (
-        OmegaConf.select(sweeper, key)
-        for key in ("optim.maximize", "ax_config.experiment.minimize")
-    )
-    return name == "maximize" or nevergrad is True or ax is False
+def _grids(config: DictConfig) -> Any:
+    """The grids of gsbench's own sweeper, whose interpolations each trial resolves."""
+    return OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
 
 
 def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
@@ -345,127 +263,3 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     if failed and all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
         return 2
     return 1 if failed else 0
-
-
-# ---- sweeps
-
-
-def run_sweep(
-    sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]
-) -> None:
-    """Run all points that ``words`` and ``params`` (``hydra.sweeper.params``) span.
-
-    ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first
-    (`gsbench.app.tuning`).
-    """
-    grids = checked_grids(sweep.task.grids or [])
-    jobs: list[list[str]] = []
-    # for each job, the settings that are searched for its arm
-    intervals: list[dict[str, Override]] = []
-    for grid_words in words_of_grids(params, grids, words):
-        by_key = {
-            bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)
-        }
-        points = grid_points(
-            [override for override in by_key.values() if not is_interval(override)]
-        )
-        jobs += points
-        searched = {
-            override.get_key_element(): override
-            for override in by_key.values()
-            if is_interval(override)
-        }
-        intervals += [searched] * len(points)
-    trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
-    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
-        _run_until_decided(sweep, trials)
-    else:
-        sweep.launch(trials)
-
-
-def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
-    """Run the trials in the looks that the sequential test plans.
-
-    Decided pairs of arms get no further trials. Raises InputError for a sweep that cannot be tested
-    in this way.
-    """
-    stopping = plan_sweep(trials)
-    if sweep.task.look_only:
-        print(stopping.describe())
-        sweep.launch(trials)
-        return
-    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
-    stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
-    launched: set[Path] = set()
-
-    def run(planned: Sequence[KeyAndSeed]) -> None:
-        batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
-        launched.update(trial.folder for trial in batch)
-        if batch:
-            sweep.launch(batch)
-
-    for verdict in run_looks(stopping.declaration, stopping.judged, run):
-        log.info("%s", headline(verdict))
-    spared = [
-        trial
-        for trial in trials
-        if trial.folder not in launched and not (trial.folder / RESULTS).exists()
-    ]
-    log.info("%d of %d trials were not needed", len(spared), len(trials))
-
-
-# ---- grids
-#
-# An experiment's file may join several grids. Each maps settings to values, and all share the
-# settings of ``hydra.sweeper.params``:
-#
-#     hydra:
-#       mode: MULTIRUN
-#       sweeper:
-#         params:
-#           seed: 0,1,2
-#         grids:
-#           - densify: adc
-#           - densify: volumetric
-#             densify.volume_threshold: 0.01,0.03
-#
-# If some grids list the setting of a word of the command line, the word replaces their values and
-# does not reach the other grids. Any other word is for all grids.
-
-
-def checked_grids(grids: Any) -> list[dict[str, str]]:
-    """The grids of the configuration, with values as texts.
-
-    Raises InputError unless they are a list of mappings.
-    """
-    if not isinstance(grids, list) or not all(isinstance(grid, dict) and grid for grid in grids):
-        raise InputError(
-            f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}"
-        )
-    return [{str(key): _text(key, value) for key, value in grid.items()} for grid in grids]
-
-
-def words_of_grids(
-    params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
-) -> list[list[str]]:
-    """The words of each grid: its own, the shared ``params``, and those ``given`` for it.
-
-    If two words set one key, the later one counts. Trials are in the order of the grids; the shared
-    settings vary fastest.
-    """
-    listed = set(map(bare_key, itertools.chain(*grids)))
-    jobs = []
-    for grid in grids or [{}]:
-        own = set(map(bare_key, grid))
-        shared = {key: value for key, value in params.items() if bare_key(key) not in own}
-        words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
-        jobs.append([*words, *(word for word in given if key_of(word) not in listed - own)])
-    return jobs
-
-
-def _text(key: object, value: object) -> str:
-    if value is None or isinstance(value, list | dict):
-        raise InputError(
-            f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}"
-        )
-    return value_text(value)

@@ -10,10 +10,11 @@ import logging
 import os
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -161,11 +162,11 @@ class TrialTask:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that Hydra has started: its configuration, task, context and launcher."""
+    """A sweep: its whole configuration, task, Hydra's loader of configurations, and launcher."""
 
     config: DictConfig
     task: TrialTask
-    context: HydraContext
+    loader: ConfigLoader
     launcher: Launcher | None = None  # None: gsbench's own, called by another sweeper
 
     @classmethod
@@ -174,11 +175,16 @@ class Sweep:
         assert isinstance(task, TrialTask)
         set_up_logging(config.hydra.verbose)
         config.allow_targets = list(task.allowed)
-        compose.resolve_times(config)
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=context, task_function=task, config=config
         )
-        return cls(config, task, context, launcher)
+        return replace(cls.plan(context.config_loader, task, config), launcher=launcher)
+
+    @classmethod
+    def plan(cls, loader: ConfigLoader, task: TrialTask, config: DictConfig) -> Self:
+        """Make a sweep without a launcher, for a task that only looks."""
+        compose.resolve_times(config)
+        return cls(config, task, loader)
 
     def parse(self, words: Sequence[str]) -> list[Override]:
         """The words as Hydra reads them, with the choices of ``glob(*)``."""
@@ -186,11 +192,11 @@ class Sweep:
             if (override := parse_word(word)).is_delete():
                 check_removal(override)
         with compose.explained(words):
-            return OverridesParser.create(self.context.config_loader).parse_overrides(list(words))
+            return OverridesParser.create(self.loader).parse_overrides(list(words))
 
     def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
         """The trials of ``jobs``, each the list of its words."""
-        return compose.compose_jobs(self.context.config_loader, self.config, jobs)
+        return compose.compose_jobs(self.loader, self.config, jobs)
 
     def launch(self, trials: Sequence[Trial]) -> None:
         """Run trials by the launcher.

@@ -363,6 +363,11 @@ def hydra_ready() -> Iterator[None]:
         HydraConfig.instance().cfg = None
 
 
+def config_loader() -> ConfigLoader:
+    """Hydra's loader of configurations. Call it within `hydra_ready`."""
+    return GlobalHydra.instance().config_loader()
+
+
 def run_main(
     task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
 ) -> None:

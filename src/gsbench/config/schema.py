@@ -169,7 +169,9 @@ COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
 def register_schemas() -> None:
     """Register the schemas with Hydra.
 
-    Schemas of groups go under ``schema/``, so that Hydra does not offer them as choices.
+    The root's schema has those of the groups. They are registered by themselves, too, for files of
+    users that name one (``defaults: [/schema/scene/base@_here_, _self_]``), under ``schema/``, so
+    that Hydra does not offer them as choices.
     """
     store = ConfigStore.instance()
     store.store(name="config_schema", node=_names_and_defaults(Config))

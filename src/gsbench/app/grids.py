@@ -1,0 +1,149 @@
+"""gsbench's own sweeper: the trials that lists, intervals and joined grids span.
+
+They run as one batch, or seed by seed until their question is decided. A sweep may first tune its
+arms (`gsbench.app.tuning`).
+"""
+
+import itertools
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.types import Override
+
+from gsbench.app.sweep import Sweep
+from gsbench.app.tuning import tuned_jobs
+from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
+from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
+from gsbench.config.compose import Trial
+from gsbench.errors import InputError
+from gsbench.files import checked_runs_folder, make_runs_folder
+from gsbench.launch.record import declare_questions
+from gsbench.runs.layout import RESULTS
+
+GRIDS = "hydra.sweeper.grids"
+
+log = logging.getLogger(__name__)
+
+
+def run_sweep(
+    sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]
+) -> None:
+    """Run all points that ``words`` and ``params`` (``hydra.sweeper.params``) span.
+
+    ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first
+    (`gsbench.app.tuning`).
+    """
+    grids = checked_grids(sweep.task.grids or [])
+    jobs: list[list[str]] = []
+    # for each job, the settings that are searched for its arm
+    intervals: list[dict[str, Override]] = []
+    for grid_words in words_of_grids(params, grids, words):
+        by_key = {
+            bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)
+        }
+        points = grid_points(
+            [override for override in by_key.values() if not is_interval(override)]
+        )
+        jobs += points
+        searched = {
+            override.get_key_element(): override
+            for override in by_key.values()
+            if is_interval(override)
+        }
+        intervals += [searched] * len(points)
+    trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        _run_until_decided(sweep, trials)
+    else:
+        sweep.launch(trials)
+
+
+def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
+    """Run the trials in the looks that the sequential test plans.
+
+    Decided pairs of arms get no further trials. Raises InputError for a sweep that cannot be tested
+    in this way.
+    """
+    stopping = plan_sweep(trials)
+    if sweep.task.look_only:
+        print(stopping.describe())
+        sweep.launch(trials)
+        return
+    make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
+    stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
+    launched: set[Path] = set()
+
+    def run(planned: Sequence[KeyAndSeed]) -> None:
+        batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
+        launched.update(trial.folder for trial in batch)
+        if batch:
+            sweep.launch(batch)
+
+    for verdict in run_looks(stopping.declaration, stopping.judged, run):
+        log.info("%s", headline(verdict))
+    spared = [
+        trial
+        for trial in trials
+        if trial.folder not in launched and not (trial.folder / RESULTS).exists()
+    ]
+    log.info("%d of %d trials were not needed", len(spared), len(trials))
+
+
+# ---- grids
+#
+# An experiment's file may join several grids. Each maps settings to values, and all share the
+# settings of ``hydra.sweeper.params``:
+#
+#     hydra:
+#       mode: MULTIRUN
+#       sweeper:
+#         params:
+#           seed: 0,1,2
+#         grids:
+#           - densify: adc
+#           - densify: volumetric
+#             densify.volume_threshold: 0.01,0.03
+#
+# If some grids list the setting of a word of the command line, the word replaces their values and
+# does not reach the other grids. Any other word is for all grids.
+
+
+def checked_grids(grids: Any) -> list[dict[str, str]]:
+    """The grids of the configuration, with values as texts.
+
+    Raises InputError unless they are a list of mappings.
+    """
+    if not isinstance(grids, list) or not all(isinstance(grid, dict) and grid for grid in grids):
+        raise InputError(
+            f"{GRIDS} must be a list, each a mapping of settings to values, got {grids!r}"
+        )
+    return [{str(key): _text(key, value) for key, value in grid.items()} for grid in grids]
+
+
+def words_of_grids(
+    params: Mapping[str, Any], grids: Sequence[Mapping[str, str]], given: Sequence[str]
+) -> list[list[str]]:
+    """The words of each grid: its own, the shared ``params``, and those ``given`` for it.
+
+    If two words set one key, the later one counts. Trials are in the order of the grids; the shared
+    settings vary fastest.
+    """
+    listed = set(map(bare_key, itertools.chain(*grids)))
+    jobs = []
+    for grid in grids or [{}]:
+        own = set(map(bare_key, grid))
+        shared = {key: value for key, value in params.items() if bare_key(key) not in own}
+        words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
+        jobs.append([*words, *(word for word in given if key_of(word) not in listed - own)])
+    return jobs
+
+
+def _text(key: object, value: object) -> str:
+    if value is None or isinstance(value, list | dict):
+        raise InputError(
+            f"{GRIDS}: {key} must list values as on the command line, such as 1,2,3, got {value!r}"
+        )
+    return value_text(value)
