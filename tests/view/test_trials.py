@@ -81,6 +81,11 @@ def test_panes_stand_side_by_side_with_labels() -> None:
     assert (labels[:, 62:] != 80).any()
     assert (row[:, 57:60] == 40).all()  # the label was made to fit
     assert (below[:, 60] == 255).all()  # a line divides the panes
+    pane = np.full((360, 100, 3), 90, np.uint8)  # its text has 10 px, and a margin of 5
+    inked = (side_by_side([("B", pane), ("B", pane)])[:, :, 0] != 90).nonzero()
+    assert 4 <= inked[0][inked[1] < 100].min() <= 9
+    assert 4 <= inked[1].min() <= 6
+    assert 104 <= inked[1][inked[1] > 101].min() <= 106
 
 
 def test_page_camera_projects_as_the_page_does() -> None:
