@@ -138,14 +138,14 @@ def paced(
         return result
 
     def loss(image: str, target: str) -> list[Any]:
-        assert (image, target) == ("image", "target")
+        assert (image, target) == ("image of 0", "target of 0")
         return spend(2, [SimpleNamespace(backward=lambda: spend(4))])
 
     stepper = object.__new__(Stepper)
     stepper.device = torch.device(request.param)
     stepper.trainer = SimpleNamespace(  # type: ignore[assignment]
-        targets=SimpleNamespace(get=lambda view: spend(100, "target")),
-        render=lambda view: spend(1, SimpleNamespace(image="image")),
+        targets=SimpleNamespace(get=lambda view: spend(100, f"target of {view}")),
+        render=lambda view: spend(1 + view, SimpleNamespace(image=f"image of {view}")),
         loss=loss,
         gaussians=SimpleNamespace(optimizer_step=lambda: spend(8)),
         iterate=lambda folder: spend(16),
@@ -217,6 +217,11 @@ def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(
         device_of("gsplat")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert device_of("gsplat").type == "cuda"
+    disabled: list[int] = []
+    monkeypatch.setattr(measure, "disable_tf32", lambda: disabled.append(1))
+    monkeypatch.setattr(measure, "make_scene", lambda *_: disabled[0] / 0)
+    with pytest.raises(ZeroDivisionError):  # not an IndexError: it was called before
+        Stepper("gsplat", Setting("trained", 40, 30, 50))
     made = make_rasterizer("reference", torch.device("cpu"), 1)
     assert isinstance(made, ReferenceRasterizer)
 
