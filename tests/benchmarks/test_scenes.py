@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from gsbench.bench.scenes import SCENES, camera_before, frontal_camera
+from gsbench.bench.scenes import (
+    SCENES,
+    camera_before,
+    frontal_camera,
+    make_scene,
+    skewed_gaussians,
+    trained_like_gaussians,
+)
+from gsbench.bench.scenes import random_gaussians as initial_gaussians
 from gsbench.errors import InputError
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import write_ply
+from gsbench.raster.reference import ReferenceRasterizer, project
 from tests.gaussians.helpers import random_gaussians
 
 
@@ -17,21 +31,95 @@ def test_the_camera_before_a_scene_is_at_twice_the_median_distance_from_its_midd
     offsets = torch.tensor([[0.0, 0, 0], [3, 4, 0], [-3, -4, 0], [0, 0, 9], [0, 0, -9]])
     scene.means = middle + offsets  # distances 0, 5, 5, 9, 9
     camera = camera_before(scene, 60, 45)
-    assert (camera.width, camera.height, camera.cx, camera.cy) == (60, 45, 30, 22.5)
     np.testing.assert_allclose(camera.translation, [-2, 1, -30 + 10], atol=1e-6)
-    np.testing.assert_array_equal(camera.rotation, np.eye(3))
+    for one in (camera, frontal_camera(60, 45)):
+        assert (one.width, one.height, one.cx, one.cy) == (60, 45, 30, 22.5)
+        assert one.fx == one.fy == 54
+        np.testing.assert_array_equal(one.rotation, np.eye(3))
+    np.testing.assert_array_equal(one.translation, np.zeros(3))
 
 
-@pytest.mark.parametrize("kind", SCENES)
-def test_scenes_have_the_wanted_count_in_front_of_the_camera(kind: str) -> None:
-    scene = SCENES[kind](40)
-    assert len(scene.means) == 40
-    camera = frontal_camera(60, 45)
-    x, y, z = (scene.means.double().numpy() @ camera.rotation.T + camera.translation).T
-    assert (z > 0).all()
-    within = np.abs(x * camera.fx / z) < camera.width
-    assert (within & (np.abs(y * camera.fy / z) < camera.height)).all()
-    assert abs((x / z).mean()) < 0.25  # around the middle of the picture
-    assert abs((y / z).mean()) < 0.25
+@pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
+def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(
+    make: Callable[..., Gaussians],
+) -> None:
+    scene = make(500)
+    assert len(scene) == 500
+    assert torch.equal(scene.means, make(500).means)
+    assert not torch.equal(scene.means, make(500, seed=1).means)
+    for camera in (frontal_camera(60, 45), camera_before(scene, 60, 45)):
+        output = ReferenceRasterizer().render(scene, camera, 3, torch.zeros(3))
+        assert 0.3 < output.visible.float().mean() <= 1
+        assert output.alpha.mean() > 0.3
     with pytest.raises(InputError, match="count must be at least 1, got 0"):
-        SCENES[kind](0)
+        make(0)
+    assert len(make(1)) == 1
+
+
+def test_a_trained_scene_has_small_flat_gaussians_at_all_depths() -> None:
+    scene = trained_like_gaussians(20_000)
+    depth = scene.means[:, 2]
+    assert (depth.min(), depth.median(), depth.max()) == pytest.approx((2, 48**0.5, 24), rel=0.03)
+    slopes = scene.means[:, :2] / depth[:, None]  # a margin around a picture of 4:3
+    assert slopes.amax(0).tolist() == pytest.approx([0.7, 0.525], rel=0.01)
+    assert slopes.amin(0).tolist() == pytest.approx([-0.7, -0.525], rel=0.01)
+    pixels = 450 * scene.scales / depth[:, None]  # [N, 3] in a picture 500 px wide
+    median = 1.6 * 5**0.4  # a fifth of 100,000
+    wanted = [median, median, median * np.exp(-1.5)]
+    assert pixels.median(0).values.tolist() == pytest.approx(wanted, rel=0.05)
+    assert pixels.log().std(0).tolist() == pytest.approx([(0.7**2 + 0.5**2) ** 0.5] * 3, rel=0.05)
+    for value, mean, spread in (
+        (scene.opacity_logits, -0.5, 2.2),
+        (scene.quaternions, 0, 1),
+        (scene.sh_dc, 0, 0.6),
+        (scene.sh_rest, 0, 0.1),
+    ):
+        assert (value.mean(), value.std()) == pytest.approx((mean, spread), rel=0.03, abs=0.05)
+
+
+def test_an_initial_scene_has_faint_spheres_of_the_size_of_their_distance_in_a_box() -> None:
+    scene = initial_gaussians(8000)
+    assert scene.means.amin(0).tolist() == pytest.approx([-2, -2, 2], abs=0.01)
+    assert scene.means.amax(0).tolist() == pytest.approx([2, 2, 6], abs=0.01)
+    torch.testing.assert_close(scene.scales, torch.full((8000, 3), 0.7 * 4 / 20))
+    torch.testing.assert_close(scene.opacities, torch.full((8000,), 0.1))
+    torch.testing.assert_close(scene.rotations, torch.eye(3).expand(8000, 3, 3))
+    assert (scene.sh_rest.shape, scene.sh_rest.any().item()) == ((8000, 15, 3), False)
+
+
+def longest_list(scene: Gaussians) -> float:
+    """The longest list of a tile over the mean one; a Gaussian counts in the tile of its mean."""
+    camera = frontal_camera(500, 375)
+    tile = (project(scene, camera).means.double() + 0.5).div(16).floor().long()  # [M, 2]
+    inside = (tile >= 0).all(-1) & (tile[:, 0] < 500 // 16) & (tile[:, 1] < 375 // 16)
+    lists = (tile[inside, 1] * 32 + tile[inside, 0]).bincount().double()
+    return (lists.max() / lists[lists > 0].mean()).item()
+
+
+def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
+    """A trained courtyard has 1,054 entries per block at most, and 117 on average."""
+    skewed, trained = skewed_gaussians(50_000), trained_like_gaussians(50_000)
+    assert longest_list(skewed) == pytest.approx(1054 / 117, rel=0.25)
+    assert longest_list(trained) < 2
+    moved = (skewed.means != trained.means).any(-1)
+    assert moved.float().mean() == pytest.approx(0.5, abs=0.01)
+    assert torch.equal(skewed.means[:, 2], trained.means[:, 2])
+    slopes = skewed.means[moved, :2] / skewed.means[moved, 2:]
+    spots = 10 * torch.tensor([0.05, 0.05])  # standard deviations beyond the outermost spot
+    assert (slopes.abs().amax(0) < torch.tensor([0.5, 0.35]) + spots).all()
+
+
+def test_a_scene_for_timing_has_two_views_of_noise(tmp_path: Path) -> None:
+    gaussians, scene = make_scene("random", 60, 45, 30)
+    assert torch.equal(gaussians.means, initial_gaussians(30).means)
+    assert ([view.name for view in scene.train], scene.test) == (["0.png", "1.png"], ())
+    one, other = (view.image for view in scene.train)
+    assert (one.shape, one.min(), one.max()) == ((45, 60, 3), 0, 255)
+    assert (one != other).any()
+    write_ply(gaussians, tmp_path / "m.ply")
+    model, scene = make_scene("unused", 60, 45, 7, tmp_path / "m.ply")
+    assert torch.equal(model.means, gaussians.means)
+    wanted = camera_before(gaussians, 60, 45).translation
+    np.testing.assert_array_equal(scene.train[1].camera.translation, wanted)
+    with pytest.raises(InputError, match="--scene nosuch is not known; choose trained or random"):
+        make_scene("nosuch", 60, 45, 30)

@@ -65,6 +65,26 @@ def test_a_wrong_offset_counts_as_damage(value: int, tmp_path: Path) -> None:
     assert not (tmp_path / "a.jpg").exists()
 
 
+def test_the_progress_of_a_damaged_member_is_taken_back(tmp_path: Path) -> None:
+    data = patched(packed("s/images/a.jpg"), DIRECTORY, 24, "<I", 14)  # bytes
+    counts: list[int] = []
+    with (
+        open_archive(io.BytesIO(data), "x.zip") as archive,
+        pytest.raises(DamagedMemberError, match="13 bytes instead of 14"),
+    ):
+        extract(archive, archive.infolist()[0], tmp_path / "new" / "a.jpg", counts.append)
+    assert counts == [13, -13]
+
+
+def test_a_packing_that_cannot_be_read_is_no_damage(tmp_path: Path) -> None:
+    data = patched(packed("s/images/a.jpg"), DIRECTORY, 8, "<H", 1)  # encrypted
+    with (
+        open_archive(io.BytesIO(data), "x.zip") as archive,
+        pytest.raises(InputError, match=r"a\.jpg is packed in a way that cannot be read here"),
+    ):
+        extract_only(archive, tmp_path / "a.jpg")
+
+
 def test_a_member_without_a_name_is_skipped() -> None:
     data = packed("s/images/a.jpg", "x")
     # zipfile cuts a name at the first NUL

@@ -110,10 +110,15 @@ def test_an_interrupted_fetch_continues(fetch: Fetch, server: Server, data: Path
     assert not (data / "garden").exists()  # half a scene would train on fewer photographs
     staged = files_below(data / ".fetch" / "garden")
     assert staged
+    (data / ".fetch" / "garden" / "images_4" / "old.JPG").touch()  # of another archive
     server.manners = Manners()
+    asked = len(server.requests)
     assert fetch("mipnerf360", "garden") == 0
     assert files_below(data / "garden") == wanted("garden", "images_4")
     assert not (data / ".fetch" / "garden").exists()
+    # what was staged is not fetched again; the directory is read once
+    missing = len(wanted("garden", "images_4")) - len(staged)
+    assert len(server.requests) - asked <= missing + 2
 
 
 def test_faults_of_the_server_do_not_change_the_files(

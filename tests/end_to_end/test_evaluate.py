@@ -167,20 +167,6 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
         assert "renders" in capsys.readouterr().err
 
 
-def test_renders_are_entered_once_and_do_not_replace_others(runs, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    first, other = (
-        better_renders(runs, tmp_path / "first", 0),
-        better_renders(runs, tmp_path / "other", 1),
-    )
-    words = ["--truth", "small:courtyard:adc:0", "--as", "small:theirs"]
-    for _ in range(2):
-        assert run(["evaluate", str(first), *words]) == 0
-    assert len(list(runs.glob("small/courtyard/random-theirs/*"))) == 1
-    assert run(["evaluate", str(other), *words]) == 2
-    assert "seed 0 of random-theirs on courtyard is taken" in capsys.readouterr().err
-
-
 def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monkeypatch, capsys):
     """Photographs are in one folder, the renders of two methods in two others."""
     truth = Path(shutil.copytree(trial(runs) / "ground_truth", tmp_path / "photographs"))
@@ -211,19 +197,6 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["RENDERS", "--truth", "nowhere"], "is no folder, no trial"),
-        (["RENDERS", "--truth", "gardn"], "did you mean garden?"),
-        (["nowhere", "--truth", "small:courtyard:adc"], "nowhere is not a folder of renders"),
-        (
-            ["RENDERS", "--truth", "small:courtyard:adc", "scene.views=3"],
-            "only eval.… can be set here",
-        ),
-        (["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x"], "give it with --scene"),
-        (["RENDERS", "--truth", "small:courtyard:adc", "--as", "small"], "is not EXPERIMENT:ARM"),
-        (
-            ["RENDERS", "--truth", "PHOTOGRAPHS", "--as", "small:x", "--scene", "courtyard"],
-            "on other photographs",
-        ),
         (["SMALLER", "--truth", "small:courtyard:adc"], "sizes are never changed"),
         (
             ["FEWER", "--truth", "small:courtyard:adc"],
@@ -233,9 +206,7 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
 def test_bad_requests_are_refused_in_one_line(runs, tmp_path, monkeypatch, capsys, words, said):
-    folders = {
-        name: tmp_path / name.lower() for name in ("RENDERS", "PHOTOGRAPHS", "SMALLER", "FEWER")
-    }
+    folders = {name: tmp_path / name.lower() for name in ("SMALLER", "FEWER")}
     for folder in folders.values():
         shutil.copytree(trial(runs) / "renders", folder)
     for file in folders["SMALLER"].glob("*.png"):

@@ -11,9 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from PIL import Image
 
+from gsbench.raster import create_rasterizer
+from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import FINISHED, SMALL
 
@@ -72,6 +75,18 @@ def test_a_sweep_leaves_complete_trials(finished_runs):
     flipped = ((picture[::-1] - truth) ** 2).mean()
     # a PSNR alone would not show a flipped picture
     assert ((picture - truth) ** 2).mean() < 0.6 * flipped
+
+
+@pytest.mark.slow
+def test_the_viewer_draws_a_test_view_as_the_evaluation_did(finished_runs):
+    cpu = torch.device("cpu")
+    for trial in trials_of(finished_runs).values():
+        viewed = load_viewed(find_trial(str(trial), finished_runs), cpu)
+        assert [view.name for view in viewed.views] == ["0000.png", "0008.png"]
+        for view in viewed.views:
+            drawn = TrialPainter(viewed, create_rasterizer("cpu", cpu)).draw(view.camera, Layers())
+            for folder, picture in (("renders", drawn), ("ground_truth", view.image)):
+                np.testing.assert_array_equal(Image.open(trial / folder / view.name), picture)
 
 
 def test_the_same_command_again_computes_nothing(gsbench, runs):

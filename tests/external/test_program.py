@@ -4,25 +4,38 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import psutil
 import pycolmap
 import pytest
 from PIL import Image
 
 from gsbench.errors import InputError, TrainingError
-from gsbench.external.exchange import write_test_cameras, write_training_views
-from gsbench.external.program import run_program
+from gsbench.external import program
+from gsbench.external.exchange import (
+    collect_model,
+    collect_renders,
+    write_test_cameras,
+    write_training_views,
+)
+from gsbench.external.program import ProgramResult, resident_memory_mb, run_program, watch
 from gsbench.external.settings import External, fill_placeholders, split_command
+from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import PointCloud
+from gsbench.normalization import IDENTITY, Normalization
 from gsbench.runs.keys import config_hash
 from gsbench.scene.types import Camera, View
-from gsbench.system.isolate import error_tail
+from gsbench.system.isolate import CrashError, error_tail
 from tests.config.test_schema import composed
+from tests.gaussians.helpers import differences, random_gaussians
 from tests.processes import is_running
 
 PATIENCE = 60.0  # seconds to wait for a process to end on a slow machine
@@ -47,13 +60,21 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
-def test_pycolmap_reads_the_training_folder(views: list[View], tmp_path: Path) -> None:
+MOVED = Normalization((10.0, 20.0, 30.0), 2.0)
+
+
+@pytest.mark.parametrize("normalization", [IDENTITY, MOVED], ids=["as it is", "moved"])
+def test_pycolmap_reads_the_training_folder(
+    normalization: Normalization, views: list[View], tmp_path: Path
+) -> None:
+    """Its points and cameras are in the coordinates in which the scene was given."""
     rng = np.random.default_rng(1)
     cloud = PointCloud(rng.normal(size=(50, 3)), rng.integers(0, 256, (50, 3), dtype=np.uint8))
-    write_training_views(tmp_path, views, cloud)
+    write_training_views(tmp_path, views, cloud, normalization)
+    center, scale = np.array(normalization.center), normalization.scale
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     points = [point for _, point in sorted(model.points3D.items())]
-    np.testing.assert_array_equal([point.xyz for point in points], cloud.points)
+    np.testing.assert_array_equal([point.xyz for point in points], cloud.points / scale + center)
     np.testing.assert_array_equal([point.color for point in points], cloud.colors)
     assert not any(point.track.elements for point in points)
     assert not any(len(image.points2D) for image in model.images.values())
@@ -64,7 +85,7 @@ def test_pycolmap_reads_the_training_folder(views: list[View], tmp_path: Path) -
         np.testing.assert_array_equal(Image.open(tmp_path / "images" / name), view.image)
         assert model.cameras[image.camera_id].model_name == "PINHOLE"
         ahead = image.cam_from_world().inverse() * np.array([0.3, -0.2, 5.0])
-        wanted = project(view.camera, ahead[None])[0]
+        wanted = project(view.camera, scale * (ahead - center)[None])[0]
         np.testing.assert_allclose(image.project_point(ahead), wanted, atol=1e-6)
 
 
@@ -89,11 +110,73 @@ def test_the_folder_of_test_cameras_has_no_images_and_the_same_projections(
         assert (frame["w"], frame["h"]) == (view.camera.width, view.camera.height)
 
 
+def test_the_one_model_of_a_program_is_taken_in_the_coordinates_of_the_training(
+    tmp_path: Path,
+) -> None:
+    gaussians = random_gaussians(9)
+    (tmp_path / "out" / "7").mkdir(parents=True)
+    for words in (r"it left no \*/p.ply \(densify.result\); it wrote no file", "it wrote 7/x.txt"):
+        with pytest.raises(TrainingError, match=words):
+            collect_model(tmp_path / "out", "*/p.ply", tmp_path / "a.ply")
+        (tmp_path / "out" / "7" / "x.txt").touch()
+    model = tmp_path / "out" / "7" / "p.ply"
+    write_ply(gaussians, model)
+    taken = collect_model(tmp_path / "out", "*/p.ply", tmp_path / "a.ply")
+    assert (tmp_path / "a.ply").read_bytes() == model.read_bytes()
+    assert not differences(taken, read_ply(model))
+    moved = collect_model(tmp_path / "out", "*/p.ply", tmp_path / "b.ply", MOVED)
+    np.testing.assert_allclose(moved.means, 2 * (taken.means.numpy() - MOVED.center), atol=1e-5)
+    assert not differences(moved, read_ply(tmp_path / "b.ply"))
+    (tmp_path / "out" / "8" / "p.ply").mkdir(parents=True)  # a folder is no file
+    collect_model(tmp_path / "out", "*/p.ply", tmp_path / "a.ply")
+    write_ply(gaussians, tmp_path / "out" / "p.ply")
+    with pytest.raises(TrainingError, match=r"2 files fit densify.result \(7/p.ply, p.ply\)"):
+        collect_model(tmp_path / "out", "**/p.ply", tmp_path / "a.ply")
+    model.write_text("no model")
+    with pytest.raises(TrainingError, match=r"7/p\.ply"):
+        collect_model(tmp_path / "out", "*/p.ply", tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("names", "by_order", "said"),
+    [
+        (("a.png", "left__b.png", "c.png"), False, ""),
+        (("1.png", "2.png", "10.png"), True, ""),  # sorted by value, as a, c and left__b are
+        (("1.png", "2.png", "10.png"), False, "densify.by_order=true takes them as they are"),
+        (("a.png", "c.png"), False, "1 of 3 photographs have no picture of their name"),
+        (("a.png", "c.png"), True, "there are 2 pictures for 3 photographs"),
+        (
+            ("a.png", "c.png", "left__b.png"),
+            False,
+            "left__b.png is 42x28 px and the view 41x29: sizes",
+        ),
+    ],
+)
+def test_renders_of_a_program_get_the_names_of_their_views(
+    names: tuple[str, ...], by_order: bool, said: str, views: list[View], tmp_path: Path
+) -> None:
+    order = (0, 2, 1) if by_order else (0, 1, 2)
+    for name, index in zip(names, order, strict=False):
+        (tmp_path / "out" / "test").mkdir(parents=True, exist_ok=True)
+        Image.fromarray(views[index].image).save(tmp_path / "out" / "test" / name)
+
+    def collect() -> None:
+        collect_renders(tmp_path / "out", "test/*.png", by_order, views, tmp_path / "target")
+
+    if said:
+        with pytest.raises(TrainingError, match=said):
+            collect()
+        return
+    collect()
+    for view, name in zip(views, ("a.png", "left__b.png", "c.png"), strict=True):
+        np.testing.assert_array_equal(Image.open(tmp_path / "target" / name), view.image)
+
+
 def test_a_command_is_split_and_its_placeholders_are_filled_once() -> None:
     assert split_command("a 'b c' {d}", "x") == ["a", "b c", "{d}"]
     # a replaced value is not replaced again
     assert fill_placeholders("{a}-{b}-{a}", {"a": "{b}", "b": 2}, "x") == "{b}-2-{b}"
-    for command, said in (("", "x is empty"), ("'a", "cannot be split")):
+    for command, said in (("", "x is empty"), (["", "b"], "x is empty"), ("'a", "cannot be split")):
         with pytest.raises(InputError, match=said):
             split_command(command, "x")
     with pytest.raises(InputError, match=r"x: unknown placeholder \{tset\}; did you mean test\?"):
@@ -127,6 +210,95 @@ def test_a_command_must_contain_data_and_its_result_tells_model_from_renders() -
     assert not External(command=["a", "{data}"], result="x/*.png", version="1").leaves_model
 
 
+@pytest.mark.parametrize(
+    ("ends", "limit", "code", "pauses"),
+    [
+        (0.1, None, 5, [0.02, 0.04, 0.08]),
+        (1e9, 1.5, None, [0.02, 0.04, 0.08, 0.16, 0.32, 0.5, 0.5]),
+    ],
+)
+def test_a_program_is_watched_to_its_end_or_limit(
+    ends: float,
+    limit: float | None,
+    code: int | None,
+    pauses: list[float],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, done, looks = [100.0], [], iter([10.0, 30.0, 20.0] + 9 * [1.0])
+
+    def wait(pause: float | None = None) -> int:
+        done.append(pause)
+        if pause is not None:
+            clock[0] += pause
+            if clock[0] < 100 + ends:
+                raise subprocess.TimeoutExpired("x", pause)
+        return 5
+
+    def start(command: list[str], cwd: Path, env: dict[str, str], stdin: int) -> Any:
+        assert (command, cwd, env, stdin) == (["x"], tmp_path, {"A": "b"}, subprocess.DEVNULL)
+        return SimpleNamespace(pid=7, wait=wait, kill=lambda: done.append("kill"))
+
+    monkeypatch.setattr(program.subprocess, "Popen", start)
+    monkeypatch.setattr(program.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(program, "resident_memory_mb", lambda pid: next(looks))
+    monkeypatch.setattr(program, "peak_child_mb", lambda: 25.0)
+    found = watch(["x"], tmp_path, {"A": "b"}, limit)
+    assert found == ProgramResult(code, pytest.approx(sum(pauses)), 30.0)
+    assert done == [*map(pytest.approx, pauses), *(["kill", None] if code is None else [])]
+
+
+def test_the_memory_of_a_program_is_the_sum_over_its_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def process(size: int | None, *children: Any) -> Any:
+        def memory() -> Any:
+            if size is None:
+                raise psutil.NoSuchProcess(1)
+            return SimpleNamespace(rss=size << 20)
+
+        return SimpleNamespace(memory_info=memory, children=lambda recursive: list(children))
+
+    found = {1: process(3, process(2), process(None), process(4)), 2: process(None, process(8))}
+    monkeypatch.setattr(psutil, "Process", found.__getitem__)
+    assert (resident_memory_mb(1), resident_memory_mb(2)) == (9, 8)
+    monkeypatch.undo()
+    assert resident_memory_mb(2**22 + 1) == 0  # no process has this number
+
+
+@pytest.mark.parametrize(
+    ("ended", "said"),
+    [
+        (ProgramResult(0, 1.0, 2.0), ""),
+        (ProgramResult(3, 1.0, 2.0), r"train ended early \(exit code 3\); its last lines: oh; log"),
+        (ProgramResult(-9, 1.0, 2.0), r"train crashed \(SIGKILL, perhaps out of memory\); .*: oh"),
+        (ProgramResult(None, 1.0, 2.0), r"train still ran after 60 s .*: oh; log: "),
+        (CrashError("train crashed"), "train crashed; log: "),
+    ],
+)
+def test_a_program_that_fails_is_reported_with_its_log(
+    ended: Any, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "log"
+    log.write_text("oh\n")
+
+    def isolated(*words: object, **named: object) -> ProgramResult:
+        assert words == (watch, ["/bin/train", "x"], tmp_path, {"A": "b"}, 60.0)
+        assert named == {"what": "train", "log": log}
+        if isinstance(ended, Exception):
+            raise ended
+        return ended
+
+    monkeypatch.setattr(program, "run_isolated", isolated)
+    call = ("/bin/train", "x"), log, tmp_path, {"A": "b"}, 60.0
+    if not said:
+        assert run_program(*call) is ended
+    else:
+        with pytest.raises(TrainingError, match=said) as caught:
+            run_program(*call)
+        assert str(caught.value).endswith(f"log: {log}")
+
+
 def run(tmp_path: Path, code: str, limit: float | None = None) -> float:
     environment = {"PATH": "/usr/bin:/bin", "MINE": "here"}
     command = [sys.executable, "-c", code]
@@ -157,25 +329,11 @@ def test_no_child_process_is_left_running(tmp_path: Path) -> None:
     assert not is_running(left)
 
 
-@pytest.mark.parametrize(
-    ("code", "limit", "said"),
-    [
-        (
-            "raise SystemExit('Error: no paint')",
-            None,
-            r"ended early \(exit code 1\); its last lines: Error: no paint",
-        ),
-        ("import os; os.kill(os.getpid(), 9)", None, "crashed .SIGKILL, perhaps out of memory."),
-        ("import time; print('working', flush=True); time.sleep(600)", 3.0, "still ran after 3 s"),
-    ],
-)
 @pytest.mark.slow
-def test_failures_are_reported_in_one_line_with_the_log(
-    tmp_path: Path, code: str, limit: float | None, said: str
-) -> None:
-    with pytest.raises(TrainingError, match=said) as caught:
-        run(tmp_path, code, limit)
-    assert str(caught.value).endswith(f"log: {tmp_path / 'log'}")
+def test_a_program_beyond_its_limit_is_ended_and_reported_in_one_line(tmp_path: Path) -> None:
+    code = "import time; print('working', flush=True); time.sleep(600)"
+    with pytest.raises(TrainingError, match=r"still ran after 3 s .* working; log: ") as caught:
+        run(tmp_path, code, 3.0)
     assert "\n" not in str(caught.value)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +14,52 @@ from gsbench.external.settings import External
 
 def external(result: str, **options: Any) -> External:
     return External(command=["train", "{data}"], result=result, version="1", **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"lr": "???"}, "densify.options.lr is not set: give it a value"),
+        ({"seed": 1}, "densify.options.seed: an option is one value with a name of its own"),
+        ({"two words": 1}, "densify.options.two words: an option is one value"),
+        ({"lr": [1, 2]}, "densify.options.lr: an option is one value"),
+        ({"lr": {"a": 1}}, "densify.options.lr: an option is one value"),
+    ],
+)
+def test_an_option_is_one_value_with_a_name_of_its_own(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        external("a.ply", options=options)
+
+
+def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed() -> None:
+    for command, result in (("train {data} {lr}", "a.ply"), ("train {data}", "{lr}.ply")):
+        key = "command" if "lr" in command else "result"
+        with pytest.raises(InputError, match=rf"densify\.{key}: unknown placeholder \{{lr\}}"):
+            External(command=command, result=result, version="1")
+    assert not external("a.ply").needs_test_cameras
+    assert external("a.ply", environment={"CAMERAS": "{test_cameras}/x"}).needs_test_cameras
+    command = ["train", "{data}", "--test={test_cameras}"]
+    assert External(command=command, result="a.ply", version="1").needs_test_cameras
+
+
+def test_the_program_is_found_on_its_own_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for place in ("one", "two"):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "train").touch(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "one"))
+    assert external("a.ply").executable() == str(tmp_path / "one" / "train")
+    own = {"PATH": str(tmp_path / "two")}
+    assert external("a.ply", environment=own).executable() == str(tmp_path / "two" / "train")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    home = External(
+        command="{where}/train {data}", result="a", version="1", options={"where": "~/two"}
+    )
+    assert home.executable() == str(tmp_path / "two" / "train")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="this machine has no program 'train': install it"):
+        external("a.ply").executable()
 
 
 @pytest.mark.parametrize(

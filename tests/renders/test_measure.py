@@ -1,24 +1,35 @@
-"""The places at which renders may be entered."""
+"""Photographs that renders are compared with, and the places at which they are entered."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import yaml
+from PIL import Image
 
+from gsbench.analysis.results import load_experiment
+from gsbench.cli import run
+from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.eval.pictures import Matching
+from gsbench.renders import measure
 from gsbench.renders.measure import (
     Destination,
     ReferenceImages,
     _lines,
     check_destination,
     find_destination,
+    find_reference_images,
 )
+from gsbench.runs.keys import STAGES
 from tests.analysis.synthetic import Plan, write_runs
 
+QUICK = ["eval.lpips=[]", "eval.flip=false"]
 COURTYARD = ReferenceImages(
     {}, "the test views of a trial", "0" * 64, (96, 72), {}, "courtyard", "sfm"
 )
@@ -42,6 +53,169 @@ def test_places_that_would_mix_or_damage_results_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=said):
         find_destination(word, scene, seed, truth, tmp_path)
+
+
+@pytest.fixture
+def trial(runs: Path) -> Path:
+    """The folder of a trial of ``exp`` that tests the scene garden in two views, one masked."""
+    plan = Plan("exp", ["garden"], densifiers=["adc"], seeds=[0], views=2, pictures=True)
+    (folder,) = write_runs(runs, plan)
+    config = json.loads((folder / "config.yaml").read_text())
+    config = compose_one(QUICK).values | config | {"scene": {"name": "garden", "path": "there"}}
+    (folder / "config.yaml").write_text(json.dumps(config))
+    (folder / "masks").mkdir()
+    mask = np.zeros((120, 160), np.uint8)
+    mask[40:, :] = 255
+    Image.fromarray(mask).save(folder / "masks" / "view001.png")
+    return folder
+
+
+def test_renders_are_entered_beside_the_trial_of_their_photographs(
+    trial: Path, runs: Path, said: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    renders = trial.parents[4] / "mine"
+    renders.mkdir()
+    for name in ("view000", "view001"):
+        picture = np.asarray(Image.open(trial / "ground_truth" / f"{name}.png")).astype(int)
+        picture[40:] += 10 - 20 * (picture[40:] > 127)  # off by 10 levels
+        Image.fromarray(picture.astype(np.uint8)).save(renders / f"{name}.png")
+    words = ["evaluate", renders, "--truth", "exp:garden:adc:0", "--as", "exp:theirs"]
+    found = json.loads(said(*words, "--seed", 3, "--json"))
+    entered = Path(found["entered"])
+    assert entered.parent == runs / "exp" / "garden" / "sfm-theirs"
+    assert entered.name.endswith("-seed3")
+    psnr = 20 * np.log10(255 / 10)
+    assert found["views"]["view001"]["psnr"] == pytest.approx(psnr)  # the upper third is masked
+    assert found["views"]["view000"]["psnr"] == pytest.approx(psnr + 10 * np.log10(1.5))
+    assert (found["names_matched"], found["left_out"]) == ("apart from the extension", [])
+    assert found["pictures"] == {"view000": "view000.png", "view001": "view001.png"}
+    results = json.loads((entered / "results.json").read_text())
+    assert results["metrics"] == pytest.approx(found["metrics"])
+    wanted: dict[str, object] = {
+        **{"status": "complete", "evaluated_from": "renders", "raster": "unknown"},
+        **{"iterations": 0, "test_views": 2, "resolution": [400, 300], "seed": 3},
+        "renders": {"folder": str(renders), "names matched": "apart from the extension"},
+    }
+    assert {key: results[key] for key in wanted} == wanted
+    assert results["hashes"]["data"] == "data-garden"
+    config = yaml.safe_load((entered / "config.yaml").read_text())
+    assert (config["name"], config["seed"], config["runs"]) == ("exp", 3, str(runs))
+    assert config["scene"] == {"name": "garden", "path": "there"}
+    assert config["init"] == {"name": "sfm"}
+    assert config["densify"] == {"name": "theirs", "evaluated_from": "renders"}
+    for folder, source in (("renders", renders), ("ground_truth", trial / "ground_truth")):
+        pictures = [Image.open(place / "view001.png") for place in (entered / folder, source)]
+        np.testing.assert_array_equal(*pictures)
+    assert [mask.name for mask in (entered / "masks").iterdir()] == ["view001.png"]
+    assert {one.densify for one in load_experiment(runs, "exp").trials} == {"adc", "theirs"}
+
+    assert f"entered as {entered}" in said(*words, "--seed", 3)  # the same again
+    Image.fromarray(np.zeros((120, 160, 3), np.uint8)).save(renders / "view000.png")
+    assert run([*map(str, words), "--seed", "3"]) == 2
+    assert "seed 3 of sfm-theirs on garden is taken" in capsys.readouterr().err
+    said(*words[:-1], "new:dnn-theirs")
+    (other,) = runs.glob("new/garden/dnn-theirs/*-seed0")
+    assert yaml.safe_load((other / "config.yaml").read_text())["init"] == {"name": "dnn"}
+
+
+def test_photographs_are_found_by_trial_folder_and_address(
+    trial: Path, runs: Path, tmp_path: Path, refused: Any, said: Any
+) -> None:
+    for place in (trial, trial / "ground_truth", trial / "renders", "exp:garden:adc"):
+        truth = find_reference_images(str(place), [], runs)
+        assert (truth.scene, truth.init, truth.resolution) == ("garden", "sfm", (400, 300))
+        assert truth.photographs["view001"] == trial / "ground_truth" / "view001.png"
+        assert truth.masks == {"view001": trial / "masks" / "view001.png"}
+    renders = trial / "renders"
+    # photographs of a scene come from the experiment's own trial of it, unless settings are given
+    garden = ["evaluate", renders, "--truth", "garden", "--as", "exp:mine"]
+    assert "the test views of exp/garden/sfm-adc/" in said(*garden, "--protocol", "standard")
+    assert "nothing" in refused(*garden, "scene.path=nothing")
+    address = ["evaluate", renders, "--truth", "exp:garden:adc"]
+    assert "protocol standard-1" in said(*address, "--protocol", "standard")
+    assert "protocol paper-1" in said(*address, *QUICK)
+    assert "scene.width=7: the settings of the test views" in refused(*address, "scene.width=7")
+    (tmp_path / "empty").mkdir()
+    for place, words in (
+        (tmp_path / "empty", "holds no pictures"),
+        ("gardn", "is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene; did you mean"),
+    ):
+        assert words in refused("evaluate", renders, "--truth", place)
+    results = json.loads((trial / "results.json").read_text())
+    del results["resolution"]
+    (trial / "results.json").write_text(json.dumps(results))
+    assert "no record of the size or hash of its test views" in refused(*address)
+
+
+@pytest.mark.parametrize(
+    ("kind", "word", "times"),
+    [("colmap", "x=1", 2), ("photos", "x=1", 1), ("colmap", "init=sfm", 1)],
+)
+def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
+    kind: str, word: str, times: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """With the fastest initialiser if the scene has cameras, unless one is chosen."""
+    composed: list[list[str]] = []
+    built: list[Path] = []
+
+    def compose(words: list[str]) -> Any:
+        composed.append(words)
+        return SimpleNamespace(values={"scene": {"kind": kind}, "runs": str(tmp_path)})
+
+    def get(step: Any) -> Any:
+        built.append(tmp_path / step.stage.name)
+        return SimpleNamespace(path=built[-1])
+
+    def view(name: str, width: int, height: int) -> Any:
+        return SimpleNamespace(name=name, camera=SimpleNamespace(width=width, height=height))
+
+    scene = SimpleNamespace(
+        train=[view("c.png", 32, 20)], test=[view("b.JPG", 30, 24), view("a.png", 32, 24)]
+    )
+    trial = SimpleNamespace(
+        steps=lambda: [SimpleNamespace(stage=stage) for stage in STAGES],
+        views=SimpleNamespace(scene=scene),
+        capture=SimpleNamespace(fingerprint="f" * 64),
+    )
+    for name, stand_in in {
+        "compose_one": compose,
+        "Parts": lambda config: config,
+        "Store": lambda root: SimpleNamespace(get=get),
+        "TrialSteps": lambda config, store: trial,
+    }.items():
+        monkeypatch.setattr(measure, name, stand_in)
+    place = tmp_path / "ground_truth"
+    (place / "masks").mkdir(parents=True)
+    (place / "masks" / "a.png").touch()
+    truth = find_reference_images("garden", [word], tmp_path)
+    asked = ["scene=garden", word]
+    assert composed == [asked, [asked[0], "init=random", "init.count=100", word]][:times]
+    assert built == [tmp_path / name for name in ("scene", "init", "ground_truth")]
+    assert truth.photographs == {"b.JPG": place / "b.png", "a.png": place / "a.png"}
+    assert (truth.what, truth.scene, truth.init) == ("the test views of garden", "garden", None)
+    assert (truth.resolution, truth.data) == ((32, 24), "f" * 64)
+    assert truth.masks == {"a.png": place / "masks" / "a.png"}
+
+
+def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_path: Path) -> None:
+    write_runs(tmp_path, Plan("exp", ["garden"], ["random"], seeds=[0]))
+    garden = ReferenceImages(
+        {}, "the pictures in a folder", "0" * 64, (96, 72), {}, "garden", "sfm"
+    )
+    assert find_destination("exp:mine", None, 0, garden, tmp_path).init == "random"
+    assert find_destination("exp:a-mine-2", None, 0, garden, tmp_path) == Destination(
+        "exp", "garden", "a", "mine-2", 0
+    )
+    assert find_destination("new:mine", "garden", 0, FOLDER, tmp_path).init == "renders"
+    write_runs(tmp_path, Plan("exp", ["garden"], ["sfm"], seeds=[0]))
+    with pytest.raises(
+        InputError, match=r"has random, sfm on garden: say which, .* exp:random-mine"
+    ):
+        find_destination("exp:mine", None, 0, garden, tmp_path)
+    for folder in (tmp_path / "exp" / "garden").glob("sfm-*/*"):
+        results = json.loads((folder / "results.json").read_text())
+        (folder / "results.json").write_text(json.dumps(results | {"evaluated_from": "renders"}))
+    assert find_destination("exp:mine", None, 0, garden, tmp_path).init == "random"
 
 
 def test_the_scene_of_the_photographs_may_be_repeated(tmp_path: Path) -> None:
@@ -80,17 +254,17 @@ def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metr
         own={},
     )
     matching = Matching({}, "by their order", ("x", "y"))
-    lines = _lines(
-        FOLDER, evaluator, matching, {"a": {"psnr": 20.0}, "b": {"psnr": 21.0}}, Path("runs/x")
-    )
+    views = {"a": {"psnr": 20.0, "ssim": 0.5}, "bcdef": {"psnr": 21.0, "ssim": 0.25}}
+    lines = _lines(FOLDER, evaluator, matching, views, Path("runs/x"))
     assert lines[0] == "2 views: the pictures in a folder; protocol paper-1"
     assert lines[1:3] == [
         "names matched by their order",
         "left out, without a photograph: x, y",
     ]
-    assert [line.split() for line in lines[4:7]] == [
-        ["a", "20.000"],
-        ["b", "21.000"],
-        ["mean", "20.500"],
+    assert lines[3:7] == [
+        "       PSNR (dB)  SSIM",
+        "a         20.000  0.5000",
+        "bcdef     21.000  0.2500",
+        "mean      20.500  0.3750",
     ]
     assert lines[7:] == ["lpips_vgg_raw: n/a, no weights", "entered as runs/x"]

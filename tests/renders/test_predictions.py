@@ -15,10 +15,10 @@ from PIL import Image
 
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.renders.predictions import opened_renders
+from gsbench.renders.predictions import _write, opened_renders
 
 VIEWS = ("DSC001", "sub/DSC002")
-SIZE = (24, 32)
+SIZE, PLACES = (24, 32), ("color", "gt-color")
 
 
 def png(values: np.ndarray) -> bytes:
@@ -31,7 +31,7 @@ def png(values: np.ndarray) -> bytes:
 def members() -> dict[str, bytes]:
     """The files of predictions by name: each render is 10 levels darker than its photograph."""
     rng = np.random.default_rng(0)
-    files = {"info.json": b"{}"}
+    files = {"info.json": b"{}", "color/notes.txt": b"no picture", "overview.png": b"neither"}
     for view in VIEWS:
         photograph = rng.integers(20, 255, (*SIZE, 3)).astype(np.uint8)
         files[f"color/{view}.png"] = png(photograph - 10)
@@ -91,6 +91,28 @@ def test_every_form_of_predictions_is_measured(
     assert "names matched" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_only_renders_and_photographs_are_unpacked_and_only_for_a_while(
+    form: str, members: dict[str, bytes], tmp_path: Path
+) -> None:
+    place = FORMS[form](members, tmp_path / "predictions")
+    with opened_renders(place) as (renders, photographs):
+        assert photographs is not None
+        home = renders.parent
+        assert (renders.name, photographs) == ("color", home / "gt-color")
+        for name, content in members.items():
+            is_wanted = name.endswith(".png") and name.startswith(("color/", "gt-color/"))
+            assert (home / name).is_file() == (is_wanted or form == "folder")
+            assert not is_wanted or (home / name).read_bytes() == content
+    assert home.exists() == (form == "folder")
+    (tmp_path / "mine").mkdir()
+    with opened_renders(tmp_path / "mine") as folders:
+        assert folders == (tmp_path / "mine", None)
+    as_folder(members, tmp_path / "result" / "predictions")
+    with opened_renders(tmp_path / "result") as folders:
+        assert folders[0] == tmp_path / "result" / "predictions" / "color"
+
+
 @pytest.mark.parametrize("pack", [as_tar, as_zip])
 @pytest.mark.parametrize(
     ("change", "message"),
@@ -128,10 +150,25 @@ def test_files_that_are_no_archive_of_predictions_are_refused(
         (tmp_path / "part.tar.gz", "cannot be unpacked"),
         (half, "has none"),
         (as_folder(renders, tmp_path / "plain"), "--truth PLACE is needed"),
+        (tmp_path / "nowhere", "nowhere is not a folder of renders"),
     ):
         assert run(["evaluate", str(place)]) == 2
         assert message in capsys.readouterr().err
-    monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", 1000)
+    wanted = [content for name, content in members.items() if name.split("/")[0] in PLACES]
+    total = sum(len(content) for content in wanted) - len(members["color/notes.txt"])
     big = as_zip(members, tmp_path / "big")
-    with pytest.raises(InputError, match="more than the limit of 1 kB"), opened_renders(big):
+    monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", total)
+    with opened_renders(big):
         pass
+    monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", total - 1)
+    with pytest.raises(InputError, match=r"unpacks to .* kB, more than"), opened_renders(big):
+        pass
+
+
+@pytest.mark.parametrize("said", [9, 11])
+def test_a_member_must_have_the_size_that_its_archive_says(said: int, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"a\.png has another size"):
+        _write(io.BytesIO(bytes(10)), tmp_path / "new" / "a.png", said)
+    assert (tmp_path / "new" / "a.png").stat().st_size <= said
+    _write(io.BytesIO(bytes(10)), tmp_path / "new" / "a.png", 10)
+    assert (tmp_path / "new" / "a.png").read_bytes() == bytes(10)

@@ -1,27 +1,47 @@
-"""Two small finished trials for the viewer to show."""
+"""Small finished trials for the viewer to show."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 
-from tests.end_to_end.conftest import SMALL
+from gsbench.gaussians.ply import write_ply
+from gsbench.scene.colmap import write_model
+from gsbench.scene.types import Camera
+from tests.analysis.synthetic import Plan, write_runs
+from tests.gaussians.helpers import random_gaussians
+
+VIEWS = {"view000.png": (64, 48), "view001.png": (48, 64)}  # width, height of their photographs
+POINTS = np.array([[0, 0, z] for z in (-3.0, 0.1, 4, 5, 8)])  # two are not before the cameras
 
 
 @pytest.fixture(scope="session")
 def small_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A runs folder with the experiment ``small``: ADC and volumetric, one seed."""
+    """A runs folder with the experiment ``small``: ADC and volumetric with two seeds, made up.
+
+    The cameras look along z, and their model is twice the size of the photographs.
+    """
     runs = tmp_path_factory.mktemp("view-runs")
-    ours = ("GSBENCH_", "MLFLOW_")
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(ours)}
-    changes = {"GSBENCH_RUNS": str(runs), "TORCH_HOME": str(tmp_path_factory.mktemp("hub"))}
-    words = ["name=small", "densify=adc,volumetric", "tracking=none", "eval.flip=false"]
-    command = [sys.executable, "-m", "gsbench.cli", "-m", *SMALL, *words]
-    said = {"capture_output": True, "text": True}
-    done = subprocess.run(command, cwd=runs, env=kept | changes, timeout=300, check=False, **said)
-    assert done.returncode == 0, done.stderr
+    rng = np.random.default_rng(0)
+    cameras = {
+        name: Camera(2 * w, 2 * h, 100.0, 110.0, w + 3, h - 2, np.eye(3), np.array([-k, 0, 0]))
+        for k, (name, (w, h)) in enumerate({"trained.png": (64, 48), **VIEWS}.items())
+    }
+    cloud = POINTS, np.full((len(POINTS), 3), 200, np.uint8)
+    write_model(runs / "store" / "init" / "init-courtyard-random" / "sparse/0", cameras, cloud)
+    plan = Plan("small", ["courtyard"], ["random"], seeds=[0, 1], views=len(VIEWS))
+    for seed, trial in enumerate(write_runs(runs, plan)):
+        gaussians = random_gaussians(40, seed, torch.float32, log_scale=(-4.0, -2.2))
+        write_ply(gaussians, trial / "point_cloud.ply")
+        causes = np.arange(50, dtype=np.uint8) % 6  # ten Gaussians were pruned
+        np.savez(trial / "lineage.npz", causes=causes, ids=np.arange(10, 50))
+        (trial / "ground_truth").mkdir()
+        for name, (width, height) in VIEWS.items():
+            noise = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+            Image.fromarray(noise).save(trial / "ground_truth" / name)
+    write_runs(runs, Plan("small", ["garden"], ["random", "sfm"], ["adc"], [0]))
     return runs

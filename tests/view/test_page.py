@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsbench.cli import run
+from gsbench.normalization import Normalization
 from gsbench.view.page import page_settings
-from gsbench.view.trials import find_trial, model_folder, read_test_views
+from gsbench.view.trials import find_trial
+from tests.view.conftest import VIEWS
 
-pytestmark = pytest.mark.slow
 ADDRESS = "small:courtyard:adc"
 NPX = """#!/bin/sh
-for word in "$@"; do [ "$previous" = -E ] && settings="$word"; previous="$word"; done
-case "$*" in *"{works}"*) cp "$settings" "$previous";; *) echo "no device" >&2; exit 1;; esac
+for word in "$@"; do
+    [ "$previous" = -E ] && settings="$word"; previous="$word"
+    case "$word" in *.ply) [ -s "$word" ] || exit 1; esac
+done
+case "$*" in *"{works}"*) cp "$settings" "$previous";; *) {fails};; esac
 """
 
 
-def stand_in(folder: Path, works: str) -> Path:
+def stand_in(folder: Path, works: str, fails: str) -> Path:
     """Write an npx that copies its settings to the page if its words contain ``works``."""
     folder.mkdir()
-    (folder / "npx").write_text(NPX.replace("{works}", works))
+    (folder / "npx").write_text(NPX.replace("{works}", works).replace("{fails}", fails))
     (folder / "npx").chmod(0o755)
     return folder
 
@@ -34,38 +39,52 @@ def test_the_page_has_every_test_view(
     works: str, small_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
-    npx = stand_in(tmp_path / "bin", works)
+    npx = stand_in(tmp_path / "bin", works, "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 0
     settings = json.loads((tmp_path / "page.html").read_text())
-    trial = find_trial(ADDRESS, small_runs)
-    assert settings == page_settings(trial)
-    views = read_test_views(trial, model_folder(trial))
-    assert [one["title"] for one in settings["annotations"]] == [view.name for view in views]
-    for view, one in zip(views, settings["annotations"], strict=True):
-        camera, shown = view.camera, one["camera"]["initial"]
-        # The viewer turns the model by half a turn about z.
-        target = camera.rotation @ (np.array(shown["target"]) * (-1, -1, 1)) + camera.translation
-        assert target[:2] == pytest.approx([0, 0], abs=1e-9)
-        assert target[2] > 0.2
-        np.testing.assert_allclose(np.array(shown["position"]) * (-1, -1, 1), camera.center)
-        assert np.tan(np.radians(shown["fov"] / 2)) * 2 * camera.fx == pytest.approx(camera.width)
-    (track,) = settings["animTracks"]
-    frames = track["keyframes"]
+    assert settings == page_settings(find_trial(ADDRESS, small_runs))
+    assert settings["background"] == {"color": [0, 0, 0]}
+    effects = settings["postEffectSettings"]
+    assert not any(effect["enabled"] for effect in effects.values())
+    neutral = {"brightness": 0, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]}
+    assert effects["grading"] == {"enabled": False, **neutral}
     shown = [one["camera"]["initial"] for one in settings["annotations"]]
-    stops = [*shown, shown[0]]
-    assert len(frames["times"]) == len(stops)
-    for key, size in (("position", 3), ("target", 3), ("fov", 1)):
-        wanted = np.ravel([stop[key] for stop in stops])
-        assert frames["values"][key] == wanted.tolist()
-        assert len(wanted) == size * len(stops)
+    assert [one["title"] for one in settings["annotations"]] == list(VIEWS)
+    assert [one["position"] for one in settings["annotations"]] == [one["target"] for one in shown]
+    assert settings["cameras"] == [{"initial": shown[0]}]
+    # The viewer turns the model by half a turn about z. The cameras look along z from x = 1 and 2,
+    # and the median depth of the points before them is 5. The longer side is that of 128 px.
+    for x, focal, one in zip((1, 2), (100, 110), shown, strict=True):
+        assert (one["position"], one["target"]) == ([-x, 0, 0], [-x, 0, 5])
+        assert np.tan(np.radians(one["fov"] / 2)) == pytest.approx(64 / focal)
+    (track,) = settings["animTracks"]
+    assert track["keyframes"]["times"] == [0, 4, 8]  # there and back, in seconds
+    assert (track["duration"], track["frameRate"]) == (8, 1)
+    for key, value in track["keyframes"]["values"].items():
+        assert value == np.ravel([stop[key] for stop in (*shown, shown[0])]).tolist()
+
+
+def test_the_page_is_in_the_models_own_coordinates(small_runs: Path) -> None:
+    trial = find_trial(ADDRESS, small_runs)
+    moved = replace(trial.record, normalization=Normalization((7.0, 0.0, 3.0), 2.0))
+    first, _ = page_settings(replace(trial, record=moved))["annotations"]
+    shown = first["camera"]["initial"]
+    assert (shown["position"], shown["target"]) == ([-7.5, 0, 3], [-7.5, 0, 5.5])
 
 
 @pytest.mark.parametrize(
-    ("works", "cause"), [("never", r"failed (no device)"), ("", "is not installed")]
+    ("fails", "cause"),
+    [
+        ("echo first; echo 'no device' >&2; exit 1", "failed (no device)"),
+        ("echo first; echo last; exit 1", "failed (last)"),
+        ("exit 0", "failed ()"),
+        ('cp "$settings" "$previous"; exit 1', "failed ()"),
+        ("", "is not installed"),
+    ],
 )
 def test_without_npx_the_error_names_the_command_to_type(
-    works: str,
+    fails: str,
     cause: str,
     small_runs: Path,
     tmp_path: Path,
@@ -73,13 +92,15 @@ def test_without_npx_the_error_names_the_command_to_type(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
-    place = f"{stand_in(tmp_path / 'bin', works)}:/bin" if works else str(tmp_path)
+    place = f"{stand_in(tmp_path / 'bin', 'never', fails)}:/bin" if fails else str(tmp_path)
     monkeypatch.setenv("PATH", place)
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 1
     said = capsys.readouterr().err
     assert cause in said
+    model, settings, page = (tmp_path / f"page.{suffix}" for suffix in ("ply", "json", "html"))
     assert "npx @playcanvas/splat-transform" in said
+    assert said.endswith(f" {model} -E {settings} {page}\n")
     assert said.count("\n") == 1
-    assert (tmp_path / "page.ply").read_bytes()[:3] == b"ply"
-    assert json.loads((tmp_path / "page.json").read_text())["version"] == 2
-    assert not (tmp_path / "page.html").exists()
+    assert model.read_bytes()[:3] == b"ply"
+    assert json.loads(settings.read_text())["version"] == 2
+    assert not page.exists()

@@ -2,33 +2,44 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageFont
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from gsbench.analysis.results import Configurations, TrialResult
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.init.base import PointCloud
+from gsbench.normalization import Normalization
 from gsbench.raster import create_rasterizer
 from gsbench.scene.types import Camera, View
-from gsbench.view.server import fitting_fov, level_up, mean_up, page_camera
+from gsbench.view.server import fitting_fov, level_up, mean_up, orbit_distance, page_camera
 from gsbench.view.trials import (
     Layers,
     TrialPainter,
     ViewedTrial,
+    _fitted,
+    find_trial,
+    load_viewed,
+    model_file,
     photograph_at,
     read_causes,
+    read_test_views,
     side_by_side,
 )
 from tests.gaussians.helpers import random_gaussians
+from tests.view.conftest import POINTS
 
 
 def smooth_image(height: int, width: int) -> np.ndarray:
@@ -70,6 +81,11 @@ def test_panes_stand_side_by_side_with_labels() -> None:
     assert (labels[:, 62:] != 80).any()
     assert (row[:, 57:60] == 40).all()  # the label was made to fit
     assert (below[:, 60] == 255).all()  # a line divides the panes
+    pane = np.full((360, 100, 3), 90, np.uint8)  # its text has 10 px, and a margin of 5
+    inked = (side_by_side([("B", pane), ("B", pane)])[:, :, 0] != 90).nonzero()
+    assert 4 <= inked[0][inked[1] < 100].min() <= 9
+    assert 4 <= inked[1].min() <= 6
+    assert 104 <= inked[1][inked[1] > 101].min() <= 106
 
 
 def test_page_camera_projects_as_the_page_does() -> None:
@@ -114,14 +130,28 @@ def test_page_stands_upright_where_the_photograph_was_taken(roll: float) -> None
         np.testing.assert_allclose(up, [0, -1, 0], atol=1e-12)
 
 
-def test_mean_up_points_up() -> None:
-    np.testing.assert_allclose(mean_up([make_view(0.0), make_view(4.0)]), [0, -1, 0])
+@pytest.mark.parametrize("up", [(0, 0, 1), (1, 0, 0)])
+def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(
+    up: tuple[float, ...],
+) -> None:
+    """The camera looks straight up, or the direction is to its right."""
+    np.testing.assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
+
+
+def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction() -> None:
+    views = [make_view(x) for x in (0.0, 3.0, 9.0)]  # 4, 1 and 5 from their middle
+    np.testing.assert_allclose(mean_up(views), [0, -1, 0])
+    assert orbit_distance(views) == pytest.approx(10 / 3)
+    assert orbit_distance(views[:1]) == 1e-3
+    camera = views[0].camera
+    opposite = replace(views[0], camera=replace(camera, rotation=np.diag([-1.0, -1, 1])))
+    np.testing.assert_array_equal(mean_up([views[0], opposite]), [0, 0, 1])
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("wxyz", (0, 0, 0, 0)),
+        ("wxyz", (1e-7, 0, 0, 0)),
         ("wxyz", (math.nan, 0, 0, 1)),
         *(("position", (x, 0, 0)) for x in (math.inf, 1e30)),
         *(("fov", value) for value in (math.pi, 0.0)),
@@ -129,8 +159,10 @@ def test_mean_up_points_up() -> None:
     ],
 )
 def test_impossible_cameras_of_a_page_are_refused(name: str, value: object) -> None:
-    sound = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 0.9, "aspect": 1.6}
-    page_camera(**sound, height=540, panes=1)  # type: ignore[arg-type]
+    sound = {"wxyz": (1, 0, 0, 0), "position": (1, 2, 3), "fov": 0.9, "aspect": 1.6}
+    for aspect, width in ((0.11, 1), (1.6, 4), (9.9, 25)):
+        pane = page_camera(**(sound | {"aspect": aspect}), height=5, panes=2)  # type: ignore[arg-type]
+        assert (pane.width, pane.height) == (width, 5)
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
         page_camera(**(sound | {name: value}), height=540, panes=1)  # type: ignore[arg-type]
 
@@ -180,6 +212,93 @@ def test_layers_choose_what_is_drawn() -> None:
     outside = (alpha == 0) & (plain.max(-1) < 255)  # brighter pixels were cut off
     assert outside.any()
     np.testing.assert_allclose(marked[outside], 0.35 * plain[outside], atol=1)
+    inside, share = alpha > 0.2, alpha[..., None].clip(1e-6)
+    colors = ((marked - 0.35 * (1 - share) * plain) / share)[inside]
+    hues = np.array([Cause.CLONE.color, Cause.SPLIT_VOLUME.color])  # they mix where they overlap
+    assert (colors > hues.min(0) - 8).all()
+    assert (colors < hues.max(0) + 8).all()
+
+
+def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word() -> None:
+    length = ImageFont.load_default(10.0).getlength
+    # half a text size stays free on either side
+    assert _fitted("ab cd ef", 10.0, math.ceil(length("ab cd ef")) + 10) == ("ab cd ef", 10.0)
+    assert _fitted("ab cd ef", 10.0, math.ceil(length("ab cd")) + 10) == ("ab cd\nef", 10.0)
+    text, size = _fitted("i wwwwwwww", 10.0, 40)
+    assert (text, size) == ("i\nwwwwwwww", pytest.approx(10 * 30 / length("wwwwwwww")))
+
+
+def configured(trial: TrialResult, **settings: object) -> TrialResult:
+    values = {key.replace("__", "."): value for key, value in settings.items()}
+    return replace(trial, settings=Configurations({trial.key: values}))
+
+
+def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs: Path) -> None:
+    trial = find_trial("small:courtyard:volumetric", small_runs)
+    moved = replace(trial.record, normalization=Normalization((1.0, 2.0, 3.0), 2.0))
+    viewed, there = (
+        load_viewed(configured(one, train__background=[1.0, 0.5, 0.0]), torch.device("cpu"))
+        for one in (trial, replace(trial, record=moved))
+    )
+    assert (viewed.label, viewed.background) == ("courtyard random-volumetric seed 0", (1, 0.5, 0))
+    assert load_viewed(trial, torch.device("cpu")).background == (0, 0, 0)
+    assert viewed.causes.tolist() == [k % 6 for k in range(10, 50)]
+    volumes = 4 / 3 * np.pi * viewed.gaussians.scales.double().prod(-1).numpy()
+    np.testing.assert_allclose(10**viewed.log10_volumes, volumes, rtol=1e-5)
+    np.testing.assert_array_equal(viewed.cloud.points, POINTS)
+    own = 2 * (viewed.gaussians.means - torch.tensor([1.0, 2, 3]))
+    torch.testing.assert_close(there.gaussians.means, own)
+    first, second = viewed.views
+    camera = first.camera  # of a photograph of half the model's size
+    assert (first.name, camera.width, camera.height) == ("view000.png", 64, 48)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 55, 33.5, 23)
+    np.testing.assert_allclose(second.camera.center, [2, 0, 0])
+    folder = small_runs / "store" / "init" / "init-courtyard-random" / "sparse" / "0"
+    centred = configured(trial, scene__principal_point="centred")
+    camera = read_test_views(centred, folder)[1].camera
+    assert (camera.cx, camera.cy) == (24, 32)
+
+
+def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs: Path, tmp_path: Path) -> None:
+    first = find_trial("small:courtyard:adc", small_runs)
+    assert (first.seed, first.densify) == (0, "adc")
+    assert find_trial("small:courtyard:random-adc:1", small_runs).seed == 1
+    assert find_trial(str(first.path), small_runs).path == first.path
+    assert find_trial("small:garden:sfm-adc", small_runs).init == "sfm"
+    for address, words in {
+        "small:garden:adc": r"names 2 trials; give a folder: .*/random-adc/.*/sfm-adc/",
+        "small:courtyard:mcmc": "small:courtyard:random-adc:0",
+        "small:courtyard:adc:7": "small:courtyard:random-adc:0",
+        "small:courtyard": "EXPERIMENT:SCENE:DENSIFY",
+        "small:courtyard:": "EXPERIMENT:SCENE:DENSIFY",
+        "small:courtyard:adc:0:0": "EXPERIMENT:SCENE:DENSIFY",
+        "nothing:courtyard:adc": "nothing",
+        str(first.path.parent): "is not a trial's folder",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            find_trial(address, small_runs)
+    copy = Path(shutil.copytree(small_runs, tmp_path / "runs")) / first.path.relative_to(small_runs)
+    results = json.loads((copy / "results.json").read_text())
+    (copy / "results.json").write_text(json.dumps(results | {"status": "running"}))
+    with pytest.raises(InputError, match="is not a complete trial"):
+        find_trial(str(copy), tmp_path / "runs")
+
+
+def test_what_is_gone_from_a_trial_is_named(small_runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_runs, tmp_path / "runs")
+    trial = find_trial("small:courtyard:adc", tmp_path / "runs")
+    renders = replace(trial.record, evaluated_from="renders")
+    with pytest.raises(InputError, match="was evaluated from renders: it has no model"):
+        model_file(replace(trial, record=renders))
+    with pytest.raises(InputError, match="is of 40 Gaussians, the model has 1: run"):
+        read_causes(trial.path / "lineage.npz", 1)
+    for folder, words in (
+        (trial.path / "ground_truth", "holds no picture of a test view"),
+        (tmp_path / "runs" / "store", "is gone, and it had the cameras of small/courtyard"),
+    ):
+        shutil.rmtree(folder)
+        with pytest.raises(InputError, match=words):
+            load_viewed(trial, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
