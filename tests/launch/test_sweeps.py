@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,6 +33,7 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, hold, is_held
 from tests.finished import record_of
+from tests.launch.test_jobs import trial as bare_trial
 from tests.runs.test_trial_folder import edit
 
 pytestmark = pytest.mark.usefixtures("runs")
@@ -45,6 +47,11 @@ def _composed(*words: str) -> Trial:
 def trial_values(*words: str) -> dict[str, Any]:
     """A configuration, composed once, in this test's runs folder."""
     return _composed(*words).values | {"runs": os.environ["GSBENCH_RUNS"]}
+
+
+def planned(runs: Path, seed: int = 0) -> Trial:
+    """A trial for a plan, which is not composed."""
+    return Trial(bare_trial(runs, seed).values, (f"seed={seed}",))
 
 
 def why_not_done(values: dict[str, Any], unavailable: Sequence[str] = ()) -> str:
@@ -246,14 +253,12 @@ def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeyp
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     words = [
         "-m",
-        "scene=courtyard,garden,truck",
+        "scene=courtyard,truck",
         "init=dataset",
         "tracking=none",
         "train.iterations=1",
     ]
-    with pytest.raises(
-        InputError, match=r"scene garden: .*garden does not exist.*; scene truck: .* does not exist"
-    ):
+    with pytest.raises(InputError, match=r"scene truck: .*truck does not exist.*; .*gsbench fetch"):
         launch(words)
     assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # no trial has begun
     assert launch([*words, "--dry-run"]) == 0
@@ -446,16 +451,20 @@ def test_a_damaged_plan_is_named_and_the_next_command_repairs_it(runs, caplog):
     assert read_plan(runs / "x") == {}
     assert states_of_experiment(runs / "x") == []
     assert "left out: " in caplog.text
-    add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
+    add_to_plan([planned(runs)])
     assert "plan.json is not JSON" in caplog.text
     assert len(read_plan(runs / "x")) == 1
 
 
 def test_dry_run_tells_states_and_time(runs):
-    trials = compose_trials(["name=x", "densify=adc,volumetric", "seed=0,1"], multirun=True)
+    trials = [
+        bare_trial(runs, seed, densify={"name": name}, raster={"name": "cpu"})
+        for name in ("adc", "volumetric")
+        for seed in (0, 1)
+    ]
     assert describe_plan(trials)[-1].startswith("time: no estimate")
     finish(trials[0].values, seconds=600)
-    finish(trial_values("name=other", "densify=adc", "seed=1"), seconds=1200)
+    finish(trials[1].values | {"name": "other"}, seconds=1200)
     lines = describe_plan(trials, parallel=2)
     assert [line.split()[0] for line in lines[:4]] == ["done", "missing", "missing", "missing"]
     assert "as in other: nothing to compute" in lines[1]
@@ -467,27 +476,6 @@ def test_dry_run_tells_states_and_time(runs):
         "1 trial: 1 missing",
         "time: seconds, since other experiments have the results",
     ]
-
-
-def test_estimate_prefers_the_same_scene_and_densifier_and_scales_with_iterations(runs):
-    finish(trial_values("densify=adc", "train.iterations=100"), seconds=10)
-    finish(trial_values("densify=mcmc", "train.iterations=100"), seconds=30)
-    finished = FinishedTrials(runs)
-    assert finished.estimate(trial_values("densify=adc", "train.iterations=1000")) == (
-        pytest.approx(100),
-        1,
-    )
-    assert finished.estimate(trial_values("densify=none", "train.iterations=1000")) == (
-        pytest.approx(200),
-        2,
-    )
-
-
-def test_estimate_is_of_the_same_scene_size_and_rasterizer_or_is_none(runs):
-    finish(trial_values("train.iterations=100"), seconds=10)
-    finished = FinishedTrials(runs)
-    for words in (["scene.width=800"], ["scene.max_size=200"], ["raster=reference"]):
-        assert finished.estimate(trial_values("train.iterations=100", *words)) == (0.0, 0)
 
 
 # ---- running a sweep
@@ -592,7 +580,7 @@ def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkey
     def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
-    add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
+    add_to_plan([planned(runs)])
     monkeypatch.setattr("gsbench.launch.record.write_json", refuse)
     said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
@@ -604,7 +592,7 @@ def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
     def refuse(descriptor, operation):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    add_to_plan(compose_trials(["name=x", "densify=adc", "seed=0"]))
+    add_to_plan([planned(runs)])
     monkeypatch.setattr(fcntl, "flock", refuse)
     assert "has no locks" in refused("status", "x", "--forget")
 
