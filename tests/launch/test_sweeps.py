@@ -19,7 +19,7 @@ from gsbench.config.command_words import GROUPS, options, parse
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
-from gsbench.files import DiskFullError, explain_storage
+from gsbench.files import DiskFullError
 from gsbench.launch import jobs
 from gsbench.launch.batch import run_batch
 from gsbench.launch.jobs import Outcome
@@ -555,24 +555,6 @@ def test_full_disk_ends_the_sweep(fake_trial):
     with pytest.raises(Exception, match="the disk is full"):
         run_trials(sweep())
     assert order == [0]
-
-
-def test_storage_errors_are_recognised(tmp_path):
-    full = [
-        "[Errno 28] No space left on device",
-        "1200 requested and 304 written",
-        "PytorchStreamWriter failed writing file",
-    ]
-    for text in full:
-        assert isinstance(explain_storage(RuntimeError(text), tmp_path), DiskFullError)
-    assert isinstance(explain_storage(OSError(28, "x"), tmp_path), DiskFullError)
-    assert isinstance(explain_storage(PermissionError(13, "x", "/some/file"), tmp_path), InputError)
-    for number, words in ((errno.EFBIG, "may not grow any more"), (errno.ENOLCK, "has no locks")):
-        found = explain_storage(OSError(number, "x", str(tmp_path / "file")), tmp_path)
-        assert isinstance(found, InputError)
-        assert words in str(found)
-    assert explain_storage(RuntimeError("shape mismatch"), tmp_path) is None
-    assert explain_storage(FileNotFoundError(2, "x"), tmp_path) is None
 
 
 @pytest.mark.parametrize("number", [errno.EFBIG, errno.ENOLCK, errno.EROFS])
