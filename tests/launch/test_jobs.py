@@ -293,7 +293,8 @@ class Jobs:
 @pytest.mark.parametrize(("minutes", "limit"), [(None, 365 * 24 * 60), (30, 30)])
 def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, minutes, limit):
     caplog.set_level(logging.INFO, "gsbench")
-    monkeypatch.setattr(jobs, "SECONDS_BETWEEN_POLLS", 0)
+    pauses: list[float] = []
+    monkeypatch.setattr("time.sleep", pauses.append)
     executor = Jobs(tmp_path, [3, 1, 2, 1])
     monkeypatch.setattr(submitit, "LocalExecutor", lambda folder: executor)
     launch = LOCAL | {"timeout_min": minutes}
@@ -304,6 +305,7 @@ def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, 
     # one of each scene first, and a trial begins as soon as another ends
     assert executor.seeds == [0, 2, 1, 3]
     assert executor.most == 2
+    assert pauses == [1.0]  # whenever none has ended
     assert [one.folder for one in outcomes] == [trials[k].folder for k in (2, 0, 1, 3)]
     assert [settings["sink"] for _, settings in mirror.followed] == ["of 0", "of 2", "of 1", "of 3"]
     assert executor.parameters == {"timeout_min": limit}
@@ -449,7 +451,8 @@ def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
     queues = iter([{"7_1"}, None, set(), {"7_1"}, set(), set()])
     asked = []
     monkeypatch.setattr(jobs, "read_queue", lambda users: asked.append(users) or next(queues))
-    monkeypatch.setattr(jobs, "SECONDS_BETWEEN_POLLS", 0)
+    pauses: list[float] = []
+    monkeypatch.setattr("time.sleep", pauses.append)
     monkeypatch.setattr(jobs, "SECONDS_BETWEEN_QUEUE_CHECKS", -1)
     trials = [trial(tmp_path, seed, SLURM) for seed in (0, 1)]
     waiting = {one.folder: job(tmp_path, f"7_{k}") for k, one in enumerate(trials)}
@@ -460,6 +463,7 @@ def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
     outcomes = jobs._wait(waiting, trials)
     assert [outcome.folder for outcome in outcomes] == [trial.folder for trial in trials]
     assert list(queues) == []
+    assert pauses == [1.0] * 4
     assert asked == [{"ada", current_user()}] * 6
     assert not submitted.exists()
     said = caplog.messages

@@ -10,7 +10,13 @@ import pytest
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.launch.progress import _in_words, _seconds_left, progress_frame, progress_of
+from gsbench.launch.progress import (
+    Progress,
+    _in_words,
+    _seconds_left,
+    progress_frame,
+    progress_of,
+)
 from gsbench.launch.states import TrialState
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
@@ -83,6 +89,8 @@ def test_a_trial_that_no_process_runs_counts_as_waiting(sweep):
     }
     assert not progress.has_ended
     assert progress.speeds == {}
+    cell = {"done": 0, "running": 1, "failed": 0, "waiting": 1}
+    assert not Progress({("a", "b"): cell}, {}, None, "").has_ended
 
 
 def test_no_arm_leads_before_all_arms_share_a_seed(tmp_path):
