@@ -61,6 +61,7 @@ def test_options_and_words_may_come_in_any_order(tmp_path: Path) -> None:
         (["--config-dir", ".", "-cd", "."], "names one folder"),
         (["--config-dir", ".", "hydra.searchpath=[a]"], "names one folder"),
         (["--config-dir"], "--config-dir needs a folder"),
+        (["--config-dir", "/nowhere"], "--config-dir /nowhere: no such folder"),
     ],
 )  # fmt: skip
 def test_options_that_do_not_exist_are_explained(words: list[str], said: str) -> None:
