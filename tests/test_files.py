@@ -16,7 +16,6 @@ import pytest
 from gsbench import files
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.files import (
-    NEARLY_NOTHING,
     DiskFullError,
     atomic,
     checked_runs_folder,
@@ -270,14 +269,14 @@ def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Path] = []
-    usage = Usage(10**9, 0, NEARLY_NOTHING - 1)
+    usage = Usage(10**9, 0, 65_535)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda path: asked.append(path) or usage)
     error, missing = RuntimeError("a library's text"), tmp_path / "not" / "there"
     assert isinstance(explain_storage(error, missing), DiskFullError)
     assert isinstance(explain_storage(OSError(errno.ENOENT, "x"), missing), DiskFullError)
     assert asked == [tmp_path, tmp_path]
     assert explain_storage(ValueError("wrong"), missing) is None  # no failed write
-    usage = Usage(10**9, 0, NEARLY_NOTHING)
+    usage = Usage(10**9, 0, 65_536)
     assert explain_storage(error, missing) is None
     usage = Usage(0, 0, 0)  # as of /proc
     assert explain_storage(error, missing) is None

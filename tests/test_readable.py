@@ -66,7 +66,7 @@ def test_a_similar_word_is_suggested_whatever_its_case() -> None:
     words = (word for word in ("status", "tables"))
     assert did_you_mean("statsu", words) == "; did you mean status?"
     assert did_you_mean("TABLES", ["status", "tables"]) == "; did you mean tables?"
-    assert did_you_mean("Seed", ["SEED", "seed"]) == "; did you mean seed?"
+    assert did_you_mean("SEEd", ["seed", "SEED"]) == "; did you mean SEED?"
     assert did_you_mean("xyz", ["status"]) == ""
 
 

@@ -114,7 +114,11 @@ REST = "; the files are complete, `gsbench sync` mirrors them later"
     ("code", "errors", "said"),
     [
         (3, b"Traceback\n  File\nMLflow does not take x\n", "MLflow does not take x"),
-        (-9, b"line\nValueError: 5\n", "the mirror crashed (SIGKILL, perhaps out of memory); its"),
+        (
+            -9,
+            b"ValueError: 5\nmore\n",
+            "the mirror crashed (SIGKILL, perhaps out of memory); its last lines: ValueError: 5;",
+        ),
         (1, b"", "the mirror ended early (exit code 1); its last lines: (no output)"),
     ],
 )
