@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -85,6 +87,80 @@ def test_errors_become_a_line_and_an_exit_code(
     monkeypatch.setattr("gsbench.app.command.launch", fail)
     assert cli.run(["seed=1"]) == code
     assert capsys.readouterr().err == text
+
+
+@pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        ("status x", ("verb", ["x"], "runs")),
+        ("status --help", ("verb", ["--help"], "runs")),
+        ("help", ("help", [])),
+        ("--help seed=1 -h", ("help", ["seed=1"])),
+        ("seed=1 -h", ("help", ["seed=1"])),
+        *((word, ("trials", [word])) for word in ("seed=1", "+a", "~a", "-m", "status=1")),
+        ("--version seed=1", ("trials", ["--version", "seed=1"])),
+        ("", ("trials", [])),
+    ],
+)
+def test_the_first_word_tells_what_is_asked(
+    words: str, asked: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[tuple[Any, ...]] = []
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    monkeypatch.setattr(
+        cli,
+        "load_verb",
+        lambda name: lambda argv, runs: found.append(("verb", argv, runs.name)) or 7,
+    )
+    monkeypatch.setattr(cli, "_help", lambda argv: found.append(("help", argv)) or 7)
+    monkeypatch.setattr(cli, "_trials", lambda argv: found.append(("trials", argv)) or 7)
+    assert cli.run(words.split()) == 7
+    assert found == [asked]
+    assert os.environ["PYTHONSAFEPATH"] == "gsbench"
+
+
+def test_the_rest_of_an_output_is_dropped_once_nobody_reads_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def write(argv: list[str]) -> int:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(cli, "_trials", write)
+    with (tmp_path / "out").open("w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        assert cli.run(["seed=1"]) == 0
+        print("the rest", file=stream, flush=True)
+    assert (tmp_path / "out").read_text() == ""
+
+
+def test_an_error_stays_a_line_whatever_it_quotes(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def fail(argv: list[str]) -> int:
+        raise InputError("no\n  file \udcff")
+
+    monkeypatch.setattr(cli, "_trials", fail)
+    assert cli.run(["seed=1"]) == 2
+    assert capfd.readouterr().err == "gsbench: no file \\udcff\n"
+
+    def write(argv: list[str], runs: Path) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(cli, "load_verb", lambda name: write)
+    assert cli.run(["status"]) == 1
+    assert " is full: free some space" in capfd.readouterr().err
+
+
+def test_help_lists_verbs_and_choices_also_of_the_users_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own" / "densify").mkdir(parents=True)
+    (tmp_path / "own" / "densify" / "calm.yaml").touch()
+    assert cli.run(["--config-dir", "own", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(cli.USAGE)
+    assert [name for name in cli.VERBS if f"\n  {name} " not in said] == []
+    assert "calm" in said
 
 
 def test_unknown_verb_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

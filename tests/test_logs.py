@@ -6,6 +6,7 @@ import io
 import logging
 import sys
 import unicodedata
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,7 +16,14 @@ from hypothesis import strategies as st
 
 from gsbench import cli
 from gsbench.errors import InputError
-from gsbench.logs import LOGGER, log_to, printable_output, set_up_logging
+from gsbench.logs import (
+    LOGGER,
+    PrintableStream,
+    _QuietHandler,
+    log_to,
+    printable_output,
+    set_up_logging,
+)
 from gsbench.words import printable
 
 CONTROL_CHARACTERS = [
@@ -115,3 +123,94 @@ def test_log_lines_go_to_the_present_stderr(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(sys, "stderr", now)
     LOGGER.warning("two")
     assert now.getvalue() == "two\n"
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+    """What has come to stderr since the last call; the handlers of all loggers are restored."""
+    monkeypatch.setattr(LOGGER, "handlers", [])
+    monkeypatch.setattr(LOGGER, "propagate", True)
+    monkeypatch.setattr(logging.getLogger("other"), "handlers", [])
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    return lambda: capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("verbose", "shown"),
+    [
+        (False, "INFO"),
+        (True, "gsbench gsbench.eval gsbench.evaluate INFO"),
+        ("gsbench.eval", "gsbench.eval INFO"),
+        (["gsbench.eval", "other"], "gsbench.eval INFO other"),
+        ("other", "INFO other"),
+    ],
+)
+def test_debug_lines_are_those_asked_for(
+    verbose: bool | str | list[str], shown: str, said: Callable[[], str]
+) -> None:
+    set_up_logging()
+    set_up_logging(verbose)  # replaces its own handlers
+    assert len(LOGGER.handlers) == 1
+    for name in ("gsbench", "gsbench.eval", "gsbench.evaluate"):
+        logging.getLogger(name).debug(name)
+    LOGGER.info("INFO")
+    other = logging.getLogger("other")
+    other.setLevel(logging.DEBUG)
+    other.debug("other")
+    assert said().split() == shown.split()
+
+
+def test_lines_go_through_the_handlers_of_another_library_and_come_once(
+    said: Callable[[], str], tmp_path: Path
+) -> None:
+    class Kept(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            kept.append(record.getMessage())
+
+    kept: list[str] = []
+    root = logging.getLogger()
+    root.addHandler(Kept())
+    set_up_logging(through_root=True)  # no console there: gsbench writes, too
+    LOGGER.info("one")
+    assert (kept, said()) == (["one"], "one\n")
+    raw = io.StringIO()
+    console = logging.StreamHandler(PrintableStream(raw))  # type: ignore[arg-type]
+    console.setFormatter(logging.Formatter("\x1b[32m%(message)s\x1b[0m"))
+    root.addHandler(console)
+    set_up_logging("gsbench.eval", through_root=True)
+    logging.getLogger("gsbench.eval").debug("two \x07")
+    LOGGER.debug("three")
+    assert kept == ["one", "two \x07"]
+    assert raw.getvalue() == "\x1b[32mtwo \\x07\x1b[0m\n"  # colours stay, the text is escaped
+    assert said() == ""
+    assert not LOGGER.propagate
+
+
+def test_a_trials_log_is_continued_with_all_lines_and_closed(
+    said: Callable[[], str], tmp_path: Path
+) -> None:
+    set_up_logging()
+    for text in ("one", "two"):
+        with log_to(tmp_path / "log.txt"):
+            LOGGER.debug(text)
+            (handler,) = set(LOGGER.handlers[1:])
+        assert handler.stream.closed  # type: ignore[attr-defined]
+    LOGGER.info("after")
+    lines = (tmp_path / "log.txt").read_text().splitlines()
+    assert [line.partition(" DEBUG ")[2] for line in lines] == ["gsbench: one", "gsbench: two"]
+    assert said() == "after\n"
+    (tmp_path / "link").symlink_to(tmp_path / "log.txt")
+    with pytest.raises(InputError, match="is a link"), log_to(tmp_path / "link"):
+        pass
+
+
+def test_a_log_on_a_full_disk_stops_nothing(said: Callable[[], str]) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    with open("/dev/full", "w") as full:
+        LOGGER.addHandler(handler := _QuietHandler(full))
+        LOGGER.warning("x" * 10)
+        LOGGER.removeHandler(handler)
+        with suppress(OSError):
+            full.close()
+    assert said() == ""

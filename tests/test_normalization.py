@@ -109,3 +109,41 @@ def test_a_normalization_needs_finite_numbers_and_a_positive_scale(
 ) -> None:
     with pytest.raises(ValueError, match="positive scale"):
         Normalization(center, scale)
+
+
+def box(size: float, center: float = 0.0) -> np.ndarray:
+    """Two cameras at the ends of a diagonal of this length along x, around ``center``."""
+    return np.array([[center - size / 2, 0, 0], [center + size / 2, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("size", "center", "scale", "moved"),
+    [
+        (30.0, 0.0, 1.0, False),  # three times COLMAP's size
+        (30.01, 0.0, 10 / 30.01, True),
+        (10 / 3, 0.0, 1.0, False),
+        (3.33, 0.0, 10 / 3.33, True),
+        (10.0, 100.0, 1.0, False),  # ten sizes from the origin
+        (10.0, 100.01, 1.0, True),
+        (40.0, 4e6, 0.25, True),
+        (1e-4, 1e5, 1e5, True),
+        (5e-7, 1e5, 1.0, False),  # below what float64 can tell apart
+    ],
+)
+def test_a_model_is_normalized_beyond_the_limits(
+    size: float, center: float, scale: float, moved: bool
+) -> None:
+    found = find_normalization(box(size, center))
+    assert found.is_identity != moved
+    assert found.scale == pytest.approx(scale, rel=1e-4)
+    assert found.center == pytest.approx((center if moved else 0.0, 0.0, 0.0))
+    if moved:
+        assert found.apply([center, 0, 2]).tolist() == pytest.approx([0, 0, 2 * scale], 1e-6, 1e-3)
+        assert found.undo([0, 0, 2]).tolist() == pytest.approx([center, 0, 2 / scale])
+
+
+def test_a_scene_is_far_beyond_ten_sizes_after_scaling() -> None:
+    assert not Normalization((0.0, -100.0, 0.0), 1.0).is_far
+    assert Normalization((0.0, -100.1, 0.0), 1.0).is_far
+    assert not Normalization((0.0, -1000.0, 0.0), 0.1).is_far
+    assert Normalization((60.0, 0.0, 0.0), 2.0).is_far

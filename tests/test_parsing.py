@@ -1,12 +1,42 @@
-"""Reading bytes of files that may be strange."""
+"""Reading files that may be strange, up to the limits and one beyond."""
 
 from __future__ import annotations
 
+import json
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from gsbench.parsing import DamagedError, read_bytes
+from gsbench import parsing
+from gsbench.errors import InputError
+from gsbench.parsing import (
+    LARGEST_INT,
+    MAX_DEPTH,
+    MAX_MESSAGE,
+    MAX_WORD,
+    Amount,
+    Count,
+    DamagedError,
+    Number,
+    Record,
+    Text,
+    Whole,
+    fault_of,
+    iterate_rows,
+    one_line,
+    parse_typed,
+    read_bytes,
+    read_if_sound,
+    read_json,
+    read_tail,
+    read_typed,
+    read_yaml,
+    resolved,
+    without_byte_order_mark,
+)
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="needs /proc")
@@ -22,3 +52,235 @@ def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path: Path) -> No
     assert read_bytes(file, most=10) == b"x" * 10
     with pytest.raises(DamagedError, match="more than 9 bytes"):
         read_bytes(file, most=9)
+    assert [read_tail(file, count) for count in (3, 10, 11)] == [b"xxx", b"x" * 10, b"x" * 10]
+
+
+def test_a_file_that_grows_while_it_is_read_is_read_up_to_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As from files in ``/proc`` that report no size, the pieces come one by one."""
+    pieces = iter([b"ab", b"cd", b"ef", b""])
+    asked: list[int] = []
+    monkeypatch.setattr(os, "read", lambda _, most: asked.append(most) or next(pieces))
+    (tmp_path / "a").write_text("x" * 4)
+    assert read_bytes(tmp_path / "a", most=6) == b"abcdef"
+    assert asked == [5, 5, 3, 1]
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("1")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    os.mkfifo(tmp_path / "pipe")
+    before = len(os.listdir("/dev/fd"))
+    for name in ("link", "pipe", "."):
+        with pytest.raises(DamagedError, match="cannot be read: it is not a regular file"):
+            read_bytes(tmp_path / name)
+    with pytest.raises(DamagedError, match="embedded null"):
+        read_bytes(Path("a\0b"))
+    for missing in ("none", "file/below"):
+        with pytest.raises(FileNotFoundError):
+            read_bytes(tmp_path / missing)
+    assert read_bytes(resolved(tmp_path / "link")) == b"1"
+    assert len(os.listdir("/dev/fd")) == before
+
+
+def test_a_byte_order_mark_is_removed_and_other_encodings_are_refused() -> None:
+    assert without_byte_order_mark("\ufeffä".encode()) == "ä".encode()
+    assert without_byte_order_mark("ä\ufeff".encode()) == "ä\ufeff".encode()
+    for encoding in ("utf-16-le", "utf-16-be", "utf-32-be", "utf-32-le"):
+        with pytest.raises(InputError, match="save it as UTF-8"):
+            without_byte_order_mark("\ufeffä".encode(encoding))
+
+
+def test_a_message_about_a_file_is_one_short_line() -> None:
+    assert one_line(" a\n\tb  c ") == "a b c"
+    assert one_line("x" * MAX_MESSAGE) == "x" * MAX_MESSAGE
+    assert one_line("x" * (MAX_MESSAGE + 1)) == "x" * MAX_MESSAGE + "…"
+    error = DamagedError(Path("a/b"), "is\nwrong")
+    assert (str(error), error.path, error.reason) == ("a/b is wrong", Path("a/b"), "is wrong")
+
+
+def nested(levels: int, innermost: Any = 1) -> Any:
+    """A value within so many lists."""
+    for _ in range(levels):
+        innermost = [innermost]
+    return innermost
+
+
+@pytest.mark.parametrize(
+    ("value", "fault"),
+    [
+        ({"a": [1, 2.5, "b", True, None]}, ""),
+        (3, ""),
+        ("\ud800", "it is a text with a lone surrogate (half a character)"),
+        (nested(MAX_DEPTH), ""),
+        (nested(MAX_DEPTH + 1), "it has more than 40 levels"),
+        ({"a": {"b": [0, float("nan")]}}, "a.b.1 is nan, which is not a finite number"),
+        ([float("-inf")], "0 is -inf, which is not a finite number"),
+        ({"a": LARGEST_INT - 1, "b": 1 - LARGEST_INT}, ""),
+        ({"a": LARGEST_INT}, "a is an integer of more than 64 bits"),
+        ({"a": -LARGEST_INT}, "a is an integer of more than 64 bits"),
+        ({"a": {1, 2}}, "a is of type set"),
+        ({"a": {1: 2, "b": 3}}, "a has keys that are not all texts, or all integers"),
+        ({1.5: 2}, "it has keys that are not all texts, or all integers"),
+        ({None: 2}, "it has keys that are not all texts, or all integers"),
+        ({1: 2, 3: 4}, ""),
+        ({LARGEST_INT: 2}, "it has a key that is an integer of more than 64 bits"),
+        (
+            {"a": {"\udfff": 2}},
+            "a has a key that is a text with a lone surrogate (half a character)",
+        ),
+    ],
+    ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
+)
+def test_values_that_are_not_plain_are_named_by_their_place(value: Any, fault: str) -> None:
+    assert fault_of(value) == fault
+
+
+def test_values_are_counted_and_may_be_infinite_where_allowed() -> None:
+    shared = [1, 2, 3]
+    assert fault_of([shared, shared], most=9) == ""  # 1 + 2 + 2 * 3
+    assert fault_of([shared, shared], most=8) == "it has more than 8 values"
+    assert fault_of([float("inf")], infinite=True) == ""
+    assert fault_of(["\ud800"], infinite=True) != ""
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("a: !!python/object:os.system x", "is damaged: it has the tag tag:yaml.org,2002:python"),
+        ("a: {b: 1, b: 2}", "is not YAML ('b' is in it twice (line 1))"),
+        ("x: 1\na: 1\nx: 2", "is not YAML ('x' is in it twice (line 3))"),
+        ("a: &a {b: 1}\nc: {<<: *a}", "is damaged: it has a merge key"),
+        ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "is damaged: it has more than 40 levels"),
+        ("a: " + "1" * (MAX_WORD + 1), "is damaged: it has a word of 4,001 characters without"),
+        ("a: [", "is not YAML ("),
+        ("a: 2020-13-50", "is not YAML ("),
+        ("a: 2020-01-01", "is damaged: a is of type date"),
+        ("a: \udcff", "is not YAML ("),
+    ],
+    ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
+)
+def test_dangers_in_yaml_are_named(tmp_path: Path, text: str, fault: str) -> None:
+    (tmp_path / "a.yaml").write_text(text, errors="surrogateescape")
+    with pytest.raises(DamagedError) as error:
+        read_yaml(tmp_path / "a.yaml")
+    assert error.value.reason.startswith(fault)
+
+
+def test_yaml_up_to_the_limits_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "a.yaml"
+    shallow = (
+        "[" + ",".join(["[]"] * (MAX_DEPTH + 5)) + "]"
+    )  # a level that has ended counts no more
+    for text, value in (
+        ("[" * MAX_DEPTH + "]" * MAX_DEPTH, nested(MAX_DEPTH - 1, [])),
+        ("a: " + "b" * MAX_WORD, {"a": "b" * MAX_WORD}),
+        (f'a: "{"1" * (MAX_WORD + 1)}"', {"a": "1" * (MAX_WORD + 1)}),
+        ('a: "<<"', {"a": "<<"}),
+        (shallow, [[]] * (MAX_DEPTH + 5)),
+        ("a: .inf", {"a": float("inf")}),
+        ("? [1]\n: 2\n? [2]\n: 3", None),
+        ("", None),
+    ):
+        file.write_text(text)
+        if text.startswith("?"):
+            with pytest.raises(DamagedError):
+                read_yaml(file)
+        else:
+            assert read_yaml(file) == value
+    monkeypatch.setattr(parsing, "MAX_YAML_BYTES", 4)
+    file.write_text("a: 1")
+    assert read_yaml(file) == {"a": 1}
+    file.write_text("a: 12")
+    with pytest.raises(DamagedError, match="more than 4 bytes"):
+        read_yaml(file)
+
+
+def test_json_is_read_if_it_is_plain(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    for text, said in (
+        ("{", r"is not JSON \("),
+        ('{"a": 1e999}', "is damaged: a is inf, which"),
+        ("[" * 300 + "]" * 300, "is not JSON|more than"),
+    ):
+        file.write_text(text)
+        with pytest.raises(DamagedError, match=said):
+            read_json(file)
+    file.write_text('{"a": [1, null]}')
+    assert read_json(file) == {"a": [1, None]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row(Record):
+    amount: Amount
+    name: Text = "a"
+    counts: dict[str, Count] = field(default_factory=dict)
+    whole: Whole = 0
+    number: Number = 0.0
+
+    def __post_init__(self) -> None:
+        if self.name == "wrong":
+            raise ValueError("Name is wrong")
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("{", "is not JSON (EOF while parsing an object at line 1 column 1)"),
+        ("{}", "is damaged: it lacks 'amount'"),
+        ("3", "is damaged: Input should be an object"),
+        ('{"amount": "27"}', "is damaged: amount is '27' (input should be a valid number)"),
+        ('{"amount": -1}', "is damaged: amount is -1 (input should be greater than or equal to 0)"),
+        ('{"amount": 1e31}', "is damaged: amount is 1e+31 (input should be less than or equal"),
+        ('{"amount": NaN}', "is damaged: amount is nan (input should be a finite number)"),
+        ('{"amount": 1, "name": ""}', "is damaged: name is '' (string should have at least 1"),
+        ('{"amount": 1, "name": "wrong"}', "is damaged: Name is wrong"),
+        ('{"amount": 1, "counts": {"b": -1}}', "is damaged: counts.b is -1 ("),
+        ('{"amount": 1, "counts": {"b": 9223372036854775808}}', "is damaged: counts.b is "),
+        ('{"amount": 1, "whole": -9223372036854775808}', "is damaged: whole is "),
+        ('{"amount": 1, "whole": 9223372036854775808}', "is damaged: whole is "),
+        ('{"amount": 1, "number": -2e30}', "is damaged: number is -2e+30"),
+        ('{"amount": true}', "is damaged: amount is True"),
+    ],
+)
+def test_a_record_that_does_not_fit_is_described(content: str, reason: str) -> None:
+    with pytest.raises(DamagedError) as error:
+        parse_typed(content.encode(), Row, Path("a.json"))
+    assert error.value.reason.startswith(reason)
+
+
+def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_path: Path) -> None:
+    row = Row(amount=0, counts={"b": 2**63 - 1}, whole=1 - 2**63)
+    assert row.to_json() == {"amount": 0, "counts": {"b": 2**63 - 1}, "whole": 1 - 2**63}
+    assert Row(amount=0, name="b").to_json() == {"amount": 0, "name": "b"}
+    file = tmp_path / "a.json"
+    assert read_if_sound(file, Row) is None
+    file.write_text(json.dumps(row.to_json() | {"later": 1}))
+    assert read_typed(file, Row) == read_if_sound(file, Row) == row
+    file.write_text("{")
+    assert read_if_sound(file, Row) is None
+
+
+@pytest.mark.parametrize(
+    ("content", "amounts", "warned"),
+    [
+        ('{"amount": 1}\n{"amount": 2}\n', [1, 2], ""),
+        ('{"amount": 1}\r\n{"amount": 2}', [1, 2], ""),
+        ("", [], ""),
+        ('{"amount": 1}\n{"amou', [1], ""),  # a killed process
+        ('{"amount": 1}\n{"amou\n', [1], "from line 2 on, which is not JSON"),
+        ('{"amount": 1}\n{"amou\n{"amount": 3}', [1], "from line 2 on, which is not JSON"),
+        ('{"amount": -1}\n{"amount": 2}\n', [], "from line 1 on, which is damaged: amount"),
+        ('{"amount": 1}, {"amount": 2}\n', [], "from line 1 on, which is not JSON"),
+    ],
+)
+def test_rows_are_read_up_to_the_first_damaged_one(
+    content: str, amounts: list[int], warned: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = list(iterate_rows(content.encode(), Row, Path("a.jsonl")))
+    assert [row.amount for _, row in rows] == amounts
+    assert [json.loads(line)["amount"] for line, _ in rows] == amounts
+    assert not any(line.endswith(("\n", "\r")) for line, _ in rows)
+    assert len(caplog.messages) == bool(warned)
+    assert warned in caplog.text

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import sys
 
 import pytest
 
-from gsbench.logs import progress
+from gsbench.logs import SECONDS_BETWEEN_LINES, no_progress, progress
 
 
 def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
@@ -23,3 +25,45 @@ def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
         "train: iteration 4/4",
         "train: export 1/1",
     ]
+
+
+def test_a_log_gets_a_line_from_time_to_time(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO, "gsbench")
+    now = 1000.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    with progress("fetch") as report:
+        report("a", 0, None)
+        for done, now in (  # noqa: B007 - read by the clock
+            (1, 1000 + 0.9 * SECONDS_BETWEEN_LINES),
+            (2, 1000 + SECONDS_BETWEEN_LINES),
+            (3, 1000 + 1.9 * SECONDS_BETWEEN_LINES),
+            (4, 1000 + 2 * SECONDS_BETWEEN_LINES),
+        ):
+            report("a", done, None, f"note {done}")
+        report("a", 0, 0)
+    assert [message.rstrip() for message in caplog.messages] == [
+        *("fetch: a 0/?", "fetch: a 2/? note 2", "fetch: a 4/? note 4", "fetch: a 0/0")
+    ]
+    no_progress("a", 1, 2)
+
+
+def test_a_terminal_gets_a_bar_without_control_characters_of_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress("fetch") as report:
+        report("a", 1, 2)
+        report("b", 1, 2, "[red]\x07 of 5")
+    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "fetch: b" in shown
+    assert "[red]\\x07 of 5" in shown
+    assert "\x07" not in shown

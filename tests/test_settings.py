@@ -17,7 +17,18 @@ from pydantic import PositiveFloat, PositiveInt
 from gsbench.densify import ADC, MCMC, Volumetric
 from gsbench.errors import InputError
 from gsbench.init import Dim, Random, Sfm
-from gsbench.settings import check_settings, check_values, describe
+from gsbench.settings import (
+    MAX_INTEGER,
+    OpenFraction,
+    TargetName,
+    Threads,
+    check_settings,
+    check_values,
+    describe,
+    is_address,
+    is_folder_name,
+    unknown_setting,
+)
 
 if TYPE_CHECKING:
     from decimal import Decimal
@@ -175,7 +186,67 @@ def test_any_value_is_accepted_or_refused_in_one_line(name: str, value: Any) -> 
     assert getattr(options, name) == number
 
 
+@pytest.mark.parametrize(
+    ("value", "good"),
+    [
+        ("a b", True),
+        ("größe", True),
+        ("x" * 100, True),
+        ("x" * 101, False),
+        ("ö" * 51, False),  # 102 bytes
+        *((name, False) for name in ("", ".a", "-a", " a", "a ", "a/b", "a:b", "a\tb", 'a"b')),
+        ("a.-b", True),
+    ],
+)
+def test_a_name_must_fit_into_a_path_on_every_system(value: str, good: bool) -> None:
+    assert is_folder_name(value) == good
+
+
+@pytest.mark.parametrize(
+    ("value", "good"),
+    [
+        ("http://a:1", True),
+        ("sqlite:///x", True),
+        ("a+b.c-1://", True),
+        *((text, False) for text in ("http:/a", "://a", "1a://b", "http://a b", "http://a\x07")),
+    ],
+)
+def test_an_address_names_its_kind(value: str, good: bool) -> None:
+    assert is_address(value) == good
+
+
+def test_whole_numbers_have_at_most_64_bits_at_any_depth() -> None:
+    @dataclass
+    class Large:
+        number: int = 0
+        numbers: list[int] = field(default_factory=list)
+        mapping: dict[str, Any] = field(default_factory=dict)
+        target: TargetName = "a.B"
+
+    for good in ({"number": MAX_INTEGER}, {"number": -MAX_INTEGER}, {"mapping": {"a": [1e300]}}):
+        assert check_values(Large, good, "x") == good
+    for wrong in (
+        {"number": MAX_INTEGER + 1},
+        {"number": -MAX_INTEGER - 1},
+        {"numbers": [1, MAX_INTEGER + 1]},
+        {"mapping": {"a": [{"b": MAX_INTEGER + 1}]}},
+    ):
+        with pytest.raises(InputError, match=f": whole numbers lie between -{MAX_INTEGER} and"):
+            check_values(Large, wrong, "x")
+    assert check_values(Large, {"target": "mine.sub.A"}, "") == {"target": "mine.sub.A"}
+    for target in ("A", "mine.", "mine.1a", "mine a.B"):
+        with pytest.raises(InputError, match=r"^target must be the import path of a class"):
+            check_values(Large, {"target": target}, "")
+    with pytest.raises(InputError, match=r"^x is not a setting \(there are no settings\)"):
+        raise InputError(unknown_setting("x", "x", []))
+
+
 def test_annotations_are_described_in_words() -> None:
+    assert describe(Annotated[int, Interval(gt=0, le=4)]) == "a whole number in (0, 4]"
+    assert describe(OpenFraction) == "a number in (0, 1)"
+    assert describe(Threads) == "a whole number in [1, 4096]"
+    assert describe(Annotated[float, Interval(lt=2)]) == "a number below 2"
+    assert describe(Annotated[int, Interval(gt=2)]) == "a whole number above 2"
     assert describe(PositiveInt | Literal["auto"]) == "a whole number above 0 or 'auto'"
     assert describe(Annotated[float, Interval(le=2)]) == "a number of at most 2"
     assert describe(dict[str, Any]) == "a mapping {key: value}"

@@ -11,10 +11,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from gsbench import downloads
 from gsbench.errors import InputError
 from gsbench.weights import (
     MissingWeightsError,
@@ -22,6 +24,7 @@ from gsbench.weights import (
     digests_of_unpinned,
     find_all_weights,
     find_weights,
+    hub_cache,
     load_state,
 )
 from tests.datasets.server import Manners, Server, serve
@@ -59,6 +62,53 @@ def test_search_order_is_argument_environment_cache(
     assert find_weights(spec(b"x")) == places[1] / "net.pth"
     monkeypatch.delenv("GSBENCH_WEIGHTS")
     assert find_weights(spec(b"x")) == places[2] / "net.pth"
+
+
+def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path: Path):
+    for name, content in (("b/net.pth", b"2"), ("a/net.pth", b"1"), ("other/net.pth", b"3")):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(content)
+    named = WeightsFile(("net.pth", "other/net.pth"), None)
+    # beside the names themselves come the sub-folders, in order
+    assert find_weights(named, tmp_path) == tmp_path / "other/net.pth"
+    assert find_weights(WeightsFile(("net.pth",), None), tmp_path) == tmp_path / "a/net.pth"
+    assert find_weights(spec(b"2"), tmp_path) == tmp_path / "b/net.pth"
+    (tmp_path / "net.pth").mkdir()
+    two = [spec(b"3"), spec(b"1"), spec(b"3")]
+    assert find_all_weights(two, tmp_path) == [
+        tmp_path / name for name in ("other/net.pth", "a/net.pth", "other/net.pth")
+    ]
+
+
+def test_only_the_cache_is_not_searched_below(empty_caches: Path, monkeypatch: pytest.MonkeyPatch):
+    (empty_caches / "deep").mkdir(parents=True)
+    (empty_caches / "deep" / "net.pth").write_bytes(b"x")
+    with pytest.raises(MissingWeightsError, match="it has no address to download from"):
+        find_weights(spec())
+    monkeypatch.setenv("GSBENCH_WEIGHTS", str(empty_caches.parent))
+    assert find_weights(spec()).parent.name == "deep"
+    monkeypatch.delenv("TORCH_HOME")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/x")
+    assert hub_cache() == Path("/x/torch/hub/checkpoints")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", "/home/me")
+    assert hub_cache() == Path("/home/me/.cache/torch/hub/checkpoints")
+
+
+def test_after_a_failed_download_no_other_is_tried(monkeypatch: pytest.MonkeyPatch):
+    asked: list[tuple[str, downloads.RetryPolicy]] = []
+
+    def download(url: str, target: Path, policy: downloads.RetryPolicy, advance: Any) -> str:
+        asked.append((url, policy))
+        raise OSError("no network")
+
+    monkeypatch.setattr(downloads, "download", download)
+    with pytest.raises(
+        MissingWeightsError, match=r"net.pth, b.pth \(.*failed: no network"
+    ) as error:
+        find_all_weights([spec(url="http://a"), spec(url="http://b", name="b.pth")])
+    assert "get them from http://a, http://b" in str(error.value)
+    assert asked == [("http://a", downloads.RetryPolicy(timeout=10.0, tries=1))]
 
 
 def test_users_files_without_a_published_checksum_are_known_by_their_digest(
@@ -207,6 +257,11 @@ def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path: Path):
     with pytest.raises(MissingWeightsError, match="no entry 'model'"):
         load_state(tmp_path / "net.pth", entry="model")
     with pytest.raises(MissingWeightsError, match="something other than tensors"):
+        load_state(tmp_path / "net.pth")
+    with pytest.raises(MissingWeightsError, match="no entry 'epoch'"):
+        load_state(tmp_path / "net.pth", entry="epoch")
+    torch.save([1], tmp_path / "net.pth")
+    with pytest.raises(MissingWeightsError, match="it holds a list, not tensors by name"):
         load_state(tmp_path / "net.pth")
 
 

@@ -26,8 +26,6 @@ def test_now_is_the_same_in_all_trials_of_a_sweep():
     ("words", "text"),
     [
         (["+hydra.job.env_set.OMP_NUM_THREADS='1'"], "hydra.job.env_set can change what runs"),
-        (["--config-name=mine"], "+experiment=mine"),
-        (["-cp", "mine"], "--config-dir"),
         (["densify.interval=1000000000000000000000"], "whole number of 64 bits"),
         (["-m", "densify.interval=50,-1000000000000000000000"], "whole number of 64 bits"),
         (['densify.interval="1000000000000000000000"'], "whole numbers lie between"),

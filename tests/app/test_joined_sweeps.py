@@ -97,8 +97,6 @@ def test_grids_in_a_users_own_experiment(tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["+experiment=demo,threshold"], "two experiments are two sweeps"),
-        (["+experiment=demo", "+experiment=threshold"], "two experiments are two sweeps"),
         (
             ["+experiment=threshold", "hydra/sweeper=basic"],
             "gsbench's own sweeper alone joins grids",

@@ -5,6 +5,7 @@ makes a folder.
 """
 
 import importlib.util
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -228,19 +229,14 @@ MODES = {
 }
 
 
-@pytest.mark.parametrize("mode", ["run", "dry run"])
-@pytest.mark.parametrize("case", STRANGE)
-def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
-    settings, said = STRANGE[case]
-    assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
-    assert not Path("exploded").exists()
+SOME = ("a callback", "made of a text", "a module of a package", "logging", "a launcher")
 
 
-@pytest.mark.parametrize("mode", ["question", "info"])
 @pytest.mark.parametrize(
-    "case", ["a callback", "made of a text", "a module of a package", "logging", "a launcher"]
+    ("case", "mode"),
+    [*((case, "run") for case in STRANGE), *product(SOME, ["dry run", "question", "info"])],
 )
-def test_queries_do_not_run_code_that_a_file_names(case, mode, capsys, monkeypatch):
+def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     settings, said = STRANGE[case]
     assert said in ask([*experiment(settings), *MODES[mode]], capsys, monkeypatch)
     assert not Path("exploded").exists()

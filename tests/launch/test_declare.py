@@ -4,17 +4,19 @@ import json
 import logging
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
-from gsbench.config.compose import Trial, compose_one
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.launch.record import declare, declare_questions, declared_metrics
+from gsbench.launch.record import add_to_plan, declare, declare_questions, declared_metrics
 from gsbench.runs.experiments import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
+from tests.launch.test_jobs import trial
 
 # later words win: a trial of seconds
 TINY = [
@@ -30,14 +32,14 @@ TINY = [
 ]
 
 
-def composed(runs: Path, *words: str) -> Trial:
-    return compose_one(["name=exp", f"runs={runs}", *words])
+def declaring(runs: Path, primary: str | None, seed: int = 0, **densify: Any) -> Trial:
+    """A trial of a command with this ``eval.primary``."""
+    named = {"densify": {"name": "adc"} | densify, "scene": {"name": "courtyard"}, "name": "exp"}
+    return trial(runs, seed, eval={"primary": primary}, **named)
 
 
 def test_a_declaration_is_kept_with_its_time_and_changes_are_added(tmp_path, caplog):
-    undeclared, psnr, ssim = (
-        composed(tmp_path, *words) for words in ([], ["eval.primary=psnr"], ["eval.primary=ssim"])
-    )
+    undeclared, psnr, ssim = (declaring(tmp_path, metric) for metric in (None, "psnr", "ssim"))
     declare([undeclared])
     assert read_declarations(tmp_path / "exp") == []
     for trials in ([psnr, psnr], [psnr], [undeclared]):  # repeated or left out, it stays declared
@@ -52,33 +54,31 @@ def test_a_declaration_is_kept_with_its_time_and_changes_are_added(tmp_path, cap
 def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_added(
     tmp_path, caplog
 ):
-    def say(*commands):
-        trials = [composed(tmp_path, *words) for words in commands]
+    def say(*trials):
         declare(trials)
         lines = (tmp_path / "exp" / "declared.jsonl").read_text().splitlines()
         return [json.loads(line)["trials"] for line in lines]
 
-    psnr = "eval.primary=psnr"
-    (first,) = say(
-        (psnr, "densify=adc"), (psnr, "densify=adc", "seed=1"), (psnr, "densify=volumetric")
-    )
+    first_seed, second_seed = (declaring(tmp_path, "psnr", seed) for seed in (0, 1))
+    (first,) = say(second_seed, first_seed, declaring(tmp_path, "psnr", name="volumetric"))
     assert sorted(first.values()) == [[0], [0, 1]]
     assert {key.rpartition("/")[0] for key in first} == {
-        "courtyard/sfm-adc",
-        "courtyard/sfm-volumetric",
+        "courtyard/a_init-adc",
+        "courtyard/a_init-volumetric",
     }
-    assert say((psnr, "densify=adc", "seed=1")) == [first]  # a part of it: nothing new
+    assert say(second_seed) == [first]  # a part of it: nothing new
     assert not caplog.text
     with caplog.at_level(logging.WARNING):  # a further seed, by a command that declares nothing
-        after = say(("densify=adc", "seed=2"))
+        after = say(declaring(tmp_path, None, 2))
     assert "trials are added to those declared with psnr" in caplog.text
     assert sorted(after[-1].values()) == [[0], [0, 1, 2]]
     # another threshold is another arm, though it has the same name
-    assert len(say((psnr, "densify=volumetric", "densify.volume_threshold=0.1"))[-1]) == 3
+    changed = declaring(tmp_path, "psnr", name="volumetric", volume_threshold=0.1)
+    assert len(say(changed)[-1]) == 3
 
 
 def test_one_command_cannot_declare_two_metrics(tmp_path, refused):
-    trials = [composed(tmp_path, f"eval.primary={metric}") for metric in ("psnr", "ssim")]
+    trials = [declaring(tmp_path, metric) for metric in ("psnr", "ssim")]
     with pytest.raises(
         InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"
     ):
@@ -91,14 +91,18 @@ def test_one_command_cannot_declare_two_metrics(tmp_path, refused):
 def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     home = tmp_path / "exp"
 
-    def claims(metric, moment):
-        return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),))
+    def claims(metric, moment, **more):
+        return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),), **more)
 
+    nothing = Declaration(time="2020-01-01T00:00:00Z")
+    assert declare_questions(home, nothing) is nothing
+    assert not home.exists()
     first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))
     # the first declaration stays, with its time
     assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first
-    declared = [composed(tmp_path, "eval.primary=psnr")]
-    declare(declared)
+    declare([declaring(tmp_path, "psnr")])
+    for number in "12":  # votes are judged by their own round alone
+        declare_questions(home, claims("psnr", f"2020-01-0{number}T00:00:00Z", vote_round=number))
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
         declare_questions(home, claims("ssim", "2022-01-01T00:00:00Z"))
@@ -106,6 +110,22 @@ def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     every = read_declarations(home)
     assert [one.primary for one in every if one.kind == "claims"] == ["psnr", "ssim"]
     assert [one.primary for one in every if one.kind == "sweep"] == ["psnr"]
+    assert [one.vote_round for one in every if one.kind == "votes"] == ["1", "2"]
+
+
+@pytest.mark.parametrize("write", [add_to_plan, declare, lambda trials: ask(trials[0].files.home)])
+def test_nothing_is_written_into_an_experiment_that_is_a_link(tmp_path, write):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "x").symlink_to(tmp_path / "elsewhere")
+    one = trial(tmp_path, eval={"primary": "psnr"})
+    with pytest.raises(InputError, match="is a link"):
+        write([Trial(one.values, ("seed=0",))])
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def ask(home):
+    questions = (Question(metric="psnr", name="claim"),)
+    declare_questions(home, Declaration(time="2020-01-01T00:00:00Z", questions=questions))
 
 
 @pytest.mark.slow

@@ -1,29 +1,207 @@
-"""Checks of trials before any of them runs."""
+"""Checks of trials before any of them runs, and the way to their launcher."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from gsbench.config.compose import compose_one
-from gsbench.launch.batch import borrowed_names
-
-OWN = "densify._target_=mine.Patient"
+from gsbench.config.compose import Trial
+from gsbench.errors import InputError
+from gsbench.launch import batch
+from gsbench.launch.batch import (
+    begin_for_another_launcher,
+    borrowed_names,
+    check_trackers,
+    missing_folders,
+    missing_weights,
+    need_no_check,
+    run_batch,
+)
+from gsbench.launch.jobs import Outcome
+from gsbench.launch.record import read_plan
+from gsbench.runs.experiments import read_declarations
+from tests.finished import write_results
+from tests.launch.test_jobs import LOCAL, SLURM, Mirrored
+from tests.launch.test_jobs import trial as bare_trial
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("group", "name", "target", "said"),
     [
-        (["densify=adc", OWN], ["densify.name=patient"]),
+        ("densify", "adc", "mine.Patient", ["densify.name=patient"]),
         # the name of another class of gsbench
-        (["densify=adc", OWN, "densify.name=volumetric"], ["densify.name=patient"]),
-        (["densify=adc", OWN, "densify.name=mine"], []),
-        (["init=random", "init._target_=mine.Shell"], ["init.name=shell"]),
+        ("densify", "volumetric", "mine.Patient", ["densify.name=patient"]),
+        ("densify", "mine", "mine.Patient", []),
+        ("init", "random", "mine.Shell", ["init.name=shell"]),
         # another class of gsbench
-        (["densify=adc", "densify._target_=gsbench.densify.AbsGS"], []),
-        (["densify=adc"], []),
+        ("densify", "adc", "gsbench.densify.AbsGS", []),
+        ("densify", "adc", None, []),
     ],
 )
-def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(words, said):
-    trials = [compose_one([*words, "allow_targets=[mine]", f"seed={seed}"]) for seed in (0, 1)]
+def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(group, name, target, said):
+    values = {"init": {"name": "sfm"}, "densify": {"name": "adc"}}
+    values[group] = {"name": name, "_target_": target}
+    trials: Any = [SimpleNamespace(values=values)] * 2
     lines = borrowed_names(trials)
     assert len(lines) == len(said)
     for line, word in zip(lines, said, strict=True):
+        assert line.startswith(f"{target} is shown as {name}, ")
         assert line.endswith(word)
+
+
+def trial(runs: Path, seed: int = 0, launch: Any = None, **settings: Any) -> Trial:
+    courtyard = {"name": "courtyard", "path": "", "kind": "courtyard"}
+    launch = launch or LOCAL | {"name": "serial"}
+    tracking = {"enabled": False, "sink": "nosuch"}
+    settings = {"scene": courtyard, "tracking": tracking} | settings
+    one = bare_trial(runs, seed, launch, **settings)
+    return Trial(one.values, (f"seed={seed}",))
+
+
+@pytest.fixture
+def called(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The launchers and checks that were called, with their seeds, instead of doing it."""
+    names: list[Any] = []
+
+    def stand_in(name: str) -> Any:
+        def launcher(trials, *mirror, **words):
+            seeds = [one.values["seed"] for one in trials]
+            names.append((name, seeds, len(mirror), *words.values()))
+            return [Outcome(one.folder, "failed") for one in trials]
+
+        return launcher
+
+    for name in ("run_serial", "run_local", "run_slurm", "check_parts"):
+        monkeypatch.setattr(batch, name, stand_in(name))
+    monkeypatch.setattr(batch, "Mirror", Mirrored)
+    return names
+
+
+@pytest.mark.parametrize(
+    ("launch", "launcher", "mirrors"),
+    [
+        (LOCAL | {"name": "serial"}, "run_serial", 1),
+        (LOCAL, "run_local", 1),
+        (SLURM, "run_slurm", 0),
+    ],
+)
+def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
+    tmp_path, monkeypatch, called, launch, launcher, mirrors
+):
+    runs = tmp_path / "runs"
+    declaring = {"eval": {"primary": "psnr"}}
+    one, two = (trial(runs, seed, launch, **declaring) for seed in (0, 1))
+    monkeypatch.setattr(batch, "_why_not_done", lambda trial: trial.folder != one.folder)
+    write_results(one.folder, one.values)
+    left = runs / "store" / "init" / ".a.removed"
+    left.mkdir(parents=True)
+    done, failed = run_batch([one, two, two])
+    assert (done.folder, done.status, done.message) == (one.folder, "done", "psnr 20.5")
+    assert (failed.folder, failed.status) == (two.folder, "failed")
+    assert called == [("check_parts", [1], 0, launch is not SLURM), (launcher, [1], mirrors)]
+    assert set(read_plan(runs / "x")) == {one.folder, two.folder}
+    (declared,) = read_declarations(runs / "x")
+    assert list(declared.planned.values()) == [(0, 1)]
+    assert not left.exists()
+    called.clear()
+    run_batch([one])
+    begin_for_another_launcher([one, two])
+    assert called == [
+        ("check_parts", [], 0, launch is not SLURM),
+        ("check_parts", [1], 0, launch is not SLURM),
+    ]
+
+
+def test_what_is_missing_here_matters_unless_the_trials_run_elsewhere(tmp_path, called):
+    runs = tmp_path / "runs"
+    photos = {"name": "mine", "path": str(tmp_path / "photos"), "kind": "images"}
+    tracked = {"enabled": True, "sink": "nosuch"}
+    for wrong, said in (
+        ({"scene": photos}, "scene mine: the folder"),
+        ({"tracking": tracked}, r"tracking\.sink=nosuch needs a package: .*pip install nosuch"),
+        ({"eval": {"weights": "nosuch"}}, r"eval\.weights=nosuch: no such folder"),
+    ):
+        with pytest.raises(InputError, match=said):
+            run_batch([trial(runs, **wrong)])
+        begin_for_another_launcher([trial(runs, 0, SLURM, **wrong)])
+    one = trial(runs, eval={"weights": "nosuch"})
+    write_results(one.folder, one.values)
+    with pytest.raises(InputError, match="no such folder"):  # wrong even if all trials are done
+        run_batch([one])
+    with pytest.raises(InputError, match="declare eval"):
+        run_batch([trial(tmp_path / "new", eval={"primary": name}) for name in ("psnr", "ssim")])
+    assert not (tmp_path / "new").exists()
+    called.clear()
+    run_batch([trial(runs, 0, SLURM, eval={"weights": "nosuch"})])
+    assert [name for name, *_ in called] == ["check_parts", "run_slurm"]
+    check_trackers([trial(runs, tracking=tracked | {"sink": "json"})])
+
+
+def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("GSBENCH_DATA", str(tmp_path))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+
+    def scene(name: str, kind: str, folder: str, **more: Any) -> Any:
+        return {"scene": {"name": name, "kind": kind, "path": str(tmp_path / folder), **more}}
+
+    trials = [
+        trial(tmp_path),
+        trial(tmp_path, **scene("b", "images", "file")),
+        *[trial(tmp_path, **scene("a", "colmap", "none", sparse=model)) for model in ("0", "1")],
+        trial(tmp_path, **scene("c", "colmap", "empty")),
+        trial(tmp_path, **scene("d", "images", "empty")),
+    ]
+    lines = missing_folders(trials)
+    assert lines[0] == f"scene a: the folder {tmp_path / 'none'} does not exist"
+    assert lines[1] == f"scene b: the folder {tmp_path / 'file'} is a file"
+    assert lines[2].startswith("scene c: ")
+    assert lines[3:] == ["set scene.path, or GSBENCH_DATA for a known scene"]
+    assert missing_folders(trials[:1]) == []
+    named = [("eval", "z"), ("eval", "y"), ("init", str(tmp_path)), ("init", "z"), ("eval", None)]
+    trials = [
+        trial(tmp_path, **{group: {"name": "a", "weights": folder}}) for group, folder in named
+    ]
+    assert [line.partition(":")[0] for line in missing_weights(trials)] == [
+        *("eval.weights=y", "eval.weights=z", "init.weights=z")
+    ]
+    assert missing_folders(trials) == missing_weights(trials)
+
+
+@pytest.mark.parametrize(
+    ("word", "free"),
+    [
+        ("seed=3", True),
+        ("densify=adc", True),
+        ("+densify=adc", True),
+        ("densify=mine", False),
+        ("densify.start=4", False),
+        ("~densify.cap", False),
+        ("init/options=a", False),
+        ("raster@x=cpu", False),
+        ("train.iterations=3", False),
+        ("hydra.job.name=a", True),
+        ("hydra.searchpath=[a]", False),
+    ],
+)
+def test_shipped_choices_alone_need_no_check(word, free):
+    trials: Any = [SimpleNamespace(overrides=words) for words in (("name=x",), ("seed=1", word))]
+    assert need_no_check(trials) == free
+
+
+def test_weights_are_searched_once_for_equal_options(monkeypatch):
+    asked = []
+
+    def make_evaluator(options):
+        asked.append(options)
+        return SimpleNamespace(awaited=["lpips_vgg"])
+
+    parts = SimpleNamespace(make_evaluator=make_evaluator)
+    monkeypatch.setitem(sys.modules, "gsbench.pipeline.parts", parts)
+    batch._unavailable.cache_clear()
+    for options in ('{"flip": false}', '{"flip": true}', '{"flip": false}'):
+        assert batch._unavailable(options) == {"lpips_vgg"}
+    assert [options.flip for options in asked] == [False, True]
+    batch._unavailable.cache_clear()

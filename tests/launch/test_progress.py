@@ -2,12 +2,22 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from gsbench.analysis.quantities import asked_quantity
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.launch.progress import progress_frame, progress_of
+from gsbench.launch.progress import (
+    Progress,
+    _in_words,
+    _seconds_left,
+    progress_frame,
+    progress_of,
+)
+from gsbench.launch.states import TrialState
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from tests.tracking.helpers import begin_trial, trial_values, write_trial
@@ -79,6 +89,8 @@ def test_a_trial_that_no_process_runs_counts_as_waiting(sweep):
     }
     assert not progress.has_ended
     assert progress.speeds == {}
+    cell = {"done": 0, "running": 1, "failed": 0, "waiting": 1}
+    assert not Progress({("a", "b"): cell}, {}, None, "").has_ended
 
 
 def test_no_arm_leads_before_all_arms_share_a_seed(tmp_path):
@@ -86,6 +98,66 @@ def test_no_arm_leads_before_all_arms_share_a_seed(tmp_path):
         begin(tmp_path, arm, 0)
     progress = progress_of(tmp_path / "swept")
     assert (progress.leader, progress.seconds_left) == ("", None)
+
+
+def test_an_arm_of_several_settings_is_named_with_their_hashes(tmp_path):
+    folders = [begin(tmp_path, "adc", seed) for seed in (0, 1)]
+    values = trial_values(tmp_path, 0, "swept") | {"densify": {"name": "adc", "start": 5}}
+    other = begin_trial(values | {"scene": {"name": "a_scene"}})
+    begin(tmp_path, "mcmc", 0)
+    progress = progress_of(tmp_path / "swept")
+    arms = [f"a_init-adc {folder.name[:8]}" for folder in (folders[0], other)]
+    assert {name: cell["waiting"] for name, cell in progress.cells.items()} == {
+        (arms[0], "a_scene"): 2,
+        (arms[1], "a_scene"): 1,
+        ("a_init-mcmc", "a_scene"): 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("names", "states", "seconds"),
+    [
+        ([("adc", "a")], ["missing"], 11),  # its arm and scene
+        ([("adc", "b")], ["partial"], 21),
+        ([("adc", "c")], ["missing"], 16),  # its arm: (11 + 21) / 2
+        ([("mcmc", "a")], ["queued"], 24),  # all: (11 + 21 + 40) / 3
+        ([("adc", "a"), ("adc", "b")], ["missing", "missing"], 32),
+        ([("adc", "a"), ("adc", "b")], ["running", "running"], 16),  # two at once
+        ([("adc", "a"), ("adc", "b")], ["running", "missing"], 32),
+        ([("adc", "a"), ("adc", "b")], ["failed", "done"], 0),
+    ],
+)
+def test_a_trial_takes_as_long_as_those_most_like_it(tmp_path, names, states, seconds):
+    known: Any = {("adc", "a"): 1.0, ("adc", "b"): 11.0, ("volumetric", "a"): 30.0}
+    done: Any = [
+        SimpleNamespace(
+            path=Path(str(k)), record=SimpleNamespace(seconds={"init": 10.0, "train": took})
+        )
+        for k, took in enumerate(known.values())
+    ]
+    waiting = [TrialState(tmp_path / str(k), state, None, "") for k, state in enumerate(states)]
+    by_folder = {one.path: name for one, name in zip(done, known, strict=True)} | {
+        one.folder: name for one, name in zip(waiting, names, strict=True)
+    }
+    assert _seconds_left(waiting, by_folder, done) == pytest.approx(seconds)
+
+
+def test_a_training_without_a_time_has_no_speed(sweep, tmp_path):
+    running = sweep["volumetric", 2]
+    (running / "building.json").write_text(json.dumps({"folder": str(running)}))
+    for rows in ("", '{"step": 75}\n', '{"step": 75, "seconds": 0}\n'):
+        (running / "metrics.jsonl").write_text(rows)
+        with hold(running / ".lock", "a trial"):
+            progress = progress_of(tmp_path / "swept")
+        assert progress.speeds == {("a_init-volumetric", "a_scene"): 0}
+        assert progress.seconds_left == pytest.approx(1.0 if rows else 2.0)
+
+
+def test_the_leader_is_best_in_the_declared_direction_unless_the_shown_values_are_equal():
+    lpips = asked_quantity("lpips_vgg")
+    said = _in_words({"adc": 0.25, "mcmc": 0.2}, lpips, 3)
+    assert said.startswith(f"mcmc leads so far: {lpips.name} 0.200, mean of the 3 ")
+    assert _in_words({"adc": 0.2, "mcmc": 0.20001}, lpips, 3).startswith("no arm leads in ")
 
 
 def test_watch_prints_the_table_and_ends_once_all_trials_have_ended(

@@ -16,7 +16,7 @@ from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.gaussians.ply import write_ply
 from gsbench.pipeline.steps import evaluate as evaluate_module
-from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed
+from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed, one_color_psnr
 from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
@@ -203,3 +203,25 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
     )
     assert len(list((folder / "renders").iterdir())) == 2
     assert told == [("views", 1, 2), ("views", 2, 2)]
+
+
+def test_the_mean_colour_of_counted_training_pixels_is_measured_against_the_test_views(tiny_scene):
+    def plain(view: View, color: tuple[int, int, int]) -> View:
+        return replace(view, image=np.broadcast_to(np.uint8(color), view.image.shape).copy())
+
+    black, light, dark = (
+        plain(view, color)
+        for view, color in zip(
+            tiny_scene.train, [(0, 0, 0), (80, 0, 40), (40, 200, 0)], strict=False
+        )
+    )
+    half = np.zeros(light.image.shape[:2], dtype=bool)
+    half[: len(half) // 2] = True
+    # half of the second and all of the third: (160, 400, 40) / 3, rounded
+    train = (replace(black, mask=np.zeros_like(half)), replace(light, mask=half), dark)
+    test = (plain(tiny_scene.test[0], (43, 133, 13)), plain(tiny_scene.test[1], (63, 133, 13)))
+    scene = replace(tiny_scene, train=train, test=test)
+    errors = [10**2 / 3, 10**2 / 3]  # of 53, 133, 13, in one channel
+    expected = np.mean([10 * np.log10(255**2 / error) for error in errors])
+    assert one_color_psnr(scene, PAPER) == pytest.approx(expected, abs=1e-4)
+    assert one_color_psnr(replace(scene, test=()), PAPER) is None

@@ -2,11 +2,13 @@
 
 import json
 import sys
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 from gsbench.config.compose import compose_one
+from gsbench.densify import ADC
 from gsbench.errors import InputError, TrainingError
 from gsbench.pipeline.parts import Parts, build, build_own_rasterizer
 from gsbench.pipeline.trial import _recorded_failures, run_trial
@@ -208,6 +210,29 @@ def test_a_users_rasterizer_needs_a_name_of_its_own(own_module, name, sound):
             with pytest.raises(InputError, match="raster=named does not give them"):
                 _ = parts.rasterizer
     assert build_own_rasterizer({"name": "cpu"}, []) is None
+
+
+def test_code_whose_version_results_cannot_record_is_named(tmp_path, monkeypatch, caplog):
+    (tmp_path / "own_helper.py").write_text("x = 1\n")
+    lines = "import own_helper\nfrom gsbench.densify import ADC\nclass Mine(ADC): pass\n"
+    (tmp_path / "own_importer.py").write_text(lines)
+    monkeypatch.syspath_prepend(tmp_path)
+    for allowed, said in (
+        (["own_importer", "own_helper"], []),
+        (["own_importer"], ["own_importer.Mine imports own_helper, and results do not record"]),
+    ):
+        for name in ("own_importer", "own_helper"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        build("densify", {"_target_": "own_importer.Mine"}, allowed)
+        assert [message[: len(said[0])] for message in caplog.messages] == said
+    caplog.clear()
+    made_up = ModuleType("made_up")
+    made_up.Mine = type("Mine", (ADC,), {"__module__": "made_up"})  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "made_up", made_up)
+    build("densify", {"_target_": "made_up.Mine"}, ["made_up"])
+    assert caplog.messages == [
+        "no file of made_up.Mine was found: results do not record its version"
+    ]
 
 
 @pytest.mark.parametrize("place", ["scene", "trial", "log.txt", "store/views"])

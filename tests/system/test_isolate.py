@@ -9,12 +9,15 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 
 import gsbench
 from gsbench.errors import InputError
+from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
 from tests.processes import heed_interrupts
 
@@ -143,3 +146,158 @@ def test_child_ends_with_its_parent(functions, tmp_path: Path, sign: signal.Sign
         assert time.monotonic() < deadline
         size = beats.stat().st_size
         time.sleep(0.5)
+
+
+# ---- parts, in this process
+
+
+@pytest.mark.parametrize(
+    ("output", "said"),
+    [
+        (b"", "(no output)"),
+        (b"\n  \n", "(no output)"),
+        (b"one\n two \nthree\nfour\n", "two | three | four"),
+        (b"Error: a\nlater\nb error\nlast\n", "Error: a | b error"),
+        (b"  File x, Error\n@ 0x1 error\n*** Check failed\nfree(): y\n\xff\n", "free(): y"),
+        (b"e1 error\ne2 error\ne3 error\ne4 error", "e2 error | e3 error | e4 error"),
+    ],
+)
+def test_the_last_lines_that_tell_a_reason_are_quoted(output: bytes, said: str, tmp_path: Path):
+    assert isolate.error_lines(output) == said
+    (tmp_path / "log").write_bytes(b"Error: earlier\n" + output)
+    assert isolate.error_tail(tmp_path / "log", 15) == said
+
+
+def test_only_the_end_of_a_long_output_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(isolate, "_TAIL_BYTES", 8)
+    (tmp_path / "log").write_text("Error: a\nError: b")
+    assert isolate.error_tail(tmp_path / "log") == "Error: b"
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (-9, "crashed (SIGKILL, perhaps out of memory)"),
+        (-11, "crashed (SIGSEGV)"),
+        (-99, "crashed (signal 99)"),
+        (0, "ended early (exit code 0)"),
+        (7, "ended early (exit code 7)"),
+    ],
+)
+def test_the_end_of_a_process_is_described(code: int, said: str):
+    assert isolate.describe_exit(code) == said
+
+
+def test_progress_comes_from_a_file_line_by_line(tmp_path: Path):
+    channel, told = isolate.ProgressFile(tmp_path / "progress"), []
+    channel("a", 1, None)
+    channel("b", 2, 3, "note")
+    waits = iter([False, False, True])
+
+    class Ended:
+        def wait(self, seconds: float) -> bool:
+            assert seconds == 0.25
+            if len(told) == 2:
+                with channel.path.open("a") as file:  # the rest of the line comes later
+                    file.write("c\t4")
+                told.append("half")
+            elif "half" in told:
+                with channel.path.open("a") as file:
+                    file.write("5\t\tend\n")
+            return next(waits)
+
+    def progress(*given: object) -> None:
+        told.append(given)
+        raise BrokenPipeError  # a closed terminal stops nothing
+
+    isolate._listen(channel.path, progress, Ended())
+    assert told == [("a", 1, None, ""), ("b", 2, 3, "note"), "half", ("c", 45, None, "end")]
+
+
+def test_the_progress_of_a_function_is_forwarded_to_the_end(monkeypatch: pytest.MonkeyPatch):
+    told: list[tuple] = []
+
+    def run_isolated(function, *arguments, what, log):
+        assert (what, log) == ("work", None)
+        return function(*arguments)
+
+    def work(job: int, progress) -> int:
+        progress("a", job, 5)
+        if job == 3:
+            raise ValueError("three")
+        return job + 1
+
+    monkeypatch.setattr(isolate, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(isolate, "run_isolated", run_isolated)
+    report = lambda *given: told.append(given)  # noqa: E731
+    assert isolate.run_with_progress(work, 2, report, "work") == 3
+    with pytest.raises(ValueError, match="three"):
+        isolate.run_with_progress(work, 3, report, "work")
+    assert told == [("a", 2, 5, ""), ("a", 3, 5, "")]
+
+
+def test_a_fresh_interpreter_gets_this_search_path(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "path", ["a"])
+    monkeypatch.setattr(isolate, "allowed_modules", lambda: {"mine": "/there"})
+    command = isolate.python_command("m.n", "f", "1", "2")
+    assert command[:3] == [sys.executable, "-P", "-c"]
+    assert command[3].endswith("from m.n import f; f()")
+    assert command[4:] == ['[["a"], {"mine": "/there"}]', "1", "2"]
+
+
+def test_descendants_are_killed_until_none_is_left(monkeypatch: pytest.MonkeyPatch):
+    did: list[object] = []
+    rounds = iter([["runs", "zombie", "gone"], ["runs"], ["zombie"]])
+
+    class Process:
+        def __init__(self, state: str = "") -> None:
+            self.state = state
+
+        def children(self, recursive: bool) -> list[Process]:
+            assert recursive
+            return [Process(state) for state in next(rounds)]
+
+        def status(self) -> str:
+            if self.state == "gone":
+                raise psutil.NoSuchProcess(1)
+            return psutil.STATUS_ZOMBIE if self.state == "zombie" else "running"
+
+        def kill(self) -> None:
+            did.append("kill")
+
+    reaped = iter([(5, 0), (0, 0)])
+
+    def waitpid(pid: int, options: int) -> tuple[int, int]:
+        assert (pid, options) == (-1, os.WNOHANG)
+        if (found := next(reaped, None)) is None:
+            raise ChildProcessError
+        return found
+
+    monkeypatch.setattr(psutil, "Process", Process)
+    monkeypatch.setattr(os, "waitpid", waitpid)
+    monkeypatch.setattr(time, "sleep", did.append)
+    isolate.end_descendants()
+    assert did == ["kill", 0.01, "kill", 0.01]
+    assert list(rounds) == []
+    assert list(reaped) == []
+
+
+def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch: pytest.MonkeyPatch):
+    now = iter([100.0, 104.9, 105.0])
+    asked = []
+    monkeypatch.setattr(time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    stubborn = SimpleNamespace(status=lambda: "running", kill=lambda: asked.append(1))
+    here = SimpleNamespace(children=lambda recursive: [stubborn])
+    monkeypatch.setattr(psutil, "Process", lambda: here)
+    isolate.end_descendants()
+    assert asked == [1]
+
+
+def test_an_error_that_cannot_be_pickled_keeps_its_text():
+    class LocalError(Exception):
+        pass
+
+    assert isinstance(isolate._portable(InputError("a")), InputError)
+    portable = isolate._portable(LocalError("b"))
+    assert (type(portable), str(portable)) == (RuntimeError, "LocalError: b")

@@ -12,12 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsbench.errors import InputError
 from gsbench.system import machine
 from gsbench.system.machine import (
     cpu_name,
     describe_machine,
     kernel_target,
     kind_of_machine,
+    load_numba,
     x86_level,
 )
 
@@ -92,20 +94,38 @@ def test_the_target_of_kernels_follows_numba_cpu_name() -> None:
 
 
 @pytest.mark.parametrize(
-    "variable", ["NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=-1", "NUMBA_DISABLE_JIT=x"]
+    ("variable", "least"),
+    [
+        *((f"NUMBA_NUM_THREADS={value}", 1) for value in ("0", "-1", "", "²", "1.5")),
+        *((f"NUMBA_DISABLE_JIT={value}", 0) for value in ("x", "-1")),
+        ("NUMBA_NUM_THREADS=1", None),
+        ("NUMBA_DISABLE_JIT=0", None),
+    ],
 )
-def test_a_variable_that_numba_cannot_read_is_refused_in_one_line(variable: str) -> None:
-    name, _, value = variable.partition("=")
-    code = (
-        "from gsbench.errors import InputError\n"
-        "try:\n    import gsbench.raster.cpu\nexcept InputError as error:\n    print(error)"
-    )
-    changed = dict(os.environ) | {name: value}
-    asked = subprocess.run(
-        [sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True
-    )
-    assert name in asked.stdout
-    assert asked.stdout.count("\n") == 1
+def test_a_variable_that_numba_cannot_read_is_refused(
+    variable: str, least: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(*variable.split("="))
+    if least is None:
+        load_numba()
+    else:
+        with pytest.raises(InputError, match=rf"^{variable}: .* a whole number from {least} on"):
+            load_numba()
+
+
+def test_kernels_are_for_the_processor_and_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    features = "+" + ",+".join(machine.X86_LEVELS["x86-64-v2"]) + ",-avx"
+    monkeypatch.setattr(machine, "numba_target", lambda: ("haswell", features))
+    for system, target in (
+        ("x86_64", "haswell, x86-64-v2"),
+        ("AMD64", "haswell, x86-64-v2"),
+        ("aarch64", "haswell"),
+    ):
+        monkeypatch.setattr(platform, "machine", lambda system=system: system)
+        assert kernel_target() == target
+    record = {"cpu": "A", "kernels": "B", "torch": "C", "device": "cpu"}
+    assert kind_of_machine(record) == "A (B, torch C)"
+    assert kind_of_machine(record | {"device": "H100"}) == "H100, A (B, torch C)"
 
 
 def test_numba_reads_no_settings_of_the_current_folder(tmp_path: Path) -> None:

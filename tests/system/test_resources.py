@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from filelock import FileLock
 
-from gsbench.system.resources import assign_gpu, available_threads, take_slot, trials_at_once
+from gsbench.system.resources import (
+    THREAD_VARIABLES,
+    assign_gpu,
+    assign_threads,
+    available_threads,
+    names_one_gpu,
+    nvidia_smi,
+    take_slot,
+    trials_at_once,
+)
 
 
 def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,6 +42,67 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert available_threads(2) == 7
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "0")
     assert available_threads(10**6) == 1
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "many")
+    monkeypatch.setattr("gsbench.system.resources.available_cores", lambda: 7)
+    assert [available_threads(parallel) for parallel in (1, 3, 8)] == [7, 2, 1]
+    for threads, expected in ((5, "5"), ("6", "6"), ("auto", "3")):
+        assign_threads(threads, 2)
+        assert {os.environ[name] for name in THREAD_VARIABLES} == {expected}
+
+
+@pytest.fixture(autouse=True)
+def _own_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in THREAD_VARIABLES:
+        monkeypatch.setenv(name, os.environ.get(name, "1"))
+
+
+def test_a_taken_slot_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+    folder = tmp_path / ".slots" / socket.gethostname()
+    folder.mkdir(parents=True)
+    other = FileLock(folder / "0.lock")
+    other.acquire()
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        if len(pauses) == 2:
+            other.release()
+
+    monkeypatch.setattr("time.sleep", sleep)
+    with take_slot(tmp_path, 1) as slot:
+        assert slot == 0
+    assert pauses == [0.5, 0.5]
+    with pytest.raises(KeyError), take_slot(tmp_path, 1):
+        raise KeyError  # frees it, too
+    with take_slot(tmp_path, 1):
+        pass
+
+
+def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def smi(command: list[str], **how: Any) -> Any:
+        asked.append(command)
+        if error:
+            raise error
+        return SimpleNamespace(stdout="0\n1\n")
+
+    error: Exception | None = None
+    monkeypatch.setattr("subprocess.run", smi)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assign_gpu(3, None)
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
+    assert asked == [["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]]
+    assign_gpu(0, " 7 , ")
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "7"
+    for error in (  # noqa: B007 - raised by the driver's program
+        FileNotFoundError(),
+        subprocess.CalledProcessError(9, "nvidia-smi"),
+    ):
+        assert nvidia_smi("name") == []
+        assign_gpu(0, None)
+        assert "CUDA_VISIBLE_DEVICES" not in os.environ
+    assert [names_one_gpu(name) for name in ("cuda:0", "cuda", "cpu")] == [True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -40,6 +114,11 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         (64, 256, 100_000, 0, 16),
         (64, 16, 3_000_000, 0, 2),
         (64, 256, None, 1, 1),
+        (64, 256, None, 3, 3),
+        (12, 256, None, 0, 3),
+        (11, 256, None, 0, 2),
+        (64, 1, None, 0, 1),  # at least one
+        (64, 5, None, 0, 2),  # 2.16 GB each
     ],
 )
 def test_trials_at_once_suit_cores_memory_and_gpus(
@@ -55,3 +134,5 @@ def test_trials_at_once_suit_cores_memory_and_gpus(
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=gigabytes * 10**9))
     assert trials_at_once.__wrapped__(most, "auto") == expected
     assert trials_at_once.__wrapped__(most, "cuda:1") == 1  # all trials are on that GPU
+    if gpus == 3:
+        assert trials_at_once.__wrapped__(most, "cpu") == 16

@@ -252,20 +252,6 @@ def test_a_killed_process_leaves_no_incomplete_database(tmp_path):
     assert (tmp_path / "mlflow.db").exists()
 
 
-def test_mlflow_is_not_loaded_if_tracking_is_switched_off(tmp_path):
-    code = (
-        "import sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\n"
-        "o = {'enabled': False, 'uri': None, 'flush_seconds': 1, 'images': 0}\n"
-        "with Mirror() as mirror: mirror.follow(Path('.'), o)\nsys.exit('mlflow' in sys.modules)"
-    )
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], cwd=tmp_path, env=child_environment(), check=False
-        ).returncode
-        == 0
-    )
-
-
 def test_deleted_experiment_is_restored(runs):
     client = connect(None, runs)
     first = ensure_experiment(client, "gone", runs)

@@ -1,0 +1,224 @@
+"""Words of a command line, without a composition."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsbench.config import command_words
+from gsbench.config.command_words import (
+    check_search_path,
+    check_single,
+    check_text,
+    check_words,
+    grid_points,
+    hint_for,
+    is_interval,
+    is_sweep,
+    key_of,
+    makes_other_trials,
+    options,
+    parse,
+    parse_word,
+    search_path,
+    searched_folders,
+    typed_permissions,
+    value_text,
+)
+from gsbench.errors import InputError
+
+
+def test_options_and_words_may_come_in_any_order(tmp_path: Path) -> None:
+    folder = f"hydra.searchpath=['file://{tmp_path}']"
+    for words in (
+        ["a=1", "--config-dir", str(tmp_path), "-m", "b=2", "--dry-run"],
+        ["--multirun", f"-cd={tmp_path}", "a=1", "--dry-run", "b=2"],
+    ):
+        assert parse(words) == ([folder, "a=1", "b=2"], True, True)
+    assert parse(["a=1"]) == (["a=1"], False, False)
+    quoted = tmp_path / "it's"
+    quoted.mkdir()
+    (word,) = search_path([quoted], [])
+    assert parse_word(word).value() == [f"file://{quoted}"]
+    assert searched_folders(["a=1", word]) == [quoted]
+    assert search_path([], ["hydra.searchpath=[a]"]) == []
+    assert searched_folders(["hydra.searchpath=[pkg://a,file:///b,/c]"]) == [Path("/b"), Path("/c")]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--config-name", "mine"], "--config-name: gsbench's main configuration is its own: write "
+            "yours to FOLDER/experiment/mine.yaml"),
+        (["-cn=mine"], "give --config-dir FOLDER +experiment=mine"),
+        (["-cp", "here"], "+experiment=NAME"),
+        (["--config-path=here"], "+experiment=NAME"),
+        (["--config-name"], "+experiment=NAME"),
+        (["--scene.path=x"], "a setting has no dashes: scene.path=…"),
+        (["--mutlirun"], "did you mean --multirun?"),
+        (["--config-dir", ".", "-cd", "."], "names one folder"),
+        (["--config-dir", ".", "hydra.searchpath=[a]"], "names one folder"),
+        (["--config-dir"], "--config-dir needs a folder"),
+        (["--config-dir", "/nowhere"], "--config-dir /nowhere: no such folder"),
+    ],
+)  # fmt: skip
+def test_options_that_do_not_exist_are_explained(words: list[str], said: str) -> None:
+    with pytest.raises(InputError) as error:
+        parse(words)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["scene=courtyard", "+densify.x=1", "~densify.x", "~raster.x", "init={a:1}"], None),
+        (["densify=adc,mcmc", "+experiment=demo", "hydra.job.name=a", "seed=range(3)"], None),
+        (["~seed"], "a setting cannot be removed"),
+        (["~densify"], "a setting cannot be removed"),
+        (["~train.x"], "a setting cannot be removed"),
+        (["hydra.job.name=a,b"], "apply to all trials"),
+        (["hydra/launcher=a,b"], "apply to all trials"),
+        (["scene@x=courtyard"], "leave out the @"),
+        (["densify=[a]"], "choose one by its name: densify=absgrad, "),
+        (["densify=null"], "choose one by its name"),
+        (["experiment=demo"], "write +experiment=NAME (choose: budget, "),
+        (["+experiment=null"], "write +experiment=NAME"),
+        (["experiment/x=demo"], "write +experiment=NAME"),
+        (["experiment=[a,b]"], "write +experiment=NAME"),
+        (["+experiment=a,b"], "two experiments are two sweeps"),
+        (["+experiment=[a,b]"], "two experiments are two sweeps"),
+        (["+experiment=a", "seed=1", "+experiment=b"], "+experiment=a +experiment=b: two"),
+        (["tracking.uri=1e3"], "read as the number 1000.0"),
+        (["a=" + "[" * 41 + "]" * 41], "opens more than 40 brackets"),
+    ],
+)
+def test_words_without_effect_are_refused(words: list[str], said: str | None) -> None:
+    if said is None:
+        check_words(words)
+    else:
+        with pytest.raises(InputError) as error:
+            check_words(words)
+        assert said in str(error.value)
+
+
+def test_brackets_are_counted_while_they_are_open() -> None:
+    for word in ("a=" + "[" * 40 + "]" * 40, "a=[" + ",".join(["[1]"] * 50) + "]"):
+        assert parse_word(word).key_or_group == "a"
+    for name in ("name", "x.path"):
+        check_text(f"{name}=12, a ,3")
+        with pytest.raises(InputError, match=r"type '.*=\"1_0\"'"):
+            check_text(f"{name}=a, 1_0")
+
+
+def test_only_a_list_of_plain_names_gives_permission() -> None:
+    assert typed_permissions(["a=1", "allow_targets=[a]", "+allow_targets=[b,c.d]"]) == ("b", "c.d")
+    assert typed_permissions(["allow_targets=[a]", "allow_targets=[b],[c]"]) == ("a",)
+    for wrong in ("a", "[1]", "[a,'']", "['${a}']", "{a:1}"):
+        with pytest.raises(InputError, match="is a list of names"):
+            typed_permissions([f"allow_targets={wrong}"])
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("hydra.searchpath=[file:///a,/b,pkg://gsbench.x,pkg://mine/sub]", None),
+        ("hydra.searchpath=[pkg://other]", r"imports a package; if you trust it, add "
+            r"allow_targets=\[mine,other\]"),
+        ("hydra.searchpath=[pkg://minefield.a]", r"allow_targets=\[mine,minefield\]"),
+        ("hydra.searchpath=[http://a]", "neither a folder .file://…. nor a package"),
+        ("hydra.other=[pkg://other]", None),
+        ("hydra.searchpath=[pkg://a],[pkg://b]", None),  # refused as a list of values
+    ],
+)  # fmt: skip
+def test_packages_of_settings_need_permission(word: str, said: str | None) -> None:
+    if said is None:
+        check_search_path([word], ["mine"])
+    else:
+        with pytest.raises(InputError, match=said):
+            check_search_path(["a=1", word], ["mine"])
+
+
+def points(*words: str) -> list[str]:
+    return [" ".join(point) for point in grid_points([parse_word(word) for word in words])]
+
+
+def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert points("a=1,2", "b=x", "~c", "d=range(0,2)") == [
+        f"a={a} b=x ~c d={d}" for a in (1, 2) for d in (0, 1)
+    ]
+    assert points("seed=1,2", "seed=3") == ["seed=3"]  # the later one counts
+    monkeypatch.setattr(command_words, "MAX_POINTS", 3)
+    assert len(points("seed=1,2,3")) == 3
+    for words, said in (
+        (["seed=1,2,3,4"], "lists more than 3 values"),
+        (["seed=range(0)"], "lists no value"),
+        (["seed=range(0,2,0)"], "must not be zero"),
+        (["seed=interval(0,1)"], "a sweep is a list of values, such as seed=1,2,3"),
+        (["threads=1,2"], "threads does not make a different trial"),
+    ):
+        with pytest.raises(InputError, match=said):
+            points(*words)
+
+
+@pytest.mark.parametrize(
+    ("key", "other"),
+    [
+        *((key, True) for key in ("seed", "name", "densify", "densify.start", "scene.path")),
+        *((key, False) for key in ("threads", "init.threads", "eval.primary", "launch.parallel")),
+        ("densify.primary", True),
+    ],
+)
+def test_settings_that_make_other_trials(key: str, other: bool) -> None:
+    assert makes_other_trials(key) == other
+
+
+def test_words_tell_their_key_value_and_kind() -> None:
+    assert [key_of(word) for word in ("+a.b=1", "~a.b", "++a/b=1", "a=1")] == [
+        *("a.b", "a.b", "a/b", "a")
+    ]
+    assert [is_sweep(word) for word in ("a=1", "a=1,2", "a=[1,2]", "a=range(3)")] == [
+        *(False, True, False, True)
+    ]
+    assert [is_interval(parse_word(word)) for word in ("a=1", "a=1,2", "a=interval(0,1)")] == [
+        *(False, False, True)
+    ]
+    values: list[Any] = [None, True, [1, [None, "a"]], 1.5, "True"]
+    assert [value_text(value) for value in values] == [
+        *("null", "true", "[1,[null,a]]", "1.5", "True")
+    ]
+    with pytest.raises(InputError, match="seed=1,2 lists several values: take one"):
+        check_single(["a=1", "seed=1,2", "b=3,4"], "take one")
+    check_single(["a=1"], "take one")
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("a b=1", r"is not a setting like key=value \([^;]*\)$"),
+        ("a=b(c", r"'a=\"b\(c\"'$"),
+        ('a=b"(', "'a='\"'\"'b\"\\('"),
+        ("a=glob(b;c)", r"'a=glob\(\"b;c\"\)'$"),
+        ("a=choice(b;c)", r"at: ';'\)$"),
+        ("=1", "names no setting"),
+        ("word", "'word' is not a setting like key=value"),
+    ],
+)
+def test_special_characters_are_shown_quoted(word: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse_word(word)
+
+
+def test_a_word_that_is_a_choice_gets_a_hint(tmp_path: Path) -> None:
+    assert hint_for("raster").startswith("; raster is a group: choose one by raster=NAME (")
+    assert hint_for("mcmc") == "; did you mean densify=mcmc?"
+    assert hint_for("demo") == "; did you mean +experiment=demo?"
+    assert hint_for("none").startswith("; did you mean densify=none or ")
+    assert hint_for("nosuch") == ""
+    (tmp_path / "densify" / "external").mkdir(parents=True)
+    for name in ("adc", "zeta", "alpha", "external/mine"):
+        (tmp_path / "densify" / f"{name}.yaml").touch()
+    found = options("densify", [tmp_path])
+    assert found[: len(options("densify"))] == options("densify")
+    assert found[len(options("densify")) :] == ["alpha", "zeta", "external/mine"]

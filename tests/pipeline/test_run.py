@@ -1,0 +1,363 @@
+"""A trial's steps in order, its files, and its failures, with stand-ins for the steps."""
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from gsbench.errors import GsbenchError, InputError, TrainingError
+from gsbench.files import DiskFullError
+from gsbench.gaussians.ply import read_ply, write_ply
+from gsbench.normalization import IDENTITY, Normalization
+from gsbench.pipeline import trial as trials
+from gsbench.pipeline.trial import TrialSteps, _publish, _recorded_failures, run_trial
+from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Stage, Step, config_hash
+from gsbench.runs.store import Store, StoredResult
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS
+from gsbench.system.locks import BusyError, hold
+from tests.finished import record_of
+from tests.gaussians.helpers import random_gaussians
+from tests.launch.test_jobs import trial
+
+# ---- the frame
+
+
+def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monkeypatch, caplog):
+    caplog.set_level(logging.INFO, "gsbench")
+    one = trial(tmp_path)
+    record = record_of(one.values, hashes={"config": config_hash(one.values)})
+    ran: list[Any] = []
+
+    def run(given: Any, folder: TrialFolder) -> Any:
+        ran.append((given, sorted(path.name for path in folder.path.iterdir())))
+        folder.write_finished(one.values, record)
+        return record
+
+    monkeypatch.setattr(trials, "_run", run)
+    one.folder.mkdir(parents=True)
+    (one.folder / ".a.tmp-1").touch()
+    with hold(one.files.lock, "other"), pytest.raises(BusyError, match="seed 0"):
+        run_trial(one, wait=False)
+    assert run_trial(one) == record
+    ((given, names),) = ran
+    assert given is one
+    assert {".lock", "log.txt"} < set(names)
+    assert ".a.tmp-1" not in names
+    assert run_trial(one, wait=False) == record
+    assert len(ran) == 1
+    assert caplog.messages == [f"{one.files.label}: already done"]
+    assert "already done" in (one.folder / "log.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message", "bad_input"),
+    [
+        (InputError("no photos"), InputError, "no photos", True),
+        (TrainingError("nan"), TrainingError, "nan", False),
+        (KeyError("x"), KeyError, "KeyError: 'x'", False),
+        (torch.OutOfMemoryError("x"), TrainingError, "the memory of device=cuda is full: ", False),
+        (RuntimeError("No space left"), DiskFullError, "the disk of ", False),
+    ],
+)
+def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, message, bad_input):
+    monkeypatch.setattr("time.time", lambda: 12.5)
+    folder = TrialFolder(tmp_path / "a" / "b" / "c" / "d")
+    folder.path.mkdir(parents=True)
+    for _ in range(2):
+        with pytest.raises(kind), _recorded_failures({"seed": 4, "device": "cuda"}, folder):
+            raise error
+        failure = folder.failure()
+        assert failure.message.startswith(message)
+        assert (failure.error, failure.seed, failure.time, failure.bad_input) == (
+            *(kind.__name__, 4, 12.5, bad_input),
+        )
+        assert type(error).__name__ in failure.traceback
+
+    def full(path: Path, values: Any) -> None:
+        raise OSError(28, "full")
+
+    monkeypatch.setattr(trials, "write_json", full)
+    with pytest.raises(kind), _recorded_failures({"seed": 4, "device": "cuda"}, folder):
+        raise error
+
+
+# ---- the steps
+
+
+def step(stage: Stage, **inputs: Any) -> Step:
+    return Step(stage, inputs, lambda folder: (folder / "made").write_text(str(inputs)))
+
+
+@pytest.fixture
+def made(monkeypatch) -> SimpleNamespace:
+    """What the steps of a trial are made of; the keys of steps are the words that made them."""
+    state = SimpleNamespace(capture_step=None, masking=None, normalizing=None, needs=False)
+    told: list[Any] = []
+    state.told = told
+
+    class Source:
+        def __init__(self, options: Any) -> None:
+            self.step = state.capture_step
+
+        def read(self, folder: Path | None) -> Any:
+            told.append(("read", folder))
+            return "given"
+
+    def note(name: str, result: Any) -> Any:
+        def call(*arguments: Any) -> Any:
+            told.append((name, *arguments))
+            return result() if callable(result) else result
+
+        return call
+
+    def init(store: Any, capture: Any, initializer: Any, *more: Any) -> Step:
+        told.append(("init", capture, initializer, *more))
+        return step(INIT, of=str(initializer))
+
+    monkeypatch.setattr(trials, "CaptureSource", Source)
+    monkeypatch.setattr(trials, "masking_step", note("masking", lambda: state.masking))
+    monkeypatch.setattr(trials, "masked_capture", lambda capture, folder: f"{capture} masked")
+    monkeypatch.setattr(trials, "normalizing_step", note("normalizing", lambda: state.normalizing))
+    monkeypatch.setattr(
+        trials, "normalized_capture", lambda capture, by, folder: f"{capture} normalized"
+    )
+    monkeypatch.setattr(trials, "init_step", init)
+    monkeypatch.setattr(trials, "Sfm", lambda threads: f"Sfm on {threads}")
+    monkeypatch.setattr(trials, "Views", lambda *given: ("views", *given))
+    monkeypatch.setattr(trials, "train_step", note("train", step(TRAIN)))
+    monkeypatch.setattr(trials, "external_step", note("external", step(TRAIN)))
+    monkeypatch.setattr(trials, "ground_truth_step", note("truth", step(GROUND_TRUTH)))
+    monkeypatch.setattr(trials, "evaluate_step", note("evaluate", step(EVALUATE)))
+    initializer = SimpleNamespace(needs_reference=lambda capture: state.needs)
+    state.parts = SimpleNamespace(
+        **{"scene": SimpleNamespace(transparent="white"), "initializer": initializer},
+        **{"threads": 3, "program": None, "user_code": "code"},
+    )
+    return state
+
+
+def test_the_steps_of_photographs_follow_each_other(made, tmp_path):
+    store = Store(tmp_path)
+    own = TrialSteps(made.parts, store)
+    assert [one.stage for one in own.steps()] == [INIT, TRAIN, GROUND_TRUTH, EVALUATE]
+    assert own.photographs == own.capture == "given"
+    init = step(INIT, of=str(made.parts.initializer))
+    assert [word for word, *_ in made.told] == [
+        *("read", "masking", "normalizing", "init", "train", "truth", "evaluate")
+    ]
+    by_name = {name: rest for name, *rest in made.told}
+    assert by_name["read"] == [None]
+    assert by_name["masking"] == ["given", "white"]
+    assert by_name["init"] == ["given", made.parts.initializer, None, "code"]
+    assert [given if not isinstance(given, Step) else given.key for given in own.views] == [
+        *("views", store, "given", init.key, made.parts.scene)
+    ]
+    assert by_name["train"] == [own.views, made.parts]
+    assert by_name["truth"] == [own.views]
+    assert by_name["evaluate"][0] == own.views
+    assert by_name["evaluate"][1].stage is TRAIN
+    assert by_name["evaluate"][2] is made.parts
+
+
+def test_steps_before_the_initialisation_change_what_it_sees(made, tmp_path):
+    store = Store(tmp_path)
+    made.capture_step, made.needs = step(CAPTURE, courtyard=1), True
+    made.masking, made.normalizing = step(CAPTURE, masks=1), step(CAPTURE, frame=1)
+    made.parts.program = "program"
+    own = TrialSteps(made.parts, store)
+    # its photographs are needed for all other keys
+    assert list(own.steps()) == [made.capture_step]
+    assert made.told == []
+    store.get(made.capture_step)
+    steps = list(own.steps())
+    assert steps[:3] == [made.capture_step, made.masking, made.normalizing]
+    assert [one.stage for one in steps[3:]] == [INIT, INIT, TRAIN, GROUND_TRUTH, EVALUATE]
+    assert made.told[0] == ("read", store.path(made.capture_step))
+    assert own.photographs == "given"
+    assert own.capture == "given masked normalized"
+    by_name = [(name, rest) for name, *rest in made.told]
+    assert ("normalizing", ["given masked"]) in by_name
+    first, second = (rest for name, rest in by_name if name == "init")
+    assert first == [own.capture, "Sfm on 3"]
+    assert second[:2] == [own.capture, made.parts.initializer]
+    assert second[2].key == steps[3].key
+    assert ("external", [own.views, "program", made.parts]) in by_name
+    assert "train" not in dict(by_name)
+
+
+# ---- the files of the trial
+
+
+@pytest.mark.parametrize("normalization", [IDENTITY, Normalization((1.0, 2.0, 3.0), 0.5)])
+def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normalization):
+    content = {
+        INIT: ["picture.png", "report.json"],
+        TRAIN: ["lineage.npz", "metrics.jsonl", "events.jsonl", "checkpoint-1.pt"],
+        EVALUATE: [
+            "per_view.csv",
+            "renders/a.png",
+            "renders/b.png",
+            "figures/c.png",
+            "metrics.json",
+        ],
+        GROUND_TRUTH: ["a.png", "b.png", "masks/b.png"],
+    }
+    entries: dict[str, Any] = {}
+    for stage, names in content.items():
+        place = tmp_path / stage.name
+        for name in names:
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_text(f"{stage.name} {name}")
+        entries[stage.name] = SimpleNamespace(path=place)
+    gaussians = random_gaussians(5, dtype=torch.float32)
+    write_ply(gaussians, tmp_path / "train" / "point_cloud.ply")
+    (tmp_path / "init" / trials.PICTURE_FILE).write_text("init picture.png")
+    folder = tmp_path / "trial"
+    folder.mkdir()
+    published = _publish(folder, entries, normalization)
+    texts = {
+        **{name: f"train {name}" for name in ("lineage.npz", "metrics.jsonl", "events.jsonl")},
+        **{name: f"evaluate {name}" for name in content[EVALUATE][:4]},
+        **{f"ground_truth/{name}": f"ground_truth {name}" for name in ("a.png", "b.png")},
+        **{"masks/b.png": "ground_truth masks/b.png"},
+        **{"figures/initial_cloud.png": "init picture.png"},
+    }
+    found = {path.relative_to(folder).as_posix() for path in published}
+    assert found == {*texts, "point_cloud.ply"}
+    assert len(published) == len(found)
+    assert {name: (folder / name).read_text() for name in texts} == texts
+    model = read_ply(folder / "point_cloud.ply")
+    given = gaussians.means / normalization.scale + torch.tensor(normalization.center)
+    torch.testing.assert_close(model.means, given.float())
+    assert (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply") == (
+        normalization is IDENTITY
+    )
+
+
+@pytest.fixture
+def running(tmp_path, monkeypatch) -> SimpleNamespace:
+    """A trial whose steps write a file each; ``record`` are the results."""
+    one = trial(tmp_path)
+    state = SimpleNamespace(trial=one, seen={}, error=None, raster="raster")
+    state.record = record_of(
+        one.values, metrics={"psnr": 20.456}, hashes={"config": config_hash(one.values)}
+    )
+
+    class Parts:
+        threads = 3
+        raster = "proven"
+
+        def __init__(self, values: Any) -> None:
+            self.values = values
+
+        def check(self, on_this_machine: bool) -> None:
+            state.seen["checked"] = on_this_machine
+            if state.error:
+                raise state.error
+
+        @property
+        def rasterizer(self) -> str:
+            state.seen["rasterizer"] = True
+            return "r"
+
+    class Steps:
+        capture = photographs = SimpleNamespace(normalization=IDENTITY)
+        views = SimpleNamespace(scene=SimpleNamespace(train=(1, 2, 3), test=(1, 2)))
+
+        def __init__(self, parts: Any, store: Store) -> None:
+            pass
+
+        def steps(self) -> Any:
+            for number, stage in enumerate((CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)):
+                yield replace(
+                    step(stage, number=number),
+                    code={stage.name: str(number), "all": str(number)},
+                    build=build,
+                )
+                if stage is INIT:  # read while the training runs
+                    state.seen["report"] = (one.folder / "init_report.json").read_text()
+
+    def build(folder: Path) -> None:
+        (folder / trials.REPORT_FILE).write_text("{}")
+        state.seen.setdefault("building", []).append(one.files.building())
+
+    def results_of(*given: Any) -> Any:
+        state.seen["given"] = given
+        return state.record
+
+    monkeypatch.setattr(trials, "Parts", Parts)
+    monkeypatch.setattr(trials, "TrialSteps", Steps)
+    monkeypatch.setattr(trials, "results_of", results_of)
+    monkeypatch.setattr(trials, "_publish", lambda folder, *given: [folder / "init_report.json"])
+    monkeypatch.setattr(trials, "source_files", lambda capture, store: [])
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: state.seen.update(threads=count))
+    return state
+
+
+def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
+    caplog.set_level(logging.INFO, "gsbench")
+    one, folder = running.trial, running.trial.folder
+    folder.mkdir(parents=True)
+    (folder / "failed.json").write_text("{}")
+    assert run_trial(one) == running.record
+    seen = running.seen
+    assert (seen["checked"], seen["rasterizer"], seen["threads"]) == (True, True, 3)
+    assert [building.stage for building in seen["building"]] == [
+        *("scene", "init", "train", "ground_truth", "evaluate")
+    ]
+    assert all(building.folder for building in seen["building"])
+    assert seen["report"] == "{}"
+    values, _, scene, raster, entries, code = seen["given"]
+    assert (values, raster) == (one.values, "proven")
+    assert len(scene.train) == 3
+    assert [type(entry) for entry in entries.values()] == [StoredResult] * 5
+    assert code == {
+        "scene": "0",
+        "init": "1",
+        "train": "2",
+        "ground_truth": "3",
+        "evaluate": "4",
+        "all": "4",
+    }
+    assert (folder / "config.yaml").read_text() == one.yaml
+    assert not (folder / "failed.json").exists()
+    assert not (folder / "building.json").exists()
+    made_of = one.files.made_of()
+    assert made_of is not None
+    # the photographs of a scene that gsbench made are not looked at again
+    assert set(made_of.entries) == {"init", "train", "ground_truth", "evaluate"}
+    assert set(made_of.published) == {"init_report.json"}
+    label = one.files.label
+    assert caplog.messages == [
+        f"{label}: 3 training and 2 test views",
+        f"{label}: psnr 20.46  10 Gaussians",
+    ]
+
+
+def test_equal_results_are_called_done_and_useless_ones_are_named(running, caplog):
+    caplog.set_level(logging.INFO, "gsbench")
+    one = running.trial
+    renders = {"num_gaussians": None, "evaluated_from": FROM_RENDERS}
+    running.record = replace(running.record, one_color_psnr=21.0, **renders)
+    run_trial(one)
+    assert caplog.messages[-2].endswith(": psnr 20.46")
+    assert "not better than one colour" in caplog.messages[-1]
+    (one.folder / "init_report.json").write_text("other")
+    run_trial(one)
+    assert caplog.messages[-2].endswith(": psnr 20.46  (already done)")
+
+
+def test_a_refused_part_leaves_the_earlier_configuration(running):
+    one, running.error = running.trial, InputError("no such device")
+    one.folder.mkdir(parents=True)
+    (one.folder / "config.yaml").write_text("earlier")
+    with pytest.raises(GsbenchError, match="no such device"):
+        run_trial(one)
+    assert (one.folder / "config.yaml").read_text() == "earlier"
+    assert json.loads((one.folder / "failed.json").read_text())["status"] == "failed"
