@@ -105,8 +105,9 @@ def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
     assert moved.float().mean() == pytest.approx(0.5, abs=0.01)
     assert torch.equal(skewed.means[:, 2], trained.means[:, 2])
     slopes = skewed.means[moved, :2] / skewed.means[moved, 2:]
-    spots = 10 * torch.tensor([0.05, 0.05])  # standard deviations beyond the outermost spot
-    assert (slopes.abs().amax(0) < torch.tensor([0.5, 0.35]) + spots).all()
+    # the spots' field, and two standard deviations beyond an outermost spot
+    inside = slopes.abs() < torch.tensor([0.5, 0.35]) + 2 * 0.05
+    assert inside.float().mean(0).min() > 0.97
 
 
 def test_a_scene_for_timing_has_two_views_of_noise(tmp_path: Path) -> None:

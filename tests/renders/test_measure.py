@@ -55,13 +55,18 @@ def test_places_that_would_mix_or_damage_results_are_refused(
         find_destination(word, scene, seed, truth, tmp_path)
 
 
+@pytest.fixture(scope="module")
+def defaults() -> dict[str, Any]:
+    return dict(compose_one(QUICK).values)
+
+
 @pytest.fixture
-def trial(runs: Path) -> Path:
+def trial(runs: Path, defaults: dict[str, Any]) -> Path:
     """The folder of a trial of ``exp`` that tests the scene garden in two views, one masked."""
     plan = Plan("exp", ["garden"], densifiers=["adc"], seeds=[0], views=2, pictures=True)
     (folder,) = write_runs(runs, plan)
     config = json.loads((folder / "config.yaml").read_text())
-    config = compose_one(QUICK).values | config | {"scene": {"name": "garden", "path": "there"}}
+    config = defaults | config | {"scene": {"name": "garden", "path": "there"}}
     (folder / "config.yaml").write_text(json.dumps(config))
     (folder / "masks").mkdir()
     mask = np.zeros((120, 160), np.uint8)
