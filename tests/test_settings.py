@@ -105,6 +105,17 @@ def test_values_are_converted_to_their_type() -> None:
     assert [type(result[name]) for name in ("count", "rate", "label")] == [int, float, str]
 
 
+def test_the_fields_of_an_object_are_converted_also_if_it_is_frozen() -> None:
+    @dataclass(frozen=True)
+    class Frozen:
+        count: PositiveInt = 1
+        label: str = ""
+
+    options: Any = Frozen(count=1e3, label=7)  # type: ignore[arg-type]
+    check_settings(options, "options")
+    assert (repr(options.count), options.label) == ("1000", "7")
+
+
 def test_a_default_of_the_class_may_break_its_own_rule() -> None:
     assert check_values(Options, {"farthest": math.inf}, "options") == {"farthest": math.inf}
     with pytest.raises(InputError, match="farthest must be a number, got -inf"):

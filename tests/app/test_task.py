@@ -267,8 +267,8 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
     assert third.status is JobStatus.FAILED
     assert isinstance(third._return_value, InputError)
     task.objective = Objective(-1)
-    (alone,) = found.run_jobs([["a=2"]])
-    assert alone.return_value == -37.0
+    other, alone = found.run_jobs([["a=1"], ["a=2"]])
+    assert (other.return_value, alone.return_value) == (-27.0, -37.0)
     assert composed[-1] == ["a=2"]
 
 

@@ -191,6 +191,8 @@ def test_words_tell_their_key_value_and_kind() -> None:
     with pytest.raises(InputError, match="seed=1,2 lists several values: take one"):
         check_single(["a=1", "seed=1,2", "b=3,4"], "take one")
     check_single(["a=1"], "take one")
+    with pytest.raises(InputError, match="a setting cannot be removed"):
+        check_single(["~seed"], "take one")
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert available_threads(10**6) == 1
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "many")
     monkeypatch.setattr("gsbench.system.resources.available_cores", lambda: 7)
-    assert [available_threads(parallel) for parallel in (1, 3, 8)] == [7, 2, 1]
+    assert [available_threads(), *map(available_threads, (1, 3, 8))] == [7, 7, 2, 1]
     for threads, expected in ((5, "5"), ("6", "6"), ("auto", "3")):
         assign_threads(threads, 2)
         assert {os.environ[name] for name in THREAD_VARIABLES} == {expected}
