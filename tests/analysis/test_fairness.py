@@ -5,10 +5,12 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from gsbench.analysis import fairness
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import NOTHING, UNLIKE, _shown, fairness_table
 from gsbench.analysis.report.build import build_report
@@ -201,6 +203,28 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
     nothing = [point | {"value": None} for point in points]
     (tmp_path / "vth" / "tuning.json").write_text(json.dumps(record | {"points": nothing}))
     assert tuning() == ["Tuning. sfm-volumetric: the search vth found nothing."]
+
+
+@pytest.mark.parametrize(
+    ("searched", "said"),
+    [
+        (("2026-01", "2026-02"), "before any of these trials"),
+        # a trial of the same moment may not have guided the search
+        (("2026-03", "2026-01"), "before any of these trials"),
+        (("2026-04", "2026-01"), "ended when 1 of these 3 trials had been measured"),
+        (("2026-06",), "ended when 3 of these 3 trials had been measured"),
+        ((), "whose own trials are missing"),
+    ],
+)
+def test_the_sheet_says_whether_a_search_ended_before_the_trials(searched, said, monkeypatch):
+    def trials(times):
+        return [
+            SimpleNamespace(measured=time, path=Path("runs/exp/garden/sfm-adc/x")) for time in times
+        ]
+
+    experiments = {Path("runs/vth"): SimpleNamespace(trials=trials(searched))}
+    monkeypatch.setattr(fairness, "read_experiment", experiments.__getitem__)
+    assert fairness._when(trials(("2026-03", "2026-05", "2026-05")), "vth") == said
 
 
 # --- where it is shown

@@ -13,7 +13,8 @@ import pytest
 from gsbench.analysis.judgement import _contradicts, find_outlying, judge
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
-from gsbench.analysis.statistics import answer_family
+from gsbench.analysis.statistics import answer_family, seeds_needed
+from gsbench.analysis.verdicts import seeds_to_resolve
 from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.runs.trial_record import Budget
 from tests.analysis.untruths import scene_pairs
@@ -166,6 +167,10 @@ def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(
     assert [scene.scene for scene in verdict.scenes] == ["courtyard", "garden"]
     spread = np.sqrt(verdict.pairs.differences.var(axis=1, ddof=1).mean()) if seeds > 1 else None
     assert verdict.deviation == (pytest.approx(spread) if seeds > 1 else None)
+    resolving = None if spread is None else seeds_needed(spread, 2, 0.1)  # 0.1 dB
+    assert seeds_to_resolve(verdict) == resolving
+    any_size = replace(verdict, quantity=replace(verdict.quantity, worthwhile=None))
+    assert seeds_to_resolve(any_size) is None
     values = {(trial.scene, trial.densify, trial.seed): trial.metrics["psnr"] for trial in trials}
     for found in verdict.scenes:
         own = [

@@ -8,8 +8,9 @@ import pytest
 
 from gsbench.analysis.fairness import counts_sentence
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.tables import build_table, held_out_notes, points_notes
+from gsbench.analysis.tables import build_table, doubt_notes, held_out_notes, points_notes
 from gsbench.runs.experiments import Arm
+from gsbench.runs.trial_record import InitialCloud, TwinViews
 from tests.analysis.synthetic import Plan, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
@@ -65,6 +66,12 @@ def test_each_way_of_holding_views_out_is_stated_with_scenes_if_there_are_severa
         "Held out, garden: by lists; 5 of 47 views.",
         "Held out, courtyard: every 8th image; 6 of 48 views.",
     ]
+    one_scene = [trial for trial in unlike if trial.scene == "garden"]
+    one_scene[0] = with_record(one_scene[0], held_out="by hand")
+    assert held_out_notes(one_scene) == [
+        "Held out: by lists; 5 of 47 views.",
+        "Held out: by hand; 5 of 47 views.",
+    ]
     uneven = [with_record(trial, test_views=6 + trial.seed) for trial in alike]
     assert held_out_notes(uneven) == ["Held out: every 8th image; 6 of 48 views and 7 of 49 views."]
     assert held_out_notes([with_record(trial, held_out="") for trial in made]) == []
@@ -90,6 +97,49 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
         in points_notes(observed)
     )
     assert points_notes([trial for trial in made if trial.init == "random"]) == []
+
+
+@pytest.mark.parametrize(
+    ("folders", "downscales", "noted"),
+    [
+        (("images", "images_4"), (4, 1), True),
+        (("images", "images"), (4, 1), False),
+        (("images", "images_4"), (1, 1), False),
+    ],
+)
+def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted):
+    paths = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))
+    for path, images, downscale in zip(paths, folders, downscales, strict=True):
+        config = json.loads((path / "config.yaml").read_text())
+        config["scene"] |= {"images": images, "downscale": downscale}
+        (path / "config.yaml").write_text(json.dumps(config))
+    notes = doubt_notes(load_experiment(tmp_path, "exp").trials)
+    assert ["different filters" in note for note in notes] == [True] * noted
+
+
+def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
+    made = trials_of(tmp_path, seeds=(0, 1), scenes=("garden",), densifiers=("adc",))
+    cloud = InitialCloud(
+        seen=1.0, color_agreement=None, identical=0.0, far=0, spread=1.0, warnings=["a", "b"]
+    )
+    changes = {
+        "one_color_psnr": made[0].metrics["psnr"],
+        "raster_passed_over": ["raster=triton is not used: alpha is off"],
+        "twins": TwinViews(near={"1.png": "2.png"}, left_out={"3.png": "4.png", "5.png": "4.png"}),
+        "initial_cloud": cloud,
+    }
+    psnr = f"{made[0].metrics['psnr']:.2f}"
+    second = with_record(made[1], **{**changes, "one_color_psnr": made[1].metrics["psnr"] - 0.1})
+    assert doubt_notes([with_record(made[0], **changes), second]) == [
+        f"(!) {made[0].label} is not better than one colour: PSNR {psnr} dB, the training views' "
+        f"mean colour has {psnr}.",
+        "raster=triton is not used: alpha is off.",
+        "garden: 1 of 6 test views have a near twin in training, so they measure memory too.",
+        "garden: 2 photographs left out, since another one has its name or content.",
+        "Before training, garden sfm: a.",
+        "Before training, garden sfm: b.",
+    ]
+    assert doubt_notes(made) == []
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from gsbench.analysis.ranks import Ranking, critical_difference, rank_arms
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.charts import rank_plot
 from gsbench.analysis.results import Experiment
+from gsbench.analysis.verdicts import p_text
 from gsbench.claims.archive import write_archive
 from gsbench.cli import run
 from gsbench.runs.experiments import Arm
@@ -36,11 +37,6 @@ def test_the_critical_values_are_those_of_demsar(arms, q):
     assert critical_difference(arms, 14) == pytest.approx(
         q * np.sqrt(arms * (arms + 1) / (6 * 14)), rel=5e-4
     )
-
-
-def test_the_example_of_demsar():
-    """Demšar 2006, section 3.2.2: four classifiers on 14 data sets, critical difference 1.25."""
-    assert critical_difference(4, 14) == pytest.approx(1.25, abs=0.005)
 
 
 @pytest.mark.parametrize("metric", ["psnr", "lpips_vgg_raw"])
@@ -88,6 +84,14 @@ def test_few_scenes_or_arms_have_no_ranking(make_experiment, plan):
     assert "Ranks of all arms" not in build_report(experiment)
 
 
+def test_two_arms_have_a_ranking_without_friedmans_test(make_experiment):
+    experiment = make_experiment(scenes=SCENES, effect={"psnr": 9.0})
+    ranking = rank_arms(experiment.trials, quantity("psnr", experiment.trials))
+    assert ranking is not None
+    assert (ranking.ranks, ranking.p) == ((1.0, 2.0), None)
+    assert ranking.critical == critical_difference(2, 7)
+
+
 def test_a_scene_that_lacks_an_arm_is_left_out(seven):
     trials = [trial for trial in seven.trials if (trial.scene, trial.densify) != ("c", "mcmc")]
     ranking = rank_arms(trials, quantity("psnr", trials))
@@ -121,6 +125,44 @@ def test_report_and_site_have_the_plot_of_ranks(seven, tmp_path):
     ranking = rank_arms(seven.trials, quantity("psnr", seven.trials))
     assert ranking is not None
     svg = rank_plot(ranking)
-    dots = [float(x) for x in re.findall(r'<circle cx="([\d.]+)"', svg)]
-    assert dots == sorted(dots)
     assert f"CD {critical_difference(3, 7):.2f}" in svg
+    assert f"that no arm differs: p {p_text(ranking.p)}.</p>" in svg
+
+
+def numbers(pattern: str, text: str) -> list[list[float]]:
+    found = re.findall(pattern.replace("#", r'"([\d.]+)"'), text)
+    return [[float(number) for number in np.atleast_1d(one)] for one in found]
+
+
+def test_a_rank_plot_puts_arms_ranks_and_groups_where_they_belong():
+    """Five arms with names of five letters: the scale is from 20 + 5 x 6.6 px to 380 - 30 px."""
+    arms = tuple(Arm("sfm", c) for c in "abcde")
+    ranks = (1.0, 1.8, 2.7, 4.0, 4.5)
+    svg = rank_plot(Ranking(quantity("psnr", []), arms, ranks, SCENES, 1.2, None))
+    assert 'viewBox="0 0 401.0 204.0"' in svg
+    step, rows = 297 / 4, [57, 83, 109, 135, 161]
+    assert numbers("<circle cx=# cy=#", svg) == [
+        [pytest.approx(53 + step * (rank - 1), abs=0.06), row]
+        for rank, row in zip(ranks, rows, strict=True)
+    ]
+    assert numbers('"group" x1=# x2=# y1=# y2=#', svg) == [
+        [364, 364, 51, 89],
+        [373, 373, 77, 115],
+        [382, 382, 129, 167],
+    ]
+    grid = numbers('"grid" x1=# x2=# y1=# y2=#', svg)
+    assert grid == [[pytest.approx(53 + step * k, abs=0.06)] * 2 + [44, 174] for k in range(5)]
+    assert numbers('"axis" x1=# x2=# y1=# y2=#', svg)[0] == [
+        53,
+        pytest.approx(53 + 1.2 * step, abs=0.06),
+        12,
+        12,
+    ]
+    assert "sfm-a 1.00, sfm-b 1.80, " in svg
+    assert "Not different: sfm-a to sfm-b; sfm-b to sfm-c; sfm-d to sfm-e." in svg
+    assert "Friedman" not in svg
+    # Long names leave at least 160 px to the scale.
+    long = (Arm("sfm", "x" * 50), Arm("sfm", "y" * 49))
+    svg = rank_plot(Ranking(quantity("psnr", []), long, (1.0, 2.0), SCENES, 0.5, None))
+    assert [x for x, _ in numbers("<circle cx=# cy=#", svg)] == pytest.approx([376.4, 536.4])
+    assert "Not different: none." in svg

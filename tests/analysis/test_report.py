@@ -6,6 +6,7 @@ import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,15 +16,20 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from gsbench.analysis.images import _jpeg_uri, choose_views, texture_energy
+from gsbench.analysis.images import _jpeg_uri, choose_views, read_compared, texture_energy
 from gsbench.analysis.pairing import pair_trials
+from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import (
+    _forest,
     _logged_histograms,
     _threshold,
+    _volumes_in_training,
     build_report,
+    event_table,
     histogram,
     log10_volumes,
     mean_by_step,
+    search_summary,
     trial_figures,
 )
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
@@ -186,6 +192,13 @@ def test_the_views_with_the_least_median_and_largest_gain_are_shown(experiment):
     )
     assert all(view.truth.startswith("data:image/jpeg;base64,") for view in views)
     assert faults == []
+    # The difference is red where the second arm is worse, as here by 20 levels of 32, else blue.
+    picture = Image.open(io.BytesIO(base64.b64decode(views[0].difference.partition(",")[2])))
+    shown = np.asarray(picture).astype(float)
+    red = 255 + 20 / 32 * np.subtract((178, 24, 43), 255)
+    assert np.abs(shown[4:36, 4:36] - red).mean() < 6
+    assert (shown[80:, 100:, 2] - shown[80:, 100:, 0]).mean() > 5
+    assert shown.max() > 250  # white: both are equally wrong
     both, _ = choose_views(pair_trials(experiment.trials, ADC, VOLUMETRIC))
     assert len(both) == 3
 
@@ -205,6 +218,25 @@ def test_one_or_two_views_are_each_shown_once(tmp_path):
         assert sorted(view.view for view in views) == [f"view00{k}" for k in range(count)]
 
 
+def test_ignored_pixels_are_shown_as_stripes_of_four_pixels(tmp_path):
+    paths = write_runs(tmp_path, Plan(scenes=("a",), seeds=(0,), views=1, pictures=True))
+    for path in paths:
+        (path / "masks").mkdir()
+        mask = np.full((120, 160), 255, np.uint8)
+        mask[:20, :20] = 0
+        Image.fromarray(mask).save(path / "masks" / "view000.png")
+    one, other = load_experiment(tmp_path, "exp").trials
+    shown = read_compared(one, other, "view000")
+    for image in shown:
+        assert image[0, :12, 0].tolist() == [110] * 4 + [150] * 4 + [110] * 4
+        assert image[3, :8].tolist() == [[110] * 3] + [[150] * 3] * 4 + [[110] * 3] * 3
+        assert (image[:20, :20] == shown[0][:20, :20]).all()
+    for image, name in zip(shown, ("renders", "renders", "ground_truth"), strict=True):
+        own = other if image is shown[1] else one
+        stored = np.asarray(Image.open(own.path / name / "view000.png"))
+        assert (image[20:] == stored[20:]).all()
+
+
 def test_missing_or_damaged_pictures_are_named(tmp_path):
     paths = write_runs(tmp_path, Plan(views=2, pictures=True))
     (paths[0] / "renders" / "view001.png").write_bytes(b"\x89PNG\r\n\x1a\nhalf")
@@ -222,6 +254,9 @@ def test_volumes_are_those_of_the_ellipsoids(experiment):
     volumes = 4 / 3 * np.pi * scales.prod(axis=0)
     found = log10_volumes(path)
     assert found == pytest.approx(np.log10(volumes), abs=1e-6)
+    record = SimpleNamespace(to_training=SimpleNamespace(scale=10.0))
+    enlarged = _volumes_in_training(SimpleNamespace(path=path.parent, record=record))
+    assert enlarged == pytest.approx(found + 3)
     shares = histogram(np.append(found, -np.inf))
     assert sum(share for _, share in shares) == pytest.approx(1)
     assert sum(share for volume, share in shares if volume > 1e-4) == pytest.approx(
@@ -263,6 +298,25 @@ def test_growth_and_pruning_by_cause_are_shown_in_a_table(page):
         "</table>"
     )[0]
     assert '<th scope="row">split volume</th><td>0</td><td>100</td>' in events
+
+
+def test_a_cause_that_an_arm_did_not_log_counts_as_zero_and_one_that_none_logged_has_no_row():
+    trials = [
+        SimpleNamespace(arm=arm, record=SimpleNamespace(events=events))
+        for arm, events in (
+            (ADC, {"cloned": 4, "pruned_size": 0}),
+            (ADC, {"cloned": 2008}),
+            (VOLUMETRIC, {"split_volume": 3}),
+        )
+    ]
+    table = event_table(trials, [ADC, VOLUMETRIC])
+    assert table is not None
+    assert {row.labels: [entry.text for entry in row.entries] for row in table.rows} == {
+        ("cloned",): ["1,006", "0"],
+        ("split volume",): ["0", "3"],
+    }
+    trials[0].record.events = {}
+    assert event_table(trials[:1], [ADC]) is None
 
 
 def test_a_truncated_point_cloud_is_refused(tmp_path, experiment):
@@ -429,9 +483,28 @@ def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict():
     assert ForestRow("s", 0.2).color(1) == ForestRow("s", 0.2, Interval(-0.1, 0.5)).color(1) == grey
 
 
+@pytest.mark.parametrize(
+    ("key", "better"), [("psnr", "right of zero is better"), ("flip", "left of zero is better")]
+)
+def test_a_forest_plot_of_a_verdict_has_its_scenes_and_from_two_on_their_mean(key, better):
+    scenes = [
+        SimpleNamespace(scene=name, mean=mean, interval=None)
+        for name, mean in (("a", 0.5), ("b", -0.25))
+    ]
+    one, two = (
+        _forest(SimpleNamespace(scenes=own, mean=0.125, interval=None, quantity=quantity(key, [])))
+        for own in (scenes[:1], scenes)
+    )
+    assert f"{quantity(key, []).name}: {better}" in one
+    assert "a 0.5." in one
+    assert "a 0.5; b −0.25; mean of scenes 0.125." in two
+
+
 def test_an_axis_from_zero_begins_at_zero():
     axis = Axis([0.0, 10.0], False, 0.0, 104.0)
     assert [axis.to_px(value) for value in (0, 5, 10)] == pytest.approx([0, 50, 100])
+    balanced = Axis([-3.0, 3.0], False, 0.0, 108.0)
+    assert [balanced.to_px(value) for value in (-3, 0, 3)] == pytest.approx([4, 54, 104])
 
 
 @pytest.mark.parametrize(
@@ -557,18 +630,28 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path):
         "their mean says little"
     )
     assert line in build_report(load_experiment(tmp_path, "exp"))
+    psnr = next(one for one in judged.verdicts if one.quantity.key == "psnr")
+    both = tuple(replace(scene, mean=abs(scene.mean)) for scene in psnr.scenes[:2])
+    for sign, word in ((1, "better"), (-1, "worse")):
+        alike = replace(psnr, scenes=both, question=replace(psnr.question, sign=sign))
+        assert by_scene_lines([alike]) == [f"PSNR (dB) by scene: {word} on courtyard, garden"]
+    unclear = (both[0], replace(both[1], p=0.05))
+    alone = replace(psnr, scenes=unclear)
+    assert by_scene_lines([alone]) == ["PSNR (dB) by scene: better on courtyard"]
 
 
-def test_no_scene_is_named_where_none_is_decided(tmp_path):
-    write_runs(tmp_path, Plan(trial_noise=0, residual_noise=0, views=3))
+@pytest.mark.parametrize(
+    ("plan", "decided"),
+    [
+        ({"trial_noise": 0, "residual_noise": 0}, False),
+        ({"scenes": ("garden",), "effect": {"psnr": 5.0}, "trial_noise": 0.01}, True),
+    ],
+)
+def test_no_scene_is_named_where_none_is_decided_or_where_there_is_one(tmp_path, plan, decided):
+    write_runs(tmp_path, Plan(views=3, **plan))
     (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
-    assert by_scene_lines(judged.verdicts) == []
-
-
-def test_the_one_scene_of_an_experiment_has_no_line_of_its_own(tmp_path):
-    write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": 5.0}, trial_noise=0.01, views=3))
-    (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
-    assert any(scene.p < 0.05 for one in judged.verdicts for scene in one.scenes if scene.p)
+    scenes = [scene for one in judged.verdicts for scene in one.scenes]
+    assert any(scene.p is not None and scene.p < 0.05 for scene in scenes) is decided
     assert by_scene_lines(judged.verdicts) == []
 
 
@@ -582,6 +665,26 @@ def test_points_of_a_search_are_not_compared(tmp_path):
     assert "Verdicts, " not in page
     assert "so there is no verdict" in page
     assert "densify.volume_threshold = 0.6841 (point 1)" in page
+
+
+def test_a_search_is_summed_up_in_a_line_and_a_chart(tmp_path):
+    def summary(*values):
+        points = [{"value": value, "settings": {"a.b": k}} for k, value in enumerate(values)]
+        (tmp_path / "tuning.json").write_text(json.dumps(search_record(points)))
+        return search_summary(tmp_path)
+
+    assert search_summary(tmp_path) is None
+    line, chart = summary(27.5, None, 27.8763)
+    assert line == (
+        "Best PSNR (dB): 27.876 at a.b = 2 (point 3). 3 of 2 points, each 1 seed; 1 failed. "
+        "Judged by validation views; no test view was looked at."
+    )
+    assert "each point from 27.5 at 1 to 27.9 at 3." in chart
+    assert summary(27.5)[0].endswith(
+        "(point 1). 1 of 2 points, each 1 seed. Judged by "
+        "validation views; no test view was looked at."
+    )
+    assert summary(None) == ("1 of 2 points, each 1 seed; 1 failed; none has a result yet.", "")
 
 
 def test_a_forest_plot_has_at_least_two_grid_lines_for_any_range():

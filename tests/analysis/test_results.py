@@ -72,6 +72,7 @@ DAMAGES = {
         lambda path: path.rename(path.with_name("copy of run")),
         "not named",
     ),
+    "a link": (lambda path: (path / "figures").symlink_to(path.parents[3]), "strange, "),
     "nothing yet": (
         lambda path: (path / "results.json").unlink(),
         "unfinished, no results.json yet",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,18 +70,14 @@ def test_the_error_is_that_of_welch() -> None:
     assert found.degrees == pytest.approx(max(4.0, 5 / 7 * welch.df))
 
 
-def test_with_single_pairs_the_spread_of_scenes_replaces_that_of_trainings() -> None:
-    values = np.array([[0.3], [0.1], [0.5]])
-    found = t_test(values)
-    assert found is not None
-    assert found.p == pytest.approx(scipy.stats.ttest_1samp(values[:, 0], 0).pvalue)
-
-
-def test_two_pairs_suffice_for_a_test() -> None:
-    for values in (np.array([[0.1, 0.3]]), np.array([[0.1], [0.3]])):
+def test_two_pairs_suffice_and_single_ones_have_the_spread_of_scenes_for_that_of_trainings() -> (
+    None
+):
+    for rows in ([[0.1, 0.3]], [[0.1], [0.3]], [[0.3], [0.1], [0.5]]):
+        values = np.array(rows)
         found = t_test(values)
         assert found is not None
-        assert found.p == pytest.approx(scipy.stats.ttest_1samp([0.1, 0.3], 0).pvalue)
+        assert found.p == pytest.approx(scipy.stats.ttest_1samp(values.ravel(), 0).pvalue)
 
 
 @pytest.mark.parametrize(
@@ -157,6 +154,9 @@ def test_too_small_is_decided_at_an_equal_share_of_the_error_rate() -> None:
     assert (one.rate, one.equal_rate) == (pytest.approx(ALPHA / 2), ALPHA / 2)
     assert one.outcome(1, 0.5) == "too small to matter"
     assert one.outcome(1, 0.3) == "supported"
+    early = replace(one, rate=0.0)  # a look that may spend nothing
+    assert early.interval is None
+    assert early.outcome(1, 0.3) == "undecided"
 
 
 # --- scenes like these
@@ -355,6 +355,7 @@ def test_seeds_do_not_replace_scenes() -> None:
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
     assert designs_needed(0.5, scattered, like_these=True) == []
     assert designs_needed(0.5, scattered, like_these=False)[0] == Design(1, 3)
+    assert Design(1, 3).trials == 6  # of two arms
 
 
 def test_impossible_plans_are_refused() -> None:

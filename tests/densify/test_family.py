@@ -6,12 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, NoDensifier, Volumetric
+from gsbench.densify import (
+    ADC,
+    GNS,
+    MCMC,
+    MRNF,
+    AbsGS,
+    DensifyContext,
+    EdgeAware,
+    NoDensifier,
+    PixelGS,
+    ResGS,
+    SteepGS,
+    Volumetric,
+)
 from gsbench.densify.base import faded, quantile, revised_logits
 from gsbench.densify.budget import Budgeted
 from gsbench.densify.mcmc import shared_opacity, spread_out
 from gsbench.errors import InputError
 from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import Footprint, RenderOutput
 from tests.densify.helpers import generator, rendered, trained
 from tests.gaussians.helpers import random_gaussians
 
@@ -132,6 +146,39 @@ def test_only_the_option_absolute_gathers_the_absolute_gradient() -> None:
     signed.begin(gaussians, DensifyContext(1.0))
     signed.observe(1, render)
     assert not signed.statistics["gradient_sum"].any()
+
+
+def seen_by_one_view() -> RenderOutput:
+    """A render in which the last of three Gaussians is not visible."""
+    gradient = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+    probe = torch.zeros(3, 3, 3, requires_grad=True)
+    probe.grad = torch.zeros(3, 3, 3)
+    ones = torch.ones(3)
+    covered = Footprint(ones.int(), ones, ones, ones)
+    more = {"splitting_probe": probe, "footprint": lambda values=None: covered}
+    return rendered(gradient, radii=[3, 7, 0], absolute=gradient, **more)
+
+
+@pytest.mark.parametrize("kind", [ADC, AbsGS, PixelGS, SteepGS, EdgeAware, GNS, ResGS, Volumetric])
+def test_variants_of_adc_gather_its_statistics_too(kind: type[ADC]) -> None:
+    densifier = kind()
+    densifier.begin(random_gaussians(3), DensifyContext(1.0))
+    for _ in range(2):
+        densifier.observe(densifier.start + 1, seen_by_one_view())
+    gathered = {name: densifier.statistics[name].tolist() for name in ADC.STATISTICS}
+    assert gathered == {
+        "gradient_sum": [10.0, 0.0, 0.0],
+        "visible_count": [2, 2, 0],
+        "max_radii": [3, 7, 0],
+    }
+
+
+def test_mrnf_gathers_which_gaussians_were_seen() -> None:
+    densifier = MRNF()
+    densifier.begin(random_gaussians(3), DensifyContext(1.0))
+    for radii in ([0, 0, 2], [1, 0, 0]):
+        densifier.observe(1, rendered(torch.zeros(3, 2), radii=radii))
+    assert densifier.statistics["seen"].tolist() == [True, False, True]
 
 
 def test_the_curve_rises_from_the_initial_count_to_the_cap() -> None:

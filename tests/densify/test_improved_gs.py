@@ -324,13 +324,16 @@ def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget() -> N
     assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
 
 
-def test_at_the_end_of_the_pressure_the_excess_is_removed_at_random(
+def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours_the_opaque(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     densifier = GNS(max_gaussians=20)
     trainable, _ = started(densifier, 0)
+    trainable.values.opacity_logits.data[20:] = -30.0
+    trainable.values.opacity_logits.data[:20] = 3.0
     event = densifier.refine(23_000, trainable, generator(0))
     assert (event.pruned_opacity, event.after) == (COUNT - 20, 20)
+    assert trainable.values.opacity_logits.tolist() == [3.0] * 20
     assert event.balances()
     assert (
         f"ended with {COUNT} Gaussians, and {COUNT - 20} of them were removed at random"

@@ -87,7 +87,8 @@ def failing() -> Any:
     [
         (
             failing,
-            r"eval\.extra\.own raised RuntimeError two lines \(.*test_own_metric\.py, line \d+\)",
+            r"eval\.extra\.own raised RuntimeError two lines \(.*test_own_metric\.py, line "
+            rf"{failing.__code__.co_firstlineno + 1}\)",
         ),
         (endless, r"eval\.extra\.own raised RecursionError .*test_own_metric\.py"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,21 @@ def pairs(tmp_path: Path) -> list[PicturePair]:
 
 
 def test_metrics_are_computed_from_the_pixels_of_the_files(pairs: list[PicturePair]) -> None:
-    per_view = measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
+    counts = np.zeros((40, 50), np.uint8)
+    counts[5:30, :20] = 255
+    mask = pairs[1].picture.with_name("mask.png")
+    Image.fromarray(counts).save(mask)
+    pairs[1] = replace(pairs[1], mask=mask)
+    told: list[tuple[object, ...]] = []
+    evaluator = Evaluator(PAPER, lpips=(), flip=False)
+    per_view = measure(pairs, evaluator, lambda *what: told.append(what))
     assert list(per_view) == ["b", "a"]
-    for pair in pairs:
+    assert told == [("views", 1, 2), ("views", 2, 2)]
+    for pair, counted in zip(pairs, (counts == counts, counts > 0), strict=True):
         render, truth = (
             np.asarray(Image.open(path), dtype=float) for path in (pair.picture, pair.photograph)
         )
-        expected = 10 * np.log10(255**2 / ((render - truth) ** 2).mean())
+        expected = 10 * np.log10(255**2 / ((render - truth)[counted] ** 2).mean())
         # pixels are in single precision before they are squared
         assert per_view[pair.view]["psnr"] == pytest.approx(expected, abs=1e-6)
 

@@ -23,6 +23,7 @@ from gsbench.eval.protocol import PAPER
 from gsbench.eval.structure import (
     MULTISCALE_MIN_SIZE,
     SCALE_WEIGHTS,
+    _enlarged,
     fsim,
     iw_ssim,
     ms_ssim,
@@ -138,6 +139,16 @@ def test_ms_ssim_halves_images_as_its_authors_do(size: tuple[int, int]) -> None:
     assert float(ms_ssim(*map(torch.tensor, (image, truth)))) == pytest.approx(
         np.mean(products), abs=1e-7
     )
+
+
+def test_a_coarser_band_is_enlarged_as_by_the_authors_of_iw_ssim() -> None:
+    """By hand: their ``imresize`` makes 0, 0.4, 2, 3.6, 4 of a line 0, 4.
+
+    Extrapolated by one on each side, every other number is kept.
+    """
+    line = torch.tensor([-0.4, 0.4, 3.6, 4.4], dtype=torch.float64)
+    band = torch.tensor([[0.0, 4.0], [40.0, 44.0]], dtype=torch.float64)
+    torch.testing.assert_close(_enlarged(band[None, None])[0, 0], line + 10 * line[:, None])
 
 
 def test_gmsd_of_a_square_equals_the_value_by_hand() -> None:

@@ -303,6 +303,7 @@ def test_a_value_beyond_float32_is_refused(tmp_path: Path) -> None:
     [
         ("scale_", (0.001, 0.5), "all scales are positive"),
         ("scale_", (-0.001, 0.5), ""),
+        ("scale_", (0.0, 0.5), ""),
         ("opacity", (0.0, 1.0), r"all opacities lie in \[0, 1\]"),
         ("opacity", (-0.01, 1.0), ""),
         ("opacity", (0.0, 1.01), ""),

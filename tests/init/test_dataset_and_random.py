@@ -18,6 +18,7 @@ from gsbench.init.sfm import shifted_copies
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
 from tests.init.models import add_point
+from tests.init.test_report import CENTERS, NAMES, model_of
 
 
 def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
@@ -76,6 +77,22 @@ def test_random_fills_the_cube_around_the_training_cameras(courtyard: Capture, t
     np.testing.assert_array_equal(read_cloud(tmp_path / "b" / MODEL_FOLDER).points, cloud.points)
     Random(count=5000, size=2.0, seed=4).run(courtyard, tmp_path / "c")
     assert not np.allclose(read_cloud(tmp_path / "c" / MODEL_FOLDER).points, cloud.points)
+
+
+def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_path: Path) -> None:
+    """By hand: their mean is (0, 1/3, 0), and the farthest are sqrt(10) / 3 away from it."""
+    capture = Capture("hand", tmp_path, NAMES, ("d.png",), None, False, "0")
+    cloud = Random(count=5000, size=2.0, seed=3).cloud(capture, model_of(CENTERS))
+    offset = (cloud.points - [0, 1 / 3, 0]) / (2.0 * 1.1 * 10**0.5 / 3)
+    assert 0.99 < np.abs(offset).max() <= 1.0
+    assert np.abs(offset.mean(axis=0)).max() < 0.03
+    assert np.abs(offset).mean() == pytest.approx(0.5, abs=0.01)
+    assert len(np.unique(cloud.colors)) == 256
+    again = Random(count=5000, size=2.0, seed=3).cloud(capture, model_of(CENTERS))
+    np.testing.assert_array_equal(cloud.points, again.points)
+    still = model_of(np.zeros((4, 3)))
+    with pytest.raises(InputError, match="training cameras of scene hand are all at one place"):
+        Random().cloud(capture, still)
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])

@@ -121,6 +121,9 @@ def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
     monkeypatch.setattr("gsbench.init.placed.seen_colors", lambda *_: seen)
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
     np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
+    seen[:] = 0
+    cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
+    assert not cloud.colors.any()
 
 
 def test_the_points_of_the_reference_are_all_replaced(courtyard: Capture, tmp_path: Path):

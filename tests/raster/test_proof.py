@@ -26,6 +26,8 @@ from gsbench.raster.executors import EXECUTORS
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.trial_record import RasterProof
 from gsbench.system.isolate import CrashError
+from gsbench.system.locks import is_held
+from gsbench.system.machine import cpu_name
 from gsbench.train import proof as module
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.proof import create_proven, known_proof, proof_of, prove, stamp_of
@@ -54,6 +56,9 @@ def passing(raster: str = "triton", failures: tuple[str, ...] = ()) -> RasterPro
 
 
 def test_the_cpu_kernels_pass_with_small_errors() -> None:
+    # messages and kept proofs name these scenes
+    names = ["33x49-n50-sh3", "48x37-n120-sh2", "20x17-n700-sh1", "7x5-n20-sh0"]
+    assert [str(scene) for scene in module.SCENES] == names
     proof = prove(CpuRasterizer(), CPU)
     assert proof.failures == []
     assert {
@@ -88,7 +93,47 @@ def test_a_fault_of_the_loss_is_a_failure() -> None:
         (TINY,),
         lambda image, target: torch_photometric_loss(image, target, 0.21),
     )
-    assert "7x5-n20-sh3: loss is off by up to" in proof.failures[0]
+    *losses, image = proof.failures
+    assert len(losses) == 10
+    for step, line in enumerate(losses, start=1):
+        assert line.startswith("7x5-n20-sh3: loss is off by up to 1.")
+        assert line.endswith(f" of itself at training step {step}")
+    assert image.startswith("7x5-n20-sh3: trained image is off by up to ")
+    assert image.endswith(" at training step 10")
+
+
+def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors() -> None:
+    class Missing(CpuRasterizer):
+        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+            output = super().render(*arguments, **options)
+            output.image, output.alpha = output.image * torch.nan, output.alpha[:-1]
+            return output
+
+    proof = prove(Missing(), CPU, (TINY,))
+    assert not proof.passed
+    assert not {"image", "alpha"} & proof.errors.keys()
+
+
+@pytest.mark.parametrize(("name", "held"), [("gsplat", False), ("cpu", True)])
+def test_an_executor_apart_from_the_contract_is_not_held_to_radii_bits_and_clamped_alphas(
+    name: str, held: bool
+) -> None:
+    opacities: list[float] = []
+
+    class Loose(CpuRasterizer):
+        def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
+            opacities.append(float(gaussians.opacities.detach().max()))
+            output = super().render(gaussians, *arguments, **options)
+            output.radii = output.radii + len(opacities) + 1
+            return output
+
+    Loose.name = name
+    proof = prove(Loose(), CPU, (TINY,))
+    assert proof.raster == name
+    assert ["radius" in line for line in proof.failures] == [True] * held
+    assert ("radius" in proof.errors) is held
+    assert (max(opacities) > 0.9) is held
+    assert "bits of a second run" not in proof.errors
 
 
 def test_a_driver_error_is_a_failure_and_a_lack_of_memory_is_raised() -> None:
@@ -113,11 +158,11 @@ def test_bits_that_differ_between_runs_are_a_failure_if_the_same_bits_are_promis
         def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
             output = super().render(*arguments, **options)
             Restless.count += 1
-            output.image = output.image * (1 + 1e-6 * (Restless.count % 3))
+            output.radii = output.radii + (Restless.count == 3)
             return output
 
-    (line,) = [line for line in prove(Restless(), CPU, (TINY,)).failures if "second run" in line]
-    assert "image" in line
+    lines = prove(Restless(), CPU, (TINY,)).failures
+    assert lines == ["7x5-n20-sh3: bits of a second run is off by up to 1.00e+00 tensors at radii"]
 
 
 # ---- a proof is kept for the versions that it depends on
@@ -193,7 +238,83 @@ def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
         raise CrashError("the proof of raster=cpu crashed (SIGSEGV); its last lines: none")
 
     monkeypatch.setattr(module, "run_isolated", crash)
-    assert "SIGSEGV" in proof_of("cpu", CPU).failures[0]
+    proof = proof_of("cpu", CPU)
+    assert proof.failures == ["the proof of raster=cpu crashed (SIGSEGV); its last lines: none"]
+    assert (proof.raster, proof.device, proof.seconds) == ("cpu", cpu_name(), 0.0)
+    assert proof.versions == module.versions_on(CPU)
+
+
+def test_a_device_without_memory_for_a_proof_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def full(*arguments: object, what: str) -> None:
+        asked.append((*arguments, what))
+        raise torch.OutOfMemoryError("full")
+
+    monkeypatch.setattr(module, "run_isolated", full)
+    with pytest.raises(InputError, match="device=cuda:1 has no memory left to prove raster=triton"):
+        module.prove_apart("triton", "cuda:1")
+    assert asked == [(module._prove_by_name, "triton", "cuda:1", "the proof of raster=triton")]
+
+
+def test_a_proof_by_name_is_that_of_its_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "prove", lambda *arguments: arguments)
+    rasterizer, device = module._prove_by_name("reference", "cpu")
+    assert (rasterizer.name, device) == ("reference", CPU)
+
+
+def test_only_one_process_makes_a_proof_at_a_time(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = stamp_of("cpu", CPU).with_suffix(".lock")
+    held = []
+
+    def prove(raster: str, device: str) -> RasterProof:
+        held.append((raster, device, is_held(lock)))
+        return passing(raster)
+
+    monkeypatch.setattr(module, "prove_apart", prove)
+    proof_of("cpu", CPU)
+    assert held == [("cpu", "cpu", True)]
+    assert not is_held(lock)
+    assert lock.parent == cache
+
+
+def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gpu = torch.device("cuda:1")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, device.index))
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "GPU")
+    assert module._device_name(gpu) == "GPU (9.1)"
+    files = [stamp_of("cpu", CPU), stamp_of("triton", CPU), stamp_of("cpu", gpu)]
+    assert [path.name.split("-")[0] for path in files] == ["cpu", "triton", "cpu"]
+    digests = {path.stem.split("-")[1] for path in files}
+    assert len(digests) == 3
+    assert {len(digest) for digest in digests} == {16}
+
+
+@pytest.mark.parametrize(
+    ("known", "has_gpu", "answers", "said"),
+    [
+        ("550.54\n", True, ["1"], "550.54"),
+        (None, True, ["551.2", "551.2"], "551.2"),
+        (None, True, [], ""),
+        (None, False, ["551.2"], ""),
+    ],
+)
+def test_the_system_knows_the_driver_or_nvidia_smi_does(
+    known: str | None, has_gpu: bool, answers: list[str], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(path: Path, encoding: str) -> str:
+        if known is None:
+            raise FileNotFoundError(path)
+        return known
+
+    monkeypatch.setattr(Path, "read_text", read)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: has_gpu)
+    monkeypatch.setattr(module, "nvidia_smi", lambda query: {"driver_version": answers}[query])
+    assert module._driver() == said
 
 
 @pytest.mark.slow

@@ -230,7 +230,9 @@ def test_a_readback_waits_only_if_its_copy_has_not_arrived(monkeypatch: pytest.M
     early, late = Readback(source), Readback(source)  # type: ignore[arg-type]
     assert host.copied == [(source, True)] * 2
     assert not early.arrived
+    event = early._event
     assert early.values() is host
+    assert event.happened  # type: ignore[union-attr] # it has waited
     assert early.arrived
     assert early.values() is host
     assert Readback.waits == 1

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
 
 from gsbench.eval.ssim import ssim_map, window
+from gsbench.train import loss as loss_module
 from gsbench.train.loss import PhotometricLoss, photometric_loss, torch_photometric_loss
 from gsbench.train.loss_cpu import CompiledLoss
 
@@ -65,6 +69,20 @@ def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise() -> None:
     assert isinstance(loss._compiled["cpu"], CompiledLoss)
     assert loss(image.to("meta"), target.to("meta"))[0].device.type == "meta"
     assert loss._compiled["meta"](image.double(), target)[0] == expected
+
+
+def test_tritons_loss_is_taken_where_triton_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in = SimpleNamespace(TritonLoss=lambda weight: lambda *images: (weight, *images))
+    monkeypatch.setitem(sys.modules, "gsbench.train.loss_triton", stand_in)
+    obstacles = {"meta": None, "mps": "runs on device=cuda"}
+    monkeypatch.setattr(
+        loss_module, "find_executor", lambda name: SimpleNamespace(obstacle=obstacles.get)
+    )
+    image = torch.zeros(4, 5, 3, device="meta")
+    weight, *images = PhotometricLoss(0.3)(image, image)
+    assert weight == 0.3
+    assert images == [image, image]
+    assert PhotometricLoss(0.3)._compile("mps").func is torch_photometric_loss
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)

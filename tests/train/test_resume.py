@@ -15,7 +15,7 @@ import pytest
 from gsbench.densify import Densifier, EdgeAware, PixelGS, ResGS, Taming, Volumetric
 from gsbench.system.stopping import Stopped, stop_on_signals
 from gsbench.train.trainer import Status, drop_after
-from tests.train.lab import EVENTS, METRICS, STATEFUL, Lab, StopError, same, small, stop_at
+from tests.train.lab import EVENTS, METRICS, STATEFUL, Lab, StopError, same, small
 
 ITERATIONS = 120
 MAKERS: dict[str, Callable[[], Densifier]] = STATEFUL | {
@@ -72,13 +72,6 @@ def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(
         for folder in ("broken", "whole")
     ]
     assert timeless[0] == timeless[1]
-
-
-def test_checkpoints_are_also_written_by_the_clock(lab: Lab) -> None:
-    settings = {"log_every": 1, "checkpoint_every": 10**6, "checkpoint_minutes": 1e-9}
-    with pytest.raises(StopError):
-        lab.train(small(), "", stop_at(5), **settings)
-    assert lab.checkpoints() == [3, 4]
 
 
 def test_a_stop_in_the_last_iteration_loses_nothing(lab: Lab) -> None:

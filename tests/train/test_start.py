@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
+import statistics
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from gsbench.errors import InputError
 from gsbench.normalization import Normalization
 from gsbench.runs.trial_record import InitialCloud
 from gsbench.scene.types import Scene, View
+from gsbench.train import start
 from gsbench.train.start import _agreement, check_start, odd_lenses
 from tests.train.conftest import orbit_camera
 
@@ -56,6 +59,15 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(
     scene: Scene, cloud: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
 ) -> None:
     facts = check_start(*cloud, scene)
+    centers = [view.camera.center for view in scene.train]
+    around, within = (
+        statistics.median(
+            math.dist(place, [*map(statistics.median, zip(*places, strict=True))])
+            for place in places
+        )
+        for places in (centers, cloud[0].tolist())
+    )
+    assert facts.spread == pytest.approx(within / around)
     assert facts.seen == 1.0
     assert facts.color_agreement > 0.85
     assert (facts.identical, facts.far, facts.warnings) == (0.0, 0, [])
@@ -64,26 +76,30 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        (lambda camera: {"fx": 0.8, "fy": 0.8}, "a focal length of 0.8 px for a width of"),
-        (lambda camera: {"fx": 300 * camera.width, "fy": 300 * camera.width}, "a focal length of"),
-        (lambda camera: {"fy": 2 * camera.fx}, "pixels are square"),
-        (lambda camera: {"fy": 0.7 * camera.fx}, "pixels are square"),
-        (lambda camera: {"cx": 0.5, "cy": 0.5}, "its principal point at (0.5, 0.5)"),
-        (lambda camera: {"cy": -3.0}, "its principal point"),
-        (lambda camera: {"cx": 1.2 * camera.cx, "fy": 1.1 * camera.fx}, ""),
+    [  # the views are 40x32 px; 20 px / tan(75 deg) = 5.36 px
+        ({"fx": 5.3, "fy": 5.3}, "a focal length of 5.3 px for a width of 40 px"),
+        ({"fx": 5.4, "fy": 5.4}, ""),
+        ({"fx": 11_500, "fy": 11_500}, "a focal length of 1.15e+04 px"),
+        ({"fx": 11_400, "fy": 11_400}, ""),  # 20 px / tan(0.1 deg) = 11459 px
+        ({"fy": 50.4}, "focal lengths of 40 and 50.4 px"),
+        ({"fy": 49.6}, ""),
+        ({"fy": 31.6}, "focal lengths of 40 and 31.6 px"),
+        ({"fy": 32.4}, ""),
+        ({"cx": 36.1}, "its principal point at (36.1, 16) of 40x32 px"),
+        ({"cx": 35.9, "cy": 28.7}, ""),
+        ({"cy": 28.9}, "its principal point at (20, 28.9)"),
+        ({"cy": 3.1}, "its principal point at (20, 3.1)"),
+        ({"cx": 4.1, "cy": 3.3}, ""),
     ],
 )
 def test_intrinsics_that_no_lens_has_cause_one_warning(
     scene: Scene,
     cloud: tuple[np.ndarray, np.ndarray],
-    change,
+    change: dict[str, float],
     said: str,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    train = tuple(
-        replace(view, camera=replace(view.camera, **change(view.camera))) for view in scene.train
-    )
+    train = tuple(replace(view, camera=replace(view.camera, **change)) for view in scene.train)
     changed = replace(scene, train=train)
     lines = odd_lenses(changed)
     assert len(lines) == bool(said)
@@ -102,6 +118,7 @@ def test_a_cloud_of_one_colour_causes_a_warning(
 ) -> None:
     points, colors = cloud
     plain = np.full_like(colors, level)
+    plain[1:, 2] ^= 1  # the first point is named
     assert check_start(points, plain, scene, random_points=True).warnings == []
     facts = check_start(points, plain, scene)
     assert facts.color_agreement is None
@@ -142,7 +159,7 @@ def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene: Sc
         (lambda points: points * [8, 8, 1], "in view of two training views"),
         (
             lambda points: np.where(np.arange(600)[:, None] < 400, points[:1], points),
-            "share their place",
+            "67% of the initial points share their place",
         ),
         (
             lambda points: np.where(np.arange(600)[:, None] < 2, points * 1e5, points),
@@ -218,6 +235,9 @@ def test_cameras_at_one_place_are_refused_and_a_far_camera_causes_a_warning(
     facts: InitialCloud = check_start(*cloud, Scene("wall", (away, *scene.train[1:]), ()))
     (line,) = facts.warnings  # other facts do not depend on the far camera
     assert line.startswith("the camera of 1.png is ")
+    centers = np.stack([away.camera.center, *(view.camera.center for view in scene.train[1:])])
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    assert f"is {distances[0] / statistics.median(distances):,.0f} times as far" in line
     assert "sets the scene extent to" in line
 
 
@@ -244,3 +264,70 @@ def test_black_pixels_count_in_the_agreement_and_points_that_no_photograph_shows
     shown[20:] = -1
     assert _agreement(colors, shown) == pytest.approx(1.0)
     assert _agreement(colors, np.full_like(shown, -1)) is None
+    # Two points with each other's colour: all pairs differ by half as much on average.
+    pair = np.array([[0, 0, 0], [255, 100, 50]], dtype=np.uint8)
+    assert _agreement(pair, pair[::-1].astype(np.int16)) == pytest.approx(-1.0)
+    assert _agreement(pair[:1], pair[1:].astype(np.int16)) is None
+
+
+def test_most_cameras_may_stand_at_one_place(
+    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Lengths are then compared with the scene's extent."""
+    first, last = scene.train[0], scene.train[-1]
+    still = Scene("still", (first, first, first, last), ())
+    facts = check_start(*cloud, still)
+    within = np.median(np.linalg.norm(cloud[0] - np.median(cloud[0], axis=0), axis=1))
+    assert facts.spread == pytest.approx(within / still.extent)
+    assert facts.warnings == []
+
+
+def test_of_a_large_cloud_evenly_spaced_points_are_measured(
+    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start, "MAX_POINTS", 3)
+    points, colors = cloud[0][:5].copy(), cloud[1][:5]
+    points[[1, 3], 2] = -50.0  # behind the cameras
+    assert check_start(points, colors, scene, random_points=True).seen == 1.0
+    points[[0, 2, 4], 2], points[[1, 3], 2] = -50.0, WALL_Z
+    with pytest.raises(InputError, match="no training view has one of the initial points in view"):
+        check_start(points, colors, scene)
+
+
+def test_a_view_shows_the_points_beyond_its_near_plane_from_its_first_to_its_last_pixel() -> None:
+    camera = orbit_camera(0.0)
+    image = np.arange(32 * 40 * 3, dtype=np.int64).reshape(32, 40, 3).astype(np.uint8)
+    pixels = {(0.1, 0.1): (0, 0), (39.9, 0.1): (0, 39), (0.1, 31.9): (31, 0), (20.5, 8.5): (8, 20)}
+    outside = [(-0.1, 5.0), (40.1, 5.0), (5.0, -0.1), (5.0, 32.1)]
+    points = np.array(
+        [[(u - 20) / 10, (v - 16) / 10, 4.0] for u, v in [*pixels, *outside]]
+        + [[0.0, 0.0, 0.2], [0.0, 0.0, 0.201], [0.0, 0.0, -4.0]]
+    )
+    seen_by, shown = start._views_of(points, (View("a.png", camera, image),))
+    assert seen_by.tolist() == [1, 1, 1, 1, 0, 0, 0, 0, 0, 1, 0]
+    found = [shown[k].tolist() for k in range(4)]
+    assert found == [image[row, column].tolist() for row, column in pixels.values()]
+    assert (shown[seen_by == 0] == -1).all()
+    # The colour is that of the nearer view, whichever comes first.
+    back = orbit_camera(np.pi)  # at (0, 0, 8)
+    views = (View("a.png", camera, image), View("b.png", back, np.full_like(image, 7)))
+    for order in (views, views[::-1]):
+        seen_by, shown = start._views_of(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 5.0]]), order)
+        assert seen_by.tolist() == [2, 2]
+        assert shown.tolist() == [image[16, 20].tolist(), [7, 7, 7]]
+
+
+def test_lengths_are_compared_with_the_median_distance_of_the_cameras(scene: Scene) -> None:
+    """The cameras are at x = -10, 0 and 10, so the unit of distances is 10."""
+    view = replace(scene.train[0], camera=orbit_camera(0.0))
+    views = [
+        replace(view, camera=replace(view.camera, translation=np.array([x, 0.0, 0.0])))
+        for x in (-10.0, 0.0, 10.0)
+    ]
+    wide = Scene("wide", tuple(views), ())
+    points = np.array([[0, 0, 4.0], [1, 0, 4], [0, 0, 99_000], [0, 0, 101_000]])
+    colors = np.zeros((4, 3), np.uint8)
+    assert check_start(points, colors, wide, random_points=True).far == 1
+    points[3, 2] = 1.1e8
+    with pytest.raises(InputError, match=r"initial point 3 of 4 is 1\.1e\+07 times as far"):
+        check_start(points, colors, wide)

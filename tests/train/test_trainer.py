@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -173,14 +174,26 @@ def test_defaults_are_those_of_3dgs() -> None:
         "scale": 0.005,
         "rotation": 0.001,
         "ssim_weight": 0.2,
+        "background": (0.0, 0.0, 0.0),
         "densify_interval": 100,
         "opacity_reset_interval": 3000,
         "densify_start": 500,
         "densify_stop": 15_000,
         "sh_interval": 1000,
     }
-    defaults = TrainConfig(name="paper")
-    assert {name: getattr(defaults, name) for name in published} == published
+    others = {
+        "name": "paper",
+        "mcmc_stop": 25_000,  # 3DGS-MCMC
+        "step_after_refine": False,
+        "resolution_schedule": "none",
+        "visible_adam": False,
+        "max_seconds": None,
+        "volume_histogram": [4000, 8000, 12_000],
+        "log_every": 10,
+        "checkpoint_every": 1000,
+        "checkpoint_minutes": 10.0,
+    }
+    assert asdict(TrainConfig(name="paper")) == published | others
 
 
 @pytest.mark.parametrize("before", [False, True])

@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.init import Sfm
+from gsbench.init.base import TrainingPoints
 from gsbench.init.colmap import alignment, geometry, mapping, reconstruct
 from gsbench.init.colmap import pairs as pairing
 from gsbench.init.colmap.database import create_database, write_keypoints, write_matches
 from gsbench.init.colmap.geometry import verify_pairs
 from gsbench.logs import no_progress
-from tests.init.models import camera_at, model_with
+from tests.init.models import add_point, camera_at, model_with
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0  # px
 NAMES = [f"{letter}.png" for letter in "abcd"]
@@ -114,6 +115,31 @@ def test_the_poses_of_two_models_are_paired_by_name() -> None:
     assert alignment.similarity_to(first, lonely) is None
     nothing = reconstruct.common_poses(first, pycolmap.Reconstruction())
     assert [part.shape for part in nothing] == [(0, 3), (0, 3, 3)] * 2
+
+
+def test_points_of_training_views_keep_place_and_observations_and_get_those_views_colours(
+    tmp_path: Path,
+) -> None:
+    model = model_with(poses(), 3, camera())
+    for shade, name in zip((10, 20, 60, 200), NAMES, strict=True):
+        Image.new("RGB", (WIDTH, HEIGHT), (shade, 0, 255 - shade)).save(tmp_path / name)
+        image = model.find_image_with_name(name)
+        for point in image.points2D:
+            point.xy = np.array([WIDTH / 2, HEIGHT / 2])
+    for index, seen in enumerate(((1, 2, 4), (3, 4), (1, 3))):
+        add_point(model, POINTS[index], seen_by=dict.fromkeys(seen, index))
+    found = reconstruct.keep_training_points(model, NAMES[:3], tmp_path)
+    assert found == TrainingPoints("train", 2, 3, pytest.approx(1 / 3))
+    assert sorted(model.points3D) == [1, 3]
+    for number, seen, shade in ((1, [1, 2], 15), (3, [1, 3], 35)):
+        point = model.points3D[number]
+        np.testing.assert_array_equal(point.xyz, POINTS[number - 1])
+        assert [element.image_id for element in point.track.elements] == seen
+        assert point.color.tolist() == [shade, 0, 255 - shade]
+        for image_id in seen:
+            assert model.images[image_id].points2D[number - 1].point3D_id == number
+    with pytest.raises(InputError, match=r"init\.points_from=train: no point is left"):
+        reconstruct.keep_training_points(model, NAMES[1:2], tmp_path)
 
 
 def test_settings_reach_colmaps_verification() -> None:

@@ -1,0 +1,50 @@
+"""Rotations and colours of Gaussians, compared with SciPy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.special import lpmv
+
+from gsbench.gaussians.model import basis, colors, quaternion_to_matrix
+from tests.gaussians.helpers import random_gaussians
+
+
+def unit_vectors(count: int) -> torch.Tensor:
+    vectors = np.random.default_rng(0).normal(size=(count, 3))
+    return torch.from_numpy(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def harmonics(directions: torch.Tensor, degree: int) -> np.ndarray:
+    """Real harmonics [N, (degree + 1)^2] with the signs of 3DGS, from SciPy's Legendre functions."""
+    x, y, z = directions.numpy().T
+    azimuth, columns = np.arctan2(y, x), []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            ratio = math.factorial(order - abs(m)) / math.factorial(order + abs(m))
+            factor = math.sqrt((2 * order + 1) * ratio * (2 if m else 1) / (4 * math.pi))
+            wave = np.sin(-m * azimuth) if m < 0 else np.cos(m * azimuth)
+            columns.append(factor * lpmv(abs(m), order, z) * wave)
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_and_colours_are_those_of_scipy(degree: int) -> None:
+    directions, gaussians = unit_vectors(30), random_gaussians(30)
+    expected = harmonics(directions, degree)
+    np.testing.assert_allclose(basis(directions, degree), expected, atol=1e-12)
+    every = torch.cat([gaussians.sh_dc.unsqueeze(1), gaussians.sh_rest], dim=1).numpy()
+    shown = np.einsum("nk,nkc->nc", expected, every[:, : expected.shape[1]]) + 0.5
+    assert (shown < 0).any()
+    found = colors(gaussians.sh_dc, gaussians.sh_rest, directions, degree)
+    np.testing.assert_allclose(found, np.maximum(shown, 0), atol=1e-12)
+
+
+def test_quaternions_of_any_length_give_scipys_rotations() -> None:
+    quaternions = random_gaussians(9).quaternions * 3
+    expected = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]].numpy()).as_matrix()
+    np.testing.assert_allclose(quaternion_to_matrix(quaternions), expected, atol=1e-12)
