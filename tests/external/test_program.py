@@ -72,6 +72,9 @@ def test_pycolmap_reads_the_training_folder(
     cloud = PointCloud(rng.normal(size=(50, 3)), rng.integers(0, 256, (50, 3), dtype=np.uint8))
     write_training_views(tmp_path, views, cloud, normalization)
     center, scale = np.array(normalization.center), normalization.scale
+    twice = [views[0], View("a.png", views[0].camera, views[0].image)]
+    with pytest.raises(InputError, match=r"a\.JPG and a\.png would both be a\.png: rename one"):
+        write_training_views(tmp_path / "twice", twice, cloud)
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     points = [point for _, point in sorted(model.points3D.items())]
     np.testing.assert_array_equal([point.xyz for point in points], cloud.points / scale + center)

@@ -31,6 +31,15 @@ def test_an_option_is_one_value_with_a_name_of_its_own(options: dict[str, Any], 
         external("a.ply", options=options)
 
 
+@pytest.mark.parametrize(
+    "settings", [{"version": ""}, {"version": "???"}, {"time_limit_minutes": 0}, {"command": 3}]
+)
+def test_a_setting_of_the_wrong_kind_is_refused_by_its_name(settings: dict[str, Any]) -> None:
+    sound = {"command": "train {data}", "result": "a.ply", "version": "1"}
+    with pytest.raises(InputError, match=rf"densify\.{next(iter(settings))}"):
+        External(**(sound | settings))
+
+
 def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed() -> None:
     for command, result in (("train {data} {lr}", "a.ply"), ("train {data}", "{lr}.ply")):
         key = "command" if "lr" in command else "result"

@@ -28,7 +28,7 @@ def small_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     runs = tmp_path_factory.mktemp("view-runs")
     rng = np.random.default_rng(0)
     cameras = {
-        name: Camera(2 * w, 2 * h, 100.0, 110.0, w + 3, h - 2, np.eye(3), np.array([-k, 0, 0]))
+        name: Camera(2 * w, 2 * h, 100.0, 110.0, w + 3, h - 2, np.eye(3), np.array([-k, -2, 0]))
         for k, (name, (w, h)) in enumerate({"trained.png": (64, 48), **VIEWS}.items())
     }
     cloud = POINTS, np.full((len(POINTS), 3), 200, np.uint8)

@@ -53,10 +53,10 @@ def test_the_page_has_every_test_view(
     assert [one["title"] for one in settings["annotations"]] == list(VIEWS)
     assert [one["position"] for one in settings["annotations"]] == [one["target"] for one in shown]
     assert settings["cameras"] == [{"initial": shown[0]}]
-    # The viewer turns the model by half a turn about z. The cameras look along z from x = 1 and 2,
+    # The viewer turns the model by half a turn about z. The cameras look along z from (1, 2, 0) and (2, 2, 0),
     # and the median depth of the points before them is 5. The longer side is that of 128 px.
     for x, focal, one in zip((1, 2), (100, 110), shown, strict=True):
-        assert (one["position"], one["target"]) == ([-x, 0, 0], [-x, 0, 5])
+        assert (one["position"], one["target"]) == ([-x, -2, 0], [-x, -2, 5])
         assert np.tan(np.radians(one["fov"] / 2)) == pytest.approx(64 / focal)
     (track,) = settings["animTracks"]
     assert track["keyframes"]["times"] == [0, 4, 8]  # there and back, in seconds
@@ -70,7 +70,7 @@ def test_the_page_is_in_the_models_own_coordinates(small_runs: Path) -> None:
     moved = replace(trial.record, normalization=Normalization((7.0, 0.0, 3.0), 2.0))
     first, _ = page_settings(replace(trial, record=moved))["annotations"]
     shown = first["camera"]["initial"]
-    assert (shown["position"], shown["target"]) == ([-7.5, 0, 3], [-7.5, 0, 5.5])
+    assert (shown["position"], shown["target"]) == ([-7.5, -1, 3], [-7.5, -1, 5.5])
 
 
 @pytest.mark.parametrize(

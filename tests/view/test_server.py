@@ -187,8 +187,8 @@ def test_a_page_moves_to_the_view_that_it_chooses(viewer: Viewer) -> None:
     session = viewer._sessions[5] = Session(viewer, page)
     session.go_to(viewer.views["view000.png"])
     camera = page.camera
-    np.testing.assert_allclose(camera.position, [1, 0, 0])
-    np.testing.assert_allclose(camera.look_at, [1, 0, 0.5])  # the cameras' distance from their mean
+    np.testing.assert_allclose(camera.position, [1, 2, 0])
+    np.testing.assert_allclose(camera.look_at, [1, 2, 0.5])  # the cameras' distance from their mean
     np.testing.assert_allclose(camera.up_direction, [0, -1, 0])
     # the picture reaches 33.5 px beside its principal point, and its focal length is 50 px
     assert math.tan(camera.fov / 2) == pytest.approx(33.5 / 50 / (1.5 / 3))
