@@ -206,6 +206,16 @@ def test_an_outlying_training_is_found() -> None:
     found = find_outlying(rows(good, [[20.5, 20.6, 10.0, 20.4], [20.5, 20.4, 20.6, 20.5]]))
     assert [trial.path for trial in found] == [Path("0/b2")]
     assert find_outlying(rows(good, good)) == []
+    # The other arm's deviation of 1, times 1.2 for being that of three trials, counts five times.
+    even = [[-1.0, 0.0, 1.0]]
+    for far, found in ((5.9, []), (6.1, [2])):
+        uneven = [[0.0, 0.0, far]]
+        assert [one.path.name for one in find_outlying(rows(even, uneven))] == [
+            f"b{k}" for k in found
+        ]
+        assert [one.path.name for one in find_outlying(rows(uneven, even))] == [
+            f"a{k}" for k in found
+        ]
     # of two trials, it is not known which one failed
     assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []
 

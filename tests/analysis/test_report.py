@@ -533,6 +533,10 @@ def test_a_chart_with_nothing_to_draw_is_an_empty_string():
     assert line_chart("t", [("a", [])], "x", "y") == ""
     assert line_chart("t", [("a", [(0, 1), (1, 0)])], "x", "y", log=True) == ""
     assert forest_plot("t", [], "x", 1) == ""
+    points = [(0.5, 0.25), (0, 1), (1, 0), (2, 0.5)]  # a logarithmic axis has no 0
+    assert "a from 0.25 at 0.5 to 0.5 at 2." in line_chart("t", [("a", points)], "x", "y", log=True)
+    dropped = line_chart("t", [("a", points[1:3] + points[:1])], "x", "y", log=True)
+    assert "a from 0.25 at 0.5 to 0.25 at 0.5." in dropped
 
 
 def test_the_report_verb_writes_the_file(runs, tmp_path, capsys):

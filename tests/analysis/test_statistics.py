@@ -175,6 +175,9 @@ def test_scenes_like_these_are_judged_by_the_sign_test() -> None:
     assert found.needed == 8
     assert found.power() == pytest.approx(0.9**8)
     assert judge_like_these(np.abs(means), 1, 0.001).outcome == "supported"  # type: ignore[union-attr]
+    lower, either = (judge_like_these(means, sign, 0.005) for sign in (-1, 0))
+    assert (lower.helped, lower.beyond) == (1, 1)  # type: ignore[union-attr]
+    assert (either.helped, either.beyond) == (7, 3)  # type: ignore[union-attr]
     assert judge_like_these(means[:5], 1, 0.005) is None
     nothing = judge_like_these(np.zeros(6), 1, 0.0)
     assert nothing is not None

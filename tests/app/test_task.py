@@ -14,16 +14,15 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from gsbench.app import command, sweep
+from gsbench.app import command, other_sweepers, sweep
 from gsbench.app.command import (
     check_sweep_settings,
-    checked_grids,
     one_trial_per_scene,
-    prepare_other_sweeper,
     summarize,
     words_for_hydras_files,
-    words_without_sweeper,
 )
+from gsbench.app.grids import checked_grids
+from gsbench.app.other_sweepers import prepare_other_sweeper, words_without_sweeper
 from gsbench.app.sweep import Objective, Sweep, TrialTask, metric_of
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
@@ -255,9 +254,7 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
 
     jobs = [["a=1"], ["a=2"], ["a=3"]]
     task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")))
-    context: Any = SimpleNamespace(config_loader=None)
     found = sweep_of(task, "gsbench", sweep={"dir": str(tmp_path / "new" / "dir")})
-    found = Sweep(found.config, task, context)
     first, second, third = found.run_jobs(jobs)
     assert composed == [[*job, seed] for job in jobs for seed in ("seed=1", "seed=2")]
     assert (tmp_path / "new" / "dir").is_dir()
@@ -328,7 +325,7 @@ def test_hydras_grid_sweeper_asks_for_no_value_and_choices_are_limited(monkeypat
     words = ["densify=a,b", "seed=1,2"]
     assert prepare_other_sweeper(config_of(), words, task, "basic") == words
     assert task.objective == Objective(-1)
-    monkeypatch.setattr(command, "MAX_CHOICES", 4)
+    monkeypatch.setattr(other_sweepers, "MAX_CHOICES", 4)
     words = ["densify=a,b", "init=a,b"]
     assert prepare_other_sweeper(config_of(), words, task, "basic") == words
     with pytest.raises(InputError, match="more than 4 combinations of choices"):

@@ -9,11 +9,12 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import MODEL_FOLDER, Carved, Dataset, Ply, Random, read_cloud
-from gsbench.init.base import GAUSSIANS_FILE
+from gsbench.init.base import GAUSSIANS_FILE, PICTURE_FILE
 from gsbench.init.sfm import shifted_copies
 from gsbench.scene.types import Capture
 from tests.gaussians.helpers import random_gaussians
@@ -50,6 +51,8 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard: Capture, tmp_path: Path
     np.testing.assert_array_equal(cloud.colors[:, 1], 2 * np.arange(20))
     assert report.num_points == 20
     assert report.mean_track_length == 3.0
+    with Image.open(tmp_path / "out" / PICTURE_FILE) as picture:
+        assert picture.size == (960, 960)
     assert any("only 20 points" in warning for warning in report.warnings)
 
 

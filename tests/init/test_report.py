@@ -102,6 +102,11 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
             {"num_registered": 8},
             "only 8 of 10 images have a pose (missing: a, b, c, d, e …)",
         ),
+        (
+            {},
+            {"num_registered": 8, "unregistered": tuple("abcde")},
+            "(missing: a, b, c, d, e): the other photos",
+        ),
         ({"num_points": 100}, {"num_points": 99}, "only 99 points"),
         ({"mean_reprojection_error": 1.5}, {"mean_reprojection_error": 1.52}, "1.52 px is large"),
         ({"mean_reprojection_error": None}, {"mean_reprojection_error": 40.0}, "40.00 px is large"),

@@ -31,7 +31,7 @@ from gsbench.launch.jobs import Outcome
 from gsbench.launch.states import describe_plan
 from gsbench.logs import set_up_logging
 
-# what Hydra raises for a user's words and files
+# the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
 HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
 
