@@ -118,7 +118,7 @@ def test_rows_have_the_medians_of_each_size_count_and_rasterizer(
 def test_a_model_is_timed_once_per_size_in_place_of_the_counts(
     reports: list[tuple[object, ...]],
 ) -> None:
-    (row,) = run_bench(["cpu"], [(40, 30)], [50, 100], Path("my/m.ply"), repeats=3, threads=2)
+    (row,) = run_bench(["cpu"], [(40, 30)], [50, 100], ply=Path("my/m.ply"), repeats=3, threads=2)
     assert (row["scene"], row["count"], row["threads"]) == ("my/m.ply", 70, 2)
     assert "kernels_ms" not in row
     assert reports[0] == ("bench", "40x30, m.ply", 0, 5, "cpu")

@@ -25,7 +25,7 @@ from gsbench.analysis.quantities import (
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, seeds_needed
-from gsbench.runs.experiments import Declaration, Question
+from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import counted, some_of
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
@@ -156,7 +156,7 @@ def _declaration(questions: Sequence[Question], declared: ActiveDeclaration | No
     if declared is None or not declared.beforehand:
         # No time: the trials then are not late, so Holm's method alone adjusts for the number of
         # metrics.
-        return Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions))
+        return Declaration(time=NO_TIME, questions=tuple(questions))
     recorded = declared.declaration
     looks = recorded.looks if all(question.seeds for question in questions) else ()
     return Declaration(

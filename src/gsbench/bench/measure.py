@@ -218,6 +218,7 @@ def run_bench(
     rasters: list[str],
     sizes: list[tuple[int, int]],
     counts: list[int],
+    *,
     ply: Path | None = None,
     repeats: int = 5,
     threads: int | None = None,

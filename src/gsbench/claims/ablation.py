@@ -15,7 +15,7 @@ from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.verdicts import WORDS
 from gsbench.errors import InputError
-from gsbench.runs.experiments import Arm, Declaration, Question
+from gsbench.runs.experiments import NO_TIME, Arm, Declaration, Question
 from gsbench.settings import Switch, check_values
 from gsbench.words import did_you_mean, listed
 
@@ -141,7 +141,7 @@ def judge_runs(
             scenes={scene: (runs[full][scene], key) for scene, key in keys.items()},
         )
         questions.append(question)
-    return judge(trials, Declaration(time="1970-01-01T00:00:00Z", questions=tuple(questions)))
+    return judge(trials, Declaration(time=NO_TIME, questions=tuple(questions)))
 
 
 def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:

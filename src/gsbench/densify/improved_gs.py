@@ -349,8 +349,8 @@ class GNS(EdgeAware):
     def meet_budget(self, refinement: Refinement) -> None:
         """Keep ``max_gaussians`` Gaussians, drawn by opacity, and end the pressure."""
         opacities = refinement.gaussians.values.opacities.detach()
-        everybody = torch.ones_like(opacities, dtype=torch.bool)
-        kept = draw(everybody, opacities, self.max_gaussians, refinement.rng)
+        candidates = torch.ones_like(opacities, dtype=torch.bool)
+        kept = draw(candidates, opacities, self.max_gaussians, refinement.rng)
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
                 "the opacity pressure was too short: it ended with %d Gaussians, and %d of them "

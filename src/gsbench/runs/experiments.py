@@ -126,6 +126,7 @@ INTERPOLATION, EXTRAPOLATION = "interpolation", "extrapolation"
 QUESTIONS = {"every_nth": INTERPOLATION, "sector": EXTRAPOLATION}
 AT = "@"  # psnr@extrapolation
 STAMP = "%Y-%m-%dT%H:%M:%SZ"  # UTC, as in the manifests of the store
+NO_TIME = "1970-01-01T00:00:00Z"  # of a declaration that is not kept
 ERROR_RATE = 0.05
 
 TrialKey = Annotated[str, Field(pattern=r"^[^/]*/[^/]*/[^/]*$")]
@@ -264,7 +265,7 @@ class Declaration(Record):
     @property
     def hash(self) -> str:
         """sha256 of all that affects the answers: different hashes are different declarations."""
-        return sha256_of(replace(self, time="1970-01-01T00:00:00Z", missing={}).to_json())
+        return sha256_of(replace(self, time=NO_TIME, missing={}).to_json())
 
     def summary(self) -> Declared:
         """The part that a trial's results.json repeats."""

@@ -85,13 +85,13 @@ def read_colmap(
         name,
         folder,
         sorted(matches.values()),
-        model_folder,
-        exact_poses,
-        max_images,
-        split,
-        root,
-        lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]),
-        mask_folder,
+        root=root,
+        max_images=max_images,
+        split=split,
+        mask_folder=mask_folder,
+        model=model_folder,
+        exact_poses=exact_poses,
+        cameras=lambda chosen: reference_cameras(model, [model_names[file] for file in chosen]),
     )
     # Only the courtyard has exact poses, and its units fit the paper's threshold without
     # normalisation.
@@ -132,14 +132,13 @@ def read_transforms(
         name,
         root,
         names,
-        model,
-        False,
-        max_images,
-        split,
-        root,
-        lambda chosen: reference_cameras(read_model(model), chosen),
-        None if masks is None else _subfolder(root, masks, "scene.masks"),
-        transforms.split,
+        root=root,
+        max_images=max_images,
+        split=split,
+        mask_folder=None if masks is None else _subfolder(root, masks, "scene.masks"),
+        model=model,
+        cameras=lambda chosen: reference_cameras(read_model(model), chosen),
+        own_split=transforms.split,
     )
     centers = [-rotation.T @ translation for _, rotation, translation in transforms.images.values()]
     return replace(
@@ -171,7 +170,13 @@ def read_photos(
     formats = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
     _require_enough(len(names), folder, f"({formats})")
     return _make_capture(
-        name, folder, names, None, False, max_images, split, root, None, mask_folder
+        name,
+        folder,
+        names,
+        root=root,
+        max_images=max_images,
+        split=split,
+        mask_folder=mask_folder,
     )
 
 
@@ -240,13 +245,14 @@ def _make_capture(
     name: str,
     folder: Path,
     names: list[str],
-    model: Path | None,
-    exact_poses: bool,
+    *,
+    root: Path,
     max_images: int,
     split: SplitRule,
-    root: Path,
+    mask_folder: Path | None,
+    model: Path | None = None,
+    exact_poses: bool = False,
     cameras: CamerasByName | None = None,
-    mask_folder: Path | None = None,
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
     lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)

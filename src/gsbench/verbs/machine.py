@@ -285,12 +285,12 @@ def bench(argv: Sequence[str], _runs: Path | None = None) -> int:
         rasters,
         sizes,
         counts,
-        options.ply,
-        options.repeats,
-        options.threads,
-        not options.no_memory,
-        options.scene,
-        options.kernels,
+        ply=options.ply,
+        repeats=options.repeats,
+        threads=options.threads,
+        memory=not options.no_memory,
+        scene=options.scene,
+        kernels=options.kernels,
     )
     print(json.dumps(rows, indent=2) if options.json else table(rows))
     return 0
