@@ -44,9 +44,9 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "hydra_plugins").mkdir()  # Hydra imports whatever it finds below this name
     (tmp_path / "hydra_plugins" / "bomb.py").write_text(BOMB)
-    for module in ("bomb", "bombs", "mine", "helper"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
     yield tmp_path
+    for module in ("bomb", "bombs", "mine", "helper"):
+        sys.modules.pop(module, None)
     allowed_modules().clear()
 
 
