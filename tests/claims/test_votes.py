@@ -274,7 +274,7 @@ def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
 # ---- files of votes
 
 
-def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, refused):
+def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, refused, capsys):
     key = made("--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
@@ -292,7 +292,11 @@ def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, re
         assert "is damaged" in refused("vote", "judge", "exp", file)
     first = saved(tmp_path, sound)
     assert "same person" in refused("vote", "judge", "exp", first, first)
+    capsys.readouterr()
     assert run(["vote", "judge", "exp", first]) == 0
+    out = capsys.readouterr().out
+    assert f"Round {key.round}: " in out
+    assert "\n| SSIM ↑ | undecided | " in out
     assert "other votes before" in refused(
         "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))
     )

@@ -15,13 +15,16 @@ import numpy as np
 import pytest
 
 from gsbench.datasets.archive import (
+    STAGING,
     DamagedMemberError,
     extract,
+    fetch_scene,
     is_complete,
     open_archive,
     open_archive_at,
     wanted_members,
 )
+from gsbench.datasets.catalog import SceneFiles
 from gsbench.downloads import FetchError, RetryPolicy, download, with_retries
 from gsbench.errors import InputError
 from tests.datasets.server import Manners, Server, serve
@@ -74,6 +77,21 @@ def test_the_progress_of_a_damaged_member_is_taken_back(tmp_path: Path) -> None:
     ):
         extract(archive, archive.infolist()[0], tmp_path / "new" / "a.jpg", counts.append)
     assert counts == [13, -13]
+
+
+def test_progress_counts_the_bytes_of_the_missing_files(tmp_path: Path) -> None:
+    files = SceneFiles("truck", "db/truck", ("images",))
+    there = tmp_path / STAGING / "truck" / "images" / "b.jpg"
+    there.parent.mkdir(parents=True)
+    there.write_bytes(b"content of it")  # by an earlier fetch that was interrupted
+    told: list[tuple[str, int, int]] = []
+    data = packed("s/images/a.jpg", "s/images/b.jpg", "s/images/c.jpg")
+    with open_archive(io.BytesIO(data), "x.zip") as archive:
+        line = fetch_scene(
+            archive, "s", "x.zip", tmp_path, files, PATIENT, lambda *at: told.append(at)
+        )
+    assert told == [("truck", 13, 26), ("truck", 26, 26)]
+    assert line == f"3 files, 39 bytes, in {tmp_path / 'db/truck'} (images)"
 
 
 def test_a_packing_that_cannot_be_read_is_no_damage(tmp_path: Path) -> None:

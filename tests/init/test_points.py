@@ -231,3 +231,5 @@ def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_beh
     assert seen.tolist() == [0, 2, 6]
     np.testing.assert_allclose(pixels, [[0, 40], [50, 0], [80, 60]])
     np.testing.assert_allclose(distances, [2**0.5, 1.64**0.5, 0.38**0.5])
+    unknown = points_in_view(points, "b", model)
+    assert [values.shape for values in unknown] == [(0,), (0, 2), (0,)]

@@ -102,6 +102,16 @@ def test_a_fault_of_the_loss_is_a_failure() -> None:
     assert image.endswith(" at training step 10")
 
 
+def test_the_compared_training_follows_the_schedule_of_learning_rates(monkeypatch) -> None:
+    steps: list[int] = []
+    monkeypatch.setattr(
+        module.TrainableGaussians, "set_step", lambda self, step: steps.append(step)
+    )
+    target = torch.zeros(TINY.height, TINY.width, 3, dtype=torch.float64)
+    module._train(ReferenceRasterizer(), TINY, target, torch_photometric_loss)
+    assert steps == [*range(1, 11)]
+
+
 def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors() -> None:
     class Missing(CpuRasterizer):
         def render(self, *arguments, **options):  # type: ignore[no-untyped-def]

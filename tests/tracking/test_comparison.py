@@ -6,6 +6,7 @@ import threading
 import time
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mlflow
@@ -17,7 +18,13 @@ from PIL import Image
 from gsbench.analysis.results import read_experiment
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, publish
-from gsbench.tracking.comparison import addresses, description
+from gsbench.tracking.comparison import (
+    MAX_TAG,
+    OWN_NOTE,
+    _set,
+    addresses,
+    description,
+)
 from gsbench.tracking.mirror import sync
 from gsbench.verbs import servers
 from tests.tracking.helpers import (
@@ -95,6 +102,20 @@ def test_a_users_description_is_kept(runs):
     client.set_experiment_tag(experiment, NOTE, "my own words")
     publish(runs / "described", None)
     assert tags_of(client, "described")[NOTE] == "my own words"
+
+
+def test_only_new_tags_are_sent_and_too_long_ones_are_left_out():
+    sent: dict[str, str] = {}
+    present = {VIEW: "same", NOTE: OWN_NOTE}
+    client: Any = SimpleNamespace(
+        get_experiment=lambda experiment: SimpleNamespace(tags=present),
+        set_experiment_tag=lambda experiment, key, value: sent.update({key: value}),
+    )
+    _set(client, "7", {VIEW: "same", NOTE: "a" * MAX_TAG})
+    assert sent == {NOTE: "a" * MAX_TAG}
+    sent.clear()
+    _set(client, "7", {VIEW: "new", NOTE: "a" * (MAX_TAG + 1)})
+    assert sent == {VIEW: "new"}
 
 
 def test_a_description_without_a_verdict_begins_with_what_is_missing(tmp_path):

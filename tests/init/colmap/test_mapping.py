@@ -232,12 +232,12 @@ def test_a_model_needs_an_angle_at_half_of_its_points(share: float, plausible: b
     """Two cameras see points at distance one under an angle; a third is at the first one's place."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)
     model = model_with(
-        {f"{x} {k}": camera_at([x, 0, 0]) for k, x in enumerate((-half, half, -half))}, 4
+        {f"{x} {k}": camera_at([x, 5, 2]) for k, x in enumerate((-half, half, -half))}, 4
     )
     for index, images in enumerate([(1, 2, 3), (1, 2), (1, 3)]):
-        add_point(model, [0, 0, 1], seen_by=dict.fromkeys(images, index))
+        add_point(model, [0, 5, 3], seen_by=dict.fromkeys(images, index))
     assert mapping._is_plausible(model) == plausible
-    add_point(model, [0, 0, 1], seen_by={1: 3, 3: 3})  # now half of them have none
+    add_point(model, [0, 5, 3], seen_by={1: 3, 3: 3})  # now half of them have none
     assert not mapping._is_plausible(model)
     assert not mapping._is_plausible(pycolmap.Reconstruction())
 

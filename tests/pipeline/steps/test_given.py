@@ -210,6 +210,8 @@ def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkey
         train_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
     )
     monkeypatch.setattr(train_steps, "reset_peak_memory", reset.append)
+    logged: list[Any] = []
+    monkeypatch.setattr(train_steps, "_log_normalization", lambda *given: logged.append(given))
     cpu = torch.device("cpu")
     parts: Any = SimpleNamespace(
         trainer=ADC(),
@@ -238,6 +240,7 @@ def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkey
     with np.load(folder / "lineage.npz") as lineage:
         assert len(lineage["ids"]) == 7
     assert reset == [cpu]
+    assert logged == [(views.capture, parts.trainer)]
     assert told[-1][:3] == ("iteration", 2, 2)
     parts.measured_earlier = []
     assert "snapshots" not in train_step(views, parts).inputs
