@@ -177,6 +177,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
     assert markdown_table(verdicts)[-1].endswith(
         "| unknown | unknown | courtyard: seed 0 has no partner |"
     )
+    assert len(markdown_table(verdicts[-1:])) == 3
 
 
 @pytest.mark.parametrize(
@@ -185,6 +186,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
         (["densify=none"], "declares no switch"),
         (["densify=adc,volumetric"], "one densifier"),
         (["densify=adc", "densify.split_shrink=1.5,2"], "only scene and seed"),
+        (["densify=adc", "name=a,b"], "only scene and seed"),
         (["densify=adc", "--switches", "opacity_rest"], "did you mean opacity_reset"),
         (["densify=adc", "+densify.switches.a.off.split_shrnk=2"], "split_shrnk"),
         (["densify=adc", "--fast"], "unrecognized arguments: --fast"),

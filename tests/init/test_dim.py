@@ -26,7 +26,6 @@ from gsbench.init.networks.extract_and_match import (
 from gsbench.init.networks.extractors import EXTRACTORS, SUPERPOINT_BORDER, extract_features
 from gsbench.init.networks.features import Features, FeatureStore
 from gsbench.init.networks.matchers import build_matcher, match, mutual_nearest_matcher
-from gsbench.logs import no_progress
 from gsbench.scene.types import Capture
 from gsbench.weights import MissingWeightsError, load_state
 from tests.init.models import digest
@@ -105,7 +104,11 @@ def test_pairs_with_few_matches_at_low_resolution_are_left_out(
         monkeypatch.setattr(extract_and_match, name, value)
     small = at_low_resolution(job)
     assert (small.settings.max_image_size, small.settings.max_keypoints) == (160, 120)
-    preparation = extract_and_match.extract_and_match(job, no_progress)
+    told: list[tuple[str, int, int]] = []
+    preparation = extract_and_match.extract_and_match(job, lambda *at: told.append(at))
+    selected = preparation.counts["pairs_selected"]
+    matched = [(done, total) for title, done, total in told if title == "match"]
+    assert matched[-selected - 1 :] == [(done, selected) for done in range(selected + 1)]
     pairs = list(itertools.combinations(few.image_names, 2))
     shared = {pair: len(open_store(small).require_matches(*pair)) for pair in pairs}
     threshold = sorted(shared.values())[2]

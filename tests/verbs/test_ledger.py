@@ -216,6 +216,8 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(
         (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
         (["seed=0,1", "--metric", "psmr"], "there is no such metric"),
         (["seed=0,1", "--fdr", "1"], "must be above 0 and below 1"),
+        (["seed=0,1", "--fdr", "0"], "must be above 0 and below 1"),
+        (["seed=0,1", "--fdr", "5%"], "must be above 0 and below 1, got '5%'"),
         (["seed=0,1", "--ideas", "0"], "must be a whole number from 1 to 10000"),
         (["seed=0,1", "eval.primary=psnr"], "eval.primary follows from the ledger"),
         (["seed=0,1", "launch.wait=false"], "launch.wait=false"),

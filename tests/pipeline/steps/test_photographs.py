@@ -11,13 +11,16 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.normalization import Normalization
 from gsbench.pipeline.steps import scene as scene_steps
 from gsbench.pipeline.steps.scene import (
+    MODEL_FOLDER,
     CaptureSource,
     Views,
     ground_truth_step,
     masked_capture,
     masking_step,
+    normalizing_step,
 )
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
@@ -62,6 +65,19 @@ def test_the_courtyard_has_a_step_and_photographs_are_read_directly(photographs)
     small = SceneConfig(name="own", kind="photos", path=str(photographs), downscale=2)
     with pytest.raises(InputError, match=r"scene\.downscale=2 leaves 15x10 px of .*a\.png"):
         CaptureSource(small).read(None)
+
+
+def test_a_capture_is_moved_to_the_coordinates_of_the_training_by_a_step(photographs, monkeypatch):
+    moved: list[tuple[Capture, Path]] = []
+    monkeypatch.setattr(scene_steps, "normalize_capture", lambda *given: moved.append(given))
+    capture = read_photos("own", photographs)
+    assert normalizing_step(capture) is None
+    far = replace(capture, advised_normalization=Normalization((1e6, 0.0, 0.0), 0.5))
+    step = normalizing_step(far)
+    assert step is not None
+    assert step.inputs["normalization"] == {"center": (1e6, 0.0, 0.0), "scale": 0.5}
+    step.build(photographs)
+    assert moved == [(far, photographs / MODEL_FOLDER)]
 
 
 def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monkeypatch):
