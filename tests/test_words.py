@@ -69,6 +69,8 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=calm": "densify=calm does not exist; a class of your own is named by densify._target_",
     "train=2k": "train=2k does not exist (choose: ",
     # sweeps
+    "-sc": "-sc takes install=bash",
+    "-sc install=bash install=zsh": "-sc takes install=bash",
     "seed=1,2": "add -m",
     "-m seed=interval(0,1)": "belongs to what all arms share",
     "-m densify.volume_threshold=interval(nan,1)": "from a number to a larger one",
