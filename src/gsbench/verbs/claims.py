@@ -321,15 +321,15 @@ def _trials(words: Sequence[str]) -> list[Trial]:
 
 
 def _only_densifier(trials: Sequence[Trial]) -> str:
-    arms = {(trial.values["init"]["name"], trial.values["densify"]["name"]) for trial in trials}
-    if len(arms) > 1 or len({trial.files.home for trial in trials}) > 1:
+    arms = {
+        (trial.values["init"]["name"], trial.values["densify"]["name"], trial.files.home)
+        for trial in trials
+    }
+    places = {(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}
+    if len(arms) > 1 or len(places) < len(trials):
         raise InputError(
             "ablate needs one initialiser and one densifier: only scene and seed may list values"
         )
-    if len({(trial.values["scene"]["name"], trial.values["seed"]) for trial in trials}) < len(
-        trials
-    ):
-        raise InputError("ablate: only scene and seed may list values")
     return str(trials[0].values["densify"]["name"])
 
 
