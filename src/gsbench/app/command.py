@@ -160,7 +160,9 @@ def _look(config: DictConfig, words: Sequence[str], multirun: bool, task: TrialT
         task.launch([compose.resolve_trial(config, words)])
         return
     task.grids = _grids(config)
-    config.hydra.sweeper.grids = []
+    if task.grids:
+        # Taken out as in a real run. Hydra 1.4 refuses a job that changes the sweep's sweeper.
+        config = compose.compose_whole([*words, f"{GRIDS}=[]", "hydra.mode=MULTIRUN"])
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=True)
     own_words = [word for word in words if not parse_word(word).is_hydra_override()]
     sweep = Sweep.plan(compose.config_loader(), task, config)
