@@ -100,20 +100,22 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         config, multirun = _checked_config(words, multirun)
         task.allowed = tuple(config[PERMISSIONS])
         other = other_sweeper(config) if multirun else ""
+        if other and task.look_only:
+            words, multirun = words_without_sweeper(config, words, other)
+            if not multirun:
+                task.handle = lambda trials: []  # trials with other values are not listed
+            config, other = compose.compose_whole([*words, _mode_word(multirun)]), ""
+        if not other:
+            task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
+        # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before
+        # each trial's values. Hydra 1.4 refuses a job whose sweeper differs from the sweep's.
+        argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
         if task.look_only:
-            if other:
-                words, multirun = words_without_sweeper(config, words, other)
-                if not multirun:
-                    task.handle = lambda trials: []  # trials with other values are not listed
-                mode = f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"
-                config = compose.compose_whole([*words, mode])
+            if task.grids:
+                config = compose.compose_whole([*argv, _mode_word(multirun)])
             with compose.explained(words, HYDRA_ERRORS):
                 _look(config, words, multirun, task)
             return
-    task.grids = None if other else _grids(config)
-    # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before each
-    # trial's values.
-    argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
     if other:
         argv = prepare_other_sweeper(config, argv, task, other)
     load_callbacks(config.hydra.callbacks, task.allowed)
@@ -124,7 +126,7 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         )
     # Another sweeper may raise any error for its settings.
     with compose.explained(words, Exception if other else HYDRA_ERRORS):
-        compose.run_main(task, [*argv, f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"], config)
+        compose.run_main(task, [*argv, _mode_word(multirun)], config)
     if other and not task.trials:
         name = config.name
         log.info(
@@ -136,8 +138,9 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
 
 
 def _checked_config(words: Sequence[str], multirun: bool) -> tuple[DictConfig, bool]:
-    """The whole configuration of ``words``, and whether it is a sweep, which a file may say."""
-    config = compose.compose_whole([*words, "hydra.mode=MULTIRUN"] if multirun else words)
+    """The whole configuration of ``words``, and whether it is a sweep."""
+    # without -m, a file may say that it is a sweep
+    config = compose.compose_whole([*words, _mode_word(True)] if multirun else words)
     multirun = config.hydra.mode == RunMode.MULTIRUN
     swept = [word for word in words if is_sweep(word)]
     if swept and not multirun:
@@ -159,19 +162,14 @@ def _look(config: DictConfig, words: Sequence[str], multirun: bool, task: TrialT
         config.hydra.runtime.output_dir = os.path.abspath(config.hydra.run.dir)
         task.launch([compose.resolve_trial(config, words)])
         return
-    task.grids = _grids(config)
-    if task.grids:
-        # Taken out as in a real run. Hydra 1.4 refuses a job that changes the sweep's sweeper.
-        config = compose.compose_whole([*words, f"{GRIDS}=[]", "hydra.mode=MULTIRUN"])
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=True)
     own_words = [word for word in words if not parse_word(word).is_hydra_override()]
     sweep = Sweep.plan(compose.config_loader(), task, config)
     run_sweep(sweep, sweeper["params"] or {}, sweeper["tune"] or {}, own_words)
 
 
-def _grids(config: DictConfig) -> Any:
-    """The grids of gsbench's own sweeper, whose interpolations each trial resolves."""
-    return OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
+def _mode_word(multirun: bool) -> str:
+    return f"hydra.mode={'MULTIRUN' if multirun else 'RUN'}"
 
 
 def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
