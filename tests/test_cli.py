@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import importlib
-import json
 import os
 import subprocess
 import sys
@@ -15,16 +14,13 @@ import pytest
 import torch
 
 from gsbench import __version__, cli
-from gsbench.app.command import compose_trials
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
-from gsbench.launch.record import add_to_plan
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.system.own_modules import allowed_modules
 from gsbench.system.stopping import Stopped
-from gsbench.verbs import load_verb, machine, servers, trials
+from gsbench.verbs import load_verb, machine, servers
 from tests.finished import write_results
 from tests.gaussians.helpers import random_gaussians
 
@@ -171,90 +167,6 @@ def test_unknown_verb_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> N
 def test_hydra_shows_the_configuration(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["--cfg", "job", "train.iterations=77"]) == 0
     assert "iterations: 77" in capfd.readouterr().out
-
-
-# ---- status and retry
-
-
-def make_experiment(runs: Path) -> list[Path]:
-    trials = compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
-    add_to_plan(trials)
-    folders = [TrialFolder.of(trial.values).path for trial in trials]
-    folders[0].mkdir(parents=True)
-    (folders[0] / "config.yaml").write_text(trials[0].yaml)
-    write_results(folders[0], trials[0].values)
-    folders[1].mkdir(parents=True)
-    (folders[1] / "config.yaml").write_text(trials[1].yaml)
-    (folders[1] / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
-    return folders
-
-
-def test_status_lists_unfinished_trials(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folders = make_experiment(runs)
-    assert cli.run(["status", "x"]) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[:2]] == ["failed", "missing"]
-    assert "the loss became nan" in lines[0]
-    assert lines[2] == "3 trials: 1 done, 1 missing, 1 failed"
-    assert cli.run(["status", "x", "--json"]) == 1
-    states = {
-        Path(trial["folder"]): trial["state"] for trial in json.loads(capsys.readouterr().out)
-    }
-    assert states == dict(zip(folders, ("done", "failed", "missing"), strict=True))
-    assert cli.run(["status"]) == 0
-    assert " ".join(capsys.readouterr().out.split()) == "x 3 trials: 1 done, 1 missing, 1 failed"
-    assert cli.run(["status", "x", "--forget"]) == 0
-    assert cli.run(["status", "x"]) == 1
-    assert capsys.readouterr().out.splitlines()[-1] == "2 trials: 1 done, 1 failed"
-    assert cli.run(["status", "y"]) == 2
-    assert "no experiment 'y'" in capsys.readouterr().err
-
-
-def test_retry_runs_the_unfinished_with_their_own_settings(
-    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    make_experiment(runs)
-    ran: list[Any] = []
-    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: ran.extend(trials) or 0)
-    assert cli.run(["retry", "x", "--dry-run"]) == 0
-    assert "2 trials: 1 missing, 1 failed" in capsys.readouterr().out
-    assert cli.run(["retry", "x", "launch=local", "launch.parallel=3"]) == 0
-    assert [(t.values["densify"]["name"], t.values["seed"]) for t in ran] == [
-        ("adc", 1),
-        ("adc", 2),
-    ]
-    assert {t.values["launch"]["parallel"] for t in ran} == {3}
-    assert {TrialFolder.of(t.values).runs for t in ran} == {runs}
-
-
-def test_retry_of_a_trial_without_a_plan_uses_its_configuration(runs: Path) -> None:
-    folders = make_experiment(runs)
-    (runs / "x" / "plan.json").unlink()
-    again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
-    assert TrialFolder.of(again.values).path == folders[1]
-    assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
-    own = trials.recompose(folders[1], None, runs, ["allow_targets=[mine.Arm]"], "theirs")
-    assert own.values["allow_targets"] == ["mine.Arm"]
-    assert allowed_modules()["mine"] == "theirs"
-    with pytest.raises(InputError, match="is in no plan, so no setting of it can be changed"):
-        trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
-
-
-def test_a_second_retry_without_a_plan_runs_the_same_trial(
-    runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folders = make_experiment(runs)
-    (runs / "x" / "plan.json").unlink()
-    ran: list[Path] = []
-
-    def killed(trials: list[Any]) -> int:
-        add_to_plan(trials)
-        ran.extend(trial.folder for trial in trials)
-        return 1
-
-    monkeypatch.setattr("gsbench.app.command.run_trials", killed)
-    assert [cli.run(["retry", "x"]), cli.run(["retry", "x"])] == [1, 1]
-    assert ran == [folders[1], folders[1]]
 
 
 # ---- export

@@ -29,6 +29,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, hold
+from tests.composed import composed
 from tests.finished import record_of
 from tests.launch.test_jobs import trial as bare_trial
 from tests.runs.test_trial_folder import edit
@@ -36,14 +37,10 @@ from tests.runs.test_trial_folder import edit
 pytestmark = pytest.mark.usefixtures("runs")
 
 
-@cache
-def _composed(*words: str) -> Trial:
-    return compose_one(words)
-
-
 def trial_values(*words: str) -> dict[str, Any]:
-    """A configuration, composed once, in this test's runs folder."""
-    return _composed(*words).values | {"runs": os.environ["GSBENCH_RUNS"]}
+    """A configuration in this test's runs folder."""
+    (trial,) = composed(words)
+    return trial.values
 
 
 def planned(runs: Path, seed: int = 0) -> Trial:
@@ -307,7 +304,7 @@ def test_changes_are_noticed_and_named(change, names, runs):
 def test_a_dry_run_says_what_has_changed(runs):
     values = trial_values()
     finish(values)
-    trial = replace(_composed(), values=values)
+    trial = replace(composed([])[0], values=values)
     assert describe_plan([trial])[0].startswith("done     courtyard/sfm-volumetric seed 0")
     (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
     assert describe_plan([trial])[0].endswith(
@@ -406,15 +403,7 @@ def fake_trial(monkeypatch):
 
 
 def sweep() -> list[Trial]:
-    return [
-        replace(trial, values=trial.values | {"runs": os.environ["GSBENCH_RUNS"]})
-        for trial in _composed_sweep()
-    ]
-
-
-@cache
-def _composed_sweep() -> list[Trial]:
-    return compose_trials(["name=x", "densify=adc", "seed=0,1,2"], multirun=True)
+    return composed(["name=x", "densify=adc", "seed=0,1,2"])
 
 
 def test_failed_trial_does_not_stop_the_others(fake_trial, capsys):
@@ -480,7 +469,7 @@ def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
 def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):
     values = trial_values()
     finish(values)
-    trials = [replace(_composed(), values=values)]
+    trials = [replace(composed([])[0], values=values)]
     before = sorted(path for path in runs.rglob("*"))
 
     def refuse(*arguments, **named):
@@ -496,4 +485,4 @@ def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):
     assert outcome.status == "done"
     assert sorted(path for path in runs.rglob("*")) == before
     with pytest.raises(InputError, match="cannot be written to"):
-        run_batch([replace(_composed(), values=trial_values("seed=1"))])
+        run_batch([replace(composed([])[0], values=trial_values("seed=1"))])

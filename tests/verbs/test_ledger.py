@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.results import read_experiment
-from gsbench.app.command import compose_trials
 from gsbench.claims.archive import _shared_ledger, without_private_words
 from gsbench.cli import run
 from gsbench.config.compose import Trial
@@ -22,6 +19,7 @@ from gsbench.runs.layout import LEDGER
 from gsbench.runs.ledger import Ended, Started, read_ledger
 from gsbench.verbs import ledger as verb
 from scripts import ledger_rates
+from tests.composed import composed
 from tests.finished import write_results
 
 SETTINGS = ["scene=courtyard", "init=random", "densify=adc", "tracking=none", "eval.lpips=[]"]
@@ -68,17 +66,6 @@ def trainings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trainings:
     monkeypatch.setattr(verb, "run_trials", made)
     monkeypatch.setattr(verb, "finished_trials", lambda home, trials: _finished(home, trials))
     return made
-
-
-@cache
-def _composed_once(words: tuple[str, ...]) -> list[Trial]:
-    return compose_trials(words, multirun=True)
-
-
-def composed(words: Sequence[str], multirun: bool) -> list[Trial]:
-    """The trials of words in this test's runs folder; Hydra composes equal words only once."""
-    runs = os.environ["GSBENCH_RUNS"]
-    return [Trial(one.values | {"runs": runs}, one.overrides) for one in _composed_once((*words,))]
 
 
 def _finished(home: Path, trials: Sequence[Trial]) -> list[Any]:

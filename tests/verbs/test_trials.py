@@ -1,0 +1,306 @@
+"""``gsbench status``, ``retry`` and ``sync``, without a training."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from gsbench.config.compose import Trial, compose_one
+from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.progress import Progress
+from gsbench.launch.record import add_to_plan, read_plan
+from gsbench.launch.states import TrialState
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.own_modules import allowed_modules
+from gsbench.tracking.mirror import MirrorError
+from gsbench.verbs import trials
+from tests.composed import composed
+from tests.finished import write_results
+
+pytestmark = pytest.mark.usefixtures("runs")
+
+
+def begin(trial: Trial) -> Path:
+    """Write the configuration of a trial that has begun; returns its folder."""
+    trial.folder.mkdir(parents=True)
+    (trial.folder / "config.yaml").write_text(trial.yaml)
+    return trial.folder
+
+
+@pytest.fixture
+def folders(runs: Path) -> list[Path]:
+    """Three planned trials: the first is done, the second failed, the third never started."""
+    planned = composed(["name=x", "densify=adc", "seed=0,1,2"])
+    add_to_plan(planned)
+    write_results(begin(planned[0]), planned[0].values)
+    (begin(planned[1]) / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
+    return [trial.folder for trial in planned]
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
+    """The trials that a verb would run."""
+    given: list[Trial] = []
+    monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: given.extend(trials) or 0)
+    return given
+
+
+# ---- status
+
+
+def test_status_lists_unfinished_trials(folders, capsys, said, refused):
+    assert trials.status(["x"], folders[0].parents[3]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[:2]] == ["failed", "missing"]
+    assert "the loss became nan" in lines[0]
+    assert lines[2] == "3 trials: 1 done, 1 missing, 1 failed"
+    assert trials.status(["x", "--json"], folders[0].parents[3]) == 1
+    states = {
+        Path(trial["folder"]): trial["state"] for trial in json.loads(capsys.readouterr().out)
+    }
+    assert states == dict(zip(folders, ("done", "failed", "missing"), strict=True))
+    assert said("status").split() == [
+        "x",
+        "3",
+        "trials:",
+        "1",
+        "done,",
+        "1",
+        "missing,",
+        "1",
+        "failed",
+    ]
+    assert said("status", "x", "--forget") == "1 trial removed from the plan\n"
+    assert trials.status(["x"], folders[0].parents[3]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "2 trials: 1 done, 1 failed"
+    assert "no experiment 'y'" in refused("status", "y")
+
+
+def test_status_of_an_empty_runs_folder_says_so(runs, said):
+    assert said("status") == f"no experiment in {runs} yet\n"
+
+
+def test_finished_trials_are_listed_with_all_or_with_a_note():
+    def state(name: str, kind: Any, note: str = "") -> TrialState:
+        return TrialState(Path("runs/x/courtyard/sfm-adc", f"{name}-seed0"), kind, None, note)
+
+    listed = [state("a", "done"), state("b", "done", "in doubt"), state("c", "missing")]
+    first, second, summary = trials.lines_of(listed, with_done=False)
+    assert first.startswith("missing  courtyard/sfm-adc seed 0 (c)")
+    assert second.startswith("done     courtyard/sfm-adc seed 0 (b)")
+    assert second.endswith("in doubt")
+    assert summary == "3 trials: 2 done, 1 missing"
+    assert len(trials.lines_of(listed, with_done=True)) == 4
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [("running", "for 2 min"), ("queued", "for 2 min"), ("failed", "2 min ago")],
+)
+def test_a_lasting_state_has_a_duration_and_a_final_one_an_age(state, words):
+    assert trials._age(TrialState(Path("x"), state, time.time() - 120, "")) == words
+
+
+def test_a_state_without_a_time_has_no_age_and_one_in_the_future_is_new():
+    assert trials._age(TrialState(Path("x"), "running", None, "")) == ""
+    assert trials._age(TrialState(Path("x"), "done", time.time() + 500, "")) == "0 s ago"
+
+
+def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch, said):
+    done = folders[0]
+    reasons = {done: "helper was 1, it is now 2"}
+    monkeypatch.setattr(trials, "find_superseded", lambda *_: reasons)
+    assert said("status").endswith(" 3 trials: 1 superseded, 1 missing, 1 failed\n")
+    lines = said("status", "x", "--forget-superseded").splitlines()
+    assert lines == [f"removed {done}: helper was 1, it is now 2", "1 superseded trial removed"]
+    assert not done.exists()
+    assert [*read_plan(done.parents[2])] == folders[1:]
+
+
+def test_user_modules_are_looked_up_where_the_command_of_each_trial_was_given(
+    folders, monkeypatch, tmp_path
+):
+    asked: list[Any] = []
+
+    def find(results: Any, present: Any) -> dict[Path, str]:
+        asked.append(present("mine", results[0]))
+        return {}
+
+    monkeypatch.setattr(trials, "find_superseded", find)
+    monkeypatch.setattr(trials, "module_digest", lambda module, folder: (module, folder))
+    trials.progress_with_superseded(folders[0].parents[2])
+    trials.forget(folders[0].parents[2], [folders[0]])
+    trials.progress_with_superseded(folders[0].parents[2])
+    assert asked == [("mine", str(tmp_path)), None]
+
+
+def shown(progress: Progress) -> list[str]:
+    """The lines of the watched table, without the frame of the table."""
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(trials._progress_view("x", progress))
+    text = console.export_text()
+    return [" ".join(line.strip("│┃ ").replace("│", " ").split()) for line in text.splitlines()]
+
+
+def test_the_watched_table_has_arms_scenes_speed_time_left_and_leader():
+    def cell(**counts: int) -> dict[str, int]:
+        return dict.fromkeys(("done", "running", "failed", "waiting"), 0) | counts
+
+    progress = Progress(
+        {
+            ("adc", "yard"): cell(done=1, running=2, waiting=1),
+            ("mcmc", "yard"): cell(done=3, failed=1),
+            ("mcmc", "hall"): cell(waiting=2),
+        },
+        {("adc", "yard"): 7.25, ("mcmc", "hall"): 1.0},
+        120.0,
+        "adc leads [so far]",
+    )
+    lines = shown(progress)
+    assert lines[0] == "x: trials done of all"
+    assert "adc – 1/4, 2 running" in lines
+    assert "mcmc 0/2 3/4, 1 failed" in lines
+    assert lines[-2:] == ["8.2 iterations/s, about 2 min left", "adc leads [so far]"]
+    ended = Progress({("adc", "yard"): cell(done=3)}, {}, 0.0, "")
+    assert not any("left" in line or "iterations" in line for line in shown(ended))
+
+
+def test_watching_looks_again_until_all_trials_have_ended(folders, monkeypatch, capsys):
+    counts = {"done": 0, "running": 1, "failed": 0, "waiting": 0}
+    ended = {"done": 1, "running": 0, "failed": 0, "waiting": 0}
+    looks = [Progress({("adc", "yard"): one}, {}, None, "") for one in (counts, counts, ended)]
+    waited: list[float] = []
+    monkeypatch.setattr(trials, "progress_of", lambda home: looks.pop(0))
+    monkeypatch.setattr(time, "sleep", waited.append)
+    trials._watch(folders[0].parents[2])
+    assert waited == [trials.SECONDS_BETWEEN_LOOKS] * 2
+    assert "1/1" in capsys.readouterr().out
+
+
+def test_ctrl_c_ends_only_the_watching(folders, monkeypatch):
+    def interrupted(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(time, "sleep", interrupted)
+    trials._watch(folders[0].parents[2])
+
+
+# ---- retry
+
+
+def test_retry_runs_the_unfinished_with_their_own_settings(folders, runs, ran, said):
+    assert "2 trials: 1 missing, 1 failed" in said("retry", "x", "--dry-run")
+    assert ran == []
+    said("retry", "x", "launch=local", "launch.parallel=3")
+    assert [(one.values["densify"]["name"], one.values["seed"]) for one in ran] == [
+        ("adc", 1),
+        ("adc", 2),
+    ]
+    assert {one.values["launch"]["parallel"] for one in ran} == {3}
+    assert {one.files.runs for one in ran} == {runs}
+
+
+def test_retry_with_everything_done_runs_nothing(folders, ran, said):
+    for folder in folders[1:]:
+        write_results(folder, composed(["name=x", "densify=adc"])[0].values)
+    line = "nothing to retry: all trials of x are done, running or queued\n"
+    assert (said("retry", "x"), ran) == (line, [])
+
+
+def test_retry_refuses_a_setting_that_makes_other_trials(folders, ran, refused):
+    line = refused("retry", "x", "launch.parallel=2", "densify.stop=5")
+    assert "densify.stop=5 would make other trials than those of the plan" in line
+    assert ran == []
+
+
+def test_planned_settings_of_a_launcher_go_with_it_unless_it_stays(runs, ran, said):
+    words = ["name=x", "densify=adc", "launch=local", "launch.parallel=2"]
+    add_to_plan(composed(words))
+    said("retry", "x", "launch=local")
+    said("retry", "x", "launch=serial")
+    assert [(one.values["launch"]["name"], one.values["launch"]["parallel"]) for one in ran] == [
+        ("local", 2),
+        ("serial", 1),
+    ]
+
+
+def test_a_trial_whose_configuration_has_changed_takes_the_place_of_the_old_one(
+    folders, monkeypatch, ran, said, caplog
+):
+    def changed(folder: Path, *_: Any) -> Trial:
+        seed = f"seed={folder.name[-1]}"
+        return composed(["name=x", "densify=adc", seed, "train.sh_interval=2"])[0]
+
+    monkeypatch.setattr(trials, "recompose", changed)
+    said("retry", "x")
+    assert {one.values["train"]["sh_interval"] for one in ran} == {2}
+    assert caplog.text.count("its configuration has changed since; the new one is run") == 2
+    assert [*read_plan(folders[0].parents[2])] == folders[:1]
+
+
+def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
+    (runs / "x" / "plan.json").unlink()
+    again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
+    assert TrialFolder.of(again.values).path == folders[1]
+    assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
+    own = trials.recompose(folders[1], None, runs, ["allow_targets=[mine.Arm]"], "theirs")
+    assert own.values["allow_targets"] == ["mine.Arm"]
+    assert allowed_modules()["mine"] == "theirs"
+    with pytest.raises(InputError, match="is in no plan, so no setting of it can be changed"):
+        trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
+
+
+def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
+    values = compose_one(["name=x", "densify=adc", "seed=1"]).values
+    values["densify"]["evaluated_from"] = "renders"
+    (folders[1] / "config.yaml").write_text(json.dumps(values))
+    with pytest.raises(InputError, match="give the command of `gsbench evaluate` again"):
+        trials.recompose(folders[1], None, runs, [], str(runs.parent))
+
+
+def test_a_second_retry_without_a_plan_runs_the_same_trial(folders, runs, monkeypatch):
+    (runs / "x" / "plan.json").unlink()
+    ran: list[Path] = []
+
+    def killed(given: list[Trial]) -> int:
+        add_to_plan(given)
+        ran.extend(trial.folder for trial in given)
+        return 1
+
+    monkeypatch.setattr("gsbench.app.command.run_trials", killed)
+    assert [trials.retry(["x"], runs), trials.retry(["x"], runs)] == [1, 1]
+    assert ran == [folders[1], folders[1]]
+
+
+# ---- sync
+
+
+def test_sync_sends_the_begun_trials_of_one_or_all_experiments(folders, runs, monkeypatch, said):
+    begin(composed(["name=y", "densify=adc"])[0])
+    sent: list[tuple[str, str | None]] = []
+
+    def send(given: list[TrialFolder], uri: str | None) -> list[str]:
+        sent.extend((one.path.parents[2].name, uri) for one in given)
+        return [f"sent {len(given)}"]
+
+    monkeypatch.setattr(trials, "send_missing", send)
+    assert said("sync", "x", "--uri", "http://here") == "sent 2\n"
+    assert sent == [("x", "http://here")] * 2
+    assert said("sync") == "sent 3\n"
+    assert sent[2:] == [("x", None), ("x", None), ("y", None)]
+
+
+@pytest.mark.parametrize("error", [MirrorError("no answer"), ConnectionError("no answer")])
+def test_a_failed_sync_says_that_nothing_is_lost(folders, runs, monkeypatch, error):
+    def send(*_: Any) -> list[str]:
+        raise error
+
+    monkeypatch.setattr(trials, "send_missing", send)
+    with pytest.raises(GsbenchError, match="no answer; the files are complete: try again"):
+        trials.sync(["x"], runs)
