@@ -53,7 +53,7 @@ ROOMS = [room for room in ROOMS if not room.startswith("_")]
 YAML = ["tests/config/test_yaml_defaults.py"]  # the defaults of classes
 FURTHER_TESTS = {
     "app": ["tests/end_to_end/test_smoke.py"],
-    "claims": ["tests/app/test_sweeps.py"],
+    "claims": ["tests/app/test_looks.py"],
     "verbs": ["tests/claims", "tests/app"],
     "pipeline": ["tests/end_to_end/test_smoke.py"],
     "densify": YAML,

@@ -6,7 +6,7 @@ import pytest
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
-from gsbench.app.grids import words_of_grids
+from gsbench.app.grids import checked_grids, words_of_grids
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan, read_plan
@@ -45,6 +45,18 @@ def test_each_grid_gets_its_own_the_shared_and_the_typed_words():
         ["densify=volumetric", "densify.volume_threshold=1,2", "seed=7", *given],
     ]
     assert words_of_grids({"seed": "0,1"}, [], given) == [["seed=0,1", *given]]
+
+
+@pytest.mark.parametrize("grids", ["x", [1], [{}], {"a": 1}])
+def test_grids_are_a_list_of_mappings(grids):
+    with pytest.raises(InputError, match=r"grids must be a list, each a mapping"):
+        checked_grids(grids)
+    assert checked_grids([{"a": 1, "b": True}, {"c": "1,2"}]) == [
+        *({"a": "1", "b": "true"}, {"c": "1,2"})
+    ]
+    for value in (None, [1], {"a": 1}):
+        with pytest.raises(InputError, match="grids: a must list values"):
+            checked_grids([{"a": value}])
 
 
 def test_a_baseline_without_the_setting_is_compared_with_arms_that_have_it():

@@ -1,0 +1,212 @@
+"""From a command line to trials and an exit code, with stand-ins for trials."""
+
+import copy
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsbench.app import command
+from gsbench.app.command import (
+    check_sweep_settings,
+    one_trial_per_scene,
+    summarize,
+    words_for_hydras_files,
+)
+from gsbench.config.compose import Trial
+from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.jobs import Outcome
+from gsbench.runs.trial_folder import TrialFolder
+from tests.app.stand_ins import trial
+
+OWN_FILES: dict[str, Any] = {
+    **{"run": {"dir": "."}, "sweep": {"dir": ".", "subdir": "."}},
+    **{"output_subdir": None, "job_logging": {}},
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "typed", "multirun", "launch", "added"),
+    [
+        ({}, [], True, "serial", []),
+        (
+            {"run": {"dir": "here"}},
+            [],
+            False,
+            "serial",
+            [
+                "hydra.output_subdir=.hydra",
+                "hydra/job_logging=default",
+                "hydra.job_logging.root.handlers=[file]",
+            ],
+        ),
+        (
+            {"output_subdir": "x", "job_logging": {"root": 1}},
+            [],
+            True,
+            "serial",
+            [
+                "hydra.run.dir=${runs}/.hydra",
+                "hydra.sweep.subdir=${hydra.job.num}",
+                "hydra/launcher=basic",
+            ],
+        ),
+        (
+            {"sweep": {"dir": "a", "subdir": "b"}, "run": {"dir": "here"}},
+            ["hydra.output_subdir=null", "hydra/job_logging=none"],
+            True,
+            "local",
+            [],
+        ),
+    ],
+)
+def test_hydra_writes_its_files_if_one_is_asked_for(
+    monkeypatch, caplog, changes, typed, multirun, launch, added
+):
+    caplog.set_level(logging.INFO, "gsbench")
+    own = copy.deepcopy(OWN_FILES)
+    monkeypatch.setattr(command.compose, "installed_nodes", lambda words: own)
+    runtime = {"choices": {"hydra/launcher": "gsbench"}}
+    config = OmegaConf.create(
+        {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}
+    )
+    assert words_for_hydras_files(config, typed, multirun) == added
+    assert ("writes no files of Hydra's" in caplog.text) == (launch == "local")
+
+
+@pytest.mark.parametrize(
+    ("changes", "multirun", "said"),
+    [
+        ({}, False, None),
+        ({"hydra.sweeper.params": {"seed": "0,1"}}, True, None),
+        ({"hydra.sweeper.params": {"seed": "0,1"}}, False, "lists values: add -m"),
+        ({"hydra.sweeper.grids": [1]}, False, "lists values: add -m"),
+        ({"hydra.sweeper.grids": [1], "hydra.mode": "RUN"}, False, None),
+        ({"hydra.sweeper.params": "x"}, True, "must map settings to values"),
+        ({"launch.stop_when_decided": True}, True, None),
+        ({"launch.stop_when_decided": True}, False, "adds seeds to a sweep"),
+        ({"hydra.runtime.choices.hydra/launcher": "joblib"}, True, None),
+        ({"hydra.runtime.choices.hydra/launcher": "joblib"}, False, "launches sweeps: add -m"),
+        (
+            {"hydra.runtime.choices.hydra/launcher": "joblib", "launch.name": "local"},
+            True,
+            "two launchers",
+        ),
+        ({"launch.name": "local"}, True, None),
+    ],
+)
+def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
+    config = OmegaConf.create(
+        {
+            "hydra": {
+                "sweeper": {"params": None, "grids": []},
+                "mode": None,
+                "runtime": {"choices": {"hydra/launcher": "gsbench"}},
+            },
+            "launch": {"stop_when_decided": False, "name": "serial"},
+        }
+    )
+    for key, value in changes.items():
+        OmegaConf.update(config, key, value, merge=False)
+    if said is None:
+        check_sweep_settings(config, multirun)
+    else:
+        with pytest.raises(InputError, match=said):
+            check_sweep_settings(config, multirun)
+
+
+# ---- the end of a command
+
+
+@pytest.mark.parametrize(
+    ("ends", "code", "advice"),
+    [
+        ("dd", 0, "2 of 2 trials done; the table: gsbench tables x"),
+        ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
+        ("df", 1, "1 of 2 trials done; again: gsbench retry x"),
+        ("bf", 1, "0 of 2 trials done; again: gsbench retry x"),
+        ("bb", 2, "0 of 2 trials done; again: gsbench retry x"),
+        ("dq", 0, "1 of 2 trials done; how far the others are: gsbench status x"),
+        ("bq", 1, "0 of 2 trials done; how far the others are: gsbench status x"),
+    ],
+)
+def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
+    caplog.set_level(logging.INFO, "gsbench")
+    status: Any = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
+    trials = [trial(tmp_path, seed) for seed in range(len(ends))]
+    outcomes = [
+        Outcome(one.folder, status[end], "why", end == "b")
+        for one, end in zip(trials, ends, strict=True)
+    ]
+    first = Trial(trials[0].values | {"name": "tuning"}, ())
+    assert summarize(outcomes, [first, *trials]) == code
+    (said,) = caplog.messages
+    assert said == advice + (str(trials[0].folder) if len(ends) == 1 else "")
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
+    assert said == [
+        f"gsbench: failed: {TrialFolder(one.folder).label}: why"
+        for one in outcomes
+        if one.status == "failed"
+    ]
+
+
+def test_the_failure_of_a_single_trial_is_raised(tmp_path):
+    for bad_input, kind in ((True, InputError), (False, GsbenchError)):
+        with pytest.raises(GsbenchError, match="why") as error:
+            summarize([Outcome(tmp_path, "failed", "why", bad_input)], [trial(tmp_path)])
+        assert type(error.value) is kind
+
+
+def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatch):
+    asked: list[Any] = []
+    made = [trial(tmp_path, scene={"name": name}) for name in ("a", "b")]
+
+    def compose_trials(words: Sequence[str], multirun: bool) -> list[Trial]:
+        asked.append((words, multirun))
+        return made
+
+    monkeypatch.setattr(command, "compose_trials", compose_trials)
+    assert one_trial_per_scene("gate", ["scene=a,b"], "train_time") == {"a": made[0], "b": made[1]}
+    one_trial_per_scene("gate", ["+name=y"], "train_time")
+    assert asked == [
+        (["scene=a,b", "seed=0", "name=gate"], True),
+        (["+name=y", "seed=0"], True),
+    ]
+    for words, said in (
+        (["seed=1"], "seed follows from the other words"),
+        (["+eval.primary=psnr"], r"eval\.primary follows from"),
+    ):
+        with pytest.raises(InputError, match=f"gate: {said}"):
+            one_trial_per_scene("gate", words, "psnr")
+    with pytest.raises(InputError, match="primary=nosuch"):
+        one_trial_per_scene("gate", [], "nosuch")
+    made.append(trial(tmp_path, 1, scene={"name": "a"}))
+    with pytest.raises(InputError, match="gate is about one arm"):
+        one_trial_per_scene("gate", [], "train_time")
+    made[:] = [trial(tmp_path)]
+    made[0].values["launch"]["wait"] = False
+    with pytest.raises(InputError, match="gate waits for its trials"):
+        one_trial_per_scene("gate", [], "train_time")
+
+
+def test_a_dry_run_explains_a_reference_to_nothing(runs):
+    with pytest.raises(InputError, match=r"^hydra\.run\.dir: Interpolation key 'nope' not found"):
+        command.compose_trials(["hydra.run.dir=${nope}"])
+
+
+@pytest.mark.parametrize(
+    ("words", "trials", "code"),
+    [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)],
+)
+def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
+    made = [trial(tmp_path, seed) for seed in range(trials)]
+
+    def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
+        assert task.look_only == (task.handle is command.list_trials)
+        task.trials = made
+
+    monkeypatch.setattr(command, "run_app", run_app)
+    monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is made))
+    assert command.launch(words) == code

@@ -1,0 +1,247 @@
+"""Hydra's task and a sweep, with stand-ins for compositions and trials."""
+
+import logging
+import os
+import pickle
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+
+from gsbench.app import sweep
+from gsbench.app.sweep import Objective, Sweep, TrialTask, metric_of
+from gsbench.config.compose import Trial
+from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.jobs import Outcome
+from tests.app.stand_ins import done, trial
+from tests.finished import write_results
+
+# ---- the value of a job
+
+
+@pytest.mark.parametrize(
+    ("primary", "found"),
+    [
+        (None, ("psnr", 1)),
+        ("ssim", ("ssim", 1)),
+        ("lpips_vgg", ("lpips_vgg", -1)),
+        ("psnr@extrapolation", ("psnr", 1)),
+    ],
+)
+def test_a_trial_is_judged_by_its_declared_metric(primary, found):
+    values = {"eval": {"primary": primary, "extra": {}}}
+    assert metric_of(values) == found
+
+
+def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_path, monkeypatch):
+    for primary, sign, value in (
+        *((None, 1, 21.0), (None, -1, -21.0)),
+        *(("lpips_vgg", 1, -0.3), ("lpips_vgg", -1, 0.3)),
+    ):
+        trials = [trial(tmp_path, seed, eval={"primary": primary, "extra": {}}) for seed in (0, 1)]
+        for one, psnr, lpips in zip(trials, (20.0, 22.0), (0.2, 0.4), strict=True):
+            write_results(one.folder, one.values, metrics={"psnr": psnr, "lpips_vgg": lpips})
+        assert Objective(sign).value(trials) == pytest.approx(value)
+    third = trial(tmp_path, 2, eval=trials[0].values["eval"])
+    with pytest.raises(GsbenchError, match="has no lpips_vgg, which the sweeper needs"):
+        Objective(1).value([*trials, third])
+    write_results(third.folder, third.values)  # without this metric
+    with pytest.raises(GsbenchError, match="has no lpips_vgg"):
+        Objective(1).value([*trials, third])
+    monkeypatch.setattr(sweep, "facts_for", lambda metric, values: SimpleNamespace(direction=0))
+    with pytest.raises(InputError, match="whether more or less of it is better is not known"):
+        metric_of(third.values)
+
+
+# ---- the task
+
+
+@pytest.fixture
+def job(tmp_path, monkeypatch) -> SimpleNamespace:
+    """A job of Hydra's that makes a trial for each list of words."""
+    state = SimpleNamespace(mode=RunMode.RUN, log={}, did=[])
+
+    def instance() -> Any:
+        node = {"job_logging": state.log, "verbose": "x", "overrides": ["w"], "mode": state.mode}
+        return SimpleNamespace(cfg=SimpleNamespace(hydra=SimpleNamespace(**node)))
+
+    def resolve(config: Any, words: Sequence[str]) -> Trial:
+        return trial(tmp_path / "runs", config.seed, words)
+
+    def note(name: str) -> Any:
+        return lambda *given: state.did.append((name, *given[-2:]))
+
+    monkeypatch.setattr(sweep.HydraConfig, "instance", instance)
+    monkeypatch.setattr(sweep.compose, "check_permitted", note("checked"))
+    monkeypatch.setattr(sweep.compose, "enforce_permissions", note("enforced"))
+    monkeypatch.setattr(sweep, "allow_modules", note("allowed"))
+    monkeypatch.setattr(sweep, "set_up_logging", note("logs"))
+    monkeypatch.setattr(sweep.compose, "typed_words", lambda words: (["hydra.x=1"], ["a=1"]))
+    monkeypatch.setattr(sweep.compose, "resolve_trial", resolve)
+    (tmp_path / "given").mkdir()
+    monkeypatch.chdir(tmp_path)
+    state.folder = str(tmp_path / "given")
+    state.config = OmegaConf.create({"seed": 4})
+    return state
+
+
+def test_a_single_trial_is_run_where_the_command_was_given(job, caplog):
+    caplog.set_level(logging.INFO, "gsbench")
+    task = TrialTask(done, allowed=("mine",), folder=job.folder)
+    assert task(job.config) is None
+    assert os.getcwd() == job.folder
+    (one,) = task.trials
+    assert (one.values["seed"], one.overrides) == (4, ("hydra.x=1", "a=1"))
+    assert [outcome.folder for outcome in task.outcomes] == [one.folder]
+    assert [name for name, *_ in job.did] == ["allowed", "checked", "logs", "enforced"]
+    assert job.did[0] == ("allowed", ("mine",), job.folder)
+    assert job.did[1][-1] == job.did[3][-1] == ("mine",)
+    assert job.did[2] == ("logs", "x", False)
+    assert not caplog.messages
+    job.log = {"root": {"level": "INFO"}}
+    TrialTask(done, folder="/nowhere")(job.config)
+    assert job.did[-2] == ("logs", "x", True)
+    assert caplog.messages == [f"the trial's folder is {one.folder}"]
+
+
+def test_a_job_of_a_sweep_raises_its_failure_and_returns_its_value(job, tmp_path):
+    job.mode = RunMode.MULTIRUN
+    task = TrialTask(done, folder=job.folder)
+    assert task(job.config) is None
+    assert (task.trials, task.outcomes) == ([], [])  # whoever launched it collects them
+    for bad_input, kind in ((True, InputError), (False, GsbenchError)):
+
+        def failing(trials: Sequence[Trial], bad_input: bool = bad_input) -> list[Outcome]:
+            return [Outcome(one.folder, "failed", "no luck", bad_input) for one in trials]
+
+        with pytest.raises(GsbenchError, match="no luck") as error:
+            TrialTask(failing, folder=job.folder)(job.config)
+        assert type(error.value) is kind
+
+    def measured(trials: Sequence[Trial]) -> list[Outcome]:
+        for one in trials:
+            write_results(one.folder, one.values, metrics={"psnr": 20.0 + one.values["seed"]})
+        return done(trials)
+
+    task = TrialTask(measured, folder=job.folder, objective=Objective(-1, ("seed=1", "seed=4")))
+    assert task(job.config) == pytest.approx(-22.5)
+    assert [one.overrides[-1] for one in task.trials] == ["seed=1", "seed=4"]
+    assert len(task.outcomes) == 2
+    assert job.config.seed == 4
+    alone = TrialTask(measured, folder=job.folder, objective=Objective(1))
+    assert alone(job.config) == pytest.approx(24)
+
+
+def test_a_task_is_pickled_without_what_it_collected(tmp_path):
+    task = TrialTask(done, True, ("a",), "/f", [{"a": 1}], Objective(1, ("seed=1",)))
+    task.launch([trial(tmp_path)])
+    assert (len(task.trials), len(task.outcomes)) == (1, 1)
+    again = pickle.loads(pickle.dumps(task))
+    assert again == TrialTask(done, True, ("a",), "/f", None, Objective(1, ("seed=1",)))
+
+
+# ---- a sweep
+
+
+@pytest.fixture
+def begun(monkeypatch) -> list[Any]:
+    begun: list[Any] = []
+    monkeypatch.setattr(sweep, "begin_for_another_launcher", begun.append)
+    return begun
+
+
+def sweep_of(task: TrialTask, launcher: str, launch: Any = None, **more: Any) -> Sweep:
+    hydra = {"runtime": {"choices": {"hydra/launcher": launcher}}}
+    config = OmegaConf.create({"hydra": hydra | more})
+    made: Any = launch and SimpleNamespace(launch=launch)
+    return Sweep(config, task, None, made)  # type: ignore[arg-type]
+
+
+def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
+    trials = [trial(tmp_path, seed, ["hydra.x=1", f"seed={seed}"]) for seed in (0, 1)]
+    for name, look_only in (("gsbench", False), ("joblib", True)):
+        task = TrialTask(done, look_only=look_only)
+        sweep_of(task, name).launch(trials)
+        assert task.trials == trials
+    assert begun == []
+    asked: list[Any] = []
+
+    def launch(jobs: Any, initial_job_idx: int) -> list[JobReturn]:
+        asked.append((jobs, initial_job_idx))
+        good, bad = JobReturn(), JobReturn()
+        good._return_value, bad._return_value = 1.0, InputError("no photos")
+        return [good, bad]
+
+    task = TrialTask(done)
+    for _ in range(2):
+        sweep_of(task, "joblib", launch).launch(trials)
+    words = [["seed=0"], ["seed=1"]]
+    assert asked == [(words, 0), (words, 2)]
+    assert begun == [trials, trials]
+    assert task.trials == trials * 2
+    assert task.outcomes[:2] == [
+        Outcome(trials[0].folder, "done"),
+        Outcome(trials[1].folder, "failed", "no photos", True),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (GsbenchError("ours"), "^ours$"),
+        (ValueError("a\n b"), "^hydra/launcher=joblib: a b .gsbench status tells"),
+        (ValueError(), "^hydra/launcher=joblib: ValueError "),
+    ],
+)
+def test_any_error_of_another_launcher_is_one_line(tmp_path, begun, error, said):
+    def launch(jobs: Any, initial_job_idx: int) -> None:
+        raise error
+
+    with pytest.raises(GsbenchError, match=said):
+        sweep_of(TrialTask(done), "joblib", launch).launch([trial(tmp_path)])
+
+
+def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
+    composed: list[Any] = []
+
+    def compose_jobs(loader: Any, config: Any, jobs: Any) -> list[Trial]:
+        composed.extend(jobs)
+        seeds = [int(dict(word.split("=") for word in job).get("seed", "7")) for job in jobs]
+        name = lambda job: {"name": job[0].replace("=", "")}  # noqa: E731
+        return [
+            trial(tmp_path / "runs", seed, job, scene=name(job))
+            for seed, job in zip(seeds, jobs, strict=True)
+        ]
+
+    monkeypatch.setattr(sweep.compose, "compose_jobs", compose_jobs)
+    monkeypatch.setattr(sweep.OverridesParser, "create", lambda loader: None)
+
+    def run(trials: Sequence[Trial]) -> list[Outcome]:
+        outcomes = []
+        for one in trials:
+            name = one.values["scene"]["name"]
+            value = 20.0 + one.values["seed"] + 10 * (name == "a2")
+            write_results(one.folder, one.values, metrics={"psnr": value})
+            status: Any = "failed" if name == "a3" else "done"
+            outcomes.append(Outcome(one.folder, status, "no luck", bad_input=True))
+        return outcomes[::-1]
+
+    jobs = [["a=1"], ["a=2"], ["a=3"]]
+    task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")))
+    found = sweep_of(task, "gsbench", sweep={"dir": str(tmp_path / "new" / "dir")})
+    first, second, third = found.run_jobs(jobs)
+    assert composed == [[*job, seed] for job in jobs for seed in ("seed=1", "seed=2")]
+    assert (tmp_path / "new" / "dir").is_dir()
+    assert [one.overrides for one in (first, second, third)] == jobs
+    assert (first.status, first.return_value) == (JobStatus.COMPLETED, 21.5)
+    assert second.return_value == 31.5
+    assert third.status is JobStatus.FAILED
+    assert isinstance(third._return_value, InputError)
+    task.objective = Objective(-1)
+    other, alone = found.run_jobs([["a=1"], ["a=2"]])
+    assert (other.return_value, alone.return_value) == (-27.0, -37.0)
+    assert composed[-1] == ["a=2"]
