@@ -203,7 +203,7 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
 def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
     made = [trial(tmp_path, seed) for seed in range(trials)]
 
-    def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
+    def run_app(words: Sequence[str], multirun: bool, task: Any) -> None:
         assert task.look_only == (task.handle is command.list_trials)
         task.trials = made
 
