@@ -180,15 +180,19 @@ def _tables_parser() -> ArgumentParser:
 def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
     """Print the texts, or write them to ``out``: a file if its ending is the format's, or a folder.
 
-    In a folder, files are named after the experiment. A second table is written beside the file
+    In a folder, files are named after the experiment. Several texts get names beside the file
     ``out``.
     """
     if out is None:
         print("\n".join(texts.values()), end="")
         return
     for end, text in texts.items():
-        is_file = out.suffix == Path(f"x{end}").suffix and not out.is_dir()
-        file = out.with_name(f"{out.stem}{end}") if is_file else out / f"{name}{end}"
+        suffix = Path(f"x{end}").suffix
+        if out.suffix.lower() == suffix and not out.is_dir():
+            part = "" if len(texts) == 1 else end.removesuffix(suffix)
+            file = out.with_name(f"{out.stem}{part}{out.suffix}")
+        else:
+            file = out / f"{name}{end}"
         with writable_output(file):
             write_text(file, text)
         print(file)

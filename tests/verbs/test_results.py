@@ -1,0 +1,162 @@
+"""``gsbench tables``, ``report`` and ``explain`` with made-up results."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.verbs.results import explain, explain_cell, report, tables
+from tests.analysis.synthetic import Plan, write_runs
+
+
+def test_a_cell_names_its_trials_hashes_and_versions(tmp_path, capsys):
+    paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
+    assert explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
+    text = capsys.readouterr().out
+    for path in paths:
+        assert (str(path) in text) == ("volumetric" in str(path))
+    for expected in (
+        "LPIPS VGG raw of dim-volumetric on garden",
+        "over 3 of 3 trials",
+        "data-garden",
+        "torch 2.13.0",
+        "protocol: paper-1",
+        "resolution: 400x300",
+        "iterations: 2000",
+    ):
+        assert expected in text
+
+
+def test_missing_trials_and_metrics_are_reported(tmp_path):
+    paths = write_runs(tmp_path, Plan(scenes=("garden",), densifiers=("adc", "adc_2")))
+    (paths[0] / "results.json").unlink()
+    (paths[-1] / "results.json").unlink()  # of another arm, whose name has the arm's
+    text = explain_cell("exp:garden:psnr:adc", tmp_path)
+    assert "over 2 of 3 trials" in text
+    assert "Left out\n  exp/garden/sfm-adc/c0ffee00-seed0: unfinished" in text
+    assert "adc_2" not in text
+    assert "not available: weights file alexnet.pth not found" in explain_cell(
+        "exp:garden:lpips_alex:adc", tmp_path
+    )
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("exp:garden:psnr", "is not EXPERIMENT:SCENE:METRIC:ARM"),
+        ("nope:garden:psnr:adc", "no experiment 'nope'"),
+        ("exp:kitchen:psnr:adc", "has no scene 'kitchen'; it has garden"),
+        (
+            "exp:garden:psnr:mcmc",
+            "names 0 arms of garden; choose one of dim-adc, dim-volumetric, sfm-adc",
+        ),
+        ("exp:garden:psnr:adc", "names 2 arms"),
+        ("exp:garden:quality:sfm-adc", "unknown metric 'quality'"),
+    ],
+)
+def test_bad_addresses_are_explained(tmp_path, address, words):
+    write_runs(tmp_path, Plan(scenes=("garden",), inits=("sfm", "dim")))
+    with pytest.raises(InputError, match=words):
+        explain_cell(address, tmp_path)
+
+
+# ---- tables
+
+
+@pytest.fixture
+def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The runs folder of an experiment with two arms on one scene, and of one with a single arm."""
+    write_runs(tmp_path / "runs", Plan(scenes=("garden",)))
+    write_runs(tmp_path / "runs", Plan(experiment="alone", densifiers=("adc",)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+FAIR = ["--layout", "fairness"]
+
+
+@pytest.mark.parametrize(
+    ("words", "files", "begins"),
+    [
+        (["--out", "new/t.csv"], ["new/t.csv"], "scene,"),
+        (["--out", "T.TeX"], ["T.TeX"], "% "),
+        (["--out", "new"], ["new/exp.md"], "### "),
+        (["--out", "new", "--format", "csv"], ["new/exp.csv"], "scene,"),
+        (["--out", "t.csv", "--format", "trials"], ["t.csv"], "experiment,"),
+        (["--out", "t.md", "--format", "csv"], ["t.md/exp.csv"], "scene,"),
+        (["--out", "t.csv", "--paper", "3dgs"], ["t.csv", "t-3dgs.csv"], ""),
+        (["--out", "f.md", *FAIR], ["f.md"], "### "),
+        (["--out", "new", *FAIR], ["new/exp-fairness-sfm-volumetric-sfm-adc.md"], "### "),
+    ],
+)
+def test_tables_are_written_where_out_says(made, capsys, words, files, begins):
+    assert tables(["exp", *words], made) == 0
+    assert capsys.readouterr().out.splitlines() == files
+    for name in files:
+        assert Path(name).read_text().startswith(begins), name
+
+
+def test_a_table_of_trials_has_a_row_for_each_and_no_option_of_a_table(made, capsys):
+    assert tables(["exp", "--format", "trials", "--where", "densify=adc"], made) == 0
+    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+    assert [(row["densify"], row["seed"]) for row in rows] == [("adc", str(k)) for k in range(3)]
+    for option in ("--rows", "--columns", "--metrics", "--layout", "--paper"):
+        value = {"--layout": "plain", "--paper": "3dgs"}.get(option, "psnr")
+        with pytest.raises(InputError, match=f"shows every column .* and takes no {option}"):
+            tables(["exp", "--format", "trials", option, value], made)
+
+
+def test_fairness_sheets_need_two_arms(made):
+    with pytest.raises(InputError, match="experiment alone has one arm"):
+        tables(["alone", *FAIR], made)
+
+
+def test_a_field_is_a_row_or_a_column(made):
+    with pytest.raises(InputError, match=r"init, scene is in --rows and --columns: choose one"):
+        tables(["exp", "--rows", "scene,init,densify", "--columns", "init,scene"], made)
+
+
+def test_the_papers_contradictions_are_listed_unless_an_experiment_has_their_name(made, capsys):
+    assert tables(["paper"], made) == 0
+    assert all(line.startswith("- ") for line in capsys.readouterr().out.splitlines())
+    write_runs(made, Plan(experiment="paper", scenes=("garden",)))
+    tables(["paper"], made)
+    assert capsys.readouterr().out.startswith("### Experiment paper")
+
+
+def test_trials_that_are_left_out_are_named_on_the_error_stream(made, capsys):
+    place = next((made / "exp").glob("*/sfm-adc/*-seed0"))
+    (place / "results.json").write_text("{")
+    for verb, words in ((tables, []), (report, ["--out", "r.html"])):
+        verb(["exp", *words], made)
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("left out: exp/garden/sfm-adc/c0ffee00-seed0")
+
+
+# ---- report
+
+
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        ([], "{runs}/exp/report.html"),
+        (["--out", "r.HTML"], "r.HTML"),
+        (["--out", "new"], "new/exp-report.html"),
+        (["--out", "r.html/"], "r.html"),
+    ],
+)
+def test_a_report_is_written_where_out_says(made, capsys, words, file):
+    assert report(["exp", *words], made) == 0
+    place = file.format(runs=made)
+    assert capsys.readouterr().out == f"{place}\n"
+    assert Path(place).read_text().startswith("<!doctype html>")
+
+
+def test_a_report_compares_with_a_densifier_of_the_experiment(made, capsys):
+    report(["exp", "--baseline", "volumetric", "--out", "r.html"], made)
+    assert "sfm-adc against sfm-volumetric" in Path("r.html").read_text()
+    with pytest.raises(InputError, match="--baseline mcmc: exp has adc, volumetric"):
+        report(["exp", "--baseline", "mcmc"], made)
