@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -19,4 +20,7 @@ def _composed(words: tuple[str, ...], multirun: bool) -> list[Trial]:
 def composed(words: Sequence[str], multirun: bool = True) -> list[Trial]:
     """The trials of a command, in this test's runs folder. Equal words are composed once."""
     runs = {"runs": os.environ["GSBENCH_RUNS"]}
-    return [replace(trial, values=trial.values | runs) for trial in _composed((*words,), multirun)]
+    return [
+        replace(trial, values=deepcopy(trial.values) | runs)
+        for trial in _composed((*words,), multirun)
+    ]

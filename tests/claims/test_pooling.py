@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from gsbench.claims.archive import write_archive
 from gsbench.claims.pooling import (
     PooledQuestion,
     Study,
+    _arm_pairs,
     describe,
     markdown_table,
     pool,
@@ -22,6 +24,7 @@ from gsbench.claims.pooling import (
 )
 from gsbench.cli import run
 from gsbench.errors import InputError
+from gsbench.runs.experiments import Arm
 from tests.analysis.synthetic import Plan, write_runs
 
 WANTED = PooledQuestion(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
@@ -241,6 +244,27 @@ def test_archives_with_the_same_file_name_are_distinguished(tmp_path, said):
         archive(tmp_path / lab, "results", seed)
     sources = [str(tmp_path / lab / "results.zip") for lab in ("one", "two")]
     assert f"| {sources[1]} |" in said("pool", *sources, "--arm", "volumetric")
+
+
+def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
+    """It is a densifier, a densifier with its variant, or the whole name."""
+    plain, once, twice = (
+        Arm("sfm", "volumetric", variant) for variant in ((), (("n", "1"),), (("n", "2"),))
+    )
+    adc, other = Arm("sfm", "adc"), Arm("dim", "adc")
+
+    def pairs(*arms: Arm, arm: str = "volumetric", baseline: str = "adc") -> list[tuple[Arm, Arm]]:
+        trials: Any = [SimpleNamespace(arm=one) for one in arms]
+        return _arm_pairs(trials, replace(WANTED, arm=(arm,), baseline=(baseline,)), Path("a.zip"))
+
+    assert pairs(adc, other, plain) == [(adc, plain)]
+    assert pairs(adc, other, Arm("dim", "volumetric"), plain)[1] == (adc, plain)
+    for name in (str(twice), str(replace(twice, init=""))):
+        assert pairs(adc, once, twice, arm=name) == [(adc, twice)]
+        assert pairs(adc, once, twice, arm="adc", baseline=name) == [(twice, adc)]
+    for names in ({}, {"arm": "adc", "baseline": "volumetric"}):
+        with pytest.raises(InputError, match=f"the name fits {once} and {twice}: choose"):
+            pairs(adc, once, twice, **names)
 
 
 def test_a_metric_that_a_source_lacks_is_named(tmp_path, refused):

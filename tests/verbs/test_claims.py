@@ -1,34 +1,41 @@
-"""``gsbench plan``: the words it prints for made-up trials, and what it refuses."""
+"""``gsbench plan`` and ``ablate``, with made-up results."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from gsbench.config.compose import Trial
 from gsbench.errors import InputError
+from gsbench.verbs import claims
 from gsbench.verbs.claims import plan
 from tests.analysis.synthetic import Plan, write_runs
+from tests.finished import write_results
 
 
 @pytest.fixture
-def runs(tmp_path) -> Path:
+def pilots(tmp_path) -> Path:
+    """The runs folder of three experiments: on three scenes, on one, and with a single arm."""
     write_runs(tmp_path, Plan(scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2))
     write_runs(tmp_path, Plan(experiment="one", scenes=("a",), trial_noise=0.3))
     write_runs(tmp_path, Plan(experiment="alone", densifiers=("adc",)))
+    for densify, seeds in (("adc", (0, 1)), ("volumetric", (2, 3))):
+        write_runs(tmp_path, Plan(experiment="apart", densifiers=(densify,), seeds=seeds))
     return tmp_path
 
 
-def test_plan_names_designs_that_suffice(runs, capsys):
-    assert plan(["exp", "--metric", "psnr", "--difference", "0.2"], runs) == 0
+def test_plan_names_designs_that_suffice(pilots, capsys):
+    assert plan(["exp", "--metric", "psnr", "--difference", "0.2"], pilots) == 0
     out = capsys.readouterr().out
     assert "sfm-volumetric against sfm-adc" in out
     assert "(from 9 pairs on 3 scenes)" in out
     assert "scenes like these (from 6 scenes on)" in out
 
 
-def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(runs, capsys):
-    assert plan(["one"], runs) == 0
+def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, capsys):
+    assert plan(["one"], pilots) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
 
 
@@ -39,9 +46,80 @@ def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(runs, caps
         (["exp", "--metric", "gaussians"], "not counts"),
         (["exp", "--difference", "0"], "above 0"),
         (["alone"], "one arm"),
+        (["apart"], r"no trials of sfm-adc and sfm-volumetric can be paired in PSNR"),
+        (["exp", "--metric", "cc_gain"], "unknown metric|--difference is needed"),
         (["nothing"], "no experiment"),
     ],
 )
-def test_bad_input_of_plan_is_refused(runs, words, message):
+def test_bad_input_of_plan_is_refused(pilots, words, message):
     with pytest.raises(InputError, match=message):
-        plan(words, runs)
+        plan(words, pilots)
+
+
+# ---- ablate
+
+
+ABLATE = ["scene=courtyard", "init=random", "tracking=none", "eval.lpips=[]", "seed=0,1,2,3"]
+SWITCH = ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
+
+
+@pytest.fixture
+def trained(runs, monkeypatch) -> list[Trial]:
+    """The trials that ``ablate`` would train; their results are made up."""
+    trained: list[Trial] = []
+
+    def run_trials(trials: Sequence[Trial]) -> int:
+        for trial in trials:
+            trained.append(trial)
+            off = trial.values["densify"]["split_size"] == 0.5
+            psnr = 20 - 3 * off + 0.1 * trial.values["seed"]
+            write_results(trial.folder, trial.values, metrics={"psnr": psnr, "ssim": psnr / 100})
+            (trial.folder / "config.yaml").write_text(trial.yaml)
+        return 0
+
+    monkeypatch.setattr(claims, "run_trials", run_trials)
+    return trained
+
+
+def test_ablate_trains_every_run_and_prints_the_verdicts(runs, trained, said):
+    lines = said("ablate", *ABLATE, "densify=adc", *SWITCH).splitlines()
+    assert lines[0] == "adc: 1 part (size), 2 runs, 8 trials"
+    hashes = [line.split(":")[0].strip() for line in lines[1:3]]
+    assert [line.split(": ")[1] for line in lines[1:3]] == ["with all of them", "without size"]
+    assert [trial.folder.name.partition("-")[0] for trial in trained[::4]] == hashes
+    assert lines[-4].startswith("| run | difference in PSNR (dB) from all parts |")
+    assert lines[-2].startswith("| without size | −3.000 |")
+    assert lines[-2].endswith(" worse |")
+    assert lines[-1] == "all metrics and pictures: gsbench report ablate_adc"
+    again = said("ablate", *ABLATE, "densify=adc", *SWITCH, "--metric", "ssim")
+    assert "difference in SSIM from all parts" in again
+
+
+def test_a_dry_run_of_ablate_trains_nothing(trained, said):
+    words = [*ABLATE, "densify=adc", "name=parts", *SWITCH, "--dry-run"]
+    assert "8 trials: 8 missing" in said("ablate", *words)
+    assert trained == []
+
+
+def test_failed_trials_of_ablate_are_not_judged(runs, monkeypatch, capsys):
+    monkeypatch.setattr(claims, "run_trials", lambda trials: 1)
+    assert claims.ablate([*ABLATE, "densify=adc", *SWITCH], runs) == 1
+    assert "| run |" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["densify=adc", "densify=taming/mine"], "ablate_taming_mine"),
+        (["seed=1"], "ablate"),
+    ],
+)
+def test_the_experiment_is_named_after_the_chosen_densifier(words, name):
+    assert claims._default_name(words) == name
+
+
+def test_a_switch_that_changes_no_setting_is_refused(runs, refused):
+    words = [*ABLATE, "densify=adc", "+densify.switches.a.off.split_size=0.5"]
+    line = refused("ablate", *words, "+densify.switches.b.off.split_size=0.5")
+    assert "switching " in line
+    assert " changes no setting: give another VALUE" in line

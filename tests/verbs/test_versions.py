@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.claims.gate import PASSED, WORSE, declare_gate, first_worse
-from gsbench.errors import TrainingError
+from gsbench.claims.gate import PASSED, WORSE, declare_gate, first_worse, most_steps
+from gsbench.errors import InputError, TrainingError
 from gsbench.verbs import versions
 from gsbench.verbs.versions import CommitSearch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.composed import composed
 
 COMMITS = [
     (letter * 40, f"2026-01-0{day}", f"change {letter}") for day, letter in enumerate("abc", 1)
@@ -112,3 +114,36 @@ def test_a_commit_that_does_not_train_is_skipped_unless_it_is_the_first_or_last(
     good = begun(tmp_path / "good", monkeypatch, Trainings(fails="a"))
     with pytest.raises(TrainingError, match="it broke"):
         good.result(1)
+
+
+@pytest.mark.usefixtures("runs")
+def test_the_same_question_continues_the_same_search(monkeypatch, tmp_path):
+    example = composed(["scene=courtyard", "densify=adc", "name=bisect", "seed=0"])[0]
+    monkeypatch.setattr(versions, "one_trial_per_scene", lambda *_: {"courtyard": example})
+    settings = ["scene=courtyard", "densify=adc"]
+
+    def begin(commits: Sequence[str], *words: str, seeds: int = 3) -> CommitSearch:
+        options = Namespace(metric="psnr", least="0.1", settings=[*settings, *words], seeds=seeds)
+        named: Any = [(commit * 40, "2026-01-01", "a change") for commit in commits]
+        return versions._begin(options, SimpleNamespace(), named)
+
+    first = begin("abc")
+    assert first.home.parent == tmp_path / "runs"
+    assert first.home.name.startswith("bisect_")
+    assert first.scenes == {"courtyard"}
+    assert begin("axc", "name=other", f"runs={tmp_path}").home == first.home
+    assert begin("abc").declaration == first.declaration
+    others = [begin(*words).home for words in (("abd",), ("dbc",), ("abc", "train=quick"))]
+    assert len({first.home, *others}) == 4
+    # all gates together err in 5 % at most
+    gates = most_steps(2)
+    assert first.declaration.error_rate == pytest.approx(0.05 / gates)
+    with pytest.raises(InputError, match="at least 2 seeds, and there is 0"):
+        begin("abcd", seeds=-1)
+    example.values["scene"]["path"] = "photos"
+    with pytest.raises(
+        InputError, match=r"scene\.path=photos: commits are trained in other folders"
+    ):
+        begin("abc")
+    example.values["scene"]["path"] = "~/photos"
+    assert begin("abc").settings == settings
