@@ -11,18 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from gsbench import __version__, cli
-from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.ply import write_ply
-from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.stopping import Stopped
-from gsbench.verbs import load_verb, machine, servers
-from tests.finished import write_results
-from tests.gaussians.helpers import random_gaussians
+from gsbench.verbs import load_verb
 
 
 @pytest.fixture(autouse=True)
@@ -167,96 +160,6 @@ def test_unknown_verb_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> N
 def test_hydra_shows_the_configuration(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["--cfg", "job", "train.iterations=77"]) == 0
     assert "iterations: 77" in capfd.readouterr().out
-
-
-# ---- export
-
-
-def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
-    """Write a complete trial with a model and an initial cloud in the store; returns its folder."""
-    values = compose_one(["name=x", "densify=adc"]).values
-    folder = TrialFolder.of(values).path
-    folder.mkdir(parents=True)
-    write_ply(gaussians, folder / "point_cloud.ply")
-    (runs / "store" / "init" / "abc" / "sparse" / "0").mkdir(parents=True)
-    (runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin").write_bytes(b"points")
-    write_results(folder, values, num_gaussians=len(gaussians), hashes={"init": "abc"})
-    return folder
-
-
-@pytest.fixture
-def gaussians() -> Gaussians:
-    return random_gaussians(60, seed=3, dtype=torch.float32)
-
-
-def test_export_of_the_model_and_the_initial_cloud(
-    runs: Path, gaussians: Gaussians, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = finished_trial(runs, gaussians)
-    assert cli.run(["export", "x:courtyard:adc:0", "--out", "new/model.ply"]) == 0
-    assert (tmp_path / "new" / "model.ply").read_bytes() == (
-        folder / "point_cloud.ply"
-    ).read_bytes()
-    assert "new/model.ply: x/courtyard/sfm-adc/" in capsys.readouterr().out
-    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 0
-    assert (tmp_path / "model" / "sparse" / "0" / "points3D.bin").read_bytes() == b"points"
-    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 2
-    assert cli.run(["export", str(folder), "--out", "model.xyz"]) == 2
-    assert cli.run(["export", "x:courtyard:mcmc", "--out", "model.ply"]) == 2
-    assert cli.run(["export", str(folder), "--out", "/proc/nowhere/model.ply"]) == 2
-    assert "give another --out" in capsys.readouterr().err
-
-
-# ---- ui, doctor
-
-
-def test_ui_needs_a_database(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["ui"]) == 2
-    assert "no MLflow database" in capsys.readouterr().err
-
-
-def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    commands: list[list[str]] = []
-
-    class Server:
-        def __init__(self, command: list[str], env: dict[str, str]) -> None:
-            commands.append(command)
-            assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
-
-        def wait(self) -> int:
-            return 0
-
-    monkeypatch.setattr(subprocess, "Popen", Server)
-    monkeypatch.setattr(servers, "end_descendants", lambda: None)
-    assert servers.serve("sqlite:///x.db", 1234) == 0
-    assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
-
-
-def test_doctor_names_the_packages_that_triton_compiles_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(machine, "version_of", lambda package: "3.7.1")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("CC", raising=False)
-    (finding,) = machine.check_triton()
-    assert finding.verdict == "note"
-    assert "a C compiler: install the package gcc" in finding.text
-    (tmp_path / "gcc").write_text("")
-    (tmp_path / "gcc").chmod(0o755)
-    monkeypatch.setattr("sysconfig.get_paths", lambda scheme: {"include": str(tmp_path)})
-    (finding,) = machine.check_triton()
-    version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    assert f"Python.h: install the package python{version}-dev" in finding.text
-    (tmp_path / "Python.h").write_text("")
-    assert not list(machine.check_triton())
-    monkeypatch.setenv("CC", "nosuchcc -O2")
-    (finding,) = machine.check_triton()
-    assert "CC is nosuchcc -O2, which is not there" in finding.text
-
-
-def test_doctor_on_a_runs_folder(runs: Path) -> None:
-    assert next(machine.check_runs(runs)).verdict in ("ok", "note")
-    assert next(machine.check_runs(Path("/proc/nowhere"))).verdict == "bad"
 
 
 def test_ctrl_c_while_a_native_module_is_imported_is_reported_as_a_stop(

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import sys
 import tomllib
 from collections.abc import Iterable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
+from gsbench.errors import InputError
 from gsbench.verbs import machine
 from gsbench.verbs.machine import Finding
 from tests.conftest import ROOT
@@ -98,3 +103,125 @@ def test_doctor_on_this_machine_covers_all_topics(tmp_path, capsys):
     for module in machine.OPTIONAL:
         (line,) = (line for line in lines if line.split()[1] == module)
         assert ("not installed" in line) == (importlib.util.find_spec(module) is None)
+
+
+def test_doctor_names_the_packages_that_triton_compiles_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine, "version_of", lambda package: "3.7.1")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC", raising=False)
+    (finding,) = machine.check_triton()
+    assert finding.verdict == "note"
+    assert "a C compiler: install the package gcc" in finding.text
+    (tmp_path / "gcc").write_text("")
+    (tmp_path / "gcc").chmod(0o755)
+    monkeypatch.setattr("sysconfig.get_paths", lambda scheme: {"include": str(tmp_path)})
+    (finding,) = machine.check_triton()
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert f"Python.h: install the package python{version}-dev" in finding.text
+    (tmp_path / "Python.h").write_text("")
+    assert not list(machine.check_triton())
+    monkeypatch.setenv("CC", "nosuchcc -O2")
+    (finding,) = machine.check_triton()
+    assert "CC is nosuchcc -O2, which is not there" in finding.text
+
+
+def test_doctor_on_a_runs_folder(runs: Path) -> None:
+    assert next(machine.check_runs(runs)).verdict in ("ok", "note")
+    assert next(machine.check_runs(Path("/proc/nowhere"))).verdict == "bad"
+
+
+def test_doctor_says_what_is_missing(monkeypatch):
+    monkeypatch.setattr(machine, "version_of", lambda name: "")
+    found = {one.topic: one for one in machine.check_packages()}
+    for name in machine.REQUIRED:
+        assert found[name].verdict == "bad"
+        assert found[name].text.startswith("missing: ")
+    for name, (purpose, _) in machine.OPTIONAL.items():
+        assert found[name].verdict == "note"
+        assert found[name].text.startswith(f"not installed; needed for {purpose}: ")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    ((verdict, text),) = said(machine.check_devices())
+    assert verdict == "bad"
+    assert text.startswith("cannot be imported (")
+
+
+def test_a_full_disk_is_noted(tmp_path, monkeypatch):
+    for free, verdict in ((machine.LITTLE_SPACE - 1, "note"), (machine.LITTLE_SPACE, "ok")):
+        monkeypatch.setattr("shutil.disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        assert next(machine.check_runs(tmp_path / "a" / "b")).verdict == verdict
+
+
+def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monkeypatch):
+    def known(name: str, device: torch.device) -> Any:
+        if name == "triton" and device.index == 0:
+            errors = {"image": 1e-6}
+            return SimpleNamespace(
+                raster=name, device=device, passed=False, seconds=2.6, errors=errors
+            )
+        return None
+
+    obstacle = lambda self, device: "no" if self.name == "gsplat" else None  # noqa: E731
+    monkeypatch.setattr(type(machine.EXECUTORS[0]), "obstacle", obstacle)
+    monkeypatch.setattr("gsbench.train.proof.known_proof", known)
+    found = said(machine.check_proofs())
+    assert (
+        "bad",
+        "raster=triton departs from the reference on cuda:0 (3 s): image 1.0e-06",
+    ) in found
+    assert ("note", "raster=triton on cuda:1: none yet; its first use makes it") in found
+    assert not [text for _, text in found if "gsplat" in text or " cpu" in text]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--json"], "belong to --prove"),
+        (["--raster", "cpu"], "belong to --prove"),
+        (["--device", "cpu"], "belong to --prove"),
+    ],
+)
+def test_options_of_a_proof_need_prove(tmp_path, words, message):
+    with pytest.raises(InputError, match=message):
+        machine.doctor(words, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--size", "15x20"], "a size is WIDTHxHEIGHT"),
+        (["--size", "500"], "a size is WIDTHxHEIGHT"),
+        (["--count", "0"], "a count is at least 1"),
+        (["--count", "5,x"], "a count is at least 1"),
+        (["--ply", "nowhere.ply"], "nowhere.ply does not exist"),
+        (["--kernels"], "has no place in the table: add --json"),
+        (["--raster", "cpu,auto"], "name those to time"),
+    ],
+)
+def test_bad_words_of_bench_are_refused(words, message):
+    with pytest.raises(InputError, match=message):
+        machine.bench(words)
+
+
+def test_bench_times_what_the_words_name(monkeypatch, capsys):
+    asked: list[Any] = []
+    row = {"raster": "cpu", "size": "16x32", "count": 7, "step_ms": 1.234, "step_ratio": 0.5}
+    row |= {"peak_mb": None} | dict.fromkeys(machine.NOT_SHOWN, 0)
+
+    def run_bench(*given: Any, **named: Any) -> list[dict[str, Any]]:
+        asked.append((*given, named))
+        return [row]
+
+    monkeypatch.setattr("gsbench.bench.measure.run_bench", run_bench)
+    words = ["--raster", "cpu,reference", "--size", "16x32,32x16", "--count", "7,8"]
+    assert machine.bench([*words, "--no-memory", "--repeats", "3"]) == 0
+    *lists, named = asked[0]
+    assert lists == [["cpu", "reference"], [(16, 32), (32, 16)], [7, 8]]
+    assert named == {
+        **{"ply": None, "repeats": 3, "threads": None, "memory": False},
+        **{"scene": "trained", "kernels": False},
+    }
+    header, line = capsys.readouterr().out.splitlines()
+    assert header.split() == ["raster", "size", "count", "step_ms", "step_ratio"]
+    assert line.split() == ["cpu", "16x32", "7", "1.2", "0.50"]

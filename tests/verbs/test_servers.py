@@ -10,16 +10,21 @@ import sys
 import time
 import urllib.request
 from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
+import torch
 
+from gsbench.runs.experiments import make_home
 from gsbench.tracking import connect
+from gsbench.verbs import servers
 
-pytestmark = pytest.mark.slow
 SECONDS = 120
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
 def test_all_processes_of_the_dashboard_end_and_none_imports_from_the_current_folder(
     tmp_path, signum
@@ -52,3 +57,202 @@ def test_all_processes_of_the_dashboard_end_and_none_imports_from_the_current_fo
         child for child in family if child.is_running() and child.status() != psutil.STATUS_ZOMBIE
     ]
     assert not (tmp_path / "exploded").exists()
+
+
+# ---- gsbench ui
+
+
+def test_ui_needs_a_database(runs, refused):
+    assert "no MLflow database" in refused("ui")
+
+
+def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    commands: list[list[str]] = []
+
+    class Server:
+        def __init__(self, command: list[str], env: dict[str, str]) -> None:
+            commands.append(command)
+            assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
+
+        def wait(self) -> int:
+            return 0
+
+    monkeypatch.setattr(subprocess, "Popen", Server)
+    monkeypatch.setattr(servers, "end_descendants", lambda: None)
+    assert servers.serve("sqlite:///x.db", 1234) == 0
+    assert commands[0][commands[0].index("--host") + 1] == "127.0.0.1"
+
+
+@pytest.fixture
+def served(runs, monkeypatch) -> list[Any]:
+    """The servers that ``ui`` would start, and the pages that it would open."""
+    served: list[Any] = []
+
+    class Thread:
+        def __init__(self, target: Any, args: Any, daemon: bool) -> None:
+            served.append((*args, daemon))
+
+        def start(self) -> None:
+            pass
+
+    runs.mkdir()
+    (runs / "mlflow.db").touch()
+    monkeypatch.setattr(servers, "publish", lambda home, uri: f"{len(home.name)}")
+    monkeypatch.setattr(servers, "version", lambda package: "3.17.0")
+    monkeypatch.setattr(servers, "serve", lambda uri, port: served.append((uri, port)) or 0)
+    monkeypatch.setattr(servers.threading, "Thread", Thread)
+    monkeypatch.setattr(servers, "_has_screen", lambda: True)
+    monkeypatch.setattr(servers, "_serves", lambda *_: False)
+    monkeypatch.setattr(
+        servers, "sys", SimpleNamespace(stdout=SimpleNamespace(isatty=lambda: True))
+    )
+    return served
+
+
+LOCAL = "http://127.0.0.1:5000"
+
+
+def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
+    uri = f"sqlite:///{runs / 'mlflow.db'}"
+    assert said("ui").split() == ["dashboard", LOCAL]
+    assert served == [(LOCAL, LOCAL, True), (uri, 5000)]
+    for name in ("ab", "cde"):
+        make_home(runs / name)
+        words = said("ui", "--port", "81").split()
+    assert words == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
+    served.clear()
+    pages = said("ui", "cde", "--no-browser").split()
+    assert pages[0] == "arms"
+    assert pages[1].startswith(f"{LOCAL}/#/experiments/3/")
+    assert pages[2] == "table"
+    assert served == [(uri, 5000)]
+
+
+def test_no_second_server_is_started(runs, served, said, monkeypatch):
+    make_home(runs / "ab")
+    address = "https://tracker.example"
+    page = said("ui", "--uri", address).split()[1]
+    assert served == [(address, page, False)]
+    served.clear()
+    monkeypatch.setattr(servers, "_serves", lambda server, name, page: name == "ab")
+    said("ui", "--no-browser")
+    assert served == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--uri", "file"], "--uri file is not an address"),
+        (["none"], "no experiment 'none'"),
+        (["ab"], "does not take ab (OSError: full)"),
+    ],
+)
+def test_what_the_dashboard_cannot_show_is_refused(
+    runs, served, refused, monkeypatch, words, message
+):
+    def full(*_: Any) -> str:
+        raise OSError("full")
+
+    make_home(runs / "ab")
+    monkeypatch.setattr(servers, "publish", full)
+    assert message in refused("ui", *words)
+    assert served == []
+
+
+def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
+    page = f"{LOCAL}/#/experiments/12/runs"
+    answers: list[Any] = [{"experiment": {"experiment_id": "12"}}, {"experiment": {}}, [], None]
+    answers += [{"experiment": {"experiment_id": "1"}}]
+
+    def get(place: str, params: dict[str, str], timeout: float) -> Any:
+        assert place == f"{LOCAL}/api/2.0/mlflow/experiments/get-by-name"
+        assert params == {"experiment_name": "x"}
+        assert timeout == servers.SECONDS_TO_ANSWER
+        return SimpleNamespace(json=lambda: answers.pop(0))
+
+    monkeypatch.setattr(servers.requests, "get", get)
+    assert [servers._serves(LOCAL, "x", page) for _ in range(4)] == [True, False, False, False]
+    assert not servers._serves(LOCAL, "x", f"{LOCAL}/#/experiments/12")
+
+
+def test_the_page_is_opened_once_the_server_answers(monkeypatch):
+    waits: list[float] = []
+    opened: list[str] = []
+    failures = [True, True, False]
+
+    def get(server: str, timeout: float) -> None:
+        assert server == LOCAL
+        if failures.pop(0):
+            raise servers.requests.ConnectionError
+
+    monkeypatch.setattr(servers.requests, "get", get)
+    monkeypatch.setattr(time, "sleep", waits.append)
+    monkeypatch.setattr(servers.webbrowser, "open", opened.append)
+    servers._open(LOCAL, "page")
+    assert (waits, opened) == ([1, 1], ["page"])
+    failures.extend([True] * servers.SECONDS_TO_START)
+    servers._open(LOCAL, "page")
+    assert (opened, failures) == (["page"], [])
+
+
+@pytest.mark.parametrize(
+    ("platform", "variables", "found"),
+    [
+        ("linux", {}, False),
+        ("linux", {"DISPLAY": ":0"}, True),
+        ("linux", {"WAYLAND_DISPLAY": "wayland-0"}, True),
+        ("darwin", {}, True),
+    ],
+)
+def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch, platform, variables, found):
+    monkeypatch.setattr(sys, "platform", platform)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert servers._has_screen() == found
+
+
+# ---- gsbench view
+
+
+def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, capsys, refused):
+    made: list[Any] = []
+
+    class Viewer:
+        url = "http://127.0.0.1:8080"
+
+        def __init__(self, painters: Any, port: int) -> None:
+            made.append((painters, port))
+
+        def stop(self) -> None:
+            made.append("stopped")
+
+    class Event:
+        def wait(self) -> None:
+            raise KeyboardInterrupt
+
+    def check_port(port: int) -> None:
+        made.append(port)
+
+    monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setitem(
+        sys.modules, "gsbench.view.server", SimpleNamespace(Viewer=Viewer, check_port=check_port)
+    )
+    monkeypatch.setattr("gsbench.view.trials.find_trial", lambda address, runs: address)
+    monkeypatch.setattr("gsbench.view.trials.load_viewed", lambda trial, device: (trial, device))
+    monkeypatch.setattr("gsbench.view.trials.TrialPainter", lambda *given: given)
+    proven = SimpleNamespace(rasterizer="rasterizer")
+    monkeypatch.setattr("gsbench.train.proof.create_proven", lambda name, device: proven)
+    monkeypatch.setattr(servers.threading, "Event", Event)
+    assert servers.view(["a", "b", "--device", "cpu", "--port", "0"], runs) == 0
+    cpu = torch.device("cpu")
+    painters = [(("a", cpu), "rasterizer"), (("b", cpu), "rasterizer")]
+    assert made == [0, (painters, 0), "stopped"]
+    assert capsys.readouterr().out.splitlines() == [
+        "http://127.0.0.1:8080  (Ctrl+C ends it)",
+        "stopped",
+    ]
+    assert "one or two trials can be viewed, not 3" in refused("view", "a", "b", "c")
+    monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: None)
+    assert "the viewer needs viser: " in refused("view", "a")

@@ -122,7 +122,7 @@ def _serves(server: str, experiment: str, page: str) -> bool:
         found = answer.json()["experiment"]["experiment_id"]
     except (requests.RequestException, ValueError, KeyError, TypeError):
         return False
-    return f"/experiments/{found}" in page
+    return f"/experiments/{found}/" in f"{page}/"  # 1 is not the experiment 12
 
 
 def _has_screen() -> bool:

@@ -1,0 +1,96 @@
+"""``gsbench export`` of models, initial models and results."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsbench import cli
+from gsbench.config.compose import compose_one
+from gsbench.errors import InputError
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.ply import write_ply
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.verbs import exchange
+from tests.analysis.synthetic import Plan, write_runs
+from tests.finished import write_results
+from tests.gaussians.helpers import random_gaussians
+
+pytestmark = pytest.mark.usefixtures("runs")
+
+
+def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
+    """Write a complete trial with a model and an initial cloud in the store; returns its folder."""
+    values = compose_one(["name=x", "densify=adc"]).values
+    folder = TrialFolder.of(values).path
+    folder.mkdir(parents=True)
+    write_ply(gaussians, folder / "point_cloud.ply")
+    (runs / "store" / "init" / "abc" / "sparse" / "0").mkdir(parents=True)
+    (runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin").write_bytes(b"points")
+    write_results(folder, values, num_gaussians=len(gaussians), hashes={"init": "abc"})
+    return folder
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    return random_gaussians(60, seed=3, dtype=torch.float32)
+
+
+def test_export_of_the_model_and_the_initial_cloud(
+    runs: Path, gaussians: Gaussians, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = finished_trial(runs, gaussians)
+    assert cli.run(["export", "x:courtyard:adc:0", "--out", "new/model.ply"]) == 0
+    assert (tmp_path / "new" / "model.ply").read_bytes() == (
+        folder / "point_cloud.ply"
+    ).read_bytes()
+    assert "new/model.ply: x/courtyard/sfm-adc/" in capsys.readouterr().out
+    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 0
+    assert (tmp_path / "model" / "sparse" / "0" / "points3D.bin").read_bytes() == b"points"
+    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 2
+    assert cli.run(["export", str(folder), "--out", "model.xyz"]) == 2
+    assert cli.run(["export", "x:courtyard:mcmc", "--out", "model.ply"]) == 2
+    assert cli.run(["export", str(folder), "--out", "/proc/nowhere/model.ply"]) == 2
+    assert "give another --out" in capsys.readouterr().err
+
+
+def test_the_archive_of_results_gets_the_name_of_the_experiment_or_of_out(runs, tmp_path, said):
+    write_runs(runs, Plan())
+    (tmp_path / "new").mkdir()
+    for out, file in (([], "exp.zip"), (["--out", "new"], "new/exp.zip"), (["--out", "a"], "a")):
+        assert said("export", "--results", "exp", *out).startswith(f"{file}: results of exp, ")
+        assert (tmp_path / file).stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--results", "exp", "a:b:c"], "takes an experiment, --out and --pictures alone"),
+        (["--results", "a/b"], "'a/b' is not the name of an experiment"),
+        (["a:b:c", "--pictures", "--out", "x.ply"], "--pictures goes with --results"),
+        (["a:b:c"], "export needs a TRIAL and --out PATH"),
+        (["--out", "x.ply"], "export needs a TRIAL and --out PATH"),
+        (["a:b:c", "d:e:f", "--out", "x.ply"], "one TRIAL is exported, not 2"),
+        (["init", "init", "d:e:f", "--out", "x"], "one TRIAL is exported, not 3"),
+    ],
+)
+def test_words_that_do_not_go_together_are_refused(refused, words, message):
+    assert message in refused("export", *words)
+
+
+@pytest.mark.parametrize(
+    ("name", "good"),
+    [("m.ply", True), ("M.PLY", True), ("m.compressed.ply", False), ("m.splat", False)],
+)
+def test_only_the_3dgs_form_is_written(name, good):
+    if good:
+        exchange.check_form(Path(name))
+    else:
+        with pytest.raises(InputError, match=r"name a file that ends in \.ply, the 3DGS form"):
+            exchange.check_form(Path(name))
+
+
+def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, refused):
+    folder = finished_trial(runs, gaussians)
+    (runs / "store" / "init" / "abc").rename(runs / "gone")
+    assert "no longer in the store" in refused("export", "init", folder, "--out", "model")
