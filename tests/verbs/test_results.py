@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.verbs.results import explain, explain_cell, report, tables
+from gsbench.runs.keys import AS_RELEASED
+from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
 from tests.analysis.synthetic import Plan, write_runs
 
 
@@ -160,3 +163,48 @@ def test_a_report_compares_with_a_densifier_of_the_experiment(made, capsys):
     assert "sfm-adc against sfm-volumetric" in Path("r.html").read_text()
     with pytest.raises(InputError, match="--baseline mcmc: exp has adc, volumetric"):
         report(["exp", "--baseline", "mcmc"], made)
+
+
+# ---- explain: where the numbers of a trial come from
+
+
+def test_an_origin_names_program_machine_and_code():
+    record = SimpleNamespace(
+        num_gaussians=12345,
+        num_init_points=None,
+        test_views=7,
+        hashes={"data": "d", "train": "t"},
+        trained_by=None,
+        renders={"folder": "r"},
+        code=SimpleNamespace(commit="", edited=False, rooms={"init": AS_RELEASED}),
+        versions={"torch": "2.13.0"},
+    )
+    trial: Any = SimpleNamespace(
+        record=record,
+        path=Path("runs/x"),
+        from_renders=False,
+        program=None,
+        conditions={"data": 1},
+        machine="",
+        code={},
+    )
+    own = {"folder": "runs/x", "Gaussians": "12,345 from 0 points", "views": "7 for testing"}
+    assert _origin(trial) == own | {"train": "t", "versions": "torch 2.13.0"}
+    trial.from_renders, record.test_views = True, None
+    assert _origin(trial)["Gaussians"] == "folder r"
+    assert _origin(trial)["views"] == "? for testing"
+    trial.program = "nerfstudio"
+    assert _origin(trial)["Gaussians"] == "its own renders"
+    record.trained_by = SimpleNamespace(version="brush 1", command=["brush", "a"])
+    trial.machine, trial.code = "a CPU", {"code:mine": "f" * 64}
+    record.code.commit, record.code.edited = "abc", True
+    found = _origin(trial)
+    assert found["program"] == "brush 1: brush a"
+    assert found["machine"] == "a CPU"
+    assert found["code"].startswith("code:mine ffff")
+    assert found["commit"] == "abc, edited"
+    assert "edited" not in found
+    record.code.rooms["eval"] = "1" * 64
+    assert _origin(trial)["edited"] == "since the last release: eval"
+    del record.code.rooms["init"]  # all rooms count as edited before the first release
+    assert "edited" not in _origin(trial)

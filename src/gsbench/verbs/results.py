@@ -301,7 +301,7 @@ def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
         lines += [
             f"    {label:<9} {text}" for label, text in origin.items() if (label, text) in new
         ]
-        previous |= origin
+        previous = origin
     return lines
 
 
