@@ -7,9 +7,17 @@ import pytest
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.statistics import Answer, StudentT
-from gsbench.claims.stopping import KeyAndSeed, headline, run_looks, trials_of_look
+from gsbench.analysis.statistics import Answer, StudentT, plan_looks
+from gsbench.claims.stopping import (
+    KeyAndSeed,
+    headline,
+    plan_sweep,
+    run_looks,
+    trials_of_look,
+)
+from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Declaration, Question
+from tests.composed import composed
 
 BOTH = Question(
     metric="psnr",
@@ -71,3 +79,62 @@ def test_the_verdict_on_a_pair_is_one_sentence():
     assert "sfm-adc: not decided yet, " in waits
     assert "not decided yet" not in decided
     assert decided.endswith("with 0 of at most 3 seeds; a note")
+
+
+# ---- the looks of a sweep
+
+WORDS = ["launch.stop_when_decided=true", "seed=3,1,2", "eval.primary=psnr", "densify=adc,mcmc"]
+
+
+@pytest.mark.usefixtures("runs")
+def test_each_pair_of_arms_is_a_question_about_the_primary_metric():
+    trials = composed([*WORDS, "scene=courtyard", "densify=adc,mcmc,volumetric"])
+    stopping = plan_sweep(trials)
+    first, second = stopping.declaration.questions
+    assert (first.metric, first.sign, first.least) == ("psnr", 1, 0.1)
+    assert {str(one.arm) for one in (first, second)} == {"sfm-mcmc", "sfm-volumetric"}
+    assert {str(one.baseline) for one in (first, second)} == {"sfm-adc"}
+    assert first.seeds == (3, 1, 2)
+    assert stopping.declaration.looks == plan_looks(3)
+    assert stopping.home == trials[0].files.home
+    assert {key: trial.values["seed"] for key, trial in stopping.trials.items()} == {
+        key: key[1] for key in stopping.trials
+    }
+    assert len(stopping.trials) == len(trials)
+    assert stopping.describe() == (
+        "stops when decided, by psnr and a least difference of 0.1: 2 pairs of arms, looks at 2, 3 "
+        "seeds, 6 trials until the first, 9 at most"
+    )
+    (own,) = plan_sweep(composed([*WORDS, "launch.least_difference=0.25"])).declaration.questions
+    assert own.least == 0.25
+
+
+@pytest.mark.usefixtures("runs")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([*WORDS, "name=a,b"], "all trials of the sweep need one name and one eval.primary"),
+        ([*WORDS, "eval.primary=null"], "needs the metric that decides"),
+        ([*WORDS, "eval.primary=fps", "eval.fps=[64,64]"], "fps has no usual least difference"),
+        ([*WORDS, "densify=adc"], "compares arms, and this sweep has one: give two densifiers"),
+    ],
+)
+def test_a_sweep_that_cannot_be_tested_in_looks_is_refused(words, message):
+    with pytest.raises(InputError, match=message):
+        composed(words)
+
+
+@pytest.mark.usefixtures("runs")
+def test_arms_of_a_sweep_in_looks_share_scenes_and_seeds():
+    """Joined grids may give them other ones."""
+    adc, mcmc = (
+        [one for one in composed([*WORDS, seeds]) if one.values["densify"]["name"] == name]
+        for name, seeds in (("adc", "seed=0,1"), ("mcmc", "seed=2,3"))
+    )
+    with pytest.raises(InputError, match="sfm-mcmc on courtyard has 2, 3, others 0, 1"):
+        plan_sweep([*adc, *mcmc])
+    for trial in mcmc:
+        trial.values["scene"]["name"] = "garden"
+        trial.values["seed"] -= 2
+    with pytest.raises(InputError, match="sfm-mcmc and sfm-adc have no scene in common"):
+        plan_sweep([*adc, *mcmc])
