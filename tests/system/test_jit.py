@@ -7,13 +7,13 @@ import inspect
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numba
 import pytest
 
-from gsbench.system.jit import PACKAGE, SOURCES, cache_base, cache_folder
+from gsbench.system.jit import PACKAGE, SOURCES, _Announcement, cache_base, cache_folder
 from tests.test_architecture import arrows, modules
 
 KERNEL_MODULES = sorted(
@@ -135,3 +135,17 @@ def test_processors_do_not_share_a_folder(monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
         folders.add(cache_folder.__wrapped__())
     assert len(folders) == 4
+
+
+def test_compiling_is_announced_once_and_only_for_own_kernels(caplog):
+    def event(module: str) -> Any:
+        function = SimpleNamespace(__module__=module)
+        return SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=function)})
+
+    announcement = _Announcement()
+    said = []
+    for module in ("gsbenchmark.kernels", "numpy", "gsbench.raster", "gsbench.train", "numpy"):
+        announcement.on_start(event(module))
+        said.append(len(caplog.messages))
+    assert said == [0, 0, 1, 1, 1]
+    assert caplog.messages == ["compiling for this processor, some 10 s, once"]

@@ -12,9 +12,10 @@ import pytest
 import torch
 
 from gsbench.system import resources as memory
-from gsbench.system.resources import MIB, peak_memory_mb, peak_resident_mb, reset_peak_memory
+from gsbench.system.resources import peak_memory_mb, peak_resident_mb, reset_peak_memory
 
 CPU = torch.device("cpu")
+MIB = 1_048_576
 LARGE_MB = 200
 
 
