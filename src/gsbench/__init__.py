@@ -15,7 +15,8 @@ if (
     # `python -m` puts the current folder first, where a capture may hold a module of any name
     del sys.path[0]
 
-import zlib  # noqa: F401 - loaded before pycolmap brings its own, with which Pillow's PNG writer crashes
+# Loaded before pycolmap brings its own, with which Pillow's PNG writer crashes.
+import zlib  # noqa: F401
 
 # torch reads this when it is loaded: its idle threads must not spin beside those of our kernels. On
 # a busy machine an optimiser step took ten times as long.

@@ -116,7 +116,8 @@ class FeatureOptions(ColmapOptions):
     ``max_image_size`` is in px of the longest side.
     """
 
-    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]  # SIFT has no "lowres"
+    # SIFT has no "lowres"
+    pairs: Pairing | Literal["lowres"] = "exhaustive"  # type: ignore[assignment]
     max_keypoints: PositiveInt = 2048
     max_image_size: ImageSize = 1600
     max_ratio: MatchRatio = 0.95

@@ -9,7 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import pycolmap  # noqa: F401 - its import replaces signal handlers, which `reinstall_handlers` then restores
+# Its import replaces signal handlers, which `reinstall_handlers` then restores.
+import pycolmap  # noqa: F401
 import torch
 
 from gsbench import __version__

@@ -2,7 +2,6 @@
 
 import codecs
 import tempfile
-import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Many exporters write photographs that are undistorted already under a model with
 coefficients are zero. Undistorting these again would resample every pixel for nothing.
 """
 
-import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
-
 import numpy as np
 import pycolmap
 

@@ -15,7 +15,6 @@ import logging
 import os
 import secrets
 import shutil
-import zlib  # noqa: F401  must be loaded before pycolmap, whose own zlib otherwise crashes Pillow's PNG code
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -101,7 +101,8 @@ def prove(
                 break
     except (torch.OutOfMemoryError, InputError):
         raise
-    except Exception as error:  # noqa: BLE001 - whatever a compiler or a driver raises is the result of the proof
+    except Exception as error:  # noqa: BLE001
+        # Whatever a compiler or a driver raises is the result of the proof.
         failures.append(
             f"{type(error).__name__}: "
             f"{str(error).strip().splitlines()[0] if str(error).strip() else ''}"

@@ -223,7 +223,8 @@ class Session:
             seen = (page.wxyz, page.position, page.fov, page.aspect)
             camera = page_camera(*seen, height, self._panes())
             image = self.viewer.draw(camera, self.viewer.layers(), self.viewer.photograph())
-        except Exception as error:  # noqa: BLE001 - a page may send any values, and they must not end this thread
+        except Exception as error:  # noqa: BLE001
+            # A page may send any values, and they must not end this thread.
             log.debug("view: %r", error)
             return
         if not self._stopped.is_set():

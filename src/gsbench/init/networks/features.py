@@ -136,8 +136,8 @@ class FeatureStore:
                 width, height, file_width, file_height = (int(side) for side in data["sizes"])
                 arrays = data["keypoints"], data["descriptors"], data["scores"]
                 return Features(*arrays, (width, height), (file_width, file_height))
-        except Exception:  # noqa: BLE001  numpy may raise any exception on a damaged file; the file is then made again
-            return None
+        except Exception:  # noqa: BLE001  numpy may raise any exception on a damaged file
+            return None  # the file is made again
 
     def write_features(self, name: str, features: Features) -> None:
         """Store the features of the image ``name``."""
