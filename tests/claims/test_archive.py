@@ -1,6 +1,8 @@
 """Archives of results: what they keep, what they never hold, and one line for every damage."""
 
 import json
+import os
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from gsbench.analysis.images import textured_error
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.claims.archive import unpack_archive, write_archive
 from gsbench.errors import InputError
@@ -245,3 +248,36 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
         [],
     ):
         refused("export", *words)
+
+
+def test_what_a_question_asks_of_pictures_comes_with_the_results(tmp_path, monkeypatch):
+    """Pictures themselves stay out; a trial whose pictures are gone has no such number."""
+    runs = tmp_path / "runs"
+    first, *_ = write_runs(runs, Plan(scenes=("yard",), seeds=(0,), pictures=True))
+    (runs / "exp" / "declared.jsonl").write_text(
+        '{"questions": [{"metric": "error_textured", "sign": 0}], "time": "2026-01-01T00:00:00Z"}\n'
+    )
+    there = {one.key: textured_error(one) for one in load_experiment(runs, "exp").trials}
+    (first / "from_pixels.json").unlink(missing_ok=True)
+    shutil.rmtree(first / "renders")
+    write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    lost, kept = unpack_archive(tmp_path / "exp.zip", tmp_path / "other").trials
+    assert textured_error(kept) == there[kept.key]
+    with pytest.raises(InputError):
+        textured_error(lost)
+
+
+def test_trials_without_a_sound_configuration_are_left_out(tmp_path):
+    runs = tmp_path / "runs"
+    first, second, *others = write_runs(runs, Plan(scenes=("yard",)))
+    (first / "config.yaml").unlink()
+    (second / "config.yaml").write_text("[1]")
+    left_out = write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    assert len(unpack_archive(tmp_path / "exp.zip", tmp_path / "other").trials) == len(others)
+    assert len(left_out) == 2
+
+
+def test_a_pipe_is_no_archive(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="it is not a regular file"):
+        unpack_archive(tmp_path / "pipe", tmp_path / "other")
