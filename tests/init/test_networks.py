@@ -1,0 +1,170 @@
+"""Features of all images and matches of all pairs, with stand-ins for the networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.errors import GsbenchError, InputError
+from gsbench.files import file_sha256
+from gsbench.init import SiftKornia
+from gsbench.init.networks import extract_and_match
+from gsbench.init.networks.extract_and_match import NetworkJob, open_store
+from gsbench.init.networks.features import Features
+from gsbench.scene.types import Capture
+
+NAMES = ("a.png", "b.png", "c.png")
+
+
+class Networks:
+    """Notes what is computed: ``keypoints`` of each image, and ``matched`` pairs of ``counts``."""
+
+    def __init__(self) -> None:
+        self.made: list[str] = []
+        self.extracted: list[str] = []
+        self.matched: list[tuple[int, int]] = []
+        self.keypoints = {"a.png": 2, "b.png": 3, "c.png": 4}
+        self.without: set[tuple[int, int]] = set()
+
+    def build(self, kind: str) -> Any:
+        def make(*_: Any) -> Any:
+            self.made.append(kind)
+            return self.match if kind == "matcher" else kind
+
+        return make
+
+    def extract(self, path: Path, extractor: Any, settings: Any, device: Any) -> Features:
+        assert extractor == "extractor"
+        self.extracted.append(path.name)
+        count = self.keypoints[path.name]
+        # on the diagonal of the image; the descriptors are the number of keypoints
+        keypoints = np.arange(count, dtype=np.float32).repeat(2).reshape(-1, 2)
+        descriptors = np.full((count, 1), count, np.float32)
+        return Features(keypoints, descriptors, np.ones(count, np.float32), (8, 8), (8, 8))
+
+    def match(self, first: Features, second: Features) -> Any:
+        pair = (len(first.keypoints), len(second.keypoints))
+        self.matched.append(pair)
+        return np.zeros((0 if pair in self.without else 1, 2), np.uint32)
+
+
+@pytest.fixture
+def networks(monkeypatch: pytest.MonkeyPatch) -> Networks:
+    made = Networks()
+    monkeypatch.setitem(extract_and_match.EXTRACTORS, "sift_kornia", made.build("extractor"))
+    monkeypatch.setattr(extract_and_match, "build_matcher", made.build("matcher"))
+    monkeypatch.setattr(extract_and_match, "extract_features", made.extract)
+    return made
+
+
+@pytest.fixture
+def job(bare_photos: Capture, tmp_path: Path) -> NetworkJob:
+    images = tmp_path / "images"
+    images.mkdir()
+    for number, name in enumerate(NAMES):
+        Image.new("L", (8, 8), number).save(images / name)
+    capture = replace(bare_photos, images=images, image_names=NAMES, test_names=())
+    options = SiftKornia(threads=1)
+    work = tmp_path / "work"
+    return NetworkJob(options, options.feature_settings(), capture, None, work, None, None)
+
+
+def run(job: NetworkJob, told: list[Any] | None = None) -> Any:
+    progress = (lambda *at: None) if told is None else (lambda *at: told.append(at))
+    return extract_and_match.extract_and_match(job, progress)
+
+
+def test_each_image_and_pair_is_computed_once(networks: Networks, job: NetworkJob) -> None:
+    told: list[Any] = []
+    found = run(job, told)
+    assert networks.made == ["extractor", "matcher"]
+    assert networks.extracted == list(NAMES)
+    assert networks.matched == [(2, 3), (2, 4), (3, 4)]
+    assert told == [(what, done, 3) for what in ("extract", "match") for done in range(4)]
+    assert found.counts == {
+        "pairs_selected": 3,
+        "pairs_without_matches": 0,
+        "images_without_keypoints": 0,
+    }
+    assert set(found.seconds) == {"extract", "match"}
+    again = run(job)
+    assert networks.made == ["extractor", "matcher"]  # no network is loaded again
+    assert (again.counts, len(networks.extracted), len(networks.matched)) == (found.counts, 3, 3)
+
+
+def test_images_without_keypoints_and_pairs_without_matches_are_counted(
+    networks: Networks, job: NetworkJob
+) -> None:
+    networks.keypoints["a.png"] = 0
+    found = run(job)
+    assert networks.matched == [(3, 4)]
+    assert found.counts["images_without_keypoints"] == 1
+    assert found.counts["pairs_without_matches"] == 2
+    assert found.warnings == ("no keypoint in a.png: no point comes from these images",)
+
+
+def test_nothing_to_match_is_refused(networks: Networks, job: NetworkJob) -> None:
+    networks.without = {(2, 3), (2, 4), (3, 4)}
+    with pytest.raises(InputError, match="sift_kornia: no pair of images has a match"):
+        run(job)
+    networks.keypoints = dict.fromkeys(NAMES, 0)
+    with pytest.raises(InputError, match="sift_kornia: no keypoint in any image"):
+        run(replace(job, work_dir=job.work_dir / "other"))
+
+
+def test_keypoints_on_ignored_pixels_are_left_out(networks: Networks, job: NetworkJob) -> None:
+    mask = np.full((8, 8), 255, np.uint8)
+    mask[1, 1] = 0
+    Image.fromarray(mask).save(job.work_dir.parent / "mask.png")
+    masks = {"c.png": job.work_dir.parent / "mask.png"}
+    masked = replace(job, capture=replace(job.capture, masks=masks))
+    run(masked)
+    store = open_store(masked)
+    assert store.require_features("c.png").keypoints.tolist() == [[0, 0], [2, 2], [3, 3]]
+    assert len(store.require_features("b.png").keypoints) == 3
+
+
+def test_pairs_that_the_preview_leaves_out_are_counted(
+    networks: Networks, job: NetworkJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+
+    def proposed(names: Sequence[str], strongest: Any) -> list[tuple[str, str]]:
+        seen.extend(strongest(name).tolist() for name in names)
+        return [("a.png", "c.png")]
+
+    monkeypatch.setattr(extract_and_match, "proposed_pairs", proposed)
+    monkeypatch.setattr(extract_and_match, "STRONGEST", 2)
+    found = run(replace(job, options=SiftKornia(threads=1, pairs="auto")))
+    assert seen == [[[2.0]] * 2, [[3.0]] * 2, [[4.0]] * 2]
+    assert networks.matched == [(2, 4)]
+    assert (found.counts["pairs_selected"], found.counts["pairs_left_out"]) == (1, 2)
+
+
+def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
+    networks: Networks, job: NetworkJob, tmp_path: Path
+) -> None:
+    run(job)
+    weights = tmp_path / "w.pth"
+    weights.write_bytes(b"weights")
+    found = run(replace(job, matcher_weights=weights))
+    assert found.settings["weights_sha256"] == {"w.pth": file_sha256(weights)}
+    assert (len(networks.extracted), len(networks.matched)) == (3, 6)
+    assert run(replace(job, extractor_weights=weights)).settings["weights_sha256"]
+    assert (len(networks.extracted), len(networks.matched)) == (6, 9)
+
+
+def test_stored_files_that_are_gone_are_named(networks: Networks, job: NetworkJob) -> None:
+    store = open_store(job)
+    with pytest.raises(GsbenchError, match=r"the stored features of a\.png are gone from .*work"):
+        store.require_features("a.png")
+    with pytest.raises(GsbenchError, match=r"the stored matches of a\.png and b\.png are gone"):
+        store.require_matches("a.png", "b.png")
+    np.save(store.matches_path("a.png", "b.png"), np.zeros((4, 3)))
+    assert store.read_matches("a.png", "b.png") is None
