@@ -394,6 +394,41 @@ def test_show_prints_all_for_programs(home: Path, capsys: pytest.CaptureFixture[
     assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
 
 
+def test_show_prints_the_rule_and_a_row_for_each_idea(home: Path, said: Any) -> None:
+    attempt(f"{SPLIT}=0.02", "--as", "good")
+    attempt(f"{SPLIT}=0.04", "--as", "bad")
+    lines = said("ledger", "show", "night").splitlines()
+    good, bad = (line.strip("| ").split(" | ") for line in lines if line[:4] in ("| 1 ", "| 2 "))
+    assert good[:4] == ["1 good", "baseline", "0.0025", "3"]
+    assert good[-3:] == ["×1.00", "kept", "better"]
+    assert bad[:4] == ["2 bad", "baseline", "0.005", "2"]
+    assert bad[-2:] == ["dropped", "a gain of 0.5 is unlikely"]
+    assert "2 of 40 planned ideas were tried, and 1 kept" in " ".join(lines)
+
+
+def test_names_of_ledgers_and_ideas_are_not_given_twice(
+    home: Path, trainings: Trainings, refused: Any
+) -> None:
+    attempt(f"{SPLIT}=0.02", "--as", "mine")
+    for name in ("mine", "baseline"):
+        line = refused("ledger", "try", "night", f"{SPLIT}=0.04", "--as", name)
+        assert f"--as {name}: another idea has this name" in line
+    assert "'store' cannot be the name" in refused("ledger", "show", "store")
+    folder = home.parent / "used" / "courtyard" / "random-adc" / "12345678-seed0"
+    write_results(folder, composed(NEW[6:])[0].values | {"name": "used"})
+    assert "used has trials already" in refused("ledger", "new", "used", *NEW[2:])
+
+
+@pytest.mark.parametrize(("code", "kind"), [(1, 1), (2, 2)])
+def test_nothing_is_confirmed_if_trials_fail(
+    home: Path, monkeypatch: pytest.MonkeyPatch, code: int, kind: int, capsys: Any
+) -> None:
+    attempt(f"{SPLIT}=0.02")
+    monkeypatch.setattr(verb, "run_trials", lambda trials: code)
+    assert run(["ledger", "confirm", "night", "scene=photos", "scene.path=x"]) == kind
+    assert "trials fail: nothing is confirmed" in capsys.readouterr().err
+
+
 def test_the_simulated_rule_decides_as_the_ledger_does(
     trainings: Trainings, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
