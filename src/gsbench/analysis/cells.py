@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gsbench.analysis.differences import (
+    conditions_between_scenes,
     describe_code,
     differing_code,
     differing_conditions,
@@ -128,11 +129,8 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
                     f"the table cell {where} has seed {seed} twice: {paths}; remove one of the "
                     "folders"
                 )
-    across = differing_conditions([group[0] for group in by_scene.values()])
-    for key in ("resolution", "data"):  # each scene has its own
-        across.pop(key, None)
-    if across:
-        raise _refusal(where, across, trials)
+    if across := conditions_between_scenes(trials):
+        raise _refusal(where, {key: list(values) for key, values in across.items()}, trials)
 
 
 def swept_settings(trials: Iterable[TrialResult]) -> list[str]:

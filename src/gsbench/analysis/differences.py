@@ -21,9 +21,10 @@ from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
 from gsbench.runs.keys import DECLARED, NOT_HASHED, SHOWN
 from gsbench.system.install import conf_dir
-from gsbench.words import counted, listed
+from gsbench.words import counted, listed, some_of
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
+ScenesByValue = dict[str, list[str]]  # value of a setting or condition -> the scenes that have it
 
 # Settings in which trials of one cell may differ: they do not change what is computed.
 # "x" stands for x and all below it (x.y).
@@ -84,6 +85,11 @@ WITHOUT_EFFECT = (
     "train.volume_histogram",
 )
 
+# Conditions and settings that each scene may have for itself. The settings of a budget are not
+# among them, so that a note says where it differs.
+OF_A_SCENE = ("resolution", "data", "budget")
+OWN_SETTINGS = (*WITHOUT_EFFECT, "scene", "init.path")
+
 CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
 
 FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
@@ -120,6 +126,69 @@ def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
     keys = {key for config in configs for key in config if not _is_among(key, IGNORED_SETTINGS)}
     values_by_key = {key: {canonical(config.get(key)) for config in configs} for key in keys}
     return {key: sorted(values) for key, values in sorted(values_by_key.items()) if len(values) > 1}
+
+
+def conditions_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
+    """The conditions, without `OF_A_SCENE`, in which the scenes of one arm differ.
+
+    A mean over such scenes would be about nothing.
+    """
+    by_scene = group_by(trials, lambda trial: trial.scene)
+    keys = differing_conditions([own[0] for own in by_scene.values()], code=False)
+    keys = {key: values for key, values in keys.items() if key not in OF_A_SCENE}
+    return _between_scenes(by_scene, keys, lambda trial, key: trial.conditions.get(key, "none"))
+
+
+def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
+    """The settings in which the scenes of one arm differ, without those of the scene itself."""
+    by_scene = group_by([trial for trial in trials if trial.config], lambda trial: trial.scene)
+    keys = differing_settings([own[0] for own in by_scene.values()])
+    keys = {key: values for key, values in keys.items() if not _is_among(key, OWN_SETTINGS)}
+    return _between_scenes(by_scene, keys, lambda trial, key: canonical(trial.config.get(key)))
+
+
+def _between_scenes(
+    by_scene: Mapping[str, Sequence[TrialResult]],
+    keys: Iterable[str],
+    value_of: Callable[[TrialResult, str], str],
+) -> dict[str, ScenesByValue]:
+    """For each of ``keys`` that differs between scenes, the scenes that have a value.
+
+    Left out is what is swept on one of the scenes: it makes several arms.
+    """
+    differing = {}
+    for key in keys:
+        values_by_scene = {
+            scene: {value_of(trial, key) for trial in own} for scene, own in by_scene.items()
+        }
+        if any(len(values) > 1 for values in values_by_scene.values()):
+            continue
+        scenes_by_value: ScenesByValue = {}
+        for scene, (value,) in values_by_scene.items():
+            scenes_by_value.setdefault(value, []).append(scene)
+        differing[key] = scenes_by_value
+    return differing
+
+
+def between_scenes_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """Lines on arms that have other settings or conditions on other scenes.
+
+    A mean over the scenes hides these: an arm may have been tuned for each scene.
+    """
+    arms_by_text: dict[str, list[str]] = {}
+    for (init, densify), own in group_by(trials, lambda one: (one.init, one.densify)).items():
+        differing = conditions_between_scenes(own) | settings_between_scenes(own)
+        texts = []
+        for key, scenes_by_value in differing.items():
+            values = [f"{value} on {some_of(scenes)}" for value, scenes in scenes_by_value.items()]
+            texts.append(f"{key} ({some_of(values)})")
+        texts += [f"the version of {part.removeprefix(CODE)}" for part in differing_code(own)]
+        if texts:
+            arms_by_text.setdefault(some_of(texts), []).append(f"{init}-{densify}")
+    return [
+        f"Scenes of {listed(arms)} differ in more than the scene: {text}."
+        for text, arms in arms_by_text.items()
+    ]
 
 
 def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.pairing import Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import TrialResult, group_by
@@ -183,8 +184,11 @@ def _with_pairs(
     new = pairs.trials[1::2] if question.versions else pairs.trials
     late = sum(trial.measured < declaration.moment for trial in new)
     quantity = asked_quantity(question.metric, trials)
+    notes = pairs.left_out
+    if question.scenes:  # other questions are below tables, which say it themselves
+        notes += tuple(between_scenes_notes(pairs.trials))
     verdict = Verdict(
-        question, quantity, pairs, notes=pairs.left_out, late=late, final=not declaration.looks
+        question, quantity, pairs, notes=notes, late=late, final=not declaration.looks
     )
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)

@@ -20,7 +20,12 @@ from gsbench.analysis.cells import (
     with_variants,
 )
 from gsbench.analysis.declaration import active_declaration
-from gsbench.analysis.differences import differing_conditions
+from gsbench.analysis.differences import (
+    between_scenes_notes,
+    conditions_between_scenes,
+    differing_code,
+    differing_conditions,
+)
 from gsbench.analysis.fairness import caveats
 from gsbench.analysis.pairing import BASELINE, are_equal, choose_pairs, controls_of, pair_trials
 from gsbench.analysis.quantities import Quantity, choose_quantities
@@ -95,7 +100,9 @@ def build_table(
         )
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
-    if "scene" in rows and len(scenes) > 1:
+    if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(trials):
+        notes.append("No mean over the scenes is shown, since they differ in conditions or code.")
+    elif "scene" in rows and len(scenes) > 1:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
         best = set() if notes else _best(means, quantities, None)[0]
@@ -232,6 +239,12 @@ def _means(
     return cells
 
 
+def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
+    """Return whether the scenes of an arm have different conditions or versions of the code."""
+    by_arm = group_by(trials, lambda trial: (trial.init, trial.densify)).values()
+    return any(conditions_between_scenes(own) or differing_code(own) for own in by_arm)
+
+
 def _reading_notes(
     cells: Mapping[Position, Cell], quantities: Sequence[Quantity], expected: int, by_scene: bool
 ) -> list[str]:
@@ -313,6 +326,7 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings
         notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
+    notes += between_scenes_notes(trials)
     return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
 
 

@@ -1,0 +1,149 @@
+"""An arm that has other settings or conditions on other scenes: no mean hides that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gsbench.analysis.judgement import judge
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.table_formats import Table
+from gsbench.analysis.tables import build_table
+from gsbench.errors import InputError
+from gsbench.runs.experiments import Arm, Declaration, Question
+from tests.analysis.synthetic import Plan, trial_data, write_trial
+
+STAGES = {"scene": 1, "init": 1, "train": 1, "evaluate": 1}
+NO_MEAN = "No mean over the scenes is shown, since they differ in conditions or code."
+
+
+def write(
+    runs: Path,
+    scene: str,
+    config_hash: str = "c0ffee00",
+    densify: str = "adc",
+    settings: Mapping[str, Any] | None = None,
+    **results: Any,
+) -> None:
+    """Two trials of a scene; ``settings`` are settings, ``results`` keys of results.json."""
+    for seed in (0, 1):
+        views = {"psnr": 20.0 + (densify == "mcmc") + np.zeros(2) + seed}
+        data = trial_data(Plan(), scene, "sfm", densify, seed, views) | results
+        write_trial(runs, data, views, config_hash, **(settings or {}))
+
+
+def table(runs: Path, **how: Any) -> tuple[Table, bool]:
+    """The table of the experiment, and whether it has a mean over scenes."""
+    made = build_table(load_experiment(runs, "exp"), metrics=["psnr"], **how)
+    return made, any(row.labels[0].startswith("mean of") for row in made.rows)
+
+
+def lines(made: Table) -> list[str]:
+    return [note for note in made.notes if "more than the scene" in note or "No mean" in note]
+
+
+def test_settings_of_an_arm_that_differ_between_scenes_are_stated(tmp_path):
+    write(tmp_path, "park", "a" * 8, settings={"densify__start": 500, "init__count": 5})
+    write(tmp_path, "room", "b" * 8, settings={"densify__start": 900, "init__count": 5})
+    write(tmp_path, "yard", "a" * 8, settings={"densify__start": 500, "init__count": 5})
+    made, has_mean = table(tmp_path)
+    assert has_mean
+    assert lines(made) == [
+        "Scenes of sfm-adc differ in more than the scene: densify.start (500 on park, yard, 900 on "
+        "room)."
+    ]
+
+
+def test_arms_with_the_same_differences_share_a_line(tmp_path):
+    for densify in ("adc", "mcmc"):
+        for scene, most in (("park", 1000), ("room", 2000)):
+            settings = {"densify__max_gaussians": most}
+            budget = {"max_gaussians": most, "cap": "hard"}
+            write(tmp_path, scene, f"{most:08d}", densify, settings, budget=budget)
+    made, has_mean = table(tmp_path)
+    assert has_mean  # each scene has its own budget, as in many papers
+    assert lines(made) == [
+        "Scenes of sfm-adc and sfm-mcmc differ in more than the scene: densify.max_gaussians (1000 "
+        "on park, 2000 on room)."
+    ]
+    table(tmp_path, rows=("densify",))  # is not refused
+
+
+def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path):
+    for scene, starts in (("park", (500, 900)), ("room", (900,))):
+        for start in starts:
+            own = {"densify__start": start, "scene__path": scene, "scene__views": len(scene) + 1}
+            write(tmp_path, scene, f"{start:08d}", settings=own)
+    assert lines(table(tmp_path)[0]) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("protocol", ("paper-1", "standard-1")),
+        ("iterations", (2000, 7000)),
+        ("raster", ("cpu", "gsplat")),
+        ("split", ("every 8th", "sector 90 deg")),
+    ],
+)
+def test_no_mean_is_shown_over_scenes_under_different_conditions(tmp_path, key, values):
+    for scene, value in zip(("park", "room"), values, strict=True):
+        write(tmp_path, scene, **{key: value})
+    made, has_mean = table(tmp_path)
+    assert not has_mean
+    first, second = lines(made)
+    assert first == NO_MEAN
+    assert second == (
+        f"Scenes of sfm-adc differ in more than the scene: {key} ({values[0]} on park, {values[1]} "
+        "on room)."
+    )
+    with pytest.raises(InputError, match=key):
+        table(tmp_path, rows=("densify",))
+
+
+def test_no_mean_is_shown_over_versions_of_the_code(tmp_path):
+    for scene, version in (("park", 1), ("room", 2)):
+        write(tmp_path, scene, code={"sources": {}, "stages": STAGES | {"train": version}})
+    made, has_mean = table(tmp_path)
+    assert not has_mean
+    assert lines(made) == [
+        NO_MEAN,
+        "Scenes of sfm-adc differ in more than the scene: the version of stage train.",
+    ]
+
+
+def test_resolution_and_data_are_those_of_a_scene(tmp_path):
+    write(tmp_path, "park", resolution=[400, 300])
+    write(tmp_path, "room", resolution=[300, 200])
+    made, has_mean = table(tmp_path)
+    assert has_mean
+    assert lines(made) == []
+
+
+def test_a_verdict_on_named_trials_says_how_the_scenes_differ(tmp_path):
+    for densify in ("adc", "mcmc"):
+        write(tmp_path, "park", "a" * 8, densify, iterations=2000)
+        write(tmp_path, "room", "a" * 8, densify, iterations=7000)
+    scenes = {
+        scene: tuple(f"{scene}/sfm-{arm}/{'a' * 8}" for arm in ("adc", "mcmc"))
+        for scene in ("park", "room")
+    }
+    asked = Question(
+        metric="psnr", sign=1, baseline=Arm("", "a"), arm=Arm("", "b"), scenes=scenes, seeds=(0, 1)
+    )
+    trials = load_experiment(tmp_path, "exp").trials
+    declaration = Declaration(time="2020-01-01T00:00:00Z", questions=(asked,))
+    (verdict,) = judge(trials, declaration)
+    assert verdict.notes == (
+        "Scenes of sfm-adc and sfm-mcmc differ in more than the scene: iterations (2000 on park, "
+        "7000 on room).",
+    )
+    (alone,) = judge(
+        trials, replace(declaration, questions=(replace(asked, scenes={"park": scenes["park"]}),))
+    )
+    assert alone.notes == ()
