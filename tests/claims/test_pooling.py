@@ -246,6 +246,20 @@ def test_archives_with_the_same_file_name_are_distinguished(tmp_path, said):
     assert f"| {sources[1]} |" in said("pool", *sources, "--arm", "volumetric")
 
 
+def test_scenes_of_an_archive_under_other_conditions_are_noted(tmp_path):
+    file = archive(tmp_path, "lab")
+    runs = tmp_path / "runs_lab_0"
+    for path in (runs / "exp" / "garden").glob("*/*"):
+        results = json.loads((path / "results.json").read_text()) | {"iterations": 7000}
+        (path / "results.json").write_text(json.dumps(results))
+    write_archive(load_experiment(runs, "exp"), file)
+    _, notes, _ = read_studies(file, WANTED, "lab")
+    assert notes[1:] == [
+        "lab: Scenes of sfm-adc and sfm-volumetric differ in more than the scene: iterations (2000 "
+        "on courtyard, 7000 on garden)."
+    ]
+
+
 def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
     """It is a densifier, a densifier with its variant, or the whole name."""
     plain, once, twice = (

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gsbench.analysis.cells import select_trials, with_variants
+from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import budget_words
 from gsbench.analysis.pairing import Pairs, ScenePairs, pair
 from gsbench.analysis.results import Arm, TrialResult, group_by
@@ -203,6 +204,7 @@ def read_studies(
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
+                    notes += [f"{label}: {line}" for line in between_scenes_notes(pairs.trials)]
                     rows += pairs.rows
                     left_out += pairs.left_out
                 if not rows:
