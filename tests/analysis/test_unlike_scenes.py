@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gsbench.analysis.differences import ingredients_between
+from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import Table
@@ -147,3 +149,42 @@ def test_a_verdict_on_named_trials_says_how_the_scenes_differ(tmp_path):
         trials, replace(declaration, questions=(replace(asked, scenes={"park": scenes["park"]}),))
     )
     assert alone.notes == ()
+
+
+@pytest.fixture
+def tuned_on_room(tmp_path):
+    """Arms that differ in one setting on one scene, and in a second one on another scene."""
+    for densify, start in (("adc", 500), ("mcmc", 900)):
+        own = {"densify___target_": "mine.Own", "densify__grow": 1 + (densify == "mcmc")}
+        write(tmp_path, "park", "a" * 8, densify, own | {"densify__split_size": 500})
+        write(tmp_path, "room", "b" * 8, densify, own | {"densify__split_size": start})
+    return load_experiment(tmp_path, "exp").trials
+
+
+FIRST, SECOND = Arm("sfm", "adc"), Arm("sfm", "mcmc")
+
+
+def test_arms_differ_by_one_setting_alone_only_if_they_do_on_every_scene(tuned_on_room):
+    assert ingredients_between(tuned_on_room, FIRST, SECOND) == ("grow", "split_size")
+    park = [trial for trial in tuned_on_room if trial.scene == "park"]
+    assert ingredients_between(park, FIRST, SECOND) == ("grow",)
+    said = "sfm-mcmc differs from sfm-adc by grow and split_size."
+    assert said in caveats(tuned_on_room, FIRST, SECOND)
+
+
+def test_a_fairness_sheet_has_the_values_of_all_scenes(tuned_on_room):
+    sheet = fairness_table(tuned_on_room, FIRST, SECOND)
+    rows = {row.labels[0]: [entry.text for entry in row.entries] for row in sheet.rows}
+    assert rows["densify.grow"] == ["1", "2", "≠"]
+    assert rows["densify.split_size"] == ["500", "500, 900", "≠"]
+    assert sheet.notes[1] == (
+        "Scenes of sfm-mcmc differ in more than the scene: densify.split_size (500 on park, 900 on "
+        "room)."
+    )
+
+
+def test_arms_without_a_common_scene_are_described_by_one_trial_each(tuned_on_room):
+    apart = [one for one in tuned_on_room if (one.scene == "room") == (one.densify == "mcmc")]
+    assert ingredients_between(apart, FIRST, SECOND) == ("grow", "split_size")
+    both = [*apart, *(one for one in tuned_on_room if one.densify == "mcmc")]
+    assert ingredients_between(both, FIRST, SECOND) == ("grow",)  # on the park, which both have

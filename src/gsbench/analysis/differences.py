@@ -16,7 +16,14 @@ from typing import Any
 
 import yaml
 
-from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, seeds_words
+from gsbench.analysis.results import (
+    Arm,
+    TrialPair,
+    TrialResult,
+    canonical,
+    group_by,
+    seeds_words,
+)
 from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
 from gsbench.runs.keys import DECLARED, NOT_HASHED, SHOWN
@@ -322,12 +329,28 @@ def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) 
 
     Only if there is exactly one, a difference of results can be put down to it.
     """
-    one, other = representatives(trials, first, second)
-    if one.made_elsewhere or other.made_elsewhere:
-        return (ELSEWHERE,)
-    return tuple(
-        dict.fromkeys([*ingredients(one.config, other.config), *differing_code((one, other))])
-    )
+    names: list[str] = []
+    for one, other in compared_trials(trials, first, second):
+        if one.made_elsewhere or other.made_elsewhere:
+            return (ELSEWHERE,)
+        names += [*ingredients(one.config, other.config), *differing_code((one, other))]
+    return tuple(dict.fromkeys(names))
+
+
+def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> list[TrialPair]:
+    """Pairs of trials that show all settings in which two arms differ.
+
+    These are one pair of `representatives`, but one of each scene that both arms have if the
+    settings of an arm differ between scenes.
+    """
+    own = [trial for trial in trials if trial.arm in (first, second)]
+    alone = [representatives(own, first, second)]
+    by_arm = group_by(own, lambda trial: trial.arm)
+    if not any(map(settings_between_scenes, by_arm.values())):
+        return alone
+    by_scene = group_by(own, lambda trial: trial.scene).values()
+    shared = [group for group in by_scene if len({trial.arm for trial in group}) == len(by_arm)]
+    return [representatives(group, first, second) for group in shared] or alone
 
 
 def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:

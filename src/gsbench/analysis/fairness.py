@@ -6,16 +6,17 @@ recorded.
 
 import itertools
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gsbench.analysis.differences import (
     CODE,
+    between_scenes_notes,
+    compared_trials,
     differing_keys,
     ingredients_between,
     ingredients_sentence,
     is_mixed,
-    representatives,
     short_version,
 )
 from gsbench.analysis.pairing import pair_trials
@@ -70,14 +71,17 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     without trials.
     """
     pairs = pair_trials(trials, first, second)
-    one, other = pairs[0] if pairs else representatives(trials, first, second)
     compared = list(itertools.chain(*pairs)) or trials
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
     rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
-    for index, key in enumerate(differing_keys(one.config, other.config)):
-        shown = [_shown(own[key]) if key in own else NONE for own in (one.config, other.config)]
+    shown_pairs = compared_trials(compared, first, second)
+    sides = [[own.config for own in side] for side in zip(*shown_pairs, strict=True)]
+    keys = itertools.chain(*itertools.starmap(differing_keys, zip(*sides, strict=True)))
+    for index, key in enumerate(dict.fromkeys(keys)):
+        shown = [_shown_in(side, key) for side in sides]
         rows.append(_row(key, shown, rule_above=index == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
+    notes += between_scenes_notes(compared)
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
     columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), DIFFERS))
@@ -89,6 +93,12 @@ def _row(what: str, values: Sequence[str], rule_above: bool = False) -> Row:
     """A row with the values of both arms, and whether they differ."""
     differs = ALIKE if values[0] == values[1] else UNLIKE
     return Row((what,), tuple(map(TableEntry, [*values, differs])), rule_above)
+
+
+def _shown_in(configs: Sequence[Mapping[str, Any]], key: str) -> str:
+    """The values of a setting: several if they differ between scenes."""
+    values = [_shown(config[key]) if key in config else NONE for config in configs]
+    return ", ".join(dict.fromkeys(values))
 
 
 def _shown(value: Any) -> str:
