@@ -5,11 +5,10 @@ that belong together share one name. A densifier class adds the ingredients in w
 ADC. All are read from the trials' recorded configurations and code.
 """
 
-import itertools
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -93,9 +92,9 @@ WITHOUT_EFFECT = (
 )
 
 # Conditions and settings that each scene may have for itself. The settings of a budget are not
-# among them, so that a note says where it differs.
+# among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
-OWN_SETTINGS = (*WITHOUT_EFFECT, "scene", "init.path")
+OWN_SETTINGS = (*WITHOUT_EFFECT, "scene", "init.path", "train.iterations")
 
 CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
 
@@ -149,9 +148,15 @@ def conditions_between_scenes(trials: Sequence[TrialResult]) -> dict[str, Scenes
 def settings_between_scenes(trials: Sequence[TrialResult]) -> dict[str, ScenesByValue]:
     """The settings in which the scenes of one arm differ, without those of the scene itself."""
     by_scene = group_by([trial for trial in trials if trial.config], lambda trial: trial.scene)
-    keys = differing_settings([own[0] for own in by_scene.values()])
-    keys = {key: values for key, values in keys.items() if not _is_among(key, OWN_SETTINGS)}
-    return _between_scenes(by_scene, keys, lambda trial, key: canonical(trial.config.get(key)))
+    first, *others = (own[0].config for own in by_scene.values()) if by_scene else ({},)
+    # Compared as they are, not as text: this runs for every pair of arms.
+    keys = {
+        key for other in others for key in first.keys() | other if first.get(key) != other.get(key)
+    }
+    keys = {key for key in keys if not _is_among(key, OWN_SETTINGS)}
+    return _between_scenes(
+        by_scene, sorted(keys), lambda trial, key: canonical(trial.config.get(key))
+    )
 
 
 def _between_scenes(
@@ -173,7 +178,8 @@ def _between_scenes(
         scenes_by_value: ScenesByValue = {}
         for scene, (value,) in values_by_scene.items():
             scenes_by_value.setdefault(value, []).append(scene)
-        differing[key] = scenes_by_value
+        if len(scenes_by_value) > 1:
+            differing[key] = scenes_by_value
     return differing
 
 
@@ -379,10 +385,25 @@ def representatives(
     without trials.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
-    pairs = itertools.product(by_arm[first], by_arm[second])
-    return max(
-        pairs, key=lambda pair: (pair[0].scene == pair[1].scene, pair[0].seed == pair[1].seed)
-    )
+    ones, others = by_arm[first], by_arm[second]
+    for place in (_scene_and_seed, _scene, _seed):
+        partners = group_by(others, place)
+        for one in ones:
+            if found := partners.get(place(one)):
+                return one, found[0]
+    return ones[0], others[0]
+
+
+def _scene_and_seed(trial: TrialResult) -> Hashable:
+    return trial.scene, trial.seed
+
+
+def _scene(trial: TrialResult) -> Hashable:
+    return trial.scene
+
+
+def _seed(trial: TrialResult) -> Hashable:
+    return trial.seed
 
 
 def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
