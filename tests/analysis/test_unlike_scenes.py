@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsbench.analysis.differences import ingredients_between
+from gsbench.analysis.differences import between_scenes_notes, ingredients_between
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import load_experiment
@@ -106,6 +106,29 @@ def test_no_mean_is_shown_over_scenes_under_different_conditions(tmp_path, key, 
     )
     with pytest.raises(InputError, match=key):
         table(tmp_path, rows=("densify",))
+
+
+def test_variants_made_by_other_code_keep_their_means(tmp_path):
+    """Each of them has one version of the code on all scenes."""
+    for start, version in ((500, 1), (900, 2)):
+        for scene in ("park", "room"):
+            code = {"sources": {}, "stages": STAGES | {"train": version}}
+            write(tmp_path, scene, f"{start:08d}", settings={"densify__start": start}, code=code)
+    made, has_mean = table(tmp_path)
+    assert has_mean
+    assert lines(made) == []
+
+
+def test_versions_that_a_gate_compares_are_no_difference_between_scenes(tmp_path):
+    for version in (1, 2):
+        code = {"sources": {}, "stages": STAGES | {"train": version}}
+        for scene in ("park", "room"):
+            write(tmp_path / str(version), scene, code=code)
+    old, new = (load_experiment(tmp_path / str(version), "exp").trials for version in (1, 2))
+    assert between_scenes_notes(old, new) == []
+    assert between_scenes_notes([*old[:2], *new[2:]]) == [
+        "Scenes of sfm-adc differ in more than the scene: the version of stage train."
+    ]
 
 
 def test_no_mean_is_shown_over_versions_of_the_code(tmp_path):

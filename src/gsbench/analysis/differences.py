@@ -166,7 +166,7 @@ def _between_scenes(
 ) -> dict[str, ScenesByValue]:
     """For each of ``keys`` that differs between scenes, the scenes that have a value.
 
-    Left out is what is swept on one of the scenes: it makes several arms.
+    Left out is what differs on one of the scenes: that is no difference between scenes.
     """
     differing = {}
     for key in keys:
@@ -183,23 +183,25 @@ def _between_scenes(
     return differing
 
 
-def between_scenes_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on arms that have other settings or conditions on other scenes.
+def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[str]:
+    """Lines on arms that have other settings, conditions or code on other scenes.
 
-    A mean over the scenes hides these: an arm may have been tuned for each scene.
+    A mean over the scenes hides these: an arm may have been tuned for each scene. ``sides`` are
+    trials with their variants; arms of one name on two sides are two arms.
     """
     arms_by_text: dict[str, list[str]] = {}
-    for (init, densify), own in group_by(trials, lambda one: (one.init, one.densify)).items():
-        differing = conditions_between_scenes(own) | settings_between_scenes(own)
-        texts = []
-        for key, scenes_by_value in differing.items():
-            values = [f"{value} on {some_of(scenes)}" for value, scenes in scenes_by_value.items()]
-            texts.append(f"{key} ({some_of(values)})")
-        texts += [f"the version of {part.removeprefix(CODE)}" for part in differing_code(own)]
-        if texts:
-            arms_by_text.setdefault(some_of(texts), []).append(f"{init}-{densify}")
+    for side in sides:
+        for arm, own in group_by(side, lambda trial: trial.arm).items():
+            differing = conditions_between_scenes(own) | settings_between_scenes(own)
+            texts = []
+            for key, by_value in differing.items():
+                values = [f"{value} on {some_of(scenes)}" for value, scenes in by_value.items()]
+                texts.append(f"{key} ({some_of(values)})")
+            texts += [f"the version of {part.removeprefix(CODE)}" for part in differing_code(own)]
+            if texts:
+                arms_by_text.setdefault(some_of(texts), []).append(str(arm))
     return [
-        f"Scenes of {listed(arms)} differ in more than the scene: {text}."
+        f"Scenes of {listed(list(dict.fromkeys(arms)))} differ in more than the scene: {text}."
         for text, arms in arms_by_text.items()
     ]
 

@@ -186,7 +186,7 @@ def _with_pairs(
     quantity = asked_quantity(question.metric, trials)
     notes = pairs.left_out
     if question.scenes:  # other questions are below tables, which say it themselves
-        notes += tuple(between_scenes_notes(pairs.trials))
+        notes += tuple(between_scenes_notes(pairs.trials[::2], pairs.trials[1::2]))
     verdict = Verdict(
         question, quantity, pairs, notes=notes, late=late, final=not declaration.looks
     )

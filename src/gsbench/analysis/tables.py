@@ -100,7 +100,8 @@ def build_table(
         )
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
-    if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(trials):
+    varied = with_variants(trials)
+    if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(varied):
         notes.append("No mean over the scenes is shown, since they differ in conditions or code.")
     elif "scene" in rows and len(scenes) > 1:
         place = list(rows).index("scene")
@@ -114,6 +115,7 @@ def build_table(
             above, text = text, " + ".join(names.get(value, value) for value in column)
         headings.append(Column(above, text, (one.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
+    notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
     if left_out := experiment.warnings:
         notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")
@@ -240,8 +242,11 @@ def _means(
 
 
 def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
-    """Return whether the scenes of an arm have different conditions or versions of the code."""
-    by_arm = group_by(trials, lambda trial: (trial.init, trial.densify)).values()
+    """Return whether the scenes of an arm have different conditions or versions of the code.
+
+    ``trials`` have their variants.
+    """
+    by_arm = group_by(trials, lambda trial: trial.arm).values()
     return any(conditions_between_scenes(own) or differing_code(own) for own in by_arm)
 
 
@@ -326,7 +331,6 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings
         notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
-    notes += between_scenes_notes(trials)
     return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
 
 

@@ -204,7 +204,8 @@ def read_studies(
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
-                    notes += [f"{label}: {line}" for line in between_scenes_notes(pairs.trials)]
+                    sides = pairs.trials[::2], pairs.trials[1::2]
+                    notes += [f"{label}: {line}" for line in between_scenes_notes(*sides)]
                     rows += pairs.rows
                     left_out += pairs.left_out
                 if not rows:
