@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsbench.analysis.statistics import Interval, LikeThese
-from gsbench.analysis.vote_words import describe_round, people_words
+from gsbench.analysis.vote_words import describe_round, load_rounds, people_words
 from gsbench.analysis.votes import PairVotes, RoundVerdict
 from gsbench.runs.experiments import Arm
 from gsbench.runs.votes import RoundKey, Showing
@@ -97,3 +97,13 @@ def test_a_ranking_gives_chances_with_intervals_and_no_votes_give_no_shares():
 
 def test_one_is_a_person():
     assert [people_words(count) for count in (0, 1, 2)] == ["0 people", "1 person", "2 people"]
+
+
+def test_a_linked_round_of_votes_is_left_out(tmp_path, caplog):
+    """A runs folder may be a stranger's, and the link may lead anywhere."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "runs" / "x" / "votes").mkdir(parents=True)
+    (tmp_path / "runs" / "x" / "votes" / "round").symlink_to(tmp_path / "elsewhere")
+    assert load_rounds(tmp_path / "runs" / "x") == []
+    (line,) = caplog.messages
+    assert "link" in line

@@ -24,6 +24,7 @@ from gsbench.eval.structure import (
     MULTISCALE_MIN_SIZE,
     SCALE_WEIGHTS,
     _enlarged,
+    _frequencies,
     fsim,
     iw_ssim,
     ms_ssim,
@@ -252,3 +253,17 @@ def test_an_unknown_metric_is_refused() -> None:
 def test_images_of_different_sizes_are_refused(key: str) -> None:
     with pytest.raises(ValueError, match=r"different shapes: \(192, 192, 3\) and \(192, 193, 3\)"):
         FUNCTIONS[key](torch.zeros(192, 192, 3), torch.zeros(192, 193, 3))
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        (4, [0, 0.25, -0.5, -0.25]),
+        # Kovesi's filters have both ends at half a cycle per pixel
+        (5, [0, 0.25, 0.5, -0.5, -0.25]),
+    ],
+)
+def test_frequencies_of_filters_reach_half_a_cycle_per_pixel(
+    size: int, expected: list[float]
+) -> None:
+    assert _frequencies(size, torch.zeros(1)).tolist() == expected

@@ -308,3 +308,16 @@ def test_more_points_are_drawn_smaller(
     draw_cloud(model, tmp_path / "cloud.png", "hand-made")
     pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB"))
     assert (pixels == [30, 90, 30]).all(axis=-1).sum() == inked
+
+
+def test_a_camera_whose_right_is_up_gives_axes_at_right_angles() -> None:
+    """The first of two cameras lies on its side, so another direction becomes the right."""
+    up = np.array([1.0, 2, 2]) / 3
+    down = np.array([2.0, 1, -2]) / 3  # at a right angle to it
+    first, second = np.stack([up, down, np.cross(up, down)]), np.eye(3)
+    second[1] = -2 * up - down  # the mean of both downward directions is -up
+    axes = view_from_above(
+        np.array([[0, 0, 0], [1.0, 0, 0]]), np.stack([first, second]), np.empty((0, 3))
+    )
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(axes[2], up, atol=1e-12)
