@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -314,6 +315,8 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(
     assert confirm(*PARK) == 0
     shown = capsys.readouterr().out
     assert "Confirmation on park with 3 seeds" in shown
+    assert re.search(r"^\| adc \| \+[23]\.\S+ \(.+\) \| kept \|$", shown, re.MULTILINE)
+    assert re.search(r"^\| adc-3 \| .+ \| dropped \|$", shown, re.MULTILINE)
     ((asked, results),) = read_ledger(home).confirmations
     assert list(asked.keys) == ["baseline", "adc", "adc-3"]
     assert results is not None
