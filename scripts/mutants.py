@@ -67,7 +67,7 @@ LEFT_OUT = "triton"  # files with this in their path
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add", "ssim_map", "similarity", "fma", "dot"}
 SPEED_ONLY = {"prefetch"}  # calls that change no result
 PYTEST = [sys.executable, "-m", "pytest", "-m", "not slow", "-p", "no:cacheprovider"]
-SECONDS = 600  # time limit for the tests of one fault; a kernel that never ends uses all of it
+SECONDS = 300  # time limit for the tests of one fault; a kernel that never ends uses all of it
 Replacements = dict[type[ast.AST], type[ast.AST]]
 OPPOSITE: Replacements = {
     **{
