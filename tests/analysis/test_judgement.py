@@ -14,7 +14,7 @@ from gsbench.analysis.judgement import _contradicts, find_outlying, judge
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.statistics import answer_family, seeds_needed
-from gsbench.analysis.verdicts import seeds_to_resolve
+from gsbench.analysis.verdicts import judge_pairs, seeds_to_resolve
 from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.runs.trial_record import Budget
 from tests.analysis.untruths import scene_pairs
@@ -291,3 +291,13 @@ def test_variants_are_compared_with_the_baseline_of_the_same_settings() -> None:
     assert choose_pairs(arms) == [(arms[0], arms[2]), (arms[1], arms[3])]
     arms = [ADC, *(Arm("sfm", "volumetric", (("threshold", str(k)),)) for k in (1, 2))]
     assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[0], arms[2])]
+
+
+def test_what_was_left_out_of_a_compared_pair_is_noted_for_each_metric(
+    make_experiment: Callable[..., Experiment],
+) -> None:
+    trials = make_experiment(scenes=("garden",)).trials
+    kept = [trial for trial in trials if (trial.densify, trial.seed) != ("adc", 1)]
+    (judged,) = judge_pairs(kept, [(ADC, VOLUMETRIC)])
+    assert len(judged.verdicts) == len(judged.notes) > 1
+    assert judged.notes[0] == "PSNR (dB): garden: seed 1 has no partner"

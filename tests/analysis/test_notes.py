@@ -8,9 +8,21 @@ import pytest
 
 from gsbench.analysis.fairness import counts_sentence
 from gsbench.analysis.results import TrialResult, load_experiment
-from gsbench.analysis.tables import build_table, doubt_notes, held_out_notes, points_notes
+from gsbench.analysis.tables import (
+    build_table,
+    doubt_notes,
+    held_out_notes,
+    origin_notes,
+    points_notes,
+)
 from gsbench.runs.experiments import Arm
-from gsbench.runs.trial_record import InitialCloud, TwinViews
+from gsbench.runs.trial_record import (
+    FROM_MODEL,
+    FROM_RENDERS,
+    ExternalTrainer,
+    InitialCloud,
+    TwinViews,
+)
 from tests.analysis.synthetic import Plan, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
@@ -158,3 +170,19 @@ def test_up_to_three_left_out_trials_are_named_and_all_are_counted(tmp_path, los
     assert note.count("unfinished") == min(lost, 3)
     assert note.endswith(f"{rest}.")
     assert ("more" in note) == bool(rest)
+
+
+def test_who_trained_an_arm_and_what_was_measured_is_said(tmp_path):
+    first, second, third = trials_of(tmp_path, scenes=("yard",), densifiers=("adc",))
+    program = ExternalTrainer(program="brush", version="1.2")
+    here = with_record(first, trained_by=program, evaluated_from=FROM_MODEL)
+    assert origin_notes([first]) == []
+    assert origin_notes([here, with_record(second, evaluated_from=FROM_RENDERS)]) == [
+        "Trained here by another program, its model rendered by gsbench (its time is that of the "
+        "whole program, and it sets its own budget): sfm-adc (version 1.2).",
+        "Renders of another program, measured as they are (its conditions are not known): sfm-adc.",
+    ]
+    renders = with_record(first, trained_by=program, evaluated_from=FROM_RENDERS)
+    own, elsewhere = origin_notes([renders, with_record(third, evaluated_from=FROM_MODEL)])
+    assert own.startswith("Trained here by another program, its own renders measured as they are (")
+    assert elsewhere.startswith("A model that another program trained, rendered here (its cond")

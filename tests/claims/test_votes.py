@@ -212,6 +212,8 @@ def test_a_repeated_pair_does_not_follow_its_first_showing_soon(runs, tmp_path):
         gaps = [places[one.id] - places[one.of] for one in key.showings if one.kind == "again"]
         assert len(gaps) == 1
         assert gaps[0] >= 4
+        (again,) = (places[one.id] for one in key.showings if one.kind == "again")
+        assert again >= 2 * (len(key.showings) - 1) // 3  # in the last third
 
 
 def test_a_lack_of_views_or_people_is_reported(made, capsys):
