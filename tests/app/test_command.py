@@ -210,3 +210,11 @@ def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trial
     monkeypatch.setattr(command, "run_app", run_app)
     monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is made))
     assert command.launch(words) == code
+
+
+def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):
+    asked: list[Any] = []
+    monkeypatch.setattr(command, "set_up_logging", asked.append)
+    command.compose_trials(["hydra.verbose=true"])
+    command.compose_trials(["hydra.verbose=[gsbench.scene]", "seed=0,1"], multirun=True)
+    assert asked == [True, ["gsbench.scene"]]

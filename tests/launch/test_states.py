@@ -186,6 +186,19 @@ def test_removed_trials_leave_the_plan_and_links_stay(tmp_path):
     assert list(elsewhere.iterdir())
 
 
+def test_a_trial_whose_removal_fails_does_not_look_finished(tmp_path, monkeypatch):
+    def fail(folder: Path) -> None:
+        raise OSError("busy")
+
+    trial = begun(tmp_path)
+    (trial.folder / "results.json").write_text("{}")
+    monkeypatch.setattr("shutil.rmtree", fail)
+    with pytest.raises(OSError, match="busy"):
+        remove(tmp_path / "x", [trial.folder])
+    assert trial.folder.is_dir()
+    assert not (trial.folder / "results.json").exists()
+
+
 @pytest.mark.parametrize("name", ["scene/arm", "scene/arm/trial/more", "scene/../trial"])
 def test_a_plan_names_folders_of_trials_alone(tmp_path, caplog, name):
     planned = {"overrides": [], "cwd": "", "time": 0}
