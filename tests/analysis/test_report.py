@@ -569,7 +569,7 @@ def test_costs_are_listed_under_the_verdict(page):
 
     Seeds 0 to 2 add as many seconds.
     """
-    costs = page.split('aria-label="Cost">')[1].split("</ul>")[0]
+    costs = page.split('aria-label="Costs and scenes">')[1].split("</ul>")[0]
     assert "<li>Gaussians +30.0% as a ratio of totals, +30.0% as the mean of 2 scenes</li>" in costs
     assert (
         "<li>Training time +29.4% as a ratio of totals, +29.4% as the mean of 2 scenes; times of "

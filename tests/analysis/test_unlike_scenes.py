@@ -13,6 +13,7 @@ import pytest
 from gsbench.analysis.differences import between_scenes_notes, ingredients_between
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import judge
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import Table
 from gsbench.analysis.tables import build_table
@@ -211,3 +212,11 @@ def test_arms_without_a_common_scene_are_described_by_one_trial_each(tuned_on_ro
     assert ingredients_between(apart, FIRST, SECOND) == ("grow", "split_size")
     both = [*apart, *(one for one in tuned_on_room if one.densify == "mcmc")]
     assert ingredients_between(both, FIRST, SECOND) == ("grow",)  # on the park, which both have
+
+
+def test_the_report_says_it_beside_the_verdict(tuned_on_room, tmp_path):
+    page = build_report(load_experiment(tmp_path, "exp"))
+    verdict = page.partition('<div class="verdict">')[2].partition("</div>")[0]
+    assert (
+        "Scenes of sfm-mcmc differ in more than the scene: densify.split_size (500 on " in verdict
+    )

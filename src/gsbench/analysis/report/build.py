@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis import verdicts
 from gsbench.analysis.declaration import active_declaration
-from gsbench.analysis.differences import short_version
+from gsbench.analysis.differences import between_scenes_notes, short_version
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
@@ -124,6 +124,7 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
 def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[str, Any]:
     """Everything that the page shows of two arms; notes say what could not be compared or read."""
     first, second = judged.first, judged.second
+    baseline, other = _trials_of(trials, first), _trials_of(trials, second)
     views, faults = choose_views(pair_trials(trials, first, second))
     return {
         "judged": judged,
@@ -131,7 +132,7 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "has_like_these": any(one.like_these is not None for one in judged.verdicts),
         "caveats": caveats(trials, first, second),
         "fairness": fairness_table(trials, first, second),
-        "costs": _costs(trials, first, second),
+        "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
         "forests": [_forest(verdict) for verdict in judged.verdicts],
         "views": views,
         "notes": dict.fromkeys([*judged.notes, *faults]),
@@ -166,9 +167,8 @@ def show_votes(
     }
 
 
-def _costs(trials: Sequence[TrialResult], first: Arm, second: Arm) -> list[str]:
+def _costs(baseline: Sequence[TrialResult], other: Sequence[TrialResult]) -> list[str]:
     """Say how counts and training times changed over the scenes that both arms have."""
-    baseline, other = _trials_of(trials, first), _trials_of(trials, second)
     lines = []
     for key in COSTS_COMPARED:
         name, read = COSTS[key]
