@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -11,7 +12,13 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.colmap import model_points, read_model, read_reference, write_model
+from gsbench.scene.colmap import (
+    _normalize_quaternions,
+    model_points,
+    read_model,
+    read_reference,
+    write_model,
+)
 from gsbench.scene.colmap_files import _MODELS, ModelChecks, check_model
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
@@ -303,3 +310,21 @@ def test_a_bad_line_of_a_text_model_is_named(
     (tmp_path / f"{stem}.txt").write_text(line)
     with pytest.raises(InputError, match=rf"{stem}\.txt: .*{said}"):
         check_model(tmp_path)
+
+
+def test_rotations_of_sensors_in_a_rig_get_unit_length() -> None:
+    """COLMAP normalises those of images only. A rotation of unit length keeps its bits."""
+    rig = pycolmap.Rig(rig_id=1)
+    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
+    unit = np.array([0.1, 0.5, 0.1, 0.7])
+    for sensor, length in ((2, 2.0), (3, 1.0)):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(unit), np.array([1.0, 2, 3]))
+        pose.rotation.normalize()
+        kept = pose.rotation.quat.copy()
+        pose.rotation.quat = length * kept
+        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, sensor), pose)
+    _normalize_quaternions(SimpleNamespace(rigs={1: rig}, frames={}))  # type: ignore[arg-type]
+    long, exact = (pose for _, pose in sorted(rig.non_ref_sensors.items(), key=str))
+    np.testing.assert_allclose(long.rotation.quat, kept, rtol=1e-15)
+    assert exact.rotation.quat.tolist() == kept.tolist()
+    assert long.translation.tolist() == [1, 2, 3]
