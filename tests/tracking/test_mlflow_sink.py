@@ -18,7 +18,7 @@ from gsbench.tracking.mlflow_sink import (
     ensure_experiment,
     require_own_artifacts,
 )
-from gsbench.tracking.sinks import Scalar, Summary
+from gsbench.tracking.sinks import MirrorState, Scalar, Summary
 
 
 class Client:
@@ -170,3 +170,25 @@ def test_settings_that_are_short_already_are_not_sent_again(sink):
     with pytest.raises(MlflowException, match="full"):
         sink._log_params()
     assert len(client.called("log_batch")) == 1
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_the_state_names_the_own_database_without_its_folder(tmp_path, own):
+    """So a runs folder may be moved; another tracker is named by its address."""
+    uri = default_uri(tmp_path) if own else "http://there"
+    artifacts = (tmp_path / "mlartifacts" / "x").as_uri()
+    run = SimpleNamespace(
+        info=SimpleNamespace(run_id="r", artifact_uri=artifacts),
+        data=SimpleNamespace(tags={"gsbench": "1"}),
+    )
+    client = Client(uri, create_run=run, get_experiment_by_name=experiment(**KIND))
+    sink = MlflowSink.__new__(MlflowSink)
+    sink.client = client  # type: ignore[assignment]
+    folder: Any = SimpleNamespace(path=tmp_path, runs=tmp_path)
+    sink._trial = SimpleNamespace(folder=folder, values={"name": "x"}, label="l", tags=dict)  # type: ignore[assignment]
+    state = sink.open(MirrorState(), None)
+    assert state.uri == ("runs/mlflow.db" if own else "http://there")
+    assert client.called("search_runs") == []  # no run is known yet
+    client.known["search_runs"] = [[run]]
+    assert sink.open(state, None) == state
+    assert len(client.called("create_run")) == 1
