@@ -166,7 +166,7 @@ def _between_scenes(
 ) -> dict[str, ScenesByValue]:
     """For each of ``keys`` that differs between scenes, the scenes that have a value.
 
-    Left out is what differs on one of the scenes: that is no difference between scenes.
+    What differs within a scene is left out: that is no difference between scenes.
     """
     differing = {}
     for key in keys:
@@ -388,24 +388,17 @@ def representatives(
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     ones, others = by_arm[first], by_arm[second]
-    for place in (_scene_and_seed, _scene, _seed):
+    places: tuple[Callable[[TrialResult], Hashable], ...] = (
+        lambda trial: (trial.scene, trial.seed),
+        lambda trial: trial.scene,
+        lambda trial: trial.seed,
+    )
+    for place in places:
         partners = group_by(others, place)
         for one in ones:
             if found := partners.get(place(one)):
                 return one, found[0]
     return ones[0], others[0]
-
-
-def _scene_and_seed(trial: TrialResult) -> Hashable:
-    return trial.scene, trial.seed
-
-
-def _scene(trial: TrialResult) -> Hashable:
-    return trial.scene
-
-
-def _seed(trial: TrialResult) -> Hashable:
-    return trial.seed
 
 
 def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:

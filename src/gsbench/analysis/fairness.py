@@ -74,9 +74,11 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     compared = list(itertools.chain(*pairs)) or trials
     groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
     rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
-    shown_pairs = compared_trials(compared, first, second)
-    sides = [[own.config for own in side] for side in zip(*shown_pairs, strict=True)]
-    keys = itertools.chain(*itertools.starmap(differing_keys, zip(*sides, strict=True)))
+    configs = [
+        (one.config, other.config) for one, other in compared_trials(compared, first, second)
+    ]
+    sides = list(zip(*configs, strict=True))
+    keys = itertools.chain(*(differing_keys(*both) for both in configs))
     for index, key in enumerate(dict.fromkeys(keys)):
         shown = [_shown_in(side, key) for side in sides]
         rows.append(_row(key, shown, rule_above=index == 0))
