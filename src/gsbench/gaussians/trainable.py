@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -22,9 +22,44 @@ class AdamState:
     """Adam's state of one parameter: rate, number of steps, and both moments in its shape."""
 
     rate: float
-    step: Tensor  # [] float32: torch's fused kernel needs a tensor
+    step: int
     first: Tensor
     second: Tensor
+
+
+class StepAll(Protocol):
+    """Applies Adam to a whole parameter [N, ...] in place, for step ``state.step`` (1, 2, …).
+
+    With ``seen`` [N], or ``active`` columns of a parameter with more, the gradient is 0 where
+    ``seen`` is 0, and from column ``active`` on. There ``gradient`` may be undefined.
+    """
+
+    def __call__(
+        self,
+        parameter: Tensor,
+        gradient: Tensor,
+        state: AdamState,
+        seen: Tensor | None = None,
+        active: int | None = None,
+    ) -> None: ...
+
+
+@dataclass(frozen=True)
+class KnownGradients:
+    """Gradients by ``parameters``, in their order, computed without autograd.
+
+    They are those of a step with harmonics up to ``sh_degree``. See `StepAll` for ``seen``.
+    """
+
+    parameters: list[Tensor]
+    gradients: list[Tensor]
+    seen: Tensor  # [N] int32
+    sh_degree: int
+
+    def active(self, k: int) -> int | None:
+        """The columns with a gradient of parameter ``k``; None: all."""
+        is_rest = k == len(self.parameters) - 1
+        return 3 * ((self.sh_degree + 1) ** 2 - 1) if is_rest else None
 
 
 class TrainableGaussians:
@@ -38,9 +73,17 @@ class TrainableGaussians:
     which takes 1.5 CPU-seconds in each process. The function `adam` does the same arithmetic.
     """
 
-    def __init__(self, gaussians: Gaussians, rates: LearningRates, spatial_scale: float) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        rates: LearningRates,
+        spatial_scale: float,
+        step_all: StepAll | None = None,
+    ) -> None:
+        """``step_all`` applies Adam to a whole parameter (None: torch's fused kernel)."""
         self.rates = rates
         self.spatial_scale = spatial_scale
+        self.step_all = step_all or torch_adam
         # the current parameters; ``edit`` and ``overwrite`` replace its tensors
         self.values = gaussians.map(lambda tensor: tensor.detach().clone().requires_grad_(True))
         initial = {
@@ -53,9 +96,8 @@ class TrainableGaussians:
         }
         self.adam = {}
         for name, tensor in self.values.tensors().items():
-            step = torch.zeros((), dtype=torch.float32, device=tensor.device)
             first, second = torch.zeros_like(tensor.detach()), torch.zeros_like(tensor.detach())
-            self.adam[name] = AdamState(initial[name], step, first, second)
+            self.adam[name] = AdamState(initial[name], 0, first, second)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -93,11 +135,39 @@ class TrainableGaussians:
         for name, parameter in self.values.tensors().items():
             if parameter.grad is None:
                 continue
+            state = self.adam[name]
+            state.step += 1
             if index is None:
-                _step_all(parameter, self.adam[name])
+                self.step_all(parameter, parameter.grad, state)
             else:
-                _step_rows(parameter, self.adam[name], index)
+                _step_rows(parameter, parameter.grad, state, index)
             parameter.grad = None
+
+    def advance(self, known: KnownGradients) -> list[AdamState | None]:
+        """Count a step with ``known`` gradients; return the state of each parameter to update.
+
+        It is None for a parameter that was replaced since, and for ``sh_rest`` at degree 0, where
+        all its gradients are 0.
+        """
+        states: list[AdamState | None] = []
+        for (name, parameter), own in zip(
+            self.values.tensors().items(), known.parameters, strict=True
+        ):
+            current = parameter is own
+            if current:
+                self.adam[name].step += 1
+            idle = name == "sh_rest" and known.sh_degree == 0
+            states.append(self.adam[name] if current and not idle else None)
+        return states
+
+    @torch.no_grad()
+    def apply(self, known: KnownGradients, states: list[AdamState | None]) -> None:
+        """Apply Adam with ``known`` gradients to the parameters with a state from `advance`."""
+        for k, state in enumerate(states):
+            if state is not None:
+                self.step_all(
+                    known.parameters[k], known.gradients[k], state, known.seen, known.active(k)
+                )
 
     @torch.no_grad()
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
@@ -146,10 +216,11 @@ class TrainableGaussians:
         rates: LearningRates,
         spatial_scale: float,
         device: torch.device | None = None,
+        step_all: StepAll | None = None,
     ) -> TrainableGaussians:
         """Make an object from a copy of ``state_dict``, on ``device`` (None: that of the state)."""
         gaussians = Gaussians(**state["gaussians"]).map(lambda tensor: tensor.to(device))
-        trainable = cls(gaussians, rates, spatial_scale)
+        trainable = cls(gaussians, rates, spatial_scale, step_all)
         for name, saved in state["adam"].items():
             copied = copy.deepcopy(saved)
             moved = {
@@ -159,17 +230,27 @@ class TrainableGaussians:
         return trainable
 
 
-def _step_all(parameter: Tensor, state: AdamState) -> None:
+def torch_adam(
+    parameter: Tensor,
+    gradient: Tensor,
+    state: AdamState,
+    seen: Tensor | None = None,
+    active: int | None = None,
+) -> None:
     """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel."""
-    assert parameter.grad is not None
+    if seen is not None or active is not None:
+        raise NotImplementedError("torch_adam: gradients must be defined everywhere")
+    fused = parameter.device.type in ("cpu", "cuda")
+    # torch counts the step itself.
+    step = torch.tensor(state.step - 1.0, device=parameter.device if fused else "cpu")
     adam(
         [parameter],
-        [parameter.grad],
+        [gradient],
         [state.first],
         [state.second],
         [],
-        [state.step],
-        fused=parameter.device.type in ("cpu", "cuda"),
+        [step],
+        fused=fused,
         amsgrad=False,
         beta1=ADAM_BETAS[0],
         beta2=ADAM_BETAS[1],
@@ -180,12 +261,10 @@ def _step_all(parameter: Tensor, state: AdamState) -> None:
     )
 
 
-def _step_rows(parameter: Tensor, state: AdamState, index: Tensor) -> None:
+def _step_rows(parameter: Tensor, gradients: Tensor, state: AdamState, index: Tensor) -> None:
     """Apply Adam to the rows ``index`` [V] only. All rows share one step count."""
-    assert parameter.grad is not None
     beta1, beta2 = ADAM_BETAS
-    state.step += 1
-    step, gradient = float(state.step), parameter.grad[index]
+    step, gradient = state.step, gradients[index]
     # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
     # m' = m / (1 - b1^step) and v' = v / (1 - b2^step). As in torch, eps is outside the root.
     first = state.first[index].lerp_(gradient, 1 - beta1)

@@ -8,6 +8,7 @@ after each row.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from gsbench.eval.ssim import C1, C2, WINDOW_RADIUS, window
 from gsbench.raster.executors import load_driver
 from gsbench.raster.staged import Lifetime
-from gsbench.raster.triton.launch import WorkspacePool, launch_grid
+from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch_grid
 
 STRIP = 128  # numbers of a row per program
 MIN_ROWS = 8  # rows per program
@@ -241,6 +242,38 @@ def differentiate(
         tl.store(gradient + center * numbers + number, sign - ssim_factor * similarity, mask=inside)
 
 
+@dataclass(frozen=True)
+class Measured:
+    """A loss that has been measured, for its gradient. The memory belongs to a workspace."""
+
+    image: Tensor  # [H, W, 3] float32
+    target: Tensor  # [H, W, 3] uint8 or float32
+    values: Tensor  # [3] loss, L1, SSIM
+    derivatives: Tensor  # [3 * 3 H W] of SSIM, see `measure_similarity`; empty if not wanted
+
+    @property
+    def height(self) -> int:
+        return self.image.shape[0]
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of a row."""
+        return 3 * self.image.shape[1]
+
+    @property
+    def rows(self) -> int:
+        return rows_of_program(self.height, self.numbers)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        return triton.cdiv(self.numbers, STRIP), triton.cdiv(self.height, self.rows)
+
+    @property
+    def scale(self) -> float:
+        """The factor of the target's numbers."""
+        return 1 / 255 if self.target.dtype == torch.uint8 else 1.0
+
+
 class TritonLoss:
     """Calls the kernels with pooled memory; see ``loss.PhotometricLoss``.
 
@@ -259,6 +292,48 @@ class TritonLoss:
         loss, l1, similarity = _TritonLossFunction.apply(self, image, target.contiguous())
         return loss, l1, similarity
 
+    def measure(
+        self, image: Tensor, target: Tensor, values: Tensor, memory: Workspace, differentiated: bool
+    ) -> Measured:
+        """Write loss, L1 and SSIM to ``values`` [3]. Images are contiguous."""
+        numbers = 3 * image.numel() if differentiated else 0
+        derivatives = memory.take("derivatives", numbers, torch.float32)
+        measured = Measured(image, target, values, derivatives)
+        columns, lines = measured.grid
+        sums = memory.take("sums", 2 * columns * lines, torch.float32)
+        launch_grid(measure_similarity, columns, lines)(
+            image,
+            target,
+            measured.scale,
+            measured.height,
+            measured.numbers,
+            derivatives,
+            sums,
+            measured.rows,
+            DIFFERENTIATE=differentiated,
+            STRIP=STRIP,
+        )
+        launch_grid(add_up, 1)(
+            sums, columns * lines, float(image.numel()), self.ssim_weight, values, GROUP=1024
+        )
+        return measured
+
+    def differentiate(self, measured: Measured, g_loss: Tensor, gradient: Tensor) -> None:
+        """Write the gradient by the image to ``gradient`` [H, W, 3], times ``g_loss`` []."""
+        launch_grid(differentiate, *measured.grid)(
+            measured.image,
+            measured.target,
+            measured.scale,
+            measured.height,
+            measured.numbers,
+            measured.derivatives,
+            g_loss,
+            self.ssim_weight,
+            gradient,
+            measured.rows,
+            STRIP=STRIP,
+        )
+
 
 class _TritonLossFunction(torch.autograd.Function):
     """Connects the kernels with autograd."""
@@ -268,39 +343,12 @@ class _TritonLossFunction(torch.autograd.Function):
         ctx: Any, loss: TritonLoss, image: Tensor, target: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         image = image.contiguous()
-        height, numbers = image.shape[0], 3 * image.shape[1]
-        differentiated = ctx.needs_input_grad[1]
-        rows = rows_of_program(height, numbers)
-        grid = triton.cdiv(numbers, STRIP), triton.cdiv(height, rows)
-        scale = 1 / 255 if target.dtype == torch.uint8 else 1.0
         ctx.holder = Lifetime()
+        values = torch.empty(3, dtype=torch.float32, device=image.device)
         with torch.cuda.device_of(image):
             memory = loss.pool.lease(ctx.holder, image.device)
-            derivatives = memory.take(
-                "derivatives", 3 * image.numel() if differentiated else 0, torch.float32
-            )
-            sums = memory.take("sums", 2 * grid[0] * grid[1], torch.float32)
-            values = torch.empty(3, dtype=torch.float32, device=image.device)
-            launch_grid(measure_similarity, *grid)(
-                image,
-                target,
-                scale,
-                height,
-                numbers,
-                derivatives,
-                sums,
-                rows,
-                DIFFERENTIATE=differentiated,
-                STRIP=STRIP,
-            )
-            launch_grid(add_up, 1)(
-                sums, grid[0] * grid[1], float(image.numel()), loss.ssim_weight, values, GROUP=1024
-            )
-        ctx.weight = loss.ssim_weight
-        ctx.scale = scale
-        ctx.derivatives = derivatives
-        ctx.rows = rows
-        ctx.grid = grid
+            measured = loss.measure(image, target, values, memory, ctx.needs_input_grad[1])
+        ctx.loss, ctx.derivatives = loss, measured.derivatives
         ctx.save_for_backward(image, target)
         ctx.set_materialize_grads(False)
         total, l1, similarity = values.unbind()
@@ -313,20 +361,8 @@ class _TritonLossFunction(torch.autograd.Function):
         if g_loss is None:
             return None, None, None
         image, target = ctx.saved_tensors
-        height, numbers = image.shape[0], 3 * image.shape[1]
         gradient = torch.empty_like(image)
         with torch.cuda.device_of(image):
-            launch_grid(differentiate, *ctx.grid)(
-                image,
-                target,
-                ctx.scale,
-                height,
-                numbers,
-                ctx.derivatives,
-                g_loss.contiguous(),
-                ctx.weight,
-                gradient,
-                ctx.rows,
-                STRIP=STRIP,
-            )
+            measured = Measured(image, target, gradient, ctx.derivatives)
+            ctx.loss.differentiate(measured, g_loss.contiguous(), gradient)
         return None, gradient, None

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 import torch
@@ -24,9 +24,10 @@ from gsbench.events import RefineEvent
 from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import write_ply
-from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.gaussians.trainable import StepAll, TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
+from gsbench.raster.executors import find_executor
 from gsbench.raster.staged import Readback
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.runs.trial_record import whole_lines
@@ -38,6 +39,9 @@ from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import Resolution, ScaledViews
 from gsbench.train.views import CameraOrder, SceneViews, Targets, generators
+
+if TYPE_CHECKING:
+    from gsbench.train.direct import DirectStep
 
 log = logging.getLogger(__name__)
 
@@ -56,13 +60,13 @@ class LossLog:
         self._pending: deque[tuple[int, Readback]] = deque()
         self._latest: dict[str, float] = {}
 
-    def add(self, step: int, loss: Tensor, l1: Tensor, ssim: Tensor, total: Tensor) -> None:
-        """Add the scalars of iteration ``step``; ``total`` is the loss plus a regulariser.
+    def add(self, step: int, scalars: Tensor) -> None:
+        """Add the ``scalars`` of iteration ``step``.
 
-        Raises FloatingPointError if a total that has arrived by now is not finite.
+        They are loss, L1, SSIM and, if there is a regulariser, the loss plus it. Raises
+        FloatingPointError if such a total that has arrived by now is not finite.
         """
-        scalars = [scalar.detach().to(loss) for scalar in (loss, l1, ssim, total)]
-        self._pending.append((step, Readback(torch.stack(scalars))))
+        self._pending.append((step, Readback(scalars)))
         while self._pending and self._pending[0][1].arrived:
             self._take()
 
@@ -77,9 +81,10 @@ class LossLog:
 
     def _take(self) -> None:
         step, readback = self._pending.popleft()
-        loss, l1, ssim, total = readback.values().tolist()
-        if not math.isfinite(total):
-            raise FloatingPointError(f"the loss became {total} at iteration {step}")
+        loss, l1, ssim, *more = readback.values().tolist()
+        for total in more or [loss]:
+            if not math.isfinite(total):
+                raise FloatingPointError(f"the loss became {total} at iteration {step}")
         is_first = math.isnan(self.smoothed)
         mean = SMOOTHING * self.smoothed + (1 - SMOOTHING) * loss
         self.smoothed = loss if is_first else mean
@@ -125,11 +130,13 @@ class Trainer:
         initial = densifier.prepare(initial)
         color = [*options.background]
         self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
-        self.gaussians = TrainableGaussians(initial, options, scene.extent)
+        self.direct, step_all = fast_steps(rasterizer, options, self.background)
+        self.gaussians = TrainableGaussians(initial, options, scene.extent, step_all)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
         self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
+        self.is_direct = False  # whether ``direct`` made the gradients of this iteration
         self.seconds = 0.0
         self.losses = LossLog()
         free = free_bytes(self.device)
@@ -240,19 +247,11 @@ class Trainer:
             step if self.resolution is None else self.resolution.position_step(step)
         )
         index = self.order.next()
-        _, targets = self.scaled_views.at(self.scale)
-        target = targets.get(index)
         try:
-            render = self.render(index)
+            render, scalars = self._differentiate(index)
         except ValueError as error:  # the rasterizer rejects a parameter that is out of range
             raise TrainingError(f"iteration {step}: {error}; {_last_state(folder)}") from error
-        loss, l1, ssim = self.loss(
-            replace_ignored(render.image, target, targets.mask(index)), target
-        )
-        regularizer = self.densifier.regularizer(self.gaussians.values)
-        total = loss if regularizer is None else loss + regularizer
-        self.losses.add(step, loss, l1, ssim, total)
-        total.backward()
+        self.losses.add(step, scalars)
         # The last iteration ends here: 3DGS saves its model before it refines and steps.
         if step == options.iterations:
             return None
@@ -273,6 +272,37 @@ class Trainer:
                 "too high"
             )
         return event
+
+    def _differentiate(self, index: int) -> tuple[RenderOutput, Tensor]:
+        """Render the training view ``index`` and compute the gradients of its loss.
+
+        Returns the render, and the scalars for ``losses``.
+        """
+        cameras, targets = self.scaled_views.at(self.scale)
+        target, mask = targets.get(index), targets.mask(index)
+        regularizer = self.densifier.regularizer(self.gaussians.values)
+        direct, camera = self.direct, cameras[index]
+        self.is_direct = (
+            direct is not None and mask is None and regularizer is None and direct.serves(camera)
+        )
+        if direct is not None and self.is_direct:
+            step = direct.step(
+                self.gaussians,
+                camera,
+                target,
+                self.sh_degree,
+                self.densifier.needs_absolute_gradient,
+                self.densifier.needs_splitting_matrix,
+            )
+            return step.render, step.losses
+        render = self.render(index)
+        loss, l1, ssim = self.loss(replace_ignored(render.image, target, mask), target)
+        scalars = [loss, l1, ssim]
+        if regularizer is not None:
+            loss = loss + regularizer
+            scalars.append(loss)
+        loss.backward()
+        return render, torch.stack([scalar.detach().to(loss) for scalar in scalars])
 
     def render(self, index: int) -> RenderOutput:
         """Render the training view ``index`` as in the current iteration, with gradients."""
@@ -318,6 +348,9 @@ class Trainer:
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
     def _optimize(self, visible: Tensor) -> None:
+        if self.direct is not None and self.is_direct:
+            self.direct.optimize(self.gaussians)
+            return
         self.gaussians.optimizer_step(
             self.sh_degree, visible if self.options.visible_adam else None
         )
@@ -341,8 +374,9 @@ class Trainer:
             self.step = state["step"]
             self.seconds = state["seconds"]
             self.losses.smoothed = state["smoothed_loss"]
+            old = self.gaussians
             self.gaussians = TrainableGaussians.load(
-                state["gaussians"], self.gaussians.rates, self.gaussians.spatial_scale, self.device
+                state["gaussians"], old.rates, old.spatial_scale, self.device, old.step_all
             )
             self.densifier.load_state_dict(state["densifier"], self.context)
             if self.resolution is not None:
@@ -365,6 +399,26 @@ def snapshot_file(step: int) -> str:
     As in 3DGS, the model is saved before the refinement and the optimiser step.
     """
     return f"snapshots/iteration_{step}.ply"
+
+
+def fast_steps(
+    rasterizer: Rasterizer, options: TrainConfig, background: Tensor
+) -> tuple["DirectStep | None", StepAll | None]:
+    """What a training on a GPU with Triton has: steps without autograd, if they serve, and Adam."""
+    device = background.device
+    if device.type != "cuda" or find_executor("triton").obstacle(device.type) is not None:
+        return None, None
+    # They import Triton.
+    from gsbench.raster.triton.executor import TritonRasterizer
+    from gsbench.train.adam_triton import TritonAdam
+    from gsbench.train.direct import DirectStep
+
+    direct = None
+    # Updating only visible Gaussians needs gradients that are 0 elsewhere.
+    if isinstance(rasterizer, TritonRasterizer) and not options.visible_adam:
+        recorded = rasterizer.records_steps
+        direct = DirectStep(rasterizer, options.ssim_weight, background, recorded)
+    return direct, TritonAdam()
 
 
 def sh_degree_at(options: TrainConfig, step: int) -> int:

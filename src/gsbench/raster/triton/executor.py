@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +11,14 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, CameraNumbers, Footprint, view_depths
 from gsbench.raster.executors import load_driver
-from gsbench.raster.staged import Gradients, Lifetime, RenderRequest, StagedRasterizer
+from gsbench.raster.staged import (
+    Gradients,
+    Lifetime,
+    Readback,
+    RenderRequest,
+    StagedRasterizer,
+    raise_for_values,
+)
 from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
@@ -24,8 +32,61 @@ from gsbench.raster.triton.layout import (
     TILE,
     count_borders,
 )
-from gsbench.raster.triton.lists import Lists, Projected, Units, find_all_units, make_lists
+from gsbench.raster.triton.lists import (
+    UNITS_AT_FIRST,
+    Lists,
+    Projected,
+    Room,
+    Units,
+    check_pairs,
+    find_all_units,
+    make_lists,
+    sort_by_depth,
+)
 from gsbench.raster.triton.projection import backproject, project, sum_units
+from gsbench.scene.types import Camera
+
+# Makes an output: name, shape, dtype.
+Allocate = Callable[[str, tuple[int, ...], torch.dtype], Tensor]
+
+
+@dataclass
+class Started:
+    """A render up to its units. The host does not know yet how many there are."""
+
+    request: RenderRequest
+    view: Tensor  # [24] float32, the numbers of the camera
+    memory: Workspace  # of what the backward pass needs
+    scratch: Workspace
+    allocate: Allocate
+    radii: Tensor  # [N] int32
+    projected: Projected
+    order: Tensor  # [N] int64 Gaussians by depth
+    unit_ends: Tensor  # [N] int64
+    flags: Tensor  # [1] int32
+    units: Units
+
+    @property
+    def blocks_x(self) -> int:
+        return -(-self.request.camera.width // BLOCK_WIDTH.value)
+
+    @property
+    def blocks(self) -> int:
+        return self.blocks_x * -(-self.request.camera.height // BLOCK_HEIGHT.value)
+
+    def find_units(self, capacity: int) -> None:
+        """Find the units again, with room for ``capacity``."""
+        self.units = find_all_units(
+            self.memory,
+            self.scratch,
+            self.projected,
+            self.order,
+            self.unit_ends,
+            capacity,
+            self.blocks_x,
+            self.flags,
+            self.request.background,
+        )
 
 
 @dataclass
@@ -34,7 +95,7 @@ class TritonFrame:
 
     blocks_x: int
     blocks: int  # number of blocks
-    view: CameraNumbers
+    view: Tensor  # [24] float32, the numbers of the camera
     projected: Projected
     units: Units
     lists: Lists
@@ -49,13 +110,15 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
     """A rasterizer in float32 on a GPU, compiled by Triton at first use.
 
     Results have the same bits on every run on one GPU. Each render keeps its intermediate results
-    until its graph is freed; then their memory is reused. A render waits for the device once, for
-    the sizes of the lists.
+    until its graph is freed; then their memory is reused. ``render`` waits for the device once, for
+    the sizes of the lists. `gsbench.train.direct` calls ``start``, ``finish`` and
+    ``differentiate`` itself, with room for lists that is known before, and so does not wait.
     """
 
     name = "triton"
 
     def __init__(self) -> None:
+        self.records_steps = True  # whether training steps may be recorded as CUDA graphs
         if CONSTANTS.tile != TILE.value:
             raise ValueError(
                 f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}"
@@ -75,63 +138,108 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
     ) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
         """Project, sort, bin, composite; see `StagedRasterizer`.
 
-        Raises ValueError for bad values.
+        Raises ValueError for bad values and for too many pairs.
         """
-        camera, device = request.camera, gaussians.means.device
-        image = torch.empty(camera.height, camera.width, 3, dtype=torch.float32, device=device)
-        alpha = torch.empty(camera.height, camera.width, dtype=torch.float32, device=device)
-        radii = torch.empty(len(gaussians), dtype=torch.int32, device=device)
+        device = gaussians.means.device
         call_lifetime = Lifetime()  # freed when this call returns
-        with torch.cuda.device_of(image):
+        with torch.cuda.device_of(gaussians.means):
             memory = self._frames.lease(request.lifetime, device)
             scratch = self._scratch.lease(call_lifetime, device)
-            # No number is an integer: Triton compiles a kernel again for the integer 1 and for
-            # multiples of 16.
-            view = CameraNumbers._make(map(float, CameraNumbers.of(camera)))
-            blocks_x = -(-camera.width // BLOCK_WIDTH.value)
-            blocks = blocks_x * -(-camera.height // BLOCK_HEIGHT.value)
-            count, background = len(gaussians), request.background
-            flags = scratch.take("flags", 1, torch.int32).zero_()
-            keys = scratch.take("depth_keys", count, torch.int32)
-            projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
-            units, owners = find_all_units(
-                memory, scratch, gaussians, projected, blocks_x, keys, flags, background
+            capacity = max(memory.capacity("unit_widths"), UNITS_AT_FIRST * len(gaussians), 1)
+            view = camera_numbers(request.camera, device)
+            started = self.start(
+                gaussians, request, view, memory, scratch, capacity, fresh_on(device)
             )
-            lists = make_lists(memory, scratch, units, owners, blocks)
-            frame = TritonFrame(
-                blocks_x,
-                blocks,
-                view,
-                projected,
-                units,
-                lists,
-                memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
-                memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
-                memory.take("past", blocks, torch.int32),
-                memory.take("borders", count_borders(units.pairs) * BORDER.value, torch.float32),
-                memory.take("last_slots", blocks, torch.int64),
-            )
-            launch_grid(composite, blocks)(
-                lists.order,
-                lists.starts,
-                lists.entries,
-                projected.records,
-                count,
-                background,
-                camera.width,
-                camera.height,
-                blocks_x,
-                image,
-                alpha,
-                frame.transmittance,
-                frame.last,
-                frame.past,
-                frame.borders,
-                lists.slots,
-                frame.last_slots,
-                num_warps=1,
-            )
-            return image, alpha, radii, frame
+            while True:
+                # the only wait for the device
+                units, pairs, bad = Readback(started.units.status).values().tolist()
+                if bad:
+                    raise_for_values(gaussians, request.background)
+                if units <= capacity:
+                    break
+                capacity = 2 * units
+                started.find_units(capacity)
+            check_pairs(pairs)
+            return self.finish(started, Room(units, pairs))
+
+    def start(
+        self,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        view: Tensor,
+        memory: Workspace,
+        scratch: Workspace,
+        capacity: int,
+        allocate: Allocate,
+    ) -> Started:
+        """Project all Gaussians, sort them by depth, and find up to ``capacity`` units."""
+        count, device = len(gaussians), gaussians.means.device
+        radii = allocate("radii", (count,), torch.int32)
+        flags = scratch.take("flags", 1, torch.int32).zero_()
+        keys = scratch.take("depth_keys", count, torch.int32)
+        projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
+        order, unit_ends = sort_by_depth(scratch, projected, keys)
+        nothing = torch.empty(0, device=device)
+        units = Units(nothing, nothing, nothing, nothing, nothing, nothing)
+        started = Started(
+            request,
+            view,
+            memory,
+            scratch,
+            allocate,
+            radii,
+            projected,
+            order,
+            unit_ends,
+            flags,
+            units,
+        )
+        started.find_units(capacity)
+        return started
+
+    def finish(self, started: Started, room: Room) -> tuple[Tensor, Tensor, Tensor, TritonFrame]:
+        """Make the lists and composite; return image, alpha, radii and the frame.
+
+        If there are more units or pairs than ``room``, the image has only the background.
+        """
+        camera, memory, blocks = started.request.camera, started.memory, started.blocks
+        image = started.allocate("image", (camera.height, camera.width, 3), torch.float32)
+        alpha = started.allocate("alpha", (camera.height, camera.width), torch.float32)
+        lists = make_lists(memory, started.scratch, started.units, room, blocks)
+        frame = TritonFrame(
+            started.blocks_x,
+            blocks,
+            started.view,
+            started.projected,
+            started.units,
+            lists,
+            memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
+            memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
+            memory.take("past", blocks, torch.int32),
+            memory.take("borders", count_borders(room.pairs) * BORDER.value, torch.float32),
+            memory.take("last_slots", blocks, torch.int64),
+        )
+        launch_grid(composite, blocks)(
+            lists.order,
+            lists.starts,
+            lists.entries,
+            frame.projected.records,
+            len(started.radii),
+            started.request.background,
+            camera.width,
+            camera.height,
+            frame.blocks_x,
+            image,
+            alpha,
+            frame.transmittance,
+            frame.last,
+            frame.past,
+            frame.borders,
+            lists.slots,
+            frame.last_slots,
+            num_warps=1,
+        )
+        return image, alpha, started.radii, frame
 
     def backward(
         self,
@@ -144,64 +252,97 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
     ) -> Gradients:
         """See `StagedRasterizer`."""
         lifetime = Lifetime()
+        device = g_image.device
         with torch.cuda.device_of(g_image):
-            scratch = self._scratch.lease(lifetime, g_image.device)
-            camera, units, lists, count = request.camera, frame.units, frame.lists, len(gaussians)
-            projected, absolute = frame.projected, request.absolute
-            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
-            inner = count_borders(units.pairs)
-            launch_grid(composite_backward, inner + frame.blocks)(
-                lists.order,
-                lists.starts,
-                frame.blocks,
-                inner,
-                lists.entries,
-                lists.slots,
-                projected.records,
-                count,
-                request.background,
-                camera.width,
-                camera.height,
-                frame.blocks_x,
-                frame.transmittance,
-                frame.last,
-                frame.past,
-                frame.borders,
+            scratch = self._scratch.lease(lifetime, device)
+            gradients = self.differentiate(
+                frame,
+                gaussians,
+                request,
                 g_image,
-                g_image if g_alpha is None else g_alpha,
-                rows,
-                HAS_ALPHA=g_alpha is not None,
-                ABSOLUTE=absolute is not None,
-                num_warps=1,
+                g_alpha,
+                want_splitting,
+                scratch,
+                fresh_on(device),
+                zeros_like_all(gaussians),
             )
-            _sum_units(frame, rows)
-            means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
-            gradients = [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
-            g_screen = torch.zeros_like(means[:, :2])
-            g_splitting = means.new_zeros(count, 3, 3) if want_splitting else None
-            launch(backproject, count, 128)(
-                means,
-                log_scales,
-                quaternions,
-                logits,
-                count,
-                frame.view,
-                projected.records.view(torch.int32),
-                projected.color_slopes,
-                projected.row_counts,
-                units.first,
-                units.pair_ends,
-                units.widths,
-                rows,
-                *gradients,
-                g_screen,
-                g_screen if absolute is None else absolute,
-                g_screen if g_splitting is None else g_splitting,
-                DEGREE=request.degree,
-                ABSOLUTE=absolute is not None,
-                SPLITTING=want_splitting,
-            )
-            return Gradients(gradients, g_screen, g_splitting)
+        return gradients
+
+    def differentiate(
+        self,
+        frame: TritonFrame,
+        gaussians: Gaussians,
+        request: RenderRequest,
+        g_image: Tensor,
+        g_alpha: Tensor | None,
+        want_splitting: bool,
+        scratch: Workspace,
+        allocate: Allocate,
+        gradients: list[Tensor],
+    ) -> Gradients:
+        """Compute the gradients of Gaussians that are seen into the six ``gradients``.
+
+        Others, and those of harmonics above the degree, are not changed.
+        """
+        camera, units, lists, count = request.camera, frame.units, frame.lists, len(gaussians)
+        projected, absolute = frame.projected, request.absolute
+        rows = scratch.take("rows", lists.room.pairs * ROW.value, torch.float32)
+        inner = count_borders(lists.room.pairs)
+        launch_grid(composite_backward, inner + frame.blocks)(
+            lists.order,
+            lists.starts,
+            frame.blocks,
+            inner,
+            lists.entries,
+            lists.slots,
+            projected.records,
+            count,
+            request.background,
+            camera.width,
+            camera.height,
+            frame.blocks_x,
+            frame.transmittance,
+            frame.last,
+            frame.past,
+            frame.borders,
+            g_image,
+            g_image if g_alpha is None else g_alpha,
+            rows,
+            HAS_ALPHA=g_alpha is not None,
+            ABSOLUTE=absolute is not None,
+            num_warps=1,
+        )
+        _sum_units(frame, rows)
+        means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
+        g_screen = allocate("g_screen", (count, 2), torch.float32)
+        g_splitting = (
+            allocate("g_splitting", (count, 3, 3), torch.float32) if want_splitting else None
+        )
+        launch(backproject, count, 128)(
+            means,
+            log_scales,
+            quaternions,
+            logits,
+            count,
+            frame.view,
+            projected.records.view(torch.int32),
+            projected.color_slopes,
+            projected.row_counts,
+            units.first,
+            units.pair_ends,
+            units.widths,
+            units.status,
+            *lists.room,
+            rows,
+            *gradients,
+            g_screen,
+            g_screen if absolute is None else absolute,
+            g_screen if g_splitting is None else g_splitting,
+            DEGREE=request.degree,
+            ABSOLUTE=absolute is not None,
+            SPLITTING=want_splitting,
+        )
+        return Gradients(gradients, g_screen, g_splitting)
 
     def footprint(
         self,
@@ -222,7 +363,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()
             # ``cover`` fills 3 of 16 columns
-            rows = scratch.take("rows", units.pairs * ROW.value, torch.float32)
+            rows = scratch.take("rows", lists.room.pairs * ROW.value, torch.float32)
             launch_grid(cover, frame.blocks)(
                 lists.starts,
                 lists.entries,
@@ -253,10 +394,27 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             return Footprint(covered, view_depths(gaussians, request.camera), sums, distances)
 
 
+def fresh_on(device: torch.device) -> Allocate:
+    """Outputs in memory of their own."""
+    return lambda _, shape, dtype: torch.empty(shape, dtype=dtype, device=device)
+
+
+def zeros_like_all(gaussians: Gaussians) -> list[Tensor]:
+    return [torch.zeros_like(tensor) for tensor in gaussians.tensors().values()]
+
+
+def camera_numbers(camera: Camera, device: torch.device) -> Tensor:
+    """`CameraNumbers` of ``camera``, [24] float32 on ``device``; the host does not wait."""
+    numbers = torch.tensor([*map(float, CameraNumbers.of(camera))], dtype=torch.float32)
+    if device.type == "cuda":
+        numbers = numbers.pin_memory()
+    return numbers.to(device, non_blocking=True)
+
+
 def _project(
     memory: Workspace,
     gaussians: Gaussians,
-    view: CameraNumbers,
+    view: Tensor,
     degree: int,
     keys: Tensor,
     radii: Tensor,
@@ -291,7 +449,7 @@ def _project(
 
 def _sum_units(frame: TritonFrame, rows: Tensor) -> None:
     """Sum the ``rows`` of the pairs of each unit, in place."""
-    units = frame.units
-    launch(sum_units, units.number, 32)(
-        units.pair_ends, units.widths, units.blocks, frame.last_slots, units.number, rows
+    units, room = frame.units, frame.lists.room
+    launch(sum_units, room.units, 32)(
+        units.pair_ends, units.widths, units.blocks, frame.last_slots, units.status, *room, rows
     )

@@ -15,8 +15,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from gsbench.gaussians.model import Gaussians
-from gsbench.raster.staged import Readback, raise_for_values
 from gsbench.raster.triton.launch import Workspace, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
@@ -138,16 +136,37 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
     tl.store(status + 2, bad.to(tl.int64))
 
 
-@triton.jit(do_not_specialize=["units"])
+@triton.jit
+def units_that_fit(status, units, pairs):
+    """The number of units in ``status``; 0 if there is no room for all units and pairs.
+
+    ``units`` and ``pairs`` are the capacities. Without room, all kernels behind behave as if no
+    Gaussian were seen, so they stay within their memory. The host looks at ``status``, makes room,
+    and repeats the render.
+    """
+    number = tl.load(status)
+    return tl.where((number <= units) & (tl.load(status + 1) <= pairs), number, 0)
+
+
+@triton.jit(do_not_specialize=["units", "pairs"])
 def write_pairs(
-    unit_owners, unit_blocks, unit_widths, pair_ends, units, keys, owners, GROUP: tl.constexpr
+    unit_owners,
+    unit_blocks,
+    unit_widths,
+    pair_ends,
+    status,
+    units,
+    pairs,
+    keys,
+    owners,
+    GROUP: tl.constexpr,
 ):
     """Write the block (``keys``) and the Gaussian (``owners``) of each slot, both [pairs].
 
-    Each lane handles one unit.
+    Each lane handles one unit. See `units_that_fit`.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = unit < units
+    inside = unit < units_that_fit(status, units, pairs)
     width = tl.load(unit_widths + unit, mask=inside, other=0)
     slot = tl.load(pair_ends + unit, mask=inside, other=0) - width
     block = tl.load(unit_blocks + unit, mask=inside, other=0)
@@ -161,6 +180,13 @@ MAX_INT16, MAX_INT32 = 2**15 - 1, 2**31 - 1
 UNITS_AT_FIRST = 2  # units per Gaussian that the first attempt has room for
 
 
+class Room(NamedTuple):
+    """The numbers of units and pairs that there is memory for."""
+
+    units: int
+    pairs: int
+
+
 class Projected(NamedTuple):
     """Results of projection for each of N Gaussians."""
 
@@ -170,95 +196,110 @@ class Projected(NamedTuple):
 
 
 class Units(NamedTuple):
-    """The units of all Gaussians; those of one Gaussian are adjacent."""
+    """The units of all Gaussians; those of one Gaussian are adjacent. R is the room for them."""
 
-    number: int
-    pairs: int  # number of pairs in all units
     first: Tensor  # [N] int64 first unit of each Gaussian
-    widths: Tensor  # [units] int32 number of pairs of each unit
-    blocks: Tensor  # [units] int32 first block of each unit
-    pair_ends: Tensor  # [units] int64 running sum of the widths
+    widths: Tensor  # [R] int32 number of pairs of each unit
+    blocks: Tensor  # [R] int32 first block of each unit
+    pair_ends: Tensor  # [R] int64 running sum of the widths
+    owners: Tensor  # [R] int32 Gaussian of each unit; scratch memory
+    status: Tensor  # [3] int64, see `summarise`
 
 
 class Lists(NamedTuple):
-    """The lists of Gaussians that blocks composite."""
+    """The lists of Gaussians that blocks composite. P is the room for pairs."""
 
+    room: Room
     order: Tensor  # [blocks] int64 blocks, longest lists first
     starts: Tensor  # [blocks + 1] int32 first entry of each block
-    entries: Tensor  # [pairs] int32 Gaussians, by block, front to back
-    slots: Tensor  # [pairs] int64 slot of each entry
+    entries: Tensor  # [P] int32 Gaussians, by block, front to back
+    slots: Tensor  # [P] int64 slot of each entry
+
+
+def sort_by_depth(scratch: Workspace, projected: Projected, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the order of the Gaussians by ``keys``, and the running sum of their units in it."""
+    count = len(keys)
+    order = scratch.take("depth_order", count, torch.int64)
+    torch.sort(keys, stable=True, out=(scratch.take("sorted_depths", count, torch.int32), order))
+    unit_ends = scratch.take("unit_ends", count, torch.int64)
+    torch.cumsum(projected.row_counts[order], 0, out=unit_ends)
+    return order, unit_ends
 
 
 def find_all_units(
     memory: Workspace,
     scratch: Workspace,
-    gaussians: Gaussians,
     projected: Projected,
+    order: Tensor,
+    unit_ends: Tensor,
+    capacity: int,
     blocks_x: int,
-    keys: Tensor,
     flags: Tensor,
     background: Tensor,
-) -> tuple[Units, Tensor]:
-    """Find the units of all Gaussians, front to back, and the Gaussian of each unit, [units].
+) -> Units:
+    """Find the units of all Gaussians in ``order``, as many as ``capacity`` admits.
 
-    If there is too little memory, allocate more and repeat. The host waits for the device here.
-    Raises ValueError for bad values and for too many pairs.
+    The host does not wait: the device keeps the real numbers of units and pairs in ``status``.
     """
-    count = len(gaussians)
-    depth_order = scratch.take("depth_order", count, torch.int64)
-    torch.sort(
-        keys, stable=True, out=(scratch.take("sorted_depths", count, torch.int32), depth_order)
+    count = len(order)
+    units = Units(
+        memory.take("first_units", count, torch.int64),
+        memory.take("unit_widths", capacity, torch.int32).zero_(),
+        memory.take("unit_blocks", capacity, torch.int32),
+        memory.take("pair_ends", capacity, torch.int64),
+        scratch.take("unit_owners", capacity, torch.int32),
+        memory.take("status", 3, torch.int64),
     )
-    unit_ends = scratch.take("unit_ends", count, torch.int64)
-    torch.cumsum(projected.row_counts[depth_order], 0, out=unit_ends)
-    first = memory.take("first_units", count, torch.int64)
-    status = scratch.take("status", 3, torch.int64)
-    capacity = max(memory.capacity("unit_widths"), UNITS_AT_FIRST * count, 1)
-    while True:
-        owners = scratch.take("unit_owners", capacity, torch.int32)
-        blocks = memory.take("unit_blocks", capacity, torch.int32)
-        widths = memory.take("unit_widths", capacity, torch.int32).zero_()
-        pair_ends = memory.take("pair_ends", capacity, torch.int64)
-        launch(find_units, count, 128)(
-            depth_order,
-            count,
-            projected.row_counts,
-            unit_ends,
-            projected.records,
-            projected.records.view(torch.int32),
-            blocks_x,
-            capacity,
-            first,
-            owners,
-            blocks,
-            widths,
-        )
-        torch.cumsum(widths, 0, out=pair_ends)
-        launch_grid(summarise, 1)(unit_ends, count, pair_ends, capacity, flags, background, status)
-        units, pairs, bad = Readback(status).values().tolist()  # the only wait for the device
-        if bad:
-            raise_for_values(gaussians, background)
-        if units <= capacity:
-            break
-        capacity = 2 * units
+    launch(find_units, count, 128)(
+        order,
+        count,
+        projected.row_counts,
+        unit_ends,
+        projected.records,
+        projected.records.view(torch.int32),
+        blocks_x,
+        capacity,
+        units.first,
+        units.owners,
+        units.blocks,
+        units.widths,
+    )
+    torch.cumsum(units.widths, 0, out=units.pair_ends)
+    launch_grid(summarise, 1)(
+        unit_ends, count, units.pair_ends, capacity, flags, background, units.status
+    )
+    return units
+
+
+def check_pairs(pairs: int) -> None:
+    """Raise ValueError if there are too many ``pairs`` to sort."""
     if pairs > MAX_INT32:
         raise ValueError(
             f"gaussians: {pairs} (Gaussian, block) pairs in one view are more than {MAX_INT32}"
         )
-    return Units(units, pairs, first, widths, blocks, pair_ends), owners
 
 
 def make_lists(
-    memory: Workspace, scratch: Workspace, units: Units, owners: Tensor, blocks: int
+    memory: Workspace, scratch: Workspace, units: Units, room: Room, blocks: int
 ) -> Lists:
-    """Sort the pairs of all units by block; within a block they stay front to back."""
-    pairs = units.pairs
+    """Sort the pairs of all units by block; within a block they stay front to back.
+
+    Pairs that ``room`` has more than there are sort behind the last block.
+    """
+    pairs = room.pairs
     key_type = torch.int16 if blocks <= MAX_INT16 else torch.int32
-    block_keys = scratch.take(f"block_keys_{key_type}", pairs, key_type)
+    block_keys = scratch.take(f"block_keys_{key_type}", pairs, key_type).fill_(blocks)
     sorted_keys = scratch.take(f"sorted_keys_{key_type}", pairs, key_type)
     slot_owners = scratch.take("slot_owners", pairs, torch.int32)
-    launch(write_pairs, units.number, 128)(
-        owners, units.blocks, units.widths, units.pair_ends, units.number, block_keys, slot_owners
+    launch(write_pairs, room.units, 128)(
+        units.owners,
+        units.blocks,
+        units.widths,
+        units.pair_ends,
+        units.status,
+        *room,
+        block_keys,
+        slot_owners,
     )
     slots = memory.take("slots", pairs, torch.int64)
     torch.sort(block_keys, stable=True, out=(sorted_keys, slots))
@@ -270,4 +311,4 @@ def make_lists(
     order = memory.take("order", blocks, torch.int64)
     lengths = scratch.take("sorted_lengths", blocks, torch.int32)
     torch.sort(starts[1:] - starts[:-1], descending=True, stable=True, out=(lengths, order))
-    return Lists(order, starts, entries, slots)
+    return Lists(room, order, starts, entries, slots)

@@ -18,6 +18,7 @@ from gsbench.raster.triton.geometry import (
     dot,
     from_camera,
     image_rows,
+    load_camera,
     load_quaternion,
     load_vector,
     minus,
@@ -58,6 +59,7 @@ from gsbench.raster.triton.layout import (
     SHEAR,
     TILE,
 )
+from gsbench.raster.triton.lists import units_that_fit
 
 NEAR = tl.constexpr(CONSTANTS.near)
 SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
@@ -105,7 +107,7 @@ def project(
     sh_dc,
     sh_rest,
     count,
-    v,
+    camera,
     records,
     record_ints,
     color_slopes,
@@ -127,6 +129,7 @@ def project(
     - ``row_counts`` [N], the number of rows of blocks that the contour can touch;
     - ``flags`` [1], set to 1 if a value is not finite or a quaternion has length 0.
     """
+    v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
     mean, log_scale = load_vector(means, index, inside), load_vector(log_scales, index, inside)
@@ -206,15 +209,25 @@ def project(
     tl.store(flags, 1, mask=tl.max((bad & inside).to(tl.int32), 0) > 0)
 
 
-@triton.jit(do_not_specialize=["units"])
-def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROUP: tl.constexpr):
+@triton.jit(do_not_specialize=["units", "pairs"])
+def sum_units(
+    pair_ends,
+    unit_widths,
+    unit_blocks,
+    last_slots,
+    status,
+    units,
+    pairs,
+    rows,
+    GROUP: tl.constexpr,
+):
     """Sum the ``rows`` [pairs, 16] of each unit, which are adjacent, into its first row.
 
     Only rows of entries that compositing reached have been written. These are the slots up to
     ``last_slots`` [blocks], because the slots in the list of a block rise.
     """
     unit = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = unit < units
+    inside = unit < units_that_fit(status, units, pairs)
     width = tl.load(unit_widths + unit, mask=inside, other=0)
     first = tl.load(pair_ends + unit, mask=inside, other=0) - width
     block = tl.load(unit_blocks + unit, mask=inside, other=0)
@@ -228,7 +241,13 @@ def sum_units(pair_ends, unit_widths, unit_blocks, last_slots, units, rows, GROU
 
 
 @triton.jit
-def _store_splitting(place, d00, d01, d11, shear, rows, mask):
+def _store_or_zero(place, value, seen, inside):
+    """Store ``value`` where a Gaussian is ``seen``, 0 for the others ``inside`` the arrays."""
+    tl.store(place, tl.where(seen, value, 0.0), mask=inside)
+
+
+@triton.jit
+def _store_splitting(place, d00, d01, d11, shear, rows, seen, mask):
     """Write the splitting matrices F^T U^T (D G D - h D) U F (SteepGS, arXiv 2505.05587).
 
     F = ``rows`` is the derivative of the projected mean; ``d00``, ``d01`` and ``d11`` are the
@@ -243,15 +262,15 @@ def _store_splitting(place, d00, d01, d11, shear, rows, mask):
     xy = r0[0] * s0[1] + r1[0] * s1[1]
     xz = r0[0] * s0[2] + r1[0] * s1[2]
     yz = r0[1] * s0[2] + r1[1] * s1[2]
-    tl.store(place, r0[0] * s0[0] + r1[0] * s1[0], mask=mask)
-    tl.store(place + 1, xy, mask=mask)
-    tl.store(place + 2, xz, mask=mask)
-    tl.store(place + 3, xy, mask=mask)
-    tl.store(place + 4, r0[1] * s0[1] + r1[1] * s1[1], mask=mask)
-    tl.store(place + 5, yz, mask=mask)
-    tl.store(place + 6, xz, mask=mask)
-    tl.store(place + 7, yz, mask=mask)
-    tl.store(place + 8, r0[2] * s0[2] + r1[2] * s1[2], mask=mask)
+    _store_or_zero(place, r0[0] * s0[0] + r1[0] * s1[0], seen, mask)
+    _store_or_zero(place + 1, xy, seen, mask)
+    _store_or_zero(place + 2, xz, seen, mask)
+    _store_or_zero(place + 3, xy, seen, mask)
+    _store_or_zero(place + 4, r0[1] * s0[1] + r1[1] * s1[1], seen, mask)
+    _store_or_zero(place + 5, yz, seen, mask)
+    _store_or_zero(place + 6, xz, seen, mask)
+    _store_or_zero(place + 7, yz, seen, mask)
+    _store_or_zero(place + 8, r0[2] * s0[2] + r1[2] * s1[2], seen, mask)
 
 
 @triton.jit
@@ -304,20 +323,23 @@ def _position_gradient(a0, a1, g_column, g_row, x, y, inverse_z, v):
     return times((view_x, view_y, view_z), (right, down, ahead))
 
 
-@triton.jit(do_not_specialize=["count"])
+@triton.jit(do_not_specialize=["count", "units", "pairs"])
 def backproject(
     means,
     log_scales,
     quaternions,
     logits,
     count,
-    v,
+    camera,
     record_ints,
     color_slopes,
     row_counts,
     first_units,
     pair_ends,
     unit_widths,
+    status,
+    units,
+    pairs,
     rows,
     g_means,
     g_log_scales,
@@ -333,9 +355,16 @@ def backproject(
     SPLITTING: tl.constexpr,
     GROUP: tl.constexpr,
 ):
-    """Write the gradients of visible Gaussians. Other gradients are not changed."""
+    """Write the gradients of Gaussians that are seen: those with a row in ``row_counts``.
+
+    Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_splitting``
+    become 0. See `units_that_fit` for ``status``, ``units`` and ``pairs``.
+    """
+    v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    row_count = tl.load(row_counts + index, mask=index < count, other=0)
+    inside = index < count
+    fits = (tl.load(status) <= units) & (tl.load(status + 1) <= pairs)
+    row_count = tl.load(row_counts + index, mask=inside & fits, other=0)
     seen = row_count > 0
     sums = sum_rows(index, row_count, first_units, pair_ends, unit_widths, rows, 9 + 2 * ABSOLUTE)
     h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
@@ -367,11 +396,11 @@ def backproject(
     g_column = a * h_t
     g_row = shear * g_column + e * h_y
     half_width, half_height = 0.5 * v.width, 0.5 * v.height
-    tl.store(g_screen + 2 * index, g_column * half_width, mask=seen)
-    tl.store(g_screen + 2 * index + 1, g_row * half_height, mask=seen)
+    _store_or_zero(g_screen + 2 * index, g_column * half_width, seen, inside)
+    _store_or_zero(g_screen + 2 * index + 1, g_row * half_height, seen, inside)
     if ABSOLUTE:
-        tl.store(g_absolute + 2 * index, a * sums[9] * half_width, mask=seen)
-        tl.store(g_absolute + 2 * index + 1, sums[10] * half_height, mask=seen)
+        _store_or_zero(g_absolute + 2 * index, a * sums[9] * half_width, seen, inside)
+        _store_or_zero(g_absolute + 2 * index + 1, sums[10] * half_height, seen, inside)
 
     # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U =
     # [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the first row of
@@ -379,7 +408,8 @@ def backproject(
     q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
     if SPLITTING:
         free = image_rows(free_x, free_y, inverse_z, v)
-        _store_splitting(g_splitting + 9 * index, q00 - a * h, q01, q11 - e * h, shear, free, seen)
+        d00, d11 = q00 - a * h, q11 - e * h
+        _store_splitting(g_splitting + 9 * index, d00, q01, d11, shear, free, seen, inside)
     u0 = plus(n0, shear, n1)
     g0, g1 = mixed(q00, u0, q01, n1), mixed(q01, u0, q11, n1)
     variances = scaled(scales, scales)

@@ -1,0 +1,117 @@
+"""Adam in one Triton kernel for each parameter. Results have the same bits on every run.
+
+torch's fused kernel reaches half of the memory's throughput on an H100 (docs/measurements.md).
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from gsbench.gaussians.trainable import ADAM_BETAS, ADAM_EPSILON, AdamState
+from gsbench.raster.triton.launch import launch_grid
+
+NUMBERS = 1024  # of a parameter per program
+BETA1, BETA2 = (tl.constexpr(beta) for beta in ADAM_BETAS)
+EPSILON = tl.constexpr(ADAM_EPSILON)
+
+
+@triton.jit(do_not_specialize=["count"])
+def adam_step(
+    values,
+    gradients,
+    first,
+    second,
+    factors,
+    seen,
+    count,
+    WIDTH: tl.constexpr,
+    ACTIVE: tl.constexpr,
+    HAS_SEEN: tl.constexpr,
+    GROUP: tl.constexpr,
+):
+    """Apply Adam (Kingma and Ba 2015, algorithm 1) to ``values`` [count, WIDTH], in place.
+
+    ``first`` and ``second`` are the moments, ``factors`` [2] those of `adam_factors`. The gradient
+    is 0 from column ``ACTIVE`` on and, if ``HAS_SEEN``, where ``seen`` [count] is 0; ``gradients``
+    is not read there and may be undefined.
+    """
+    place = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
+    inside = place < count.to(tl.int64) * WIDTH
+    read = inside
+    if HAS_SEEN:
+        read &= tl.load(seen + place // WIDTH, mask=inside, other=0) > 0
+    if ACTIVE < WIDTH:
+        read &= place % WIDTH < ACTIVE
+    g = tl.load(gradients + place, mask=read, other=0.0)
+    m = BETA1 * tl.load(first + place, mask=inside, other=0.0) + (1 - BETA1) * g
+    v = BETA2 * tl.load(second + place, mask=inside, other=0.0) + (1 - BETA2) * (g * g)
+    value = tl.load(values + place, mask=inside, other=0.0)
+    step = tl.load(factors) * m / (tl.sqrt(v) * tl.load(factors + 1) + EPSILON)
+    tl.store(first + place, m, mask=inside)
+    tl.store(second + place, v, mask=inside)
+    tl.store(values + place, value - step, mask=inside)
+
+
+def adam_factors(rate: float, step: int) -> tuple[float, float]:
+    """The two numbers of step ``step`` (1, 2, …) that `adam_step` multiplies by.
+
+    With m' = m / (1 - b1^step) and v' = v / (1 - b2^step), the step is rate m' / (sqrt(v') + eps).
+    """
+    beta1, beta2 = ADAM_BETAS
+    return rate / (1 - beta1**step), (1 - beta2**step) ** -0.5
+
+
+class TritonAdam:
+    """Adam for `TrainableGaussians` on a GPU; see `gsbench.gaussians.trainable.StepAll`."""
+
+    def __call__(
+        self,
+        parameter: Tensor,
+        gradient: Tensor,
+        state: AdamState,
+        seen: Tensor | None = None,
+        active: int | None = None,
+    ) -> None:
+        """Apply step ``state.step``; the host does not wait."""
+        numbers = torch.tensor(adam_factors(state.rate, state.step), dtype=torch.float32)
+        if parameter.device.type == "cuda":
+            numbers = numbers.pin_memory()
+        self.launch(
+            parameter,
+            gradient,
+            state,
+            numbers.to(parameter.device, non_blocking=True),
+            seen,
+            active,
+        )
+
+    def launch(
+        self,
+        parameter: Tensor,
+        gradient: Tensor,
+        state: AdamState,
+        factors: Tensor,
+        seen: Tensor | None,
+        active: int | None,
+    ) -> None:
+        """Apply Adam with ``factors`` [2] in the memory of the device."""
+        count = len(parameter)
+        if count:
+            width = parameter.numel() // count
+            with torch.cuda.device_of(parameter):
+                launch_grid(adam_step, triton.cdiv(parameter.numel(), NUMBERS))(
+                    parameter.detach(),
+                    gradient,
+                    state.first,
+                    state.second,
+                    factors,
+                    gradient if seen is None else seen,
+                    count,
+                    WIDTH=width,
+                    ACTIVE=width if active is None else active,
+                    HAS_SEEN=seen is not None,
+                    GROUP=NUMBERS,
+                )

@@ -1,0 +1,379 @@
+"""Training steps on a GPU without autograd, recorded as CUDA graphs.
+
+Most of a step's time on the host is Python: autograd, some sixty operations of torch, eleven
+launches of Triton. Between two refinements every step launches the same kernels on the same memory,
+so `DirectStep` records them once and replays them. Whatever changes from step to step is in the
+memory of the device: camera, photograph, learning rates.
+
+The sizes of the lists also change. Kernels therefore get room for more entries than the last views
+needed. If a view needs still more, its kernels behave as if nothing were seen; the host reads the
+real sizes before it uses the result, makes room, and repeats the render. The host reads them while
+the device composites, so neither waits for the other. The bits are the same as without recording.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsbench.gaussians.trainable import AdamState, KnownGradients, TrainableGaussians
+from gsbench.raster.base import RenderOutput
+from gsbench.raster.staged import Lifetime, Readback, RenderRequest, raise_for_values
+from gsbench.raster.triton.executor import Started, TritonFrame, TritonRasterizer, camera_numbers
+from gsbench.raster.triton.launch import Workspace
+from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, check_pairs
+from gsbench.scene.types import Camera
+from gsbench.train.adam_triton import TritonAdam, adam_factors
+from gsbench.train.loss_triton import TritonLoss
+
+log = logging.getLogger(__name__)
+
+# Room for lists, relative to the largest that was needed. More costs time to sort; less costs
+# repeated renders.
+MARGIN = 1.2
+MOST_SIZES = 4  # of images; each has memory of its own
+# Adam's factors of so many steps are in page-locked memory at once. The host is at most two ahead.
+FACTORS_KEPT = 4
+
+
+class Differentiated(NamedTuple):
+    """Results of a training step before Adam. The next step overwrites their memory."""
+
+    render: RenderOutput  # ``screen_points.grad`` is filled
+    losses: Tensor  # [3] loss, L1, SSIM
+    known: KnownGradients
+
+
+class Shape(NamedTuple):
+    """What must be equal for two steps to have the same launches, besides the parameters."""
+
+    width: int  # px
+    height: int
+    degree: int
+    absolute: bool
+    splitting: bool
+    target: torch.dtype
+
+
+class DirectStep:
+    """Renders, measures and differentiates training views; applies Adam.
+
+    It can do what `serves` says. ``graphs`` turns recording on; without it, the same launches are
+    made one by one.
+    """
+
+    def __init__(
+        self, rasterizer: TritonRasterizer, ssim_weight: float, background: Tensor, graphs: bool
+    ) -> None:
+        self.rasterizer = rasterizer
+        self.loss = TritonLoss(ssim_weight)
+        self.background = background
+        self.graphs = graphs
+        self.repeats = 0  # renders that were repeated because lists had too little room
+        self._memory: dict[tuple[int, int], _Memory] = {}
+        self._plan: dict[tuple[int, int], _Plan] = {}
+        self._last: _Plan | None = None
+        self._cameras: dict[int, tuple[Camera, Tensor]] = {}
+        self._pool: _GraphPool | None = None
+
+    def serves(self, camera: Camera) -> bool:
+        """Whether there is memory for images of this size: at most `MOST_SIZES` sizes have it."""
+        size = camera.width, camera.height
+        return size in self._memory or len(self._memory) < MOST_SIZES
+
+    def step(
+        self,
+        gaussians: TrainableGaussians,
+        camera: Camera,
+        target: Tensor,
+        degree: int,
+        absolute: bool,
+        splitting: bool,
+    ) -> Differentiated:
+        """Render ``camera``, and differentiate the loss against ``target`` [H, W, 3].
+
+        Raises ValueError for bad values of parameters.
+        """
+        size = camera.width, camera.height
+        shape = Shape(*size, degree, absolute, splitting, target.dtype)
+        memory = self._memory.setdefault(size, _Memory(self.background.device))
+        plan = self._plan.get(size)
+        if plan is None or not plan.suits(gaussians, shape):
+            self._plan.pop(size, None)  # first free the memory of its graphs
+            self._last = None
+            plan = _Plan(self, gaussians, camera, shape, memory)
+            self._plan[size] = plan
+        self._last = plan
+        plan.view.copy_(self._numbers(camera), non_blocking=True)
+        plan.target.copy_(target, non_blocking=True)
+        with torch.cuda.device_of(self.background):
+            while not plan.run():
+                self.repeats += 1
+        return plan.result()
+
+    def optimize(self, gaussians: TrainableGaussians) -> None:
+        """Apply Adam with the gradients of the last step; replaced parameters are left out."""
+        plan = self._last
+        assert plan is not None, "optimize follows step"
+        states = gaussians.advance(plan.known)
+        if plan.suits(gaussians, plan.shape) and plan.adam_graph is not None:
+            plan.replay_adam(states)
+        else:
+            gaussians.apply(plan.known, states)
+
+    def graph_pool(self) -> _GraphPool:
+        if self._pool is None:
+            self._pool = _GraphPool()
+        return self._pool
+
+    def _numbers(self, camera: Camera) -> Tensor:
+        """The numbers of ``camera`` on the device; kept, since training views come back."""
+        known = self._cameras.get(id(camera))
+        if known is None or known[0] is not camera:
+            known = camera, camera_numbers(camera, self.background.device)
+            self._cameras[id(camera)] = known
+        return known[1]
+
+
+class _Memory:
+    """Memory of steps with one size of image, and the room for their lists."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.kept, self.scratch, self.outputs = (Workspace(device) for _ in range(3))
+        self.room: Room | None = None  # None: not known yet
+
+    def allocate(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        return self.outputs.take(name, math.prod(shape), dtype).view(shape)
+
+
+class _Plan:
+    """The launches of steps with the same parameters and `Shape`, and their graphs, if recorded."""
+
+    def __init__(
+        self,
+        step: DirectStep,
+        gaussians: TrainableGaussians,
+        camera: Camera,
+        shape: Shape,
+        memory: _Memory,
+    ) -> None:
+        self.owner, self.shape, self.memory = step, shape, memory
+        self.parameters = list(gaussians.values.tensors().values())
+        self.values = gaussians.values.detach()
+        step.rasterizer.check(self.values)
+        self.adam = list(gaussians.adam.values())
+        count, allocate = len(self.values), memory.allocate
+        size = camera.height, camera.width
+        self.view = allocate("view", (24,), torch.float32)
+        self.target = allocate(f"target_{shape.target}", (*size, 3), shape.target)
+        self.one = allocate("one", (), torch.float32).fill_(1.0)
+        self.losses = allocate("losses", (3,), torch.float32)
+        self.g_image = allocate("g_image", (*size, 3), torch.float32)
+        absolute = allocate("g_absolute", (count, 2), torch.float32) if shape.absolute else None
+        self.gradients = [
+            allocate(f"g_{name}", tuple(tensor.shape), torch.float32)
+            for name, tensor in self.values.tensors().items()
+        ]
+        self.factors = allocate("factors", (len(self.parameters), 2), torch.float32)
+        self.factors_on_host = torch.empty(
+            (FACTORS_KEPT, *self.factors.shape), pin_memory=memory.device.type == "cuda"
+        )
+        self.request = RenderRequest(camera, shape.degree, step.background, absolute, Lifetime())
+        self.screen_points = torch.zeros_like(self.values.means[:, :2], requires_grad=True)
+        self.probe = (
+            self.values.means.new_zeros(count, 3, 3, requires_grad=True)
+            if shape.splitting
+            else None
+        )
+        self.runs = 0
+        self.started: Started | None = None
+        self.finished: tuple[Tensor, Tensor, Tensor, TritonFrame] | None = None
+        self.render_graphs: tuple[Graph, Graph] | None = None
+        self.adam_graph: Graph | None = None
+        self.known: KnownGradients
+
+    def suits(self, gaussians: TrainableGaussians, shape: Shape) -> bool:
+        """Whether a step with these parameters and this shape has these launches."""
+        current = gaussians.values.tensors().values()
+        return shape == self.shape and all(
+            own is now for own, now in zip(self.parameters, current, strict=True)
+        )
+
+    def run(self) -> bool:
+        """Render and differentiate; False if lists had too little room, so it must be repeated."""
+        if self.memory.room is None:
+            self._measure_room()
+        self.runs += 1
+        # The first step compiles kernels and allocates memory, which must not be recorded.
+        if self.runs == 2 and self.owner.graphs:
+            self._record()
+        first, second = self.render_graphs or (self._first, self._second)
+        first()
+        sizes = Readback(self._status)
+        second()
+        units, pairs, bad = sizes.values().tolist()
+        if bad:
+            raise_for_values(self.values, self.owner.background)
+        room = self.memory.room
+        assert room is not None
+        if units <= room.units and pairs <= room.pairs:
+            return True
+        # If the units had no room, the number of pairs is not known, but is larger.
+        self._make_room(units, max(pairs, room.pairs))
+        return False
+
+    def result(self) -> Differentiated:
+        assert self.finished is not None
+        image, alpha, radii, frame = self.finished
+        footprint = partial(self.owner.rasterizer.footprint, frame, self.values, self.request)
+        render = RenderOutput(
+            image,
+            alpha,
+            radii,
+            self.screen_points,
+            self.request.absolute,
+            footprint,
+            self.probe,
+        )
+        return Differentiated(render, self.losses, self.known)
+
+    def replay_adam(self, states: list[AdamState | None]) -> None:
+        """Apply the recorded Adam with the rates and step counts of ``states``."""
+        assert self.adam_graph is not None
+        host = self.factors_on_host[self.adam[0].step % FACTORS_KEPT]
+        rows = [(0.0, 0.0) if x is None else adam_factors(x.rate, x.step) for x in states]
+        host.copy_(torch.tensor(rows, dtype=torch.float32))
+        self.factors.copy_(host, non_blocking=True)
+        self.adam_graph()
+
+    @property
+    def _status(self) -> Tensor:
+        assert self.started is not None
+        return self.started.units.status
+
+    def _first(self) -> None:
+        room = self.memory.room
+        capacity = UNITS_AT_FIRST * len(self.values) if room is None else room.units
+        self.started = self.owner.rasterizer.start(
+            self.values,
+            self.request,
+            self.view,
+            self.memory.kept,
+            self.memory.scratch,
+            max(capacity, 1),
+            self.memory.allocate,
+        )
+
+    def _second(self) -> None:
+        rasterizer, loss, memory = self.owner.rasterizer, self.owner.loss, self.memory
+        assert self.started is not None
+        assert memory.room is not None
+        self.finished = rasterizer.finish(self.started, memory.room)
+        image, _, _, frame = self.finished
+        measured = loss.measure(image, self.target, self.losses, memory.scratch, True)
+        loss.differentiate(measured, self.one, self.g_image)
+        found = rasterizer.differentiate(
+            frame,
+            self.values,
+            self.request,
+            self.g_image,
+            None,
+            self.shape.splitting,
+            memory.scratch,
+            memory.allocate,
+            self.gradients,
+        )
+        self.screen_points.grad = found.screen
+        if self.probe is not None:
+            self.probe.grad = found.splitting
+        seen = frame.projected.row_counts
+        self.known = KnownGradients(self.parameters, self.gradients, seen, self.shape.degree)
+
+    def _third(self) -> None:
+        adam = TritonAdam()
+        for k, state in enumerate(self.adam):
+            active = self.known.active(k)
+            if active != 0:
+                adam.launch(
+                    self.parameters[k],
+                    self.gradients[k],
+                    state,
+                    self.factors[k],
+                    self.known.seen,
+                    active,
+                )
+
+    def _measure_room(self) -> None:
+        """Find the sizes of the lists of this view, and make room for them."""
+        self._first()
+        while True:
+            units, pairs, _ = Readback(self._status).values().tolist()
+            assert self.started is not None
+            capacity = len(self.started.units.widths)
+            if units <= capacity:
+                break
+            self.started.find_units(2 * units)
+        self._make_room(units, pairs)
+
+    def _make_room(self, units: int, pairs: int) -> None:
+        check_pairs(pairs)
+        known = self.memory.room or Room(1, 1)
+        self.memory.room = Room(
+            max(known.units, int(MARGIN * units) + 1), max(known.pairs, int(MARGIN * pairs) + 1)
+        )
+        self.render_graphs = self.adam_graph = None
+        self.runs = 0
+
+    def _record(self) -> None:
+        """Record the launches. If CUDA refuses, steps are never recorded again."""
+        pool = self.owner.graph_pool()
+        try:
+            first, second = pool.record(self._first), pool.record(self._second)
+            self.adam_graph = pool.record(self._third)
+            self.render_graphs = first, second
+        except torch.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            log.warning(
+                "training steps are not recorded as CUDA graphs, so they are slower: %s",
+                str(error).strip().splitlines()[0],
+            )
+            self.owner.graphs = False
+            self.render_graphs = self.adam_graph = None
+
+
+Graph = Callable[[], None]  # replays it
+
+
+class _GraphPool:
+    """Records graphs, which share a pool of memory."""
+
+    def __init__(self) -> None:
+        self._stream = torch.cuda.Stream()
+        self._handle = torch.cuda.graph_pool_handle()
+        # torch frees the pool with its last graph, so one must stay.
+        self._keeper = self._capture(lambda: torch.empty(1, device="cuda").zero_())
+
+    def record(self, launches: Callable[[], object]) -> Graph:
+        return self._capture(launches).replay
+
+    def _capture(self, launches: Callable[[], object]) -> torch.cuda.CUDAGraph:
+        # `torch.cuda.graph` would also collect garbage and empty the cache of the allocator.
+        graph = torch.cuda.CUDAGraph()
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            # "thread_local": other threads, such as that of checkpoints, may use the GPU meanwhile.
+            graph.capture_begin(pool=self._handle, capture_error_mode="thread_local")
+            try:
+                launches()
+            finally:
+                graph.capture_end()
+        torch.cuda.current_stream().wait_stream(self._stream)
+        return graph
