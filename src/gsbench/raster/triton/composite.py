@@ -52,6 +52,7 @@ from gsbench.raster.triton.layout import (
 ALPHA_MAX = tl.constexpr(CONSTANTS.alpha_max)
 TRANSMITTANCE_MIN = tl.constexpr(CONSTANTS.transmittance_min)
 UNROLL = tl.constexpr(4)  # entries between two checks whether all pixels have stopped
+NUMBERS = tl.constexpr(9)  # of a record that compositing loads
 UNROLL_BACK = tl.constexpr(2)  # entries per iteration of the backward pass's loop
 # -curve to entry of the inverse covariance, up to sign
 TO_PRECISION = tl.constexpr(2 * math.log(2.0))
@@ -96,6 +97,25 @@ def load_record(records, entry):
         tl.load(place + GREEN),
         tl.load(place + BLUE),
     )
+
+
+@triton.jit
+def _load_entries(entries, position, end, closing):
+    """``UNROLL`` entries of a list from ``position`` on; ``closing`` from ``end`` on."""
+    found = ()
+    for k in tl.static_range(UNROLL):
+        entry = tl.load(entries + position + k, mask=position + k < end, other=closing)
+        found = found + (entry,)  # type: ignore[assignment]  # noqa: RUF005
+    return found
+
+
+@triton.jit
+def _load_records(records, found):
+    """The records of the entries ``found``, one after the other in one tuple."""
+    flat = ()
+    for k in tl.static_range(UNROLL):
+        flat = flat + load_record(records, found[k])
+    return flat
 
 
 @triton.jit
@@ -181,10 +201,11 @@ def composite(
     red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
     seen = tl.where(inside, begin, 0)
 
-    # Records are loaded one entry ahead, entries two ahead; behind the end of the list, the
-    # invisible record is used.
-    ahead = load_record(records, tl.load(entries + begin, mask=begin < end, other=closing))
-    entry = tl.load(entries + begin + 1, mask=begin + 1 < end, other=closing)
+    # The longest lists end last, when nothing else hides that a record comes from far away. So
+    # records are loaded UNROLL entries ahead, all at once, and entries twice as far; behind the end
+    # of the list, the invisible record is used.
+    ahead = _load_records(records, _load_entries(entries, begin, end, closing))
+    found = _load_entries(entries, begin + UNROLL, end, closing)
     alive = True
     position = begin
     places = block_places()
@@ -193,10 +214,11 @@ def composite(
     while (position < end) & alive:
         border = tl.minimum(position + SEGMENT, end)
         while (position < border) & alive:
-            for _ in tl.static_range(UNROLL):
-                record = ahead
-                ahead = load_record(records, entry)
-                entry = tl.load(entries + position + 2, mask=position + 2 < end, other=closing)
+            current = ahead
+            ahead = _load_records(records, found)
+            found = _load_entries(entries, position + 2 * UNROLL, end, closing)
+            for k in tl.static_range(UNROLL):
+                record = current[NUMBERS * k : NUMBERS * k + NUMBERS]
                 position += 1
                 power, _, _ = log2_alpha(record, x, y)
                 opacity = tl.where(

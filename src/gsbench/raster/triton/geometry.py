@@ -302,10 +302,28 @@ def colors(direction, dc, sh_rest, index, mask, DEGREE: tl.constexpr):
 
 
 @triton.jit
+def _four_columns(a, b, c, d):
+    """Four arrays [N] as the columns of one [N, 4]."""
+    return tl.reshape(tl.join(tl.join(a, c), tl.join(b, d)), [a.shape[0], 4])
+
+
+@triton.jit
 def store_gradients(direction, g_rgb, g_sh_rest, index, mask, DEGREE: tl.constexpr):
-    """Store the gradients by the coefficients of degrees 1 to ``DEGREE``."""
+    """Store the gradients by the coefficients of degrees 1 to ``DEGREE``.
+
+    They are products of a basis function and a colour. Four functions at a time, as an array
+    [N, basis, colour], are stored by lanes in the order of memory. With one lane per Gaussian, each
+    instruction would write to 32 places far apart.
+    """
     if DEGREE >= 1:
-        values = basis(direction, DEGREE)
-        for k in tl.static_range(0, (DEGREE + 1) * (DEGREE + 1) - 1):
-            own = stretched(g_rgb, values[k])
-            store_vector(g_sh_rest + 3 * k, index * NUM_SH, own, mask)
+        zero = tl.zeros_like(g_rgb[0])
+        count: tl.constexpr = (DEGREE + 1) * (DEGREE + 1) - 1
+        values = basis(direction, DEGREE) + (zero,)  # noqa: RUF005
+        rgb = _four_columns(g_rgb[0], g_rgb[1], g_rgb[2], zero)
+        k, c = tl.arange(0, 4)[None, :, None], tl.arange(0, 4)[None, None, :]
+        place = g_sh_rest + (index * (3 * NUM_SH))[:, None, None] + (3 * k + c)
+        seen = mask[:, None, None] & (c < 3)
+        for first in tl.static_range(0, count, 4):
+            four = _four_columns(*values[first : first + 4])
+            own = four[:, :, None] * rgb[:, None, :]
+            tl.store(place + 3 * first, own, mask=seen & (k + first < count))
