@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 from triton import language as tl
 from triton.runtime.interpreter import interpreter_builder
 
 from gsbench.densify import ADC
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import AdamState
 from gsbench.raster import staged
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
@@ -29,6 +31,9 @@ from gsbench.raster.triton import composite, layout, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.launch import Workspace
 from gsbench.scene.types import Camera, Scene, View
+from gsbench.train.adam_triton import TritonAdam
+from gsbench.train.direct import DirectStep
+from gsbench.train.direct_proof import direct_fault
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.options import TrainConfig
@@ -389,3 +394,117 @@ def test_equal_images_have_no_loss_and_an_image_without_gradient_has_the_same_lo
     value = TritonLoss(0.2)(transposed, target)[0]
     assert not value.requires_grad
     assert value == TritonLoss(0.2)(leaf, target)[0]
+
+
+class FixedViews:
+    """Trains a small scene from two cameras, by steps with autograd or by direct ones."""
+
+    def __init__(self, direct: bool, absolute: bool = False) -> None:
+        generator = torch.Generator().manual_seed(5)
+        views = tuple(
+            View(
+                f"{k}.png",
+                orbit_camera(angle, width=20, height=17),
+                torch.randint(0, 256, (17, 20, 3), dtype=torch.uint8, generator=generator).numpy(),
+            )
+            for k, angle in enumerate((0.0, 0.4))
+        )
+        densifier = ADC(
+            start=1,
+            stop=9,
+            interval=3,
+            opacity_reset_interval=4,
+            gradient_threshold=1e-7,
+            gradient="absolute" if absolute else "signed",
+        )
+        options = TrainConfig(name="test", iterations=100, sh_interval=2, densify_start=1)
+        scene = Scene("test", views, ())
+        initial = random_gaussians(25, seed=3).map(lambda tensor: tensor.float())
+        self.trainer = Trainer(scene, initial, densifier, TritonRasterizer(), options, seed=0)
+        trainer = self.trainer
+        trainer.gaussians.step_all = TritonAdam()
+        trainer.loss = TritonLoss(options.ssim_weight)  # type: ignore[assignment]
+        self.direct = DirectStep(trainer.rasterizer, options.ssim_weight, BLACK, graphs=False)
+        if direct:
+            trainer.direct = self.direct
+
+    def iterate(self, steps: int) -> None:
+        for _ in range(steps):
+            self.trainer.iterate(Path("/nonexistent"))
+
+    def state(self) -> list[Tensor]:
+        state = self.trainer._state()
+        return [x for x in tree_leaves([state["gaussians"], state["densifier"]])]
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_direct_steps_have_the_bits_of_steps_with_autograd(absolute: bool) -> None:
+    """Statistics, moments and step counts, too; with refinements and an opacity reset between."""
+    expected, found = FixedViews(False, absolute), FixedViews(True, absolute)
+    expected.iterate(7)
+    found.iterate(7)
+    assert found.trainer.is_direct
+    for own, theirs in zip(found.state(), expected.state(), strict=True):
+        same = torch.equal(own, theirs) if isinstance(own, Tensor) else own == theirs
+        assert same
+    assert found.trainer.losses.wait() == expected.trainer.losses.wait()
+
+
+@pytest.mark.parametrize("room", [lists.Room(1, 10**4), lists.Room(10**4, 1)], ids=str)
+def test_lists_without_room_are_repeated_with_the_same_bits(room: lists.Room) -> None:
+    expected, found = FixedViews(False), FixedViews(True)
+    expected.iterate(3)
+    found.iterate(2)
+    before = found.direct.repeats
+    found.direct.limit_room(room)
+    found.iterate(1)
+    assert found.direct.repeats > before
+    for own, theirs in zip(found.state(), expected.state(), strict=True):
+        assert torch.equal(own, theirs) if isinstance(own, Tensor) else own == theirs
+
+
+def test_the_footprint_of_a_direct_step_is_that_of_its_own_view() -> None:
+    steps = FixedViews(True)
+    model, cameras = steps.trainer.gaussians, [view.camera for view in steps.trainer.scene.train]
+    target = torch.zeros(17, 20, 3, dtype=torch.uint8)
+    for camera in cameras:
+        render = steps.direct.step(model, camera, target, 1, False, False).render
+        found = render.require_footprint()
+        expected = TritonRasterizer().render(model.values, camera, 1, BLACK).require_footprint()
+        for own, theirs in zip(vars(found).values(), vars(expected).values(), strict=True):
+            assert torch.equal(own, theirs)
+
+
+def test_direct_steps_pass_their_proof_and_a_fault_of_them_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cpu = torch.device("cpu")
+    assert direct_fault(TritonRasterizer(), cpu, TINY) == ""
+    real = TritonAdam.launch
+
+    def late(self: TritonAdam, parameter: Tensor, *rest: object) -> None:
+        real(self, parameter, *rest)  # type: ignore[arg-type]
+        if rest[3] is not None:  # the gradients of Gaussians that are not seen are undefined
+            parameter.detach().mul_(1 + 1e-6)
+
+    monkeypatch.setattr(TritonAdam, "launch", late)
+    assert "has other bits after 10 direct steps" in direct_fault(TritonRasterizer(), cpu, TINY)
+
+
+@pytest.mark.parametrize("active", [None, 9])
+def test_adam_matches_that_of_torch_and_reads_no_undefined_gradient(active: int | None) -> None:
+    generator = torch.Generator().manual_seed(2)
+    values = torch.randn(30, 15, 3, generator=generator)
+    seen = (torch.rand(30, generator=generator) < 0.6).int()
+    theirs = torch.nn.Parameter(values.double())
+    optimizer = torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
+    state = AdamState(0.01, 0, torch.zeros_like(values), torch.zeros_like(values))
+    for _ in range(5):
+        gradient = torch.randn(30, 15, 3, generator=generator)
+        read = (seen > 0)[:, None] & (torch.arange(45) < (active or 45))
+        theirs.grad = torch.where(read.view(30, 15, 3), gradient, 0.0).double()
+        optimizer.step()
+        state.step += 1
+        undefined = torch.where(read.view(30, 15, 3), gradient, torch.nan)
+        TritonAdam()(values, undefined, state, seen, active)
+    assert torch.allclose(values.double(), theirs.detach(), rtol=0, atol=1e-6)

@@ -140,7 +140,7 @@ class RasterProof(Record):
     """A comparison of a rasterizer with the float64 reference on a device (`gsbench.train.proof`).
 
     ``errors`` has the largest error of each quantity. ``failures`` has a line for each that is too
-    large.
+    large. ``direct_fault`` says why training steps use autograd; "" if they need not.
     """
 
     raster: Text
@@ -149,6 +149,7 @@ class RasterProof(Record):
     errors: dict[str, Number]
     failures: list[str]
     seconds: Amount
+    direct_fault: str = ""
 
     @property
     def passed(self) -> bool:

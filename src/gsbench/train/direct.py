@@ -110,6 +110,7 @@ class DirectStep:
             plan = _Plan(self, gaussians, camera, shape, memory)
             self._plan[size] = plan
         self._last = plan
+        plan.camera = camera
         plan.view.copy_(self._numbers(camera), non_blocking=True)
         plan.target.copy_(target, non_blocking=True)
         with torch.cuda.device_of(self.background):
@@ -126,6 +127,12 @@ class DirectStep:
             plan.replay_adam(states)
         else:
             gaussians.apply(plan.known, states)
+
+    def limit_room(self, room: Room) -> None:
+        """Give the lists of all sizes no more than ``room``, so that the next render repeats."""
+        for size, memory in self._memory.items():
+            memory.room = room
+            self._plan.pop(size, None)
 
     def graph_pool(self) -> _GraphPool:
         if self._pool is None:
@@ -165,6 +172,7 @@ class _Plan:
         memory: _Memory,
     ) -> None:
         self.owner, self.shape, self.memory = step, shape, memory
+        self.camera = camera  # of the current step
         self.parameters = list(gaussians.values.tensors().values())
         self.values = gaussians.values.detach()
         step.rasterizer.check(self.values)
@@ -232,7 +240,8 @@ class _Plan:
     def result(self) -> Differentiated:
         assert self.finished is not None
         image, alpha, radii, frame = self.finished
-        footprint = partial(self.owner.rasterizer.footprint, frame, self.values, self.request)
+        request = self.request._replace(camera=self.camera)
+        footprint = partial(self.owner.rasterizer.footprint, frame, self.values, request)
         render = RenderOutput(
             image,
             alpha,

@@ -52,6 +52,9 @@ SOURCES = (
     "gaussians/trainable.py",
     "train/loss.py",
     "train/loss_triton.py",
+    "train/adam_triton.py",
+    "train/direct.py",
+    "train/direct_proof.py",
     "train/proof.py",
 )
 SCENES = (
@@ -116,7 +119,21 @@ def prove(
         },
         failures=failures,
         seconds=round(time.perf_counter() - started, 1),
+        direct_fault="" if failures else _direct_fault(rasterizer, device, scenes[-1]),
     )
+
+
+def _direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> str:
+    """`direct_fault` of an executor that has direct steps, "" for others."""
+    if rasterizer.name != "triton":
+        return ""
+    # They import Triton.
+    from gsbench.raster.triton.executor import TritonRasterizer
+    from gsbench.train.direct_proof import direct_fault
+
+    if not isinstance(rasterizer, TritonRasterizer):
+        return ""
+    return direct_fault(rasterizer, device, case)
 
 
 def _render_errors(
@@ -372,9 +389,15 @@ def create_proven(name: str, device: torch.device, threads: int | None = None) -
         except InputError as error:  # the executor cannot run on this device
             proof, reason = None, str(error)
         if not reason:
-            return Proven(
-                create_rasterizer(executor.name, device, threads), proof, tuple(passed_over)
-            )
+            rasterizer = create_rasterizer(executor.name, device, threads)
+            if proof is not None and proof.direct_fault:
+                log.warning(
+                    "raster=%s: steps use autograd and take longer, since %s",
+                    executor.name,
+                    proof.direct_fault,
+                )
+                rasterizer.direct_steps = False  # type: ignore[attr-defined]
+            return Proven(rasterizer, proof, tuple(passed_over))
         passed_over.append(f"raster={executor.name} is not used: {reason}")
         if name == AUTO:
             log.warning("%s", passed_over[-1])

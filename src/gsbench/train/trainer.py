@@ -415,9 +415,12 @@ def fast_steps(
 
     direct = None
     # Updating only visible Gaussians needs gradients that are 0 elsewhere.
-    if isinstance(rasterizer, TritonRasterizer) and not options.visible_adam:
-        recorded = rasterizer.records_steps
-        direct = DirectStep(rasterizer, options.ssim_weight, background, recorded)
+    if (
+        isinstance(rasterizer, TritonRasterizer)
+        and rasterizer.direct_steps
+        and not options.visible_adam
+    ):
+        direct = DirectStep(rasterizer, options.ssim_weight, background, graphs=True)
     return direct, TritonAdam()
 
 

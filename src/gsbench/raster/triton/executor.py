@@ -118,7 +118,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
     name = "triton"
 
     def __init__(self) -> None:
-        self.records_steps = True  # whether training steps may be recorded as CUDA graphs
+        self.direct_steps = True  # whether trainings may use `gsbench.train.direct`
         if CONSTANTS.tile != TILE.value:
             raise ValueError(
                 f"the Triton rasterizer has tiles of {TILE.value} px, the contract {CONSTANTS.tile}"

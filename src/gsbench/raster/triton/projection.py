@@ -274,15 +274,13 @@ def _store_splitting(place, d00, d01, d11, shear, rows, seen, mask):
 
 
 @triton.jit
-def _color_gradients(offset, g_rgb, color_slopes, g_sh_rest, index, mask, DEGREE: tl.constexpr):
-    """Store the gradients by ``sh_rest``; return that by the mean, through the view direction."""
-    to, inverse_distance = normalized(offset)
+def _turned(to, inverse_distance, g_rgb, color_slopes, index, mask, DEGREE: tl.constexpr):
+    """The gradient by the mean through the view direction ``to``, which changes the colour."""
     zero = tl.zeros_like(inverse_distance)
     turned = (zero, zero, zero)
     if DEGREE > 0:
         for c in tl.static_range(3):
             turned = plus(turned, g_rgb[c], load_vector(color_slopes + 3 * c, 3 * index, mask))
-    store_gradients(to, g_rgb, g_sh_rest, index, mask, DEGREE)
     # Only the part of the gradient that is tangent to the unit sphere turns the direction.
     return stretched(minus(turned, dot(turned, to), to), inverse_distance)
 
@@ -379,7 +377,8 @@ def backproject(
         tl.where(clamped & 4 != 0, 0.0, blue),
     )
     store_vector(g_sh_dc, index, stretched(g_rgb, F0), seen)
-    tangent = _color_gradients(offset, g_rgb, color_slopes, g_sh_rest, index, seen, DEGREE)
+    to, inverse_distance = normalized(offset)
+    tangent = _turned(to, inverse_distance, g_rgb, color_slopes, index, seen, DEGREE)
 
     # Repeat the geometry of the forward pass.
     quaternion, inverse_norm, _ = load_quaternion(quaternions, index, seen)
@@ -439,3 +438,5 @@ def backproject(
     # d log(alpha) / d logit = 1 - opacity
     g_logit = h / (tl.exp(tl.load(logits + index, mask=seen, other=0.0)) + 1.0)
     tl.store(g_logits + index, g_logit, mask=seen)
+    # Last, when few other values need registers.
+    store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)

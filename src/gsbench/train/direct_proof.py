@@ -1,0 +1,98 @@
+"""The proof of direct steps: they must give the bits of steps with autograd on the user's GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.contract import Case
+from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.raster.triton.lists import Room
+from gsbench.train.adam_triton import TritonAdam
+from gsbench.train.direct import DirectStep
+from gsbench.train.loss_triton import TritonLoss
+
+STEPS = 10
+CRAMPED_STEP = 6  # the step before which lists lose their room, so that the render is repeated
+SSIM_WEIGHT = 0.2
+
+
+def direct_fault(rasterizer: TritonRasterizer, device: torch.device, case: Case) -> str:
+    """Train ``case`` for ten steps in three ways; return how they differ, "" if they do not.
+
+    The ways are autograd, direct steps launched one by one and, on a GPU, direct steps recorded as
+    CUDA graphs. All parameters must have the same bits after the last step.
+    """
+    expected = _train(device, case, lambda model: _with_autograd(model, rasterizer, case))
+    for graphs in (False, True) if device.type == "cuda" else (False,):
+        name = "recorded steps" if graphs else "direct steps"
+        try:
+            found = _train(
+                device, case, lambda model, on=graphs: _direct(model, rasterizer, case, on)
+            )
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, ValueError) as error:
+            first, *_ = str(error).strip().splitlines() or [""]
+            return f"{name} fail: {type(error).__name__}: {first}"
+        for parameter, tensor in expected.tensors().items():
+            if not torch.equal(tensor, getattr(found, parameter)):
+                return f"{parameter} has other bits after {STEPS} {name} than with autograd"
+    return ""
+
+
+Step = Callable[[int], None]  # makes one step
+
+
+def _train(
+    device: torch.device, case: Case, stepper: Callable[[TrainableGaussians], Step]
+) -> Gaussians:
+    initial = case.gaussians().map(lambda tensor: tensor.to(device, torch.float32))
+    model = TrainableGaussians(initial, LearningRates(), 1.0, TritonAdam())
+    make = stepper(model)
+    for step in range(1, STEPS + 1):
+        model.set_step(step)
+        make(step)
+    return model.values.detach()
+
+
+def _target(case: Case, device: torch.device) -> Tensor:
+    """A picture [H, W, 3] uint8 that no render has."""
+    numbers = torch.arange(case.height * case.width * 3, device=device) * 37 % 256
+    return numbers.to(torch.uint8).view(case.height, case.width, 3)
+
+
+def _with_autograd(model: TrainableGaussians, rasterizer: TritonRasterizer, case: Case) -> Step:
+    loss, target = TritonLoss(SSIM_WEIGHT), _target(case, model.device)
+    black = torch.zeros(3, device=model.device)
+
+    def step(_: int) -> None:
+        image = rasterizer.render(model.values, case.camera(), case.sh_degree, black).image
+        loss(image, target)[0].backward()
+        model.optimizer_step(case.sh_degree)
+
+    return step
+
+
+def _direct(
+    model: TrainableGaussians, rasterizer: TritonRasterizer, case: Case, graphs: bool
+) -> Step:
+    black, target = torch.zeros(3, device=model.device), _target(case, model.device)
+    direct, camera = DirectStep(rasterizer, SSIM_WEIGHT, black, graphs), case.camera()
+
+    def step(number: int) -> None:
+        if number == CRAMPED_STEP:
+            direct.limit_room(Room(1, 1))
+        direct.step(model, camera, target, case.sh_degree, False, False)
+        direct.optimize(model)
+        if number == CRAMPED_STEP and direct.repeats == 0:
+            raise RuntimeError("lists without room were not noticed")
+        if number == STEPS and direct.graphs != graphs:
+            raise RuntimeError("CUDA refuses to record steps")
+
+    return step
