@@ -18,7 +18,7 @@ pytest.importorskip("triton")
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
-from gsbench.raster.triton import composite, lists
+from gsbench.raster.triton import composite, executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.train.loss_triton import MULTIPROCESSORS, STRIP, TritonLoss, rows_of_program
 from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
@@ -58,7 +58,7 @@ class Answer:
 def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
     """The launches of kernels, which are recorded instead of run."""
     Answer.asked = 0
-    monkeypatch.setattr(lists, "Readback", Answer)
+    monkeypatch.setattr(executor, "Readback", Answer)
     with recorded(monkeypatch) as record:
         yield record
 
@@ -181,7 +181,8 @@ def test_a_step_waits_once_for_the_device(launches: list[Launch]) -> None:
         output = rasterizer.render(gaussians, CASE.camera(), 3, background, absolute_gradient=True)
         value = loss(output.image, target)[0]
         value.backward()
-    assert watch.waits == []
+    # the numbers of the camera, from page-locked memory on a GPU
+    assert watch.waits == ["aten._to_copy.default"]
     assert watch.operations > 20
     assert Answer.asked == 1
     assert gaussians.means.grad.shape == gaussians.means.shape

@@ -434,7 +434,7 @@ class FixedViews:
 
     def state(self) -> list[Tensor]:
         state = self.trainer._state()
-        return [x for x in tree_leaves([state["gaussians"], state["densifier"]])]
+        return list(tree_leaves([state["gaussians"], state["densifier"]]))
 
 
 @pytest.mark.parametrize("absolute", [False, True])

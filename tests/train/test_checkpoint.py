@@ -176,6 +176,7 @@ def test_a_state_is_loaded_completely_on_another_device() -> None:
     assert {tensor.device.type for tensor in moved.values.tensors().values()} == {"meta"}
     moments = moved.adam["means"]
     assert {moments.first.device.type, moments.second.device.type} == {"meta"}
+    assert moments.step == 1
 
 
 @pytest.mark.parametrize("background", [False, True])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -28,13 +29,11 @@ def direct_fault(rasterizer: TritonRasterizer, device: torch.device, case: Case)
     The ways are autograd, direct steps launched one by one and, on a GPU, direct steps recorded as
     CUDA graphs. All parameters must have the same bits after the last step.
     """
-    expected = _train(device, case, lambda model: _with_autograd(model, rasterizer, case))
+    expected = _train(device, case, partial(_with_autograd, rasterizer, case))
     for graphs in (False, True) if device.type == "cuda" else (False,):
         name = "recorded steps" if graphs else "direct steps"
         try:
-            found = _train(
-                device, case, lambda model, on=graphs: _direct(model, rasterizer, case, on)
-            )
+            found = _train(device, case, partial(_direct, rasterizer, case, graphs))
         except torch.OutOfMemoryError:
             raise
         except (RuntimeError, ValueError) as error:
@@ -67,7 +66,7 @@ def _target(case: Case, device: torch.device) -> Tensor:
     return numbers.to(torch.uint8).view(case.height, case.width, 3)
 
 
-def _with_autograd(model: TrainableGaussians, rasterizer: TritonRasterizer, case: Case) -> Step:
+def _with_autograd(rasterizer: TritonRasterizer, case: Case, model: TrainableGaussians) -> Step:
     loss, target = TritonLoss(SSIM_WEIGHT), _target(case, model.device)
     black = torch.zeros(3, device=model.device)
 
@@ -80,7 +79,7 @@ def _with_autograd(model: TrainableGaussians, rasterizer: TritonRasterizer, case
 
 
 def _direct(
-    model: TrainableGaussians, rasterizer: TritonRasterizer, case: Case, graphs: bool
+    rasterizer: TritonRasterizer, case: Case, graphs: bool, model: TrainableGaussians
 ) -> Step:
     black, target = torch.zeros(3, device=model.device), _target(case, model.device)
     direct, camera = DirectStep(rasterizer, SSIM_WEIGHT, black, graphs), case.camera()

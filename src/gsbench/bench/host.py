@@ -1,0 +1,152 @@
+"""What a training step costs the host, measured without a GPU.
+
+All kernels are replaced by launches that do nothing, and tensors are tiny, so that only the host's
+work remains: Python, torch's operations, autograd. A recorded graph becomes a call that does
+nothing. The costs of Triton's launcher and of CUDA's runtime are not in it; the counts of launches
+and operations say how often they are paid.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gsbench.bench.measure import UNUSED_FOLDER, constant_scene_options
+from gsbench.bench.scenes import SEED, make_scene
+from gsbench.densify import ADC
+from gsbench.raster.triton import executor, lists
+from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.train import adam_triton, direct, loss_triton
+from gsbench.train.adam_triton import TritonAdam
+from gsbench.train.direct import DirectStep
+from gsbench.train.loss_triton import TritonLoss
+from gsbench.train.trainer import Trainer
+
+WIDTH, HEIGHT, COUNT = 32, 16, 64  # px, px, Gaussians: so few that their values cost nothing
+WAYS = ("autograd", "direct", "recorded")
+STEPS, REPEATS, WARM_UP = 20, 7, 4
+SIZES = [2 * COUNT, 4 * COUNT, 0]  # units, pairs, no bad value
+
+
+class Counts(TorchDispatchMode):
+    """Counts the operations of torch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations = 0
+
+    def __torch_dispatch__(
+        self, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        self.operations += 1
+        return operation(*args, **(kwargs or {}))
+
+
+class _Sizes:
+    """Stands in for `gsbench.raster.staged.Readback` of the sizes of lists."""
+
+    def __init__(self, source: Tensor) -> None:
+        pass
+
+    def values(self) -> Tensor:
+        return torch.tensor(SIZES)
+
+
+class _NullPool:
+    """Stands in for a pool of graphs. Recording makes the launches once; replaying does nothing."""
+
+    def record(self, launches: Any) -> Any:
+        launches()
+        return lambda: None
+
+
+class NullDevice:
+    """A training whose kernels do nothing; ``way`` is one of `WAYS`."""
+
+    def __init__(self, way: str) -> None:
+        self.launches = 0
+        gaussians, scene = make_scene("trained", WIDTH, HEIGHT, COUNT)
+        options = constant_scene_options()
+        never = options.iterations
+        densifier = ADC(start=never - 1, stop=never, opacity_reset_interval=never)
+        self.trainer = Trainer(scene, gaussians, densifier, TritonRasterizer(), options, SEED)
+        trainer = self.trainer
+        trainer.gaussians.step_all = TritonAdam()
+        trainer.loss = TritonLoss(options.ssim_weight)  # type: ignore[assignment]
+        trainer.step = 3  # full degree of harmonics
+        if way != "autograd":
+            recorded = way == "recorded"
+            trainer.direct = DirectStep(
+                TritonRasterizer(), options.ssim_weight, trainer.background, graphs=recorded
+            )
+            trainer.direct._pool = _NullPool()  # type: ignore[assignment]
+
+    def step(self) -> None:
+        self.trainer.iterate(UNUSED_FOLDER)
+
+    def _launch(self, kernel: Any, *programs: Any) -> Any:
+        def count(*arguments: Any, **constants: Any) -> None:
+            self.launches += 1
+
+        return count
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Replace the kernels within this context."""
+        with (
+            mock.patch.multiple(executor, launch=self._launch, launch_grid=self._launch),
+            mock.patch.multiple(lists, launch=self._launch, launch_grid=self._launch),
+            mock.patch.object(loss_triton, "launch_grid", self._launch),
+            mock.patch.object(adam_triton, "launch_grid", self._launch),
+            mock.patch.object(executor, "Readback", _Sizes),
+            mock.patch.object(direct, "Readback", _Sizes),
+        ):
+            for _ in range(WARM_UP):
+                self.step()
+            yield
+
+
+def count_step(way: str) -> tuple[int, int]:
+    """The numbers of launches and of torch's operations in one step."""
+    device = NullDevice(way)
+    with device.running():
+        device.launches = 0
+        with Counts() as counts:
+            device.step()
+        return device.launches, counts.operations
+
+
+def time_host() -> list[dict[str, Any]]:
+    """A row for each of `WAYS`: launches, operations and ms of the host in one step, medians.
+
+    The ways take turns.
+    """
+    devices = {way: NullDevice(way) for way in WAYS}
+    times: dict[str, list[float]] = {way: [] for way in WAYS}
+    for _ in range(REPEATS):
+        for way, device in devices.items():
+            with device.running():
+                begin = time.perf_counter()
+                for _ in range(STEPS):
+                    device.step()
+                times[way].append(1e3 * (time.perf_counter() - begin) / STEPS)
+    rows = []
+    for way in WAYS:
+        launches, operations = count_step(way)
+        rows.append(
+            {
+                "way": way,
+                "launches": launches,
+                "operations": operations,
+                "host_ms": round(statistics.median(times[way]), 3),
+            }
+        )
+    return rows
