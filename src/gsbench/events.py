@@ -81,6 +81,11 @@ class RefineEvent:
         grown = sum(getattr(self, name) for name in self.GROWN)
         return self.after == self.before + grown - sum(getattr(self, name) for name in self.PRUNED)
 
+    @property
+    def grew_or_was_blocked(self) -> bool:
+        """Whether this refinement wanted to grow; one that only resets opacities does not."""
+        return self.blocked_by_cap > 0 or any(getattr(self, name) for name in self.GROWN)
+
     def as_dict(self) -> dict[str, object]:
         """The record for ``events.jsonl``, without unset and infinite values."""
         return {

@@ -158,7 +158,12 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
         if name == "triton" and device.index == 0:
             errors = {"image": 1e-6}
             return SimpleNamespace(
-                raster=name, device=device, passed=False, seconds=2.6, errors=errors
+                raster=name,
+                device=device,
+                passed=False,
+                seconds=2.6,
+                errors=errors,
+                direct_fault="",
             )
         return None
 

@@ -35,6 +35,7 @@ from gsbench.scene.types import Scene
 from gsbench.system.device import free_bytes
 from gsbench.system.stopping import deferred, requested
 from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint
+from gsbench.train.growth import GrowthWatch
 from gsbench.train.loss import PhotometricLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import Resolution, ScaledViews
@@ -139,6 +140,7 @@ class Trainer:
         self.is_direct = False  # whether ``direct`` made the gradients of this iteration
         self.seconds = 0.0
         self.losses = LossLog()
+        self.growth = GrowthWatch()
         free = free_bytes(self.device)
         image_budget = None if free is None else int(SHARE_FOR_IMAGES * free)
         self.targets = Targets(scene.train, self.device, image_budget)
@@ -261,8 +263,10 @@ class Trainer:
         if options.step_after_refine:
             self._optimize(render.visible)
         event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
-        if event is not None and self.resolution is not None:
-            self.resolution.observe(event)
+        if event is not None:
+            self.growth.observe(event)
+            if self.resolution is not None:
+                self.resolution.observe(event)
         if not options.step_after_refine:
             self._optimize(render.visible)
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
