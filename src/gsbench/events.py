@@ -83,7 +83,7 @@ class RefineEvent:
 
     @property
     def grew_or_was_blocked(self) -> bool:
-        """Whether this refinement wanted to grow; one that only resets opacities does not."""
+        """True if this refinement wanted to grow; one that only resets opacities does not."""
         return self.blocked_by_cap > 0 or any(getattr(self, name) for name in self.GROWN)
 
     def as_dict(self) -> dict[str, object]:

@@ -104,7 +104,7 @@ def test_the_gradient_of_the_colour_clamp_passes_at_zero(
     gradient = gaussians.sh_dc.grad[0]
     assert gradient[1] == 0
     assert gradient[2] > 0
-    assert gradient[0] == pytest.approx(gradient[2].item(), rel=1e-5)
+    assert gradient[0].item() == pytest.approx(gradient[2].item(), rel=1e-5)
 
 
 def test_without_visible_gaussians_the_image_is_the_background(

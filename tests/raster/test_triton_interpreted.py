@@ -424,7 +424,9 @@ class FixedViews:
         trainer = self.trainer
         trainer.gaussians.step_all = TritonAdam()
         trainer.loss = TritonLoss(options.ssim_weight)  # type: ignore[assignment]
-        self.direct = DirectStep(trainer.rasterizer, options.ssim_weight, BLACK, graphs=False)
+        self.direct = DirectStep(
+            trainer.rasterizer, TritonLoss(options.ssim_weight), BLACK, graphs=False
+        )
         if direct:
             trainer.direct = self.direct
 

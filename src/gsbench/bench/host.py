@@ -1,4 +1,4 @@
-"""What a training step costs the host, measured without a GPU.
+"""The host's cost of a training step, measured without a GPU.
 
 All kernels are replaced by launches that do nothing, and tensors are tiny, so that only the host's
 work remains: Python, torch's operations, autograd. A recorded graph becomes a call that does
@@ -85,7 +85,10 @@ class NullDevice:
         if way != "autograd":
             recorded = way == "recorded"
             trainer.direct = DirectStep(
-                TritonRasterizer(), options.ssim_weight, trainer.background, graphs=recorded
+                TritonRasterizer(),
+                TritonLoss(options.ssim_weight),
+                trainer.background,
+                graphs=recorded,
             )
             trainer.direct._pool = _NullPool()  # type: ignore[assignment]
 

@@ -51,7 +51,7 @@ class Differentiated(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """What must be equal for two steps to have the same launches, besides the parameters."""
+    """The properties that two steps with the same launches share, besides the parameters."""
 
     width: int  # px
     height: int
@@ -69,10 +69,10 @@ class DirectStep:
     """
 
     def __init__(
-        self, rasterizer: TritonRasterizer, ssim_weight: float, background: Tensor, graphs: bool
+        self, rasterizer: TritonRasterizer, loss: TritonLoss, background: Tensor, graphs: bool
     ) -> None:
         self.rasterizer = rasterizer
-        self.loss = TritonLoss(ssim_weight)
+        self.loss = loss
         self.background = background
         self.graphs = graphs
         self.repeats = 0  # renders that were repeated because lists had too little room
@@ -83,7 +83,7 @@ class DirectStep:
         self._pool: _GraphPool | None = None
 
     def serves(self, camera: Camera) -> bool:
-        """Whether there is memory for images of this size: at most `MOST_SIZES` sizes have it."""
+        """Return whether there is memory for images of this size; `MOST_SIZES` sizes have it."""
         size = camera.width, camera.height
         return size in self._memory or len(self._memory) < MOST_SIZES
 
@@ -208,7 +208,7 @@ class _Plan:
         self.known: KnownGradients
 
     def suits(self, gaussians: TrainableGaussians, shape: Shape) -> bool:
-        """Whether a step with these parameters and this shape has these launches."""
+        """Return whether a step with these parameters and this shape has these launches."""
         current = gaussians.values.tensors().values()
         return shape == self.shape and all(
             own is now for own, now in zip(self.parameters, current, strict=True)

@@ -82,7 +82,7 @@ def _direct(
     rasterizer: TritonRasterizer, case: Case, graphs: bool, model: TrainableGaussians
 ) -> Step:
     black, target = torch.zeros(3, device=model.device), _target(case, model.device)
-    direct, camera = DirectStep(rasterizer, SSIM_WEIGHT, black, graphs), case.camera()
+    direct, camera = DirectStep(rasterizer, TritonLoss(SSIM_WEIGHT), black, graphs), case.camera()
 
     def step(number: int) -> None:
         if number == CRAMPED_STEP:

@@ -34,7 +34,7 @@ class GrowthWatch:
         if self._runaway_rounds == RUNAWAY_ROUNDS:
             self._warn(
                 "runaway",
-                "iteration %d: in %d refinements in a row, at least %.0f %% of the splits by volume "
+                "iteration %d: in %d refinements in a row, at least %.0f %% of splits by volume "
                 "had children that are over the threshold again, so they split again and again; "
                 "densify=volumetric_once does not split near-spheres",
                 event.step,

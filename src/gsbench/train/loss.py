@@ -65,10 +65,13 @@ class PhotometricLoss:
             )
         if image.dtype != torch.float32:
             return torch_photometric_loss(image, target, self.ssim_weight)
-        device_type = image.device.type
+        return self.implementation(image.device.type)(image, target)
+
+    def implementation(self, device_type: str) -> Loss:
+        """The loss of float32 images on a type of device."""
         if device_type not in self._compiled:
             self._compiled[device_type] = self._compile(device_type)
-        return self._compiled[device_type](image, target)
+        return self._compiled[device_type]
 
     def _compile(self, device_type: str) -> Loss:
         """Return the loss for a type of device; import only the packages that it needs."""

@@ -131,9 +131,9 @@ class Trainer:
         initial = densifier.prepare(initial)
         color = [*options.background]
         self.background = torch.tensor(color, dtype=torch.float32, device=self.device)  # [3]
-        self.direct, step_all = fast_steps(rasterizer, options, self.background)
-        self.gaussians = TrainableGaussians(initial, options, scene.extent, step_all)
         self.loss = PhotometricLoss(options.ssim_weight, torch.get_num_threads())
+        self.direct, step_all = fast_steps(rasterizer, self.loss, options, self.background)
+        self.gaussians = TrainableGaussians(initial, options, scene.extent, step_all)
         self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
@@ -406,9 +406,9 @@ def snapshot_file(step: int) -> str:
 
 
 def fast_steps(
-    rasterizer: Rasterizer, options: TrainConfig, background: Tensor
+    rasterizer: Rasterizer, loss: PhotometricLoss, options: TrainConfig, background: Tensor
 ) -> tuple["DirectStep | None", StepAll | None]:
-    """What a training on a GPU with Triton has: steps without autograd, if they serve, and Adam."""
+    """Make direct steps, if they can be used, and Adam for a GPU with Triton; None without."""
     device = background.device
     if device.type != "cuda" or find_executor("triton").obstacle(device.type) is not None:
         return None, None
@@ -416,15 +416,17 @@ def fast_steps(
     from gsbench.raster.triton.executor import TritonRasterizer
     from gsbench.train.adam_triton import TritonAdam
     from gsbench.train.direct import DirectStep
+    from gsbench.train.loss_triton import TritonLoss
 
-    direct = None
-    # Updating only visible Gaussians needs gradients that are 0 elsewhere.
+    kernels, direct = loss.implementation(device.type), None
     if (
         isinstance(rasterizer, TritonRasterizer)
         and rasterizer.direct_steps
+        and isinstance(kernels, TritonLoss)
+        # Updating only visible Gaussians needs gradients that are 0 elsewhere.
         and not options.visible_adam
     ):
-        direct = DirectStep(rasterizer, options.ssim_weight, background, graphs=True)
+        direct = DirectStep(rasterizer, kernels, background, graphs=True)
     return direct, TritonAdam()
 
 
