@@ -5,6 +5,7 @@ It is made once for each version.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -411,6 +413,20 @@ def test_a_named_executor_that_fails_is_an_error(gpu: dict[str, list[str]]) -> N
     gpu |= {name: ["alpha is off"] for name in ("gsplat", "reference")}
     with pytest.raises(InputError, match=r"raster=triton .*raster=gsplat .*raster=reference "):
         create_proven("auto", torch.device("cuda"))
+
+
+@pytest.mark.parametrize("fault", ["", "means has other bits after 10 recorded steps"])
+def test_direct_steps_that_fail_are_turned_off_with_a_line(
+    gpu: dict[str, list[str]], fault: str, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    proof = dataclasses.replace(passing("triton", ()), direct_fault=fault)
+    monkeypatch.setattr(module, "prove_apart", lambda *_: proof)
+    made = SimpleNamespace(direct_steps=True)
+    monkeypatch.setattr(module, "create_rasterizer", lambda *_: made)
+    assert create_proven("triton", torch.device("cuda")).rasterizer is made
+    assert made.direct_steps == (not fault)
+    line = f"raster=triton: steps use autograd and take longer, since {fault}"
+    assert (line in caplog.text) == bool(fault)
 
 
 def test_nothing_is_proven_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:

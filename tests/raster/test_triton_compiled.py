@@ -16,10 +16,12 @@ pytest.importorskip("triton")
 
 
 from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.trainable import AdamState
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
 from gsbench.raster.triton import composite, executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
+from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.loss_triton import MULTIPROCESSORS, STRIP, TritonLoss, rows_of_program
 from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
 
@@ -79,12 +81,24 @@ def step(
     return gaussians, output
 
 
+def adam_step(case: Case) -> None:
+    """Adam as in a direct step, and as in a step with autograd."""
+    seen = torch.zeros(case.count, dtype=torch.int32)
+    for tensor in case.gaussians().map(lambda tensor: tensor.float()).tensors().values():
+        state = AdamState(0.1, 1, torch.zeros_like(tensor), torch.zeros_like(tensor))
+        TritonAdam()(
+            tensor, torch.zeros_like(tensor), state, seen, 24 if tensor.dim() == 3 else None
+        )
+        TritonAdam()(tensor, torch.zeros_like(tensor), state)
+
+
 @pytest.mark.parametrize("target", TARGETS, ids="sm_{}".format)
 def test_kernels_compile_without_spills(
     launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step(CASE)
     step(CASE, absolute=True, footprint=True)
+    adam_step(CASE)
     # further variants: lower degrees, and 32-bit numbers of blocks
     if target == 90:
         monkeypatch.setattr(lists, "MAX_INT16", 0)
@@ -107,8 +121,9 @@ def test_kernels_compile_without_spills(
             assert made.inner_loop / composite.UNROLL.value < FORWARD_ENTRY
         if launch.name == "composite_backward":
             assert made.inner_loop / composite.UNROLL_BACK.value < BACKWARD_ENTRY
-    assert len({name for name, _ in compiled}) == 13
-    assert len(compiled) == (23 if target == 90 else 16)
+    assert len({name for name, _ in compiled}) == 14
+    # Adam has a variant for each width of a parameter, with and without a mask
+    assert len(compiled) == (23 if target == 90 else 16) + 8
 
 
 def test_no_kernel_is_compiled_again_for_other_sizes(launches: list[Launch]) -> None:
