@@ -30,6 +30,7 @@ from gsbench.scene.options import (
     TRAIN_LIST,
     SplitRule,
 )
+from gsbench.scene.side_files import photographs_among
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
 from gsbench.scene.types import Capture
@@ -156,8 +157,9 @@ def read_photos(
 ) -> Capture:
     """Read bare photographs: all in ``path/<images>``, else ``path/images``, else ``path``.
 
-    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP
-    model beside the photographs is ignored.
+    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``, and files
+    that are no photographs by their names (`photographs_among`). A COLMAP model beside the
+    photographs is ignored.
 
     Raises `InputError` if the folder is missing or holds fewer than three images.
     """
@@ -167,6 +169,7 @@ def read_photos(
     else:
         folder = root / "images" if (root / "images").is_dir() else root
     mask_folder, names = _masks_and_images(root, folder, masks)
+    names = photographs_among(folder, names)
     formats = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
     _require_enough(len(names), folder, f"({formats})")
     return _make_capture(

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from PIL import Image
 
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
-from gsbench.scene.images import image_size, read_image
+from gsbench.scene.exif import lens_of
+from gsbench.scene.images import image_size, open_image, read_image, write_png
 from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -76,7 +76,9 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if name in unreadable:
-            Image.fromarray(read_image(images / name)).save(target, format="PNG")
+            with open_image(images / name) as original:
+                exif = original.info.get("exif", b"")
+            write_png(read_image(images / name), target, exif)
         else:
             target.symlink_to((images / name).resolve())
     return folder
@@ -118,8 +120,9 @@ def unknown_camera_groups(
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
     """Cameras to be estimated, each with the names of its images.
 
-    ``sharing`` is ``single`` for one camera for all images of a size, ``per_folder`` for one for
-    each size in each sub-folder, or ``per_image``. The initial focal length in px is
+    ``sharing`` is ``exif`` for one camera for all images of a size with the same lens and zoom
+    (`lens_of`), ``single`` for one for all images of a size, ``per_folder`` for one for each size
+    in each sub-folder, or ``per_image``. The initial focal length in px is
     ``focal_length``, else from the EXIF data of the group's first image, else 1.2 x the longest
     side (COLMAP's default).
     """
@@ -127,7 +130,9 @@ def unknown_camera_groups(
     for name in names:
         size = image_size(images / name)
         folder = str(Path(name).parent)
-        key = {"single": size, "per_folder": (folder, *size), "per_image": (name,)}[sharing]
+        key = {"single": size, "per_folder": (folder, *size), "per_image": (name,)}.get(sharing)
+        if key is None:
+            key = (lens_of(images / name), *size)
         groups.setdefault(key, []).append(name)
     options = pycolmap.ImageReaderOptions()
     options.camera_model = model
