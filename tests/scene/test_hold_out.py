@@ -185,7 +185,9 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
 )
 def test_a_setting_has_limits(name: str, least: int, most: int) -> None:
     def config(value: int) -> SceneConfig:
-        return SceneConfig(name="a", kind="colmap", path="/a", **{name: value})  # type: ignore[arg-type]
+        of_courtyard = name in ("views", "width", "height", "seed")
+        kind, path = ("courtyard", None) if of_courtyard else ("colmap", "/a")
+        return SceneConfig(name="a", kind=kind, path=path, **{name: value})  # type: ignore[arg-type]
 
     assert [getattr(config(value), name) for value in (least, most)] == [least, most]
     for value in (least - 1, *([most + 1] if most in (7, 9999, 16384, 2**31 - 1) else [])):

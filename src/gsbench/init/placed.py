@@ -418,16 +418,26 @@ class Ply(CloudFromFile):
 
         check_ply(self.file)
 
+    def run(
+        self,
+        capture: Capture,
+        output_dir: Path,
+        progress: Progress = no_progress,
+        reference: Path | None = None,
+        work_dir: Path | None = None,
+    ) -> InitReport:
+        from gsbench.gaussians.ply import read_ply
+
+        read_ply(self.file)  # in this process too, because the isolated one has no log
+        return super().run(capture, output_dir, progress, reference, work_dir)
+
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
         from gsbench.gaussians.ply import read_ply, write_ply
 
-        target, normalization = output_dir / GAUSSIANS_FILE, capture.normalization
-        if normalization.is_identity:
-            shutil.copyfile(self.file, target)
-        else:
-            write_ply(read_ply(self.file, normalization=normalization), target)
+        gaussians = read_ply(self.file, normalization=capture.normalization)
+        write_ply(gaussians, output_dir / GAUSSIANS_FILE)
         return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
