@@ -20,7 +20,7 @@ from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
-from gsbench.init.placed import read_points
+from gsbench.init.point_files import read_points
 from gsbench.normalization import Normalization
 from tests.gaussians.helpers import differences, random_gaussians
 
@@ -323,7 +323,8 @@ def test_unknown_columns_are_named_or_refused(
             read_ply(tmp_path / "b.ply")
         return
     read_ply(tmp_path / "b.ply")
-    assert (said in caplog.text) and bool(caplog.text) is bool(said)
+    assert said in caplog.text
+    assert bool(caplog.text) is bool(said)
 
 
 def test_files_of_gsbench_are_not_suspected(tmp_path: Path, caplog) -> None:

@@ -15,7 +15,8 @@ from PIL import Image
 
 from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER, Initializer
-from gsbench.init.placed import GREY, read_points
+from gsbench.init.placed import GREY
+from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, progress
 from gsbench.normalization import IDENTITY
 from gsbench.runs.keys import (
