@@ -195,6 +195,26 @@ def test_a_setting_has_limits(name: str, least: int, most: int) -> None:
             config(value)
 
 
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        ("transforms", {"sparse": "sparse/0"}),
+        ("photos", {"sparse": "sparse/0"}),
+        ("photos", {"width": 640}),
+        ("colmap", {"views": 12}),
+        ("colmap", {"seed": 1}),
+        ("courtyard", {"images": "images_4"}),
+        ("courtyard", {"sparse": "sparse/1"}),
+        ("courtyard", {"masks": "masks"}),
+    ],
+)
+def test_a_setting_that_the_kind_of_scene_does_not_read_is_refused(kind, changes) -> None:
+    path = None if kind == "courtyard" else "/a"
+    (key,) = changes
+    with pytest.raises(InputError, match=rf"scene.{key}=.* is not read by scene.kind={kind}, only"):
+        SceneConfig(name="a", kind=kind, path=path, **changes)
+
+
 def test_default_settings_are_those_of_the_paper() -> None:
     config = SceneConfig(name="a", kind="courtyard")
     assert (config.max_images, config.test_every, config.sectors, config.sector) == (200, 8, 8, 0)

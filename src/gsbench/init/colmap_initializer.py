@@ -78,7 +78,7 @@ class ColmapInitializer(ColmapOptions):
         """
         self.check(capture, reference)
         if self.camera == "exif" and not self.takes_cameras_from(capture, reference):
-            _report_lenses(capture)
+            report_lenses(capture)
         output_dir.mkdir(parents=True, exist_ok=True)
         work = output_dir / WORK_FOLDER if work_dir is None else work_dir
         work.mkdir(parents=True, exist_ok=True)
@@ -118,7 +118,7 @@ class ColmapInitializer(ColmapOptions):
         return report
 
 
-def _report_lenses(capture: Capture) -> None:
+def report_lenses(capture: Capture) -> None:
     """Write one line if the photographs have several lenses or zooms, which get cameras each."""
     counts = Counter(str(lens_of(capture.images / name)) for name in capture.image_names)
     if len(counts) > 1:

@@ -187,10 +187,11 @@ def _walk_text(
     try:
         text = content.decode()
     except UnicodeDecodeError as error:
-        before = content[: error.end].splitlines()
-        if file.stem == "images" and len(before[-1].split()) >= 10:
-            _decoded(before[-1], f"line {len(before)}")
-        raise InputError(f"line {len(before)} is not UTF-8") from error
+        number = content.count(b"\n", 0, error.start)
+        damaged = content.split(b"\n")[number].strip()
+        if file.stem == "images" and len(damaged.split()) >= 10:  # numbers and a name
+            _decoded(damaged, f"line {number + 1}")
+        raise InputError(f"line {number + 1} is not UTF-8") from error
     lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
     try:
         for line in filter(None, lines):

@@ -95,7 +95,7 @@ def _companions(names: Sequence[str]) -> dict[str, str]:
     """Files beside their photograph: ``a_mask.png`` or ``a.jpg.png`` for ``a.jpg``, thumbnails."""
     paths = {name: PurePosixPath(name) for name in names}
     stems = {stem_of(name).casefold() for name in names}
-    found = {}
+    found: dict[str, str] = {}
     for name, path in paths.items():
         stem = PurePosixPath(stem_of(name))
         words = re.split(r"[^A-Za-z]+", stem.name)
@@ -123,7 +123,7 @@ def _smaller_copies(folder: Path, names: Sequence[str]) -> dict[str, str]:
             families[path.with_name(match[1] or path.name).as_posix()].append(
                 (int(match[2]), place)
             )
-    found = {}
+    found: dict[str, str] = {}
     for original, reduced in families.items():
         ordered = [original] * (original in files) + [place for _, place in sorted(reduced)]
         for place in ordered[1:]:

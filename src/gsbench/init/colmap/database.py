@@ -1,7 +1,7 @@
 """COLMAP's database: creating it, and adding keypoints and matches of any extractor."""
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,6 +115,15 @@ def reference_camera_groups(
     return result
 
 
+# What photographs of one size must have in common to share a camera.
+SHARED_BY: dict[str, Callable[[Path, str], object]] = {
+    "exif": lambda images, name: lens_of(images / name),
+    "single": lambda images, name: None,
+    "per_folder": lambda images, name: Path(name).parent,
+    "per_image": lambda images, name: name,
+}
+
+
 def unknown_camera_groups(
     images: Path, names: Sequence[str], sharing: str, model: str, focal_length: float | None
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
@@ -128,11 +137,7 @@ def unknown_camera_groups(
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
-        size = image_size(images / name)
-        folder = str(Path(name).parent)
-        key = {"single": size, "per_folder": (folder, *size), "per_image": (name,)}.get(sharing)
-        if key is None:
-            key = (lens_of(images / name), *size)
+        key = (SHARED_BY[sharing](images, name), image_size(images / name))
         groups.setdefault(key, []).append(name)
     options = pycolmap.ImageReaderOptions()
     options.camera_model = model
