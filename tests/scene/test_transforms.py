@@ -383,6 +383,14 @@ def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path: Path, ke
     capture = capture_of(folder, tmp_path / "made", images="images_2")
     assert capture.image_names == tuple(f"images_2/{k}.png" for k in range(6))
     fitted = read_reference(capture)
+    lists = {
+        "train_filenames": [f"images/{k}.png" for k in range(4)],
+        "test_filenames": ["images/5"],
+    }
+    document = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").write_text(json.dumps(document | lists))
+    train, test = read_transforms(folder, image_folder="images_2").split or ([], [])
+    assert (len(train), test) == (4, ["images_2/5.png"])
     full = read_transforms(write(tmp_path / "full")).images["images/0.png"][0]
     for camera in fitted.cameras.values():
         assert (camera.width, camera.height) == (24, 18)

@@ -1,4 +1,4 @@
-"""What a photograph's EXIF data say about its lens."""
+"""The lens of a photograph, from its EXIF data."""
 
 from dataclasses import dataclass
 from pathlib import Path

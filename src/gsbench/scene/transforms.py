@@ -223,7 +223,7 @@ def read_transforms(
             points, applied_to_points = named, applied
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
-    own_lists = _named_split(files[""], records[""], images) if "" in files else None
+    own_lists = _named_split(files[""], records[""], images, find) if "" in files else None
     held_out = next((sorted(names[split]) for split in ("test", "val") if split in files), None)
     return Transforms(
         tuple(files.values()),
@@ -275,13 +275,16 @@ class _FileFinder:
     def _files(self) -> list[str]:
         return list_images(self.folder)
 
+    def place(self, path: Path, written: str) -> PurePosixPath:
+        """The path of an image as the file writes it, or in the folder that is read instead."""
+        relative = _relative_path(path, written)
+        if self.image_folder is None:
+            return relative
+        return PurePosixPath(self.image_folder, *(relative.parts[1:] or relative.parts))
+
     def __call__(self, path: Path, written: str) -> str | None:
         """The name below the folder, or None if no file fits. Blender writes no extension."""
-        relative = _relative_path(path, written)
-        if self.image_folder is not None:
-            # the named path without its first folder, or a file's name alone
-            below = relative.parts[1:] or relative.parts
-            relative = PurePosixPath(self.image_folder, *below)
+        relative = self.place(path, written)
         if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
             return relative.as_posix()
         try:
@@ -304,7 +307,7 @@ class _FileFinder:
 
 
 def _named_split(
-    path: Path, record: TransformsRecord, images: Collection[str]
+    path: Path, record: TransformsRecord, images: Collection[str], find: _FileFinder
 ) -> tuple[list[str], list[str]] | None:
     """nerfstudio's lists: names to train on, and to test on or, without these, to validate on."""
     train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
@@ -314,7 +317,7 @@ def _named_split(
     written = {"train": train or [], "held-out": held_out}
     chosen = {}
     for which, listed in written.items():
-        wanted = [_relative_path(path, name).as_posix() for name in listed]
+        wanted = [find.place(path, name).as_posix() for name in listed]
         matches = match_names(wanted, images)
         if missing := [name for name in wanted if name not in matches]:
             raise InputError(

@@ -115,7 +115,7 @@ def reference_camera_groups(
     return result
 
 
-# What photographs of one size must have in common to share a camera.
+# Property that photographs of one size must have in common to share a camera.
 SHARED_BY: dict[str, Callable[[Path, str], object]] = {
     "exif": lambda images, name: lens_of(images / name),
     "single": lambda images, name: None,
