@@ -42,7 +42,7 @@ def read_header(path: Path) -> bytes:
 
 
 def _other_format(path: Path, start: bytes) -> str:
-    """What a file that is no PLY is, and what to do, by its first bytes and its name; else ""."""
+    """Describe a file that is no PLY by its first bytes and its name, and what to do; else ""."""
     suffix = path.suffix.lower()
     if suffix in CHECKPOINT_SUFFIXES or start.startswith(PICKLE):
         return CHECKPOINT

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.parsing import without_byte_order_mark
+from gsbench.parsing import one_line, without_byte_order_mark
 
 
 class NamesError(InputError):
@@ -141,8 +141,8 @@ def _decoded(content: bytes, what: str) -> str:
     except UnicodeDecodeError as error:
         # not "copy or export it again", which would write the same names
         raise NamesError(
-            f"{what} is not UTF-8 ({content.decode('ascii', 'backslashreplace')}): rename the "
-            "photographs to ASCII, and make the model again"
+            f"{what} is not UTF-8 ({one_line(str(content)[2:-1])}): rename the photographs to "
+            "ASCII, and make the model again"
         ) from error
 
 
