@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import gzip
+import io
 import math
 import re
+import zipfile
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from numpy.lib.recfunctions import append_fields
 from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
-from gsbench.init.placed import read_points
+from gsbench.init.point_files import read_points
 from gsbench.normalization import Normalization
 from tests.gaussians.helpers import differences, random_gaussians
 
@@ -252,13 +255,99 @@ COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty f
 COMPRESSED += b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
 
 
+def zipped(*names: str) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name in names:
+            archive.writestr(name, b"x")
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.pth", b"PK\3\4" + bytes(9), "a checkpoint of PyTorch: give the PLY"),
+        ("last.ckpt", bytes(9), "a checkpoint of PyTorch: give the PLY"),
+        ("a.bin", zipped("a/version", "a/data.pkl"), "a checkpoint of PyTorch: give the PLY"),
+        ("a.bin", b"\x80\2}q\0.", "a checkpoint of PyTorch: give the PLY"),
+        ("a.npz", zipped("means.npy"), "a ZIP archive: unpack it, and give the PLY in it"),
+        ("a.ply.gz", gzip.compress(b"ply\n"), "a PLY compressed by gzip: gunzip a.ply.gz"),
+        ("a.json", b'{"frames": []}', "JSON: give the PLY of a model"),
+    ],
+)
+def test_files_that_are_no_model_are_named(tmp_path: Path, name, content, said: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    for read in (read_ply, check_ply):
+        with pytest.raises(InputError, match=re.escape(f"(it is {said}")):
+            read(tmp_path / name)
+
+
+def test_the_filter_of_mip_splatting_is_applied(tmp_path: Path, caplog) -> None:
+    """Scales .3 and filter .4 give scales .5, and opacity .8 times (.3 / .5)³."""
+    table = table_of(tmp_path / "a.ply")
+    for axis in range(3):
+        table[f"scale_{axis}"] = math.log(0.3)
+    table["opacity"] = math.log(0.8 / 0.2)
+    table = append_fields(table, "filter_3D", np.float32([0.4, 0.4, 0.4, 0.0]), usemask=False)
+    read = read_ply(save(table, tmp_path / "b.ply"))
+    assert "Mip-Splatting's filter_3D is applied" in caplog.text
+    assert read.scales[:3].flatten().tolist() == pytest.approx([0.5] * 9)
+    assert read.opacities.tolist() == pytest.approx([0.8 * 0.6**3] * 3 + [0.8])
+    assert read.scales[3].tolist() == pytest.approx([0.3] * 3)
+    table["filter_3D"][1] = np.nan
+    with pytest.raises(InputError, match="filter_3D is negative or not a finite number"):
+        read_ply(save(table, tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize(
+    ("column", "refused", "said"),
+    [
+        ("beta", True, "the column beta: Beta Splatting's kernels are no Gaussians"),
+        ("sb_params_3", True, "Beta Splatting's"),
+        ("nu_degree", True, "Student"),
+        ("scale_t", True, "its Gaussians move with time"),
+        ("segment", False, "the column segment is not known and not used"),
+        ("scale_3", False, "the column scale_3 is not known and not used"),
+        ("red", False, ""),
+    ],
+)
+def test_unknown_columns_are_named_or_refused(
+    tmp_path: Path, column: str, refused: bool, said: str, caplog
+) -> None:
+    table = append_fields(
+        table_of(tmp_path / "a.ply"), column, np.zeros(4, np.float32), usemask=False
+    )
+    save(table, tmp_path / "b.ply")
+    if refused:
+        with pytest.raises(InputError, match=said):
+            read_ply(tmp_path / "b.ply")
+        return
+    read_ply(tmp_path / "b.ply")
+    assert said in caplog.text
+    assert bool(caplog.text) is bool(said)
+
+
+def test_files_of_gsbench_are_not_suspected(tmp_path: Path, caplog) -> None:
+    """Sparse clouds in large units have logarithms above 0, as lengths do."""
+    gaussians = random_gaussians(4, dtype=torch.float32)
+    gaussians.log_scales[:] = 0.5
+    gaussians.opacity_logits[:] = 0.5
+    write_ply(gaussians, tmp_path / "own.ply")
+    read_ply(tmp_path / "own.ply")
+    assert not caplog.records
+    save(PlyData.read(str(tmp_path / "own.ply"))["vertex"].data, tmp_path / "foreign.ply")
+    read_ply(tmp_path / "foreign.ply")
+    assert "opacities" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
         ("a.compressed.ply", COMPRESSED, "a compressed PLY, as SuperSplat writes it"),
         ("a.ply", gzip.compress(b"NGSP", mtime=0), "the format SPZ"),
         ("a.ply", b"NGSP" + bytes(9), "the format SPZ"),
-        ("a.ply", b"PK\3\4" + bytes(9), "the format SOG"),
+        ("a.ply", zipped("meta.json"), "the format SOG"),
+        ("a.sog", b"PK\3\4" + bytes(9), "the format SOG"),
         ("meta.json", b'{"version": 2}', "the format SOG"),
         ("a.splat", bytes(32), "the format splat"),
         ("a.KSPLAT", bytes(32), "the format ksplat"),

@@ -14,7 +14,8 @@ from plyfile import PlyData, PlyElement
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
 from gsbench.init.base import PointCloud
-from gsbench.init.placed import GREY, points_in_view, read_points, seen_colors
+from gsbench.init.placed import GREY, points_in_view, seen_colors
+from gsbench.init.point_files import read_points
 from gsbench.scene.images import read_image
 from gsbench.scene.types import Capture
 from tests.init.models import camera_at, model_with
@@ -82,6 +83,42 @@ def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path: P
     path.write_text("1 2 3\n", encoding="utf-16")
     with pytest.raises(InputError, match="UTF-16 or UTF-32: save it as UTF-8"):
         read_points(path)
+
+
+def rows(*columns: np.ndarray, between: str = " ") -> str:
+    table = np.column_stack(columns)
+    return "".join(between.join(f"{value:.17g}" for value in row) + "\n" for row in table)
+
+
+INTENSITY = np.arange(len(XYZ)) - 1200.0
+NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "colored"),
+    [
+        ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY, RGB)}", True),
+        ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY)}", False),
+        ("a.pts", f"3\n{rows(XYZ[:3], RGB[:3])}{len(XYZ) - 3}\n{rows(XYZ[3:], RGB[3:])}", True),
+        ("a.csv", f"X,Y,Z,Intensity,R,G,B\n{rows(XYZ, INTENSITY, RGB, between=',')}", True),
+        ("a.csv", f"r;g;b;z;y;x\n{rows(RGB, XYZ[:, ::-1], between=';')}", True),
+        ("a.csv", f'"x [m]", "y [m]", "z [m]"\n{rows(XYZ, between=", ")}', False),
+        ("a.txt", f"//X Y Z Rf Gf Bf\n{rows(XYZ, RGB / 255)}", True),
+        ("a.asc", f"# a scan\n# x y z\n{rows(XYZ)}", False),
+        ("a.xyz", rows(XYZ, NORMALS), False),
+        ("a.xyz", rows(XYZ, RGB, NORMALS), True),
+        ("a.xyz", rows(XYZ, NORMALS, RGB), True),
+        ("a.xyz", rows(XYZ, RGB, INTENSITY), True),
+        ("a.xyz", rows(XYZ, between="\t"), False),
+    ],
+)
+def test_tables_of_scanners_and_other_programs_are_read(
+    tmp_path: Path, name: str, text: str, colored: bool
+):
+    (tmp_path / name).write_text(text)
+    points, colors = read_points(tmp_path / name)
+    np.testing.assert_array_equal(points, XYZ)
+    np.testing.assert_array_equal(colors, RGB if colored else None)
 
 
 def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path: Path):
@@ -179,10 +216,15 @@ def empty_ply(path: Path) -> None:
     [
         ("a.ply", bad_ply, "no property y, z"),
         ("a.ply", lambda path: path.write_bytes(b"no cloud"), "not a readable file of points"),
-        ("a.xyz", lambda path: save(path, XYZ[:, :2]), "3 or 6 columns"),
+        (
+            "a.xyz",
+            lambda path: save(path, XYZ[:, :2]),
+            "it has 2 columns without names: wanted are x y z",
+        ),
         ("a.ply", empty_ply, "holds no point"),
         ("a.xyz", lambda path: save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
         ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
+        ("a.xyz", lambda path: path.write_text("1,5 2,5 3,5\n"), "decimal commas: write points"),
         ("a.las", lambda path: path.write_bytes(b"LASF"), "known are .ply"),
         ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],

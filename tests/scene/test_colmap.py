@@ -271,6 +271,33 @@ def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(
         check_model(rigs)
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_a_name_in_a_code_page_is_named(make_scene, text: bool) -> None:
+    root = make_scene(names=[f"{k:04d}.png" for k in range(4)], text=text)
+    file = root / "sparse/0" / ("images.txt" if text else "images.bin")
+    file.write_bytes(file.read_bytes().replace(b"0003.png", "가나.png".encode("cp949")))
+    said = r"image.*not UTF-8 .*\\xb0\\xa1\\xb3\\xaa.png.*: rename the photographs to ASCII"
+    with pytest.raises(InputError, match=said) as caught:
+        read_colmap("toy", root)
+    assert "export it again" not in str(caught.value)
+
+
+@pytest.mark.parametrize("names", [("a.png", "b c.png", "d.png"), ("1", "22", "333")])
+def test_an_image_without_its_line_of_points_is_named(make_scene, names) -> None:
+    root = make_scene(text=True)
+    file = root / "sparse/0/images.txt"
+    for stem in ("rigs", "frames"):
+        (root / f"sparse/0/{stem}.txt").unlink()
+    pose = "1 0 0 0 0 0 5 1"
+    lines = [f"{k} {pose} {name}" for k, name in enumerate(names, 1)]
+    file.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"images.txt: image 1 has no line of 2D points: each"):
+        check_model(root / "sparse/0")
+    file.write_text("\n\n".join(lines) + "\n1 2 -1 3 4 -1 5 6 -1 7 8 -1")
+    (root / "sparse/0/points3D.txt").write_text("")
+    check_model(root / "sparse/0")
+
+
 @pytest.mark.parametrize(
     ("stem", "line", "said"),
     [

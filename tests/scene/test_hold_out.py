@@ -185,12 +185,34 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused() -> None:
 )
 def test_a_setting_has_limits(name: str, least: int, most: int) -> None:
     def config(value: int) -> SceneConfig:
-        return SceneConfig(name="a", kind="colmap", path="/a", **{name: value})  # type: ignore[arg-type]
+        of_courtyard = name in ("views", "width", "height", "seed")
+        kind, path = ("courtyard", None) if of_courtyard else ("colmap", "/a")
+        return SceneConfig(name="a", kind=kind, path=path, **{name: value})  # type: ignore[arg-type]
 
     assert [getattr(config(value), name) for value in (least, most)] == [least, most]
     for value in (least - 1, *([most + 1] if most in (7, 9999, 16384, 2**31 - 1) else [])):
         with pytest.raises(InputError, match=rf"scene\.{name}"):
             config(value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        ("transforms", {"sparse": "sparse/0"}),
+        ("photos", {"sparse": "sparse/0"}),
+        ("photos", {"width": 640}),
+        ("colmap", {"views": 12}),
+        ("colmap", {"seed": 1}),
+        ("courtyard", {"images": "images_4"}),
+        ("courtyard", {"sparse": "sparse/1"}),
+        ("courtyard", {"masks": "masks"}),
+    ],
+)
+def test_a_setting_that_the_kind_of_scene_does_not_read_is_refused(kind, changes) -> None:
+    path = None if kind == "courtyard" else "/a"
+    (key,) = changes
+    with pytest.raises(InputError, match=rf"scene.{key}=.* is not read by scene.kind={kind}, only"):
+        SceneConfig(name="a", kind=kind, path=path, **changes)
 
 
 def test_default_settings_are_those_of_the_paper() -> None:

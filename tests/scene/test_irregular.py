@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.gaussians.ply import check_ply, read_ply
-from gsbench.init.placed import read_points
+from gsbench.init.point_files import read_points
 from gsbench.scene.colmap import read_model
 from gsbench.scene.colmap_files import check_model
 from gsbench.scene.images import (

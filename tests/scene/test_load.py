@@ -15,18 +15,18 @@ from PIL import Image
 from gsbench.errors import InputError
 from gsbench.logs import no_progress
 from gsbench.scene.colmap import plain_camera, read_model
-from gsbench.scene.distortion import largest_distortion
+from gsbench.scene.distortion import folded_share, largest_distortion
 from gsbench.scene.load import (
     INTRINSICS,
     Downscaling,
     ImageToPrepare,
     load_scene,
     prepare_all,
-    undistort,
 )
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import CameraModel, Scene
+from gsbench.scene.undistortion import check_lenses, folded_shares, undistort
 
 WIDTH, HEIGHT = 200, 150
 UNCHANGED = Downscaling(1, None, "lanczos")
@@ -124,6 +124,52 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
     cancelling = [150, 150, 100, 75, 0.1, 0, 0, 0, 0, 0.1, 0, 0]  # (1 + .1 r^2) / (1 + .1 r^2)
     camera = pycolmap.Camera(model="FULL_OPENCV", width=WIDTH, height=HEIGHT, params=cancelling)
     assert plain_camera(camera) == CameraModel("PINHOLE", WIDTH, HEIGHT, (150, 150, 100, 75))
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "share"),
+    [
+        ("SIMPLE_RADIAL", (90, 80, 60, -0.35), 0.68),
+        ("SIMPLE_RADIAL", (150, 80, 60, -0.1), 0.0),
+        ("SIMPLE_RADIAL", (90, 80, 60, 0.35), 0.0),
+        ("RADIAL", (80, 80, 60, -0.3, 0.03), 0.49),
+        ("OPENCV", (90, 90, 80, 60, -0.35, 0, 0, 0), 0.68),
+        ("OPENCV_FISHEYE", (60, 60, 80, 60, -0.05, -0.1, 0, 0), 0.35),
+        ("OPENCV_FISHEYE", (60, 60, 80, 60, -0.01, 0, 0, 0), 0.0),
+        ("FOV", (90, 90, 80, 60, 0.9), 0.0),
+    ],
+)
+def test_lenses_that_turn_back_inside_the_picture_are_refused(name, params, share, caplog):
+    camera = CameraModel(name, 160, 120, tuple(map(float, params)))
+    (found,) = folded_shares([camera])
+    assert found == pytest.approx(share, abs=0.01)
+    if share:
+        said = rf"the camera of a.png \({name}: .*\) turns back .*: {found:.1%}"
+        with pytest.raises(InputError, match=said):
+            check_lenses({"a.png": camera})
+    else:
+        check_lenses({"a.png": camera})
+    assert not caplog.records
+
+
+def test_a_lens_turns_back_where_its_polynomial_does():
+    """f(r) = r + k r³ has its maximum at r = sqrt(-1 / 3k)."""
+    source = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=160, height=120, params=[90, 80, 60, -0.35]
+    )
+    pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
+    x = (np.arange(pinhole.width) + 0.5 - pinhole.principal_point_x) / pinhole.focal_length_x
+    y = (np.arange(pinhole.height) + 0.5 - pinhole.principal_point_y) / pinhole.focal_length_y
+    outside = np.hypot(x, y[:, None]) > np.sqrt(1 / (3 * 0.35))
+    assert folded_share(source, pinhole) == pytest.approx(outside.mean(), abs=0.02)
+
+
+def test_a_small_fold_in_the_corners_is_reported(caplog):
+    camera = CameraModel("SIMPLE_RADIAL", 160, 120, (90.0, 80.0, 60.0, -0.185))
+    (share,) = folded_shares([camera])
+    assert 0 < share < 0.01
+    check_lenses({"a.png": camera})
+    assert "turns back inside the picture" in caplog.text
 
 
 def test_panoramas_are_refused(tmp_path: Path):

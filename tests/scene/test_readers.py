@@ -7,11 +7,12 @@ import logging
 import shutil
 from pathlib import Path
 
+import pycolmap
 import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
-from gsbench.scene.colmap import read_model
+from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.hold_out import select_images, split_names
 from gsbench.scene.images import list_images, match_names
 from gsbench.scene.options import SceneConfig, SplitRule
@@ -89,6 +90,46 @@ def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, m
         return
     with pytest.raises(InputError, match=matches):
         match_names(wanted, files)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "files", "matches"),
+    [
+        (["images/a.png"], ["a.png"], {"images/a.png": "a.png"}),
+        (["/home/x/a.png"], ["a.JPG"], {"/home/x/a.png": "a.JPG"}),
+        ([r"C:\data\b\a.png"], ["b/a.png", "c/a.png"], {r"C:\data\b\a.png": "b/a.png"}),
+        (["a.png"], ["cam/a.png"], {"a.png": "cam/a.png"}),
+        (["x/a.png", "b.png"], ["a.png", "b.png"], {"b.png": "b.png"}),  # one name fits as it is
+        (["x/a.png"], ["b/a.png", "c/a.png"], "x/a.png may be b/a.png or c/a.png"),
+        (["x/a.png", "y/a.png"], ["a.png"], "a.png may be x/a.png or y/a.png"),
+    ],
+)
+def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, files, matches):
+    if isinstance(matches, dict):
+        assert match_names(wanted, files, other_folders=True) == matches
+    else:
+        with pytest.raises(InputError, match=matches):
+            match_names(wanted, files, other_folders=True)
+    assert set(match_names(wanted, files)) <= {"b.png"}
+
+
+@pytest.mark.parametrize("prefix", ["images/", "/home/x/images/", "C:\\data\\images\\", "./"])
+def test_a_model_whose_names_have_another_folder_gives_the_same_capture(
+    make_scene, caplog, prefix: str
+) -> None:
+    plain = read_colmap("toy", make_scene(), max_images=4)
+    root = make_scene(root="other")
+    (root / "images/thumbs").mkdir()
+    Image.new("RGB", (8, 6)).save(root / "images/thumbs/00.png")
+    model = pycolmap.Reconstruction(root / "sparse/0")
+    for image in model.images.values():
+        image.name = f"{prefix}{image.name}"
+    model.write_binary(root / "sparse/0")
+    capture = read_colmap("toy", root, max_images=4)
+    assert (capture.image_names, capture.test_names) == (plain.image_names, plain.test_names)
+    assert "found by the last part of their path" in caplog.text
+    fitted = read_reference(capture)
+    assert {image.name for image in fitted.images.values()} == set(capture.image_names)
 
 
 @pytest.mark.parametrize("text", [False, True])

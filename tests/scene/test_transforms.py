@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from gsbench.errors import InputError
 from gsbench.init.base import read_cloud
 from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.scene import transforms
-from gsbench.scene.colmap import read_model
+from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.transforms import read_transforms
 from gsbench.scene.transforms_keys import HARMLESS, REFUSED
@@ -364,6 +365,49 @@ def test_images_without_a_file_are_left_out(
     (folder / "images" / "4.png").unlink()
     assert len(read_transforms(folder).images) == 5
     assert "1 of 6 images have no file: ./images/4.png" in caplog.text
+
+
+def reduced(folder: Path, name: str = "images_2") -> Path:
+    """Add the photographs of ``folder`` at .6 of their size."""
+    for file in (folder / "images").iterdir():
+        (folder / name).mkdir(exist_ok=True)
+        Image.open(file).resize((24, 18)).save(folder / name / file.name)
+    return folder
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_scene_images_replaces_the_folder_that_the_file_names(tmp_path: Path, keep: bool) -> None:
+    folder = reduced(write(tmp_path / "in"))
+    if not keep:
+        shutil.rmtree(folder / "images")
+    capture = capture_of(folder, tmp_path / "made", images="images_2")
+    assert capture.image_names == tuple(f"images_2/{k}.png" for k in range(6))
+    fitted = read_reference(capture)
+    lists = {
+        "train_filenames": [f"images/{k}.png" for k in range(4)],
+        "test_filenames": ["images/5"],
+    }
+    document = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").write_text(json.dumps(document | lists))
+    train, test = read_transforms(folder, image_folder="images_2").split or ([], [])
+    assert (len(train), test) == (4, ["images_2/5.png"])
+    full = read_transforms(write(tmp_path / "full")).images["images/0.png"][0]
+    for camera in fitted.cameras.values():
+        assert (camera.width, camera.height) == (24, 18)
+        assert camera.focal_length_x == pytest.approx(full.params[0] * 0.6)
+    with pytest.raises(InputError, match=r"nowhere: no such folder; set scene.images to one of"):
+        capture_of(folder, tmp_path / "made", images="nowhere")
+
+
+def test_an_error_says_which_folder_has_the_named_files(tmp_path: Path) -> None:
+    folder = reduced(write(tmp_path / "in"))
+    shutil.rmtree(folder / "images")
+    said = (
+        r"0 images with a file and a camera in transforms.json, while ./images/0.png, .* have no "
+        r"file, but at least 3 are needed: images_2 has 6 of the names: set scene.images=images_2"
+    )
+    with pytest.raises(InputError, match=said):
+        capture_of(folder, tmp_path / "made")
 
 
 def test_transforms_json_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from gsbench.errors import InputError
@@ -126,6 +128,16 @@ def test_equal_pixels_are_left_out_and_near_twins_are_reported(
     assert len(caplog.records) == left_out + is_near
     if is_near:
         assert "1 of 1 test views have a near twin in training: 0.png (twin.png)" in caplog.text
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(40, 200), st.integers(-2, 2), st.integers(0, 4))
+def test_a_near_twin_is_found_at_any_size(width: int, rounding: int, cut: int) -> None:
+    image = picture(0)[: 128 - cut]
+    height = round(128 * width / 160) + rounding
+    small = np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.LANCZOS))
+    twins = without_copies(scene_of(picture(0), small)).twins
+    assert [*twins.near, *twins.left_out.values()] == ["0.png"]
 
 
 def test_pixels_under_a_mask_do_not_make_photographs_different() -> None:

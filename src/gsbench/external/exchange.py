@@ -1,6 +1,5 @@
 """Input folders of another program (training views, test cameras), and the check of its results."""
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -79,7 +78,7 @@ def _frame(name: str, camera: Camera) -> dict[str, Any]:
 def collect_model(
     output: Path, pattern: str, target: Path, normalization: Normalization = IDENTITY
 ) -> Gaussians:
-    """Copy the one file that fits ``pattern`` to ``target``, normalised; return its Gaussians.
+    """Write the model in the one file that fits ``pattern`` to ``target``, normalised; return it.
 
     Raises `TrainingError` if there is not exactly one such file, or if it is not a valid 3DGS PLY.
     """
@@ -94,10 +93,7 @@ def collect_model(
         gaussians = read_ply(files[0], normalization=normalization)
     except InputError as error:
         raise TrainingError(str(error)) from error
-    if normalization.is_identity:
-        shutil.copyfile(files[0], target)
-    else:
-        write_ply(gaussians, target)
+    write_ply(gaussians, target)
     return gaussians
 
 

@@ -14,6 +14,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_regular
+from gsbench.gaussians.foreign_columns import check_columns, with_filter_applied
 from gsbench.gaussians.model import MAX_SH_DEGREE, NUM_SH_REST, Gaussians
 from gsbench.gaussians.ply_files import read_header, read_ply_data
 from gsbench.normalization import IDENTITY, Normalization
@@ -32,6 +33,9 @@ COLUMNS = (
     + [f"scale_{i}" for i in range(3)]
     + [f"rot_{i}" for i in range(4)]
 )
+
+# Marks files of gsbench, whose values need no doubt.
+OWN_COMMENT = "written by gsbench"
 
 # errors that plyfile and numpy raise for a damaged file; OverflowError is not a ValueError
 DAMAGE = (OSError, LookupError, PlyParseError, ValueError, TypeError, OverflowError, MemoryError)
@@ -78,8 +82,9 @@ def write_ply(gaussians: Gaussians, path: Path, normalization: Normalization = I
         own = normalization.undo(raw.means.numpy())  # [N, 3]
         for axis, name in enumerate(POSITION):
             vertices[name] = own[:, axis]
+    element = PlyElement.describe(vertices, "vertex")
     with atomic(path, sync=False) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
+        PlyData([element], byte_order="<", comments=[OWN_COMMENT]).write(str(temporary))
 
 
 def check_ply(path: Path) -> None:
@@ -191,11 +196,14 @@ def read_ply(
     """Read a 3DGS PLY of SH degree 0 to 3 as float32; coefficients above its degree become zero.
 
     ``normalization`` is applied to positions, before they become float32, and to scales.
+    Mip-Splatting's filter is applied, other columns that gsbench does not know are named
+    (`foreign_columns`).
 
     Raises InputError if the file is not a PLY, lacks a property, or has invalid values.
     """
     with _checked(path):
-        vertices = read_ply_data(path)["vertex"].data
+        content = read_ply_data(path)
+        vertices = content["vertex"].data
     present = set(vertices.dtype.names or ())
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]
@@ -213,6 +221,7 @@ def read_ply(
         is_cloud = present >= set(POSITION) and "f_dc_0" in missing
         hint = ": it is a point cloud, which init=points reads" if is_cloud else ""
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
+    check_columns(vertices.dtype.names or (), COLUMNS, path)
     vertices = _with_finite_opacities(vertices, path)
     for name in (*required, *rest):
         _check_finite(vertices[name], name, path)
@@ -221,7 +230,9 @@ def read_ply(
             f"{path}: a Gaussian has a rotation of (0, 0, 0, 0): export the model again"
         )
 
-    _warn_of_activated(vertices, path)
+    if OWN_COMMENT not in content.comments:
+        _warn_of_activated(vertices, path)
+    vertices = with_filter_applied(vertices, path, MAX_LOGIT)
 
     def columns(names: list[str]) -> torch.Tensor:
         table = np.stack([vertices[name].astype(np.float32) for name in names], axis=1)

@@ -3,6 +3,8 @@
 import codecs
 import io
 import re
+import zipfile
+import zlib
 from pathlib import Path
 
 from plyfile import PlyData
@@ -13,9 +15,12 @@ NOT_ASCII = re.compile(rb"[^\x00-\x7f]")
 # Formats that are not PLY, by the first bytes of a file. Sources: Niantic's repository "spz" (files
 # are compressed by gzip until version 3, later they start with NGSP); PlayCanvas's page on SOG (a
 # ZIP archive, or meta.json next to WebP images).
-MAGIC = {b"\x1f\x8b": "SPZ", b"NGSP": "SPZ", b"PK\x03\x04": "SOG", b"{": "SOG"}
+SPZ, SOG = "SPZ", "SOG"
 # the first two have no magic number
-SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": "SPZ", ".sog": "SOG"}
+SUFFIXES = {".splat": "splat", ".ksplat": "ksplat", ".spz": SPZ, ".sog": SOG}
+GZIP, ZIP, PICKLE = b"\x1f\x8b", b"PK\x03\x04", b"\x80"
+CHECKPOINT = "a checkpoint of PyTorch: give the PLY that its trainer wrote or exports"
+CHECKPOINT_SUFFIXES = (".pth", ".pt", ".ckpt")
 
 
 def read_header(path: Path) -> bytes:
@@ -26,18 +31,57 @@ def read_header(path: Path) -> bytes:
     with path.open("rb") as stream:
         start = stream.read(MAX_HEADER)
     start = start.removeprefix(codecs.BOM_UTF8)
-    if not start.startswith(b"ply"):
-        found = SUFFIXES.get(path.suffix.lower()) or next(
-            (MAGIC[key] for key in MAGIC if start.startswith(key)), None
-        )
-        if found is not None:
-            raise ValueError(f"it is in the format {found}: {_how_to_unpack(path)}")
+    if not start.startswith(b"ply") and (kind := _other_format(path, start)):
+        raise ValueError(f"it is {kind}")
     header, end, _ = start.partition(END)
     if not end:
         raise ValueError("it has no header")
     if b"element chunk" in header and b"packed_position" in header:
         raise ValueError(f"it is a compressed PLY, as SuperSplat writes it: {_how_to_unpack(path)}")
     return header
+
+
+def _other_format(path: Path, start: bytes) -> str:
+    """Describe a file that is no PLY by its first bytes and its name, and what to do; else ""."""
+    suffix = path.suffix.lower()
+    if suffix in CHECKPOINT_SUFFIXES or start.startswith(PICKLE):
+        return CHECKPOINT
+    packed = SUFFIXES.get(suffix, "")
+    if start.startswith(ZIP) and not packed:
+        names = _names_in_zip(path)
+        if "data.pkl" in names:
+            return CHECKPOINT
+        if "meta.json" not in names:
+            return "a ZIP archive: unpack it, and give the PLY in it"
+        packed = SOG
+    elif start.startswith(GZIP) and not packed:
+        if _gunzipped(start).startswith(b"ply"):
+            return f"a PLY compressed by gzip: gunzip {path.name}"
+        packed = SPZ
+    elif start.startswith(b"{") and not packed:
+        if path.name != "meta.json" and b'"means"' not in start:
+            return "JSON: give the PLY of a model"
+        packed = SOG
+    if start.startswith(b"NGSP"):
+        packed = SPZ
+    return f"in the format {packed}: {_how_to_unpack(path)}" if packed else ""
+
+
+def _names_in_zip(path: Path) -> set[str]:
+    """The names of the files in a ZIP archive, without their folders; none if it is damaged."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name.rpartition("/")[2] for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        return set()
+
+
+def _gunzipped(start: bytes) -> bytes:
+    """The first bytes of gzip's data."""
+    try:
+        return zlib.decompressobj(wbits=31).decompress(start, 16)
+    except zlib.error:
+        return b""
 
 
 def _how_to_unpack(path: Path) -> str:

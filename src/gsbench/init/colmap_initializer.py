@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import shutil
 from abc import abstractmethod
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -23,10 +24,11 @@ from gsbench.init.base import (
 )
 from gsbench.init.options import ColmapOptions
 from gsbench.logs import Progress, no_progress
+from gsbench.scene.exif import lens_of
 from gsbench.scene.options import MIN_IMAGES
 from gsbench.scene.types import Capture
 from gsbench.system.isolate import run_with_progress
-from gsbench.words import counted
+from gsbench.words import counted, some_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -75,6 +77,8 @@ class ColmapInitializer(ColmapOptions):
         Raises ``InputError`` if no model can be made from the photographs with these settings.
         """
         self.check(capture, reference)
+        if self.camera == "exif" and not self.takes_cameras_from(capture, reference):
+            report_lenses(capture)
         output_dir.mkdir(parents=True, exist_ok=True)
         work = output_dir / WORK_FOLDER if work_dir is None else work_dir
         work.mkdir(parents=True, exist_ok=True)
@@ -112,6 +116,19 @@ class ColmapInitializer(ColmapOptions):
     def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
         """Change the model before it is written; returns its report. Runs isolated."""
         return report
+
+
+def report_lenses(capture: Capture) -> None:
+    """Write one line if the photographs have several lenses or zooms, which get cameras each."""
+    counts = Counter(str(lens_of(capture.images / name)) for name in capture.image_names)
+    if len(counts) > 1:
+        logger.warning(
+            "%s: by EXIF, the photographs have %d focal lengths or lenses, and get a camera for "
+            "each: %s; init.camera=single shares one",
+            capture.images,
+            len(counts),
+            some_of([f"{lens}: {count}" for lens, count in counts.most_common()]),
+        )
 
 
 @dataclass(frozen=True)

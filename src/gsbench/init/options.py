@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 Pairing = Literal["exhaustive", "auto", "sequential"]
-CameraSharing = Literal["single", "per_folder", "per_image"]
+CameraSharing = Literal["exif", "single", "per_folder", "per_image"]
 CameraModel = Literal[
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
 ]
@@ -46,7 +46,7 @@ class ColmapOptions(Initializer):
 
     poses: Poses = "shared"
     align: bool = True
-    camera: CameraSharing = "single"
+    camera: CameraSharing = "exif"
     camera_model: CameraModel = "SIMPLE_RADIAL"
     focal_length: PositiveFloat | None = None
     intrinsics: Literal["estimate", "reference"] = "estimate"
@@ -74,6 +74,10 @@ class ColmapOptions(Initializer):
     def uses_reference_cameras(self) -> bool:
         """Return whether at least the intrinsics are taken from the reference, if there is one."""
         return self.poses == "shared" or self.intrinsics == "reference"
+
+    def takes_cameras_from(self, capture: Capture, reference: object | None) -> bool:
+        """Return whether the cameras come from ``reference`` or the capture's own model."""
+        return self.uses_reference_cameras and not (reference is None and capture.model is None)
 
     def ignores_test_photographs(self, reference: pycolmap.Reconstruction | None) -> bool:
         """Return whether test photographs are not read at all: given cameras do not need them."""

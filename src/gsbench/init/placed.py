@@ -6,12 +6,9 @@ The points are those of the reference, random, or from a file. A file holds poin
 
 from __future__ import annotations
 
-import math
 import shutil
 from abc import abstractmethod
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -21,8 +18,7 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.files import file_sha256, require_regular
-from gsbench.gaussians.ply_files import read_ply_data
+from gsbench.files import file_sha256
 from gsbench.init.base import (
     GAUSSIANS_FILE,
     WORK_FOLDER,
@@ -34,8 +30,8 @@ from gsbench.init.base import (
     Timer,
     TrainingPoints,
 )
+from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, no_progress
-from gsbench.parsing import one_line, without_byte_order_mark
 from gsbench.scene.images import read_image, read_mask
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import AnyPath, check_settings
@@ -239,92 +235,6 @@ def points_in_view(
     return seen, pixels[inside], np.linalg.norm(local[seen], axis=1)
 
 
-COLOR_NAMES = (
-    ("red", "green", "blue"),
-    ("r", "g", "b"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-)
-DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
-SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
-TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts")
-
-
-def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
-    """Read points [P, 3] float64 and colours [P, 3], or None for a file without colours.
-
-    The suffix tells the format. A ``.ply`` file, text or binary, has vertices with x, y, z in any
-    order and type, and colours as whole numbers or in [0, 1]. A text file has the columns x, y, z,
-    optionally followed by red, green, blue. Raises ``InputError`` for a file that cannot be read,
-    holds no point, or has a coordinate or colour that is not a finite number.
-    """
-    suffix = path.suffix.lower()
-    require_regular(path)
-    try:
-        if suffix == ".ply":
-            points, colors = _read_ply(path)
-        elif suffix in TEXT_SUFFIXES:
-            content = without_byte_order_mark(path.read_bytes()).decode()
-            between = "," if suffix == ".csv" else None
-            points, colors = _columns(np.loadtxt(StringIO(content), delimiter=between, ndmin=2))
-        else:
-            raise ValueError(f"known are .ply, {', '.join(TEXT_SUFFIXES)}")
-    # readers may raise any exception on a damaged file, numpy even tokenizer errors
-    except Exception as error:
-        raise InputError(
-            f"{path}: not a readable file of points ({one_line(str(error))})"
-        ) from error
-    if len(points) == 0:
-        raise InputError(f"{path}: holds no point")
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        raise InputError(
-            f"{path}: {bad.sum():,} of {len(points):,} points have coordinates that are not "
-            "finite numbers"
-        )
-    if colors is None:
-        return points, None
-    if not np.isfinite(colors.astype(np.float64)).all() or colors.min() < 0:
-        raise InputError(f"{path}: has colours that are negative or not finite numbers")
-    return points, _eight_bits(colors)
-
-
-def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
-    vertices = read_ply_data(path)["vertex"].data
-    present = set(vertices.dtype.names or ())
-    if lacking := [name for name in "xyz" if name not in present]:
-        raise ValueError(f"its vertices have no property {', '.join(lacking)}")
-
-    def columns(names: Iterable[str]) -> NDArray[np.generic]:
-        return np.stack([vertices[name] for name in names], axis=1)
-
-    points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
-    for names in COLOR_NAMES:
-        if present.issuperset(names):
-            return points, columns(names)
-    if present.issuperset(DC_NAMES):  # a model of Gaussians
-        dc = columns(DC_NAMES).astype(np.float64)
-        return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
-    return points, None
-
-
-def _columns(table: NDArray[np.generic]) -> tuple[Array, NDArray[np.generic] | None]:
-    if table.ndim != 2 or table.shape[1] not in (3, 6) or table.dtype.kind not in "fiu":
-        raise ValueError(
-            f"must be a table of 3 or 6 columns of numbers, is {table.shape} {table.dtype}"
-        )
-    return table[:, :3].astype(np.float64), table[:, 3:] if table.shape[1] == 6 else None
-
-
-def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] times 255."""
-    values = colors.astype(np.float64)
-    if colors.dtype.kind == "f" and values.max() <= 1.0:
-        values = values * 255
-    elif values.max() > 255:
-        values = values / 257  # 65535 becomes 255
-    return values.round().clip(0, 255).astype(np.uint8)
-
-
 GREY = 128  # for points without a colour in the file and out of view of all training cameras
 
 
@@ -418,16 +328,26 @@ class Ply(CloudFromFile):
 
         check_ply(self.file)
 
+    def run(
+        self,
+        capture: Capture,
+        output_dir: Path,
+        progress: Progress = no_progress,
+        reference: Path | None = None,
+        work_dir: Path | None = None,
+    ) -> InitReport:
+        from gsbench.gaussians.ply import read_ply
+
+        read_ply(self.file)  # in this process too, because the isolated one has no log
+        return super().run(capture, output_dir, progress, reference, work_dir)
+
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
         from gsbench.gaussians.ply import read_ply, write_ply
 
-        target, normalization = output_dir / GAUSSIANS_FILE, capture.normalization
-        if normalization.is_identity:
-            shutil.copyfile(self.file, target)
-        else:
-            write_ply(read_ply(self.file, normalization=normalization), target)
+        gaussians = read_ply(self.file, normalization=capture.normalization)
+        write_ply(gaussians, output_dir / GAUSSIANS_FILE)
         return super().set_points(model, capture, output_dir)
 
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:

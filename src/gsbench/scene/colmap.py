@@ -137,7 +137,7 @@ def read_reference(capture: Capture) -> pycolmap.Reconstruction:
             "init.poses=own"
         )
     model = read_model(capture.model)
-    names = match_names(registered_names(model), capture.image_names)
+    names = match_names(registered_names(model), capture.image_names, other_folders=True)
     fitted = pycolmap.Reconstruction()
     # The files of one camera may have several sizes, for example if some were shrunk. Then each
     # size gets a camera, and the first one keeps the id.

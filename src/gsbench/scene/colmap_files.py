@@ -15,7 +15,12 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.parsing import without_byte_order_mark
+from gsbench.parsing import one_line, without_byte_order_mark
+
+
+class NamesError(InputError):
+    """Raised for a record whose message says what to do."""
+
 
 REQUIRED = ("cameras", "images", "points3D")
 OPTIONAL = ("rigs", "frames")  # since COLMAP 3.12
@@ -83,6 +88,8 @@ def check_model(folder: Path) -> None:
             else:
                 _walk_text(file, text_record, checks)
         except (struct.error, ValueError, IndexError, OverflowError) as error:
+            if isinstance(error, NamesError):
+                raise InputError(f"{file}: {error}") from error
             if isinstance(error, InputError):  # a ValueError that already says what is wrong
                 raise InputError(f"{file}: {error}: copy or export it again") from error
             raise InputError(
@@ -122,10 +129,21 @@ def _binary_camera(data: bytes, offset: int, checks: ModelChecks) -> int:
 def _binary_image(data: bytes, offset: int, checks: ModelChecks) -> int:
     image_id, *pose, camera_id = _IMAGE.unpack_from(data, offset)
     end = data.index(b"\0", offset + _IMAGE.size)
-    name = data[offset + _IMAGE.size : end].decode()
+    name = _decoded(data[offset + _IMAGE.size : end], f"the name of image {image_id}")
     (points,) = _COUNT.unpack_from(data, end + 1)
     checks.image(image_id, pose, camera_id, name, points)
     return end + 1 + _COUNT.size + points * _POINT2D_BYTES
+
+
+def _decoded(content: bytes, what: str) -> str:
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        # not "copy or export it again", which would write the same names
+        raise NamesError(
+            f"{what} is not UTF-8 ({one_line(str(content)[2:-1])}): rename the photographs to "
+            "ASCII, and make the model again"
+        ) from error
 
 
 def _binary_point(data: bytes, offset: int, checks: ModelChecks) -> int:
@@ -165,7 +183,15 @@ def _walk_text(
     file: Path, record: Callable[[str, Lines, ModelChecks], None], checks: ModelChecks
 ) -> None:
     """Check a text file without comments; ``record`` gets a line and an iterator of later lines."""
-    text = without_byte_order_mark(file.read_bytes()).decode()
+    content = without_byte_order_mark(file.read_bytes())
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as error:
+        number = content.count(b"\n", 0, error.start)
+        damaged = content.split(b"\n")[number].strip()
+        if file.stem == "images" and len(damaged.split()) >= 10:  # numbers and a name
+            _decoded(damaged, f"line {number + 1}")
+        raise InputError(f"line {number + 1} is not UTF-8") from error
     lines = (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
     try:
         for line in filter(None, lines):
@@ -214,10 +240,30 @@ def _text_camera(line: str, _: Lines, checks: ModelChecks) -> None:
 def _text_image(line: str, lines: Lines, checks: ModelChecks) -> None:
     words = line.split(maxsplit=9)  # the name comes last, and may contain blanks
     # the line after an image holds its 2D points, and may be empty
-    points = next(lines, "").split()
+    following = next(lines, "")
+    points = following.split()
+    if _is_image_line(following):
+        raise NamesError(
+            f"image {words[0]} has no line of 2D points: each image needs a second line, which may "
+            "be empty"
+        )
     if len(words) < 10 or len(points) % 3 or not all(map(math.isfinite, _numbers(points))):
         raise InputError(f"image {words[0]} lacks numbers")
     checks.image(int(words[0]), _numbers(words[1:8]), int(words[8]), words[9], len(points) // 3)
+
+
+def _is_image_line(line: str) -> bool:
+    """Return whether a line has an image's numbers and a name, and is no line of 2D points."""
+    words = line.split(maxsplit=9)
+    if len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
+        return False
+    try:
+        quaternion = _numbers(words[1:8])[:4]
+        _numbers(words[9].split())
+    except ValueError:  # a name that is no number
+        return True
+    # Of 2D points, the third number is an id or -1; of a quaternion, numbers have length 1.
+    return len(line.split()) % 3 != 0 and abs(math.hypot(*quaternion) - 1) < NEARLY
 
 
 def _text_point(line: str, _: Lines, checks: ModelChecks) -> None:
@@ -253,6 +299,7 @@ _RECORDS = {
 }
 
 
+NEARLY = 0.01  # the length of a quaternion in a text differs from 1 by less
 # Largest length of a quaternion; the smallest is 1 / MAX_LENGTH. COLMAP normalises quaternions of
 # any length.
 MAX_LENGTH = 1e6

@@ -54,6 +54,7 @@ IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
 # largest share of pixels between black and the brightest value; a photograph has far more
 MAX_GREY_SHARE = 0.05
 NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
+WHOLE = 0  # all parts of a path
 
 
 def list_images(folder: Path) -> list[str]:
@@ -95,17 +96,45 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
         return []
 
 
-def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
+def match_names(
+    wanted: Iterable[str], files: Iterable[str], other_folders: bool = False
+) -> dict[str, str]:
     """Map each wanted image name to its file; names without a file are left out.
 
     A file of the same name comes first, then the only file whose path differs in the extension
     alone (``a.png`` for ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG``
-    for ``img_1.jpg``). Raises `InputError` if several such files fit a name, or if several names
-    fit such a file.
+    for ``img_1.jpg``). With ``other_folders``, if no file fits any name, names and files are
+    compared by the last parts of their paths, as many as give a match (``b/a.jpg`` for
+    ``C:\\data\\b\\a.jpg``). Raises `InputError` if several such files fit a name, or if several
+    names fit such a file.
     """
+    names, found = list(dict.fromkeys(wanted)), set(files)
+    matches = _matched(names, found, WHOLE)
+    longest = max((len(_parts(name)) for name in names), default=0)
+    for count in range(longest if other_folders else 0, 0, -1):
+        if not matches:
+            matches = _matched(names, found, count)
+    return matches
+
+
+def _parts(path: str) -> list[str]:
+    return path.replace("\\", "/").split("/")
+
+
+def _matched(wanted: Iterable[str], files: Iterable[str], count: int) -> dict[str, str]:
+    """`match_names` by the last ``count`` parts of each path."""
+
+    def tail(path: str) -> str:
+        return path if count == WHOLE else "/".join(_parts(path)[-count:])
+
     unmatched, free = dict.fromkeys(wanted), set(files)
     matches = {name: name for name in unmatched if name in free}
-    for key_of in (stem_of, lambda path: path.casefold(), lambda path: stem_of(path).casefold()):
+    for key_of in (
+        tail,
+        lambda path: stem_of(tail(path)),
+        lambda path: tail(path).casefold(),
+        lambda path: stem_of(tail(path)).casefold(),
+    ):
         # Better matches come first and take their files, so that no name is matched to the file of
         # another name.
         free -= set(matches.values())
@@ -130,6 +159,11 @@ def match_names(wanted: Iterable[str], files: Iterable[str]) -> dict[str, str]:
                 )
             matches[names[0]] = found[0]
     return matches
+
+
+def same_folder(one: str, other: str) -> bool:
+    """Return whether two names have the same folder, up to capitals."""
+    return _parts(one)[:-1] == _parts(other)[:-1] or one.casefold() == other.casefold()
 
 
 def stem_of(name: str) -> str:

@@ -23,7 +23,6 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
@@ -43,6 +42,7 @@ from gsbench.scene.images import (
 )
 from gsbench.scene.options import MIN_IMAGES, downscaled_size
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
+from gsbench.scene.undistortion import check_lenses, undistort
 from gsbench.system.isolate import CrashError, run_isolated
 from gsbench.system.resources import available_threads
 from gsbench.words import some_of
@@ -152,6 +152,8 @@ def _prepare_views(
                 changes[name] = ImageToPrepare(source, model, work / file, downscaling, mask)
             else:
                 entries[name] |= _intrinsics(to_pinhole(model))
+        lenses = {name: image.camera for name, image in changes.items() if image.camera.distorted}
+        check_lenses(lenses)
         prepared = prepare_all(list(changes.values()), progress)
         for name, camera in zip(changes, prepared, strict=True):
             entries[name] |= _intrinsics(camera)
@@ -316,29 +318,3 @@ def _prepare_mask(source: Path, image: ImageToPrepare, width: int, height: int) 
             f"{source}: no pixel is left that counts at {width}x{height} px: leave its image out"
         )
     write_mask(mask, image.target.with_name(mask_file(image.target.name)))
-
-
-def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
-    """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
-
-    Raises `InputError` for a camera without a pinhole image (a full panorama) or with impossible
-    parameters.
-    """
-    import pycolmap  # slow to load, and not needed for pinhole images
-
-    from gsbench.scene.colmap import plain_camera
-
-    size = {"width": camera.width, "height": camera.height}
-    source = pycolmap.Camera(model=camera.name, params=list(camera.params), **size)
-    refusal = (
-        f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
-        "pinhole images: use another camera model"
-    )
-    if source.is_spherical():
-        raise InputError(refusal)
-    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image))
-    try:
-        flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(refusal) from error
-    return np.array(flat.to_array()), to_pinhole(plain_camera(pinhole))

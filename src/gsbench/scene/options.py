@@ -124,6 +124,14 @@ Backdrop = Literal["black", "white"]  # the colour under transparent pixels
 MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
 
+# Kinds of scenes, and the settings that only they read.
+READ_BY = {
+    ("colmap", "photos", "transforms"): ("images", "masks"),
+    ("colmap",): ("sparse",),
+    ("courtyard",): ("views", "width", "height", "seed"),
+}
+
+
 def folder_name(path: str | None) -> str:
     """The last part of ``path`` as the scene's name, or ``scene`` if it names no folder."""
     name = Path(path or "").expanduser().absolute().name
@@ -135,7 +143,8 @@ class SceneConfig:
     name: FolderName | None = MISSING  # null: the name of the folder `path`
     kind: Literal["colmap", "photos", "transforms", "courtyard"] = MISSING
     path: PathName | None = None  # folder of the capture
-    images: PathName | None = None  # image folder below path; null: images
+    # image folder below path; null: images, or what transforms.json names
+    images: PathName | None = None
     sparse: PathName | None = None  # model folder below path; null: sparse/0 or sparse
     transparent: Backdrop = "black"  # colour under transparent pixels
     # folder below path with a mask for each image, black where ignored; null: no masks
@@ -176,20 +185,28 @@ class SceneConfig:
                 f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos "
                 "(bare photographs), scene=colmap or scene=transforms"
             )
+        self._check_that_all_is_read()
         self.split_rule.check()
         if self.split == "sector" and self.kind == "photos":
             raise InputError(
                 "scene.split=sector needs the cameras, and these photographs came without: give a "
                 "COLMAP model (scene=colmap)"
             )
-        if self.kind == "courtyard" and self.masks is not None:
-            raise InputError(
-                "scene.masks: the courtyard's photographs are made here and have none: leave it out"
-            )
         if self.kind == "courtyard":
             check_final_size(
                 (self.width, self.height), self.downscale, self.max_size, "the courtyard"
             )
+
+    def _check_that_all_is_read(self) -> None:
+        """Raise InputError for a setting that the scene's kind would ignore."""
+        defaults = {one.name: one.default for one in fields(self)}
+        for kinds, keys in READ_BY.items():
+            for key in keys:
+                if self.kind not in kinds and getattr(self, key) != defaults[key]:
+                    raise InputError(
+                        f"scene.{key}={getattr(self, key)} is not read by scene.kind={self.kind}, "
+                        f"only by {' and '.join(kinds)}: leave it out (default: {defaults[key]})"
+                    )
 
     @property
     def split_rule(self) -> SplitRule:

@@ -21,6 +21,7 @@ from gsbench.scene.images import (
     find_masks,
     list_images,
     match_names,
+    same_folder,
 )
 from gsbench.scene.options import (
     EVERY_NTH,
@@ -30,6 +31,7 @@ from gsbench.scene.options import (
     TRAIN_LIST,
     SplitRule,
 )
+from gsbench.scene.side_files import photographs_among
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
 from gsbench.scene.types import Capture
@@ -71,15 +73,26 @@ def read_colmap(
         why = f"is read because it has the most images ({', '.join(others)})"
         chosen = model_folder.relative_to(root)
         log.warning("%s has %s; %s %s; scene.sparse chooses another", root, found, chosen, why)
-    folder = _subfolder(root, images or "images", "scene.images")
+    folder = require_subfolder(root, images or "images", "scene.images")
     model = read_model(model_folder)
     wanted = registered_names(model)
     mask_folder, files = _masks_and_images(root, folder, masks)
     matches = match_names(wanted, files)
+    if not matches:
+        photographs = photographs_among(folder, files)
+        matches = match_names(wanted, photographs, other_folders=True)
     if missing := [image for image in wanted if image not in matches]:
         share = f"{len(missing)} of {len(wanted)} images of the model"
         log.warning("%s: %s have no file: %s", folder, share, some_of(missing))
-    _require_enough(len(matches), folder, f"that the model {model_folder} has a pose for")
+    _require_enough(
+        len(matches),
+        folder,
+        f"that the model {model_folder} has a pose for (it names {some_of(wanted)})",
+        "set scene.images to the folder of the model's photographs",
+    )
+    if moved := [image for image, file in matches.items() if not same_folder(image, file)]:
+        pairs = some_of([f"{image} ({matches[image]})" for image in moved])
+        log.warning("%s: files found by the last part of their path: %s", folder, pairs)
     model_names = {file: image for image, file in matches.items()}
     capture = _make_capture(
         name,
@@ -120,7 +133,13 @@ def read_transforms(
 
     root = existing_folder(name, path)
     names = list(transforms.images)
-    _require_enough(len(names), root, "that its transforms.json names are")
+    lacking = f", while {some_of(transforms.missing)} have no file" if transforms.missing else ""
+    _require_enough(
+        len(names),
+        root,
+        f"with a file and a camera in {transforms.files[0].name}{lacking}",
+        transforms.remedy,
+    )
     if transforms.has_mask_paths and masks is None:
         raise InputError(
             f"{transforms.files[0]}: mask_path is not read: give the folder of the masks as "
@@ -135,7 +154,7 @@ def read_transforms(
         root=root,
         max_images=max_images,
         split=split,
-        mask_folder=None if masks is None else _subfolder(root, masks, "scene.masks"),
+        mask_folder=None if masks is None else require_subfolder(root, masks, "scene.masks"),
         model=model,
         cameras=lambda chosen: reference_cameras(read_model(model), chosen),
         own_split=transforms.split,
@@ -156,17 +175,19 @@ def read_photos(
 ) -> Capture:
     """Read bare photographs: all in ``path/<images>``, else ``path/images``, else ``path``.
 
-    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``. A COLMAP
-    model beside the photographs is ignored.
+    Sub-folders are read too, except ``masks``, the folder of the masks below ``path``, and files
+    that are no photographs by their names (`photographs_among`). A COLMAP model beside the
+    photographs is ignored.
 
     Raises `InputError` if the folder is missing or holds fewer than three images.
     """
     root = existing_folder(name, path)
     if images is not None:
-        folder = _subfolder(root, images, "scene.images")
+        folder = require_subfolder(root, images, "scene.images")
     else:
         folder = root / "images" if (root / "images").is_dir() else root
     mask_folder, names = _masks_and_images(root, folder, masks)
+    names = photographs_among(folder, names)
     formats = ", ".join(sorted(suffix[1:] for suffix in IMAGE_SUFFIXES))
     _require_enough(len(names), folder, f"({formats})")
     return _make_capture(
@@ -184,7 +205,7 @@ def _masks_and_images(root: Path, folder: Path, masks: str | None) -> tuple[Path
     """The folder of the masks, if any, and the images in ``folder`` outside it."""
     if masks is None:
         return None, list_images(folder)
-    mask_folder = _subfolder(root, masks, "scene.masks")
+    mask_folder = require_subfolder(root, masks, "scene.masks")
     resolved = mask_folder.resolve()
     if resolved == folder.resolve():
         raise InputError(
@@ -329,7 +350,8 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
 
 
-def _subfolder(root: Path, folder: str, key: str) -> Path:
+def require_subfolder(root: Path, folder: str, key: str) -> Path:
+    """The folder below ``root`` that the setting ``key`` names; raises `InputError` without it."""
     path = root / folder
     if not path.is_dir():
         existing = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
@@ -376,8 +398,9 @@ def _is_model(folder: Path) -> bool:
         return False
 
 
-def _require_enough(count: int, folder: Path, which: str) -> None:
+def _require_enough(count: int, folder: Path, which: str, remedy: str = "") -> None:
     if count < MIN_IMAGES:
         raise InputError(
             f"{folder}: {counted(count, 'image')} {which}, but at least {MIN_IMAGES} are needed"
+            + (f": {remedy}" if remedy else "")
         )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -33,7 +34,7 @@ from gsbench.parsing import (
     resolved,
     without_byte_order_mark,
 )
-from gsbench.scene.images import IMAGE_SUFFIXES, image_size, list_images, match_names
+from gsbench.scene.images import IMAGE_SUFFIXES, image_size, list_images, match_names, stem_of
 from gsbench.scene.options import Backdrop
 from gsbench.scene.transforms_keys import check_keys
 from gsbench.scene.types import Array, CameraModel
@@ -115,7 +116,8 @@ class Transforms:
 
     ``split`` are the names for training and for testing, or None if one file holds all images.
     ``points`` is a PLY file; ``applied_to_points.undo`` converts its coordinates to those of the
-    cameras. ``has_mask_paths`` says that at least one image names a mask.
+    cameras. ``has_mask_paths`` says that at least one image names a mask. ``missing`` are the
+    images without a file, and ``remedy`` says where files with such names lie.
     """
 
     files: tuple[Path, ...]
@@ -124,6 +126,8 @@ class Transforms:
     points: Path | None
     applied_to_points: AppliedTransform
     has_mask_paths: bool
+    missing: tuple[str, ...] = ()
+    remedy: str = ""
 
     @property
     def sources(self) -> tuple[Path, ...]:
@@ -174,17 +178,22 @@ def find_files(folder: Path) -> dict[str, Path]:
     return files
 
 
-def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
+def read_transforms(
+    folder: Path, backdrop: Backdrop = "black", image_folder: str | None = None
+) -> Transforms:
     """Read the cameras in ``folder``; raises InputError for a file that cannot be understood.
 
-    ``backdrop`` is the colour under transparent pixels.
+    ``backdrop`` is the colour under transparent pixels. ``image_folder`` replaces the folder that
+    the files name, as nerfstudio replaces ``images`` by ``images_4``: ``images_4/a.png`` is read
+    for ``images/a.png``.
     """
     files = find_files(folder)
     records = {split: _read_record(path, backdrop) for split, path in files.items()}
-    find = _FileFinder(folder)
+    find = _FileFinder(folder, image_folder)
     images: dict[str, PosedCamera] = {}
     names: dict[str, list[str]] = {split: [] for split in files}
     points, applied_to_points = None, AppliedTransform()
+    all_missing: list[str] = []
     for split, record in records.items():
         path, missing = files[split], []
         applied = _applied_transform(path, record)
@@ -200,6 +209,7 @@ def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
         if missing:
             share = f"{len(missing)} of {len(record.frames)}"
             log.warning("%s: %s images have no file: %s", path, share, some_of(missing))
+            all_missing += missing
         if record.ply_file_path is not None:
             named = folder / _relative_path(path, record.ply_file_path)
             if points not in (None, named):
@@ -213,7 +223,7 @@ def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
             points, applied_to_points = named, applied
             if not points.is_file():
                 raise InputError(f"{path} names {record.ply_file_path}, which is not there")
-    own_lists = _named_split(files[""], records[""], images) if "" in files else None
+    own_lists = _named_split(files[""], records[""], images, find) if "" in files else None
     held_out = next((sorted(names[split]) for split in ("test", "val") if split in files), None)
     return Transforms(
         tuple(files.values()),
@@ -222,6 +232,8 @@ def read_transforms(folder: Path, backdrop: Backdrop = "black") -> Transforms:
         points,
         applied_to_points,
         any(frame.mask_path for record in records.values() for frame in record.frames),
+        tuple(all_missing),
+        find.remedy(all_missing),
     )
 
 
@@ -256,16 +268,23 @@ def names_of(kind: type[Record]) -> frozenset[str]:
 class _FileFinder:
     """Finds the image that ``file_path`` names, as for COLMAP models (`match_names`)."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, image_folder: str | None = None) -> None:
+        self.folder, self.image_folder = folder, image_folder
 
     @cached_property
     def _files(self) -> list[str]:
         return list_images(self.folder)
 
+    def place(self, path: Path, written: str) -> PurePosixPath:
+        """The path of an image as the file writes it, or in the folder that is read instead."""
+        relative = _relative_path(path, written)
+        if self.image_folder is None:
+            return relative
+        return PurePosixPath(self.image_folder, *(relative.parts[1:] or relative.parts))
+
     def __call__(self, path: Path, written: str) -> str | None:
         """The name below the folder, or None if no file fits. Blender writes no extension."""
-        relative = _relative_path(path, written)
+        relative = self.place(path, written)
         if relative.suffix.lower() in IMAGE_SUFFIXES and (self.folder / relative).is_file():
             return relative.as_posix()
         try:
@@ -273,9 +292,22 @@ class _FileFinder:
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
+    def remedy(self, missing: Collection[str]) -> str:
+        """What to set if one folder has files with the last parts of the ``missing`` names."""
+        wanted = {stem_of(PurePosixPath(name).name).casefold() for name in missing}
+        folders = Counter(
+            file.rpartition("/")[0]
+            for file in (self._files if wanted else ())
+            if stem_of(PurePosixPath(file).name).casefold() in wanted
+        )
+        if not folders:
+            return ""
+        folder, count = folders.most_common(1)[0]
+        return f"{folder or '.'} has {count} of the names: set scene.images={folder or '.'}"
+
 
 def _named_split(
-    path: Path, record: TransformsRecord, images: Collection[str]
+    path: Path, record: TransformsRecord, images: Collection[str], find: _FileFinder
 ) -> tuple[list[str], list[str]] | None:
     """nerfstudio's lists: names to train on, and to test on or, without these, to validate on."""
     train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
@@ -285,7 +317,7 @@ def _named_split(
     written = {"train": train or [], "held-out": held_out}
     chosen = {}
     for which, listed in written.items():
-        wanted = [_relative_path(path, name).as_posix() for name in listed]
+        wanted = [find.place(path, name).as_posix() for name in listed]
         matches = match_names(wanted, images)
         if missing := [name for name in wanted if name not in matches]:
             raise InputError(

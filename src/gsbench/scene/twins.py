@@ -16,7 +16,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
-from gsbench.scene.images import resize_mask, same_up_to_rounding, stem_of
+from gsbench.scene.images import resize_mask, stem_of
 from gsbench.scene.types import Scene, Twins, View
 from gsbench.words import counted, some_of
 
@@ -27,12 +27,12 @@ log = logging.getLogger(__name__)
 FORMATS = (".jpg", ".png", ".tif", ".webp", ".bmp")
 SAME_FORMAT = {".jpeg": ".jpg", ".tiff": ".tif"}
 
-# Near twins are compared as grey pictures with a longest side of 32 px. In 16 captures, a second
-# shot that is moved by half a percent of its width correlates by at least .978 with the first, and
-# one that is encoded again by over .99. Between neighbours of ordinary captures the median is .25
-# to .92.
-GRID = 32  # px
-NEAR = 0.975  # correlation
+# Near twins are compared as grey pictures of 24 x 24 cells, whatever their sizes and shapes,
+# because a copy may be shrunk, rounded or cut. In 16 captures, a second shot that is moved by half
+# a percent of its width correlates by at least .983 with the first, and one that is encoded again
+# by over .99. Between neighbours of ordinary captures the median is .09 to .98.
+GRID = 24  # cells per side
+NEAR = 0.978  # correlation
 LEAST_CELLS = 64  # cells that count in both small pictures; fewer are too few to compare
 LEAST_DEVIATION = 1.0  # of 255 grey values; a small picture that varies less has no content
 
@@ -138,28 +138,23 @@ def without_copies(scene: Scene) -> Scene:
     return replace(scene, train=train, twins=Twins(left_out=equal, near=near))
 
 
-# grey, counted cells, size of the view
-SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_], tuple[int, int]]
+SmallPicture = tuple[NDArray[np.float64], NDArray[np.bool_]]  # grey values and counted cells
 
 
 def small_picture(view: View) -> SmallPicture:
-    """The view as a small grey picture, the cells that count, and its own (width, height) in px."""
-    height, width = view.image.shape[:2]
-    scale = GRID / max(width, height)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    """The view as a small grey picture [GRID, GRID], and the cells that count."""
+    size = (GRID, GRID)
     grey = Image.fromarray(view.image).convert("L").resize(size, Image.Resampling.BOX)
-    counts = np.ones(size[::-1], bool) if view.mask is None else resize_mask(view.mask, *size)
-    return np.asarray(grey, dtype=np.float64), counts, (width, height)
+    counts = np.ones(size, bool) if view.mask is None else resize_mask(view.mask, *size)
+    return np.asarray(grey, dtype=np.float64), counts
 
 
 def likeness(one: SmallPicture, other: SmallPicture) -> float:
     """The correlation of two small pictures over the cells that count in both.
 
-    It is -1 if their shapes differ, and NaN if there is too little to compare. A correlation
-    ignores brightness and contrast, which a camera's exposure changes between two shots.
+    It is NaN if there is too little to compare. A correlation ignores brightness and contrast,
+    which a camera's exposure changes between two shots.
     """
-    if one[0].shape != other[0].shape or not same_up_to_rounding(one[2], other[2]):
-        return -1.0
     both = one[1] & other[1]
     if both.sum() < LEAST_CELLS:
         return float("nan")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,18 @@ from PIL import Image
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import features, geometry, matches
+from gsbench.init.colmap_initializer import report_lenses
 from gsbench.logs import Progress
+from gsbench.scene.exif import (
+    DIGITAL_ZOOM,
+    EXIF_IFD,
+    FOCAL_LENGTH,
+    FOCAL_LENGTH_35MM,
+    LENS,
+    MAKE,
+    MODEL,
+)
+from gsbench.scene.types import Capture
 
 SIZES = {
     "a.png": (40, 30),
@@ -46,6 +58,7 @@ def database(images: Path, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("sharing", "expected"),
     [
+        ("exif", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
         ("single", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
         ("per_folder", [{"a.png", "b.png"}, {"c.png"}, {"left/a.png", "left/b.png"}]),
         ("per_image", [{name} for name in SIZES]),
@@ -63,6 +76,65 @@ def test_images_share_a_camera_by_size_folder_or_not_at_all(
     assert all(
         (camera.focal_length, camera.has_prior_focal_length) == (51.0, True) for camera, _ in known
     )
+
+
+def with_exif(path: Path, size: tuple[int, int] = (40, 30), **tags: object) -> None:
+    """Write a photograph with EXIF data."""
+    exif = Image.Exif()
+    own = exif.get_ifd(EXIF_IFD)
+    ids = {"make": MAKE, "model": MODEL}
+    own_ids = {"mm": FOCAL_LENGTH, "film": FOCAL_LENGTH_35MM, "zoom": DIGITAL_ZOOM, "lens": LENS}
+    for name, value in tags.items():
+        if name in ids:
+            exif[ids[name]] = value
+        else:
+            own[own_ids[name]] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize(
+    ("change", "cameras"),
+    [
+        ({}, 1),
+        ({"mm": 6.8004}, 1),  # as written by another program
+        ({"film": 52}, 2),  # digital zoom of one lens
+        ({"zoom": 2.0}, 2),
+        ({"mm": 9.0, "film": 77}, 2),
+        ({"lens": "telephoto"}, 2),
+        ({"model": "X 8"}, 2),
+        ({"size": (30, 40)}, 2),
+        ({"film": 0, "mm": 0.0}, 2),  # unknown
+    ],
+)
+def test_photographs_share_a_camera_by_their_exif_data(
+    tmp_path: Path, suffix: str, change: dict[str, object], cameras: int
+) -> None:
+    names = [f"{k}{suffix}" for k in range(6)]
+    for k, name in enumerate(names):
+        with_exif(tmp_path / "images" / name, **TELEPHONE | (change if k % 3 == 2 else {}))
+    images = made.readable_images(tmp_path / "images", names, tmp_path / "work")
+    groups = made.unknown_camera_groups(images, names, "exif", "SIMPLE_RADIAL", None)
+    assert [len(group) for _, group in groups] == ([6] if cameras == 1 else [4, 2])
+    assert groups[0][0].has_prior_focal_length
+    single = made.unknown_camera_groups(images, names, "single", "SIMPLE_RADIAL", None)
+    assert len(single) == (2 if "size" in change else 1)
+
+
+def test_a_line_names_the_lenses_of_the_photographs(tmp_path: Path, caplog) -> None:
+    names = tuple(f"{k}.jpg" for k in range(5))
+    for k, name in enumerate(names):
+        with_exif(tmp_path / name, **TELEPHONE | ({"film": 52} if k == 0 else {}))
+    capture = Capture("a", tmp_path, names, (), None, False, "")
+    report_lenses(capture)
+    assert "X 7 26 mm (on 35 mm film): 4, X 7 52 mm (on 35 mm film): 1" in caplog.text
+    caplog.clear()
+    report_lenses(replace(capture, image_names=names[1:]))
+    assert not caplog.records
 
 
 def test_ids_follow_the_names_and_each_camera_has_a_rig(database: Path) -> None:

@@ -1,7 +1,7 @@
 """COLMAP's database: creating it, and adding keypoints and matches of any extractor."""
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from PIL import Image
 
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
-from gsbench.scene.images import image_size, read_image
+from gsbench.scene.exif import lens_of
+from gsbench.scene.images import image_size, open_image, read_image, write_png
 from gsbench.scene.types import Capture
 
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -76,7 +76,9 @@ def readable_images(images: Path, names: Sequence[str], work_dir: Path) -> Path:
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if name in unreadable:
-            Image.fromarray(read_image(images / name)).save(target, format="PNG")
+            with open_image(images / name) as original:
+                exif = original.info.get("exif", b"")
+            write_png(read_image(images / name), target, exif)
         else:
             target.symlink_to((images / name).resolve())
     return folder
@@ -113,21 +115,29 @@ def reference_camera_groups(
     return result
 
 
+# Property that photographs of one size must have in common to share a camera.
+SHARED_BY: dict[str, Callable[[Path, str], object]] = {
+    "exif": lambda images, name: lens_of(images / name),
+    "single": lambda images, name: None,
+    "per_folder": lambda images, name: Path(name).parent,
+    "per_image": lambda images, name: name,
+}
+
+
 def unknown_camera_groups(
     images: Path, names: Sequence[str], sharing: str, model: str, focal_length: float | None
 ) -> list[tuple[pycolmap.Camera, list[str]]]:
     """Cameras to be estimated, each with the names of its images.
 
-    ``sharing`` is ``single`` for one camera for all images of a size, ``per_folder`` for one for
-    each size in each sub-folder, or ``per_image``. The initial focal length in px is
+    ``sharing`` is ``exif`` for one camera for all images of a size with the same lens and zoom
+    (`lens_of`), ``single`` for one for all images of a size, ``per_folder`` for one for each size
+    in each sub-folder, or ``per_image``. The initial focal length in px is
     ``focal_length``, else from the EXIF data of the group's first image, else 1.2 x the longest
     side (COLMAP's default).
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
-        size = image_size(images / name)
-        folder = str(Path(name).parent)
-        key = {"single": size, "per_folder": (folder, *size), "per_image": (name,)}[sharing]
+        key = (SHARED_BY[sharing](images, name), image_size(images / name))
         groups.setdefault(key, []).append(name)
     options = pycolmap.ImageReaderOptions()
     options.camera_model = model

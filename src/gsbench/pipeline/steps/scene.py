@@ -15,7 +15,8 @@ from PIL import Image
 
 from gsbench.files import file_sha256
 from gsbench.init.base import MODEL_FOLDER, Initializer
-from gsbench.init.placed import GREY, read_points
+from gsbench.init.placed import GREY
+from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, progress
 from gsbench.normalization import IDENTITY
 from gsbench.runs.keys import (
@@ -54,6 +55,7 @@ from gsbench.scene.readers import (
     read_colmap,
     read_photos,
     read_transforms,
+    require_subfolder,
 )
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
@@ -106,7 +108,10 @@ class CaptureSource:
     @cached_property
     def _transforms(self) -> Transforms:
         folder = existing_folder(self.name, str(self.options.path))
-        return read_transforms_files(folder, self.options.transparent)
+        images = self.options.images
+        if images is not None:
+            require_subfolder(folder, images, "scene.images")
+        return read_transforms_files(folder, self.options.transparent, images)
 
 
 def _courtyard_step(options: SceneConfig) -> Step:

@@ -1,0 +1,73 @@
+"""Columns that other programs add to 3DGS's PLY, and what they mean for a render."""
+
+import logging
+import re
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+
+log = logging.getLogger(__name__)
+
+FILTER = "filter_3D"
+# Names of columns, and why a model with them is no set of 3D Gaussians that stand still.
+REFUSED = {
+    r"beta|sb_params_\d+": "Beta Splatting's kernels are no Gaussians",
+    r"nu_degree|nu": "kernels of Student Splatting are no Gaussians",
+    r"shapes?(_\d+)?": "generalised exponentials (GES) are no Gaussians",
+    r"t|scale_t|rot_r_\d|trbf_\w+|motion_\d+|omega_\d+": "its Gaussians move with time",
+}
+# Found so in exports, and without effect on a render of f_dc and f_rest.
+HARMLESS = re.compile("red|green|blue")
+
+
+def check_columns(names: Collection[str], known: Collection[str], path: Path) -> None:
+    """Raise InputError for a column that changes what is drawn; log those that are not known."""
+    unknown = [
+        name for name in names if name not in {*known, FILTER} and not HARMLESS.fullmatch(name)
+    ]
+    for name in unknown:
+        if reason := next((REFUSED[key] for key in REFUSED if re.fullmatch(key, name)), None):
+            raise InputError(
+                f"{path}: it has the column {name}: {reason}, and gsbench draws Gaussians alone"
+            )
+    if unknown:
+        noun, verb = ("column", "is") if len(unknown) == 1 else ("columns", "are")
+        listed = ", ".join(unknown)
+        log.warning("%s: the %s %s %s not known and not used", path, noun, listed, verb)
+
+
+def with_filter_applied(vertices: NDArray[Any], path: Path, largest_logit: float) -> NDArray[Any]:
+    """Apply Mip-Splatting's 3D filter, if there is one: to scales and opacities, with a log line.
+
+    As its ``create_fused_ply.py``: each scale s becomes sqrt(s² + f²), and the opacity is
+    multiplied by the ratio of the volumes before and after (Yu et al. 2024, equation 7). Logits
+    are limited to ``largest_logit``.
+    """
+    if FILTER not in (vertices.dtype.names or ()):
+        return vertices
+    sizes = vertices[FILTER].astype(np.float64)  # [N]
+    if not (np.isfinite(sizes) & (sizes >= 0)).all():
+        raise InputError(f"{path}: {FILTER} is negative or not a finite number: export it again")
+    log.warning("%s: Mip-Splatting's %s is applied to scales and opacities", path, FILTER)
+    names = [f"scale_{axis}" for axis in range(3)]
+    logs = np.stack([vertices[name] for name in names]).astype(np.float64)  # [3, N]
+    with np.errstate(divide="ignore"):
+        fused = 0.5 * np.logaddexp(2 * logs, 2 * np.log(sizes))  # log sqrt(s² + f²)
+    logits = vertices["opacity"].astype(np.float64)
+    # log of the new opacity, then its logit: log p - log(1 - p)
+    log_opacity = -np.logaddexp(0.0, -logits) + (logs - fused).sum(axis=0)
+    with np.errstate(divide="ignore"):
+        new_logits = log_opacity - np.log(-np.expm1(np.minimum(log_opacity, 0.0)))
+    kinds = [(name, vertices.dtype[name]) for name in vertices.dtype.names or ()]
+    changed = vertices.astype(
+        [(name, "f8" if name in (*names, "opacity") else kind) for name, kind in kinds]
+    )
+    for name, values in zip(names, fused, strict=True):
+        changed[name] = values
+    changed["opacity"] = new_logits.clip(-largest_logit, largest_logit)
+    return changed

@@ -1,0 +1,110 @@
+"""Undistorting photographs with COLMAP, and refusing lenses for which that is not possible."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+from gsbench.scene.types import Camera, CameraModel, to_pinhole
+from gsbench.system.isolate import CrashError, run_isolated
+from gsbench.words import some_of
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+# A larger share of folded pixels is refused, a smaller one is reported: fitted lenses of correct
+# models may turn back in the outermost corners, which hardly change a result.
+MAX_FOLDED = 0.01
+
+
+def check_lenses(cameras: Mapping[str, CameraModel]) -> None:
+    """Check that the lens of each distorted image maps one to one (`folded_share`).
+
+    Raises `InputError` for a lens with a larger share of folded pixels than `MAX_FOLDED`; reports
+    a smaller one.
+    """
+    names: dict[CameraModel, list[str]] = {}
+    for name, camera in cameras.items():
+        names.setdefault(camera, []).append(name)
+    if not names:
+        return
+    try:
+        shares = run_isolated(folded_shares, list(names), what="undistortion")
+    except CrashError as error:
+        raise InputError(f"{error}: check the cameras of {some_of(list(cameras))}") from error
+    for (camera, users), share in zip(names.items(), shares, strict=True):
+        if share == 0:
+            continue
+        parameters = ", ".join(f"{value:g}" for value in camera.params)
+        message = (
+            f"the camera of {some_of(users)} ({camera.name}: {parameters}) turns back inside the "
+            f"picture: {max(share, 0.001):.1%} of the undistorted photograph would be a mirrored "
+            "ghost"
+        )
+        if share > MAX_FOLDED:
+            raise InputError(
+                f"{message}: correct its distortion, estimate another model "
+                "(scene=photos init.camera_model=RADIAL), or give undistorted photographs"
+            )
+        log.warning("%s", message)
+
+
+def folded_shares(cameras: Sequence[CameraModel]) -> list[float]:
+    """`folded_share` of each camera; COLMAP's native code can abort, so run it isolated."""
+    import pycolmap
+
+    from gsbench.scene.distortion import folded_share
+
+    shares = []
+    for camera in cameras:
+        source = _colmap_camera(camera)
+        try:
+            pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(_no_pinhole(camera)) from error
+        shares.append(folded_share(source, pinhole))
+    return shares
+
+
+def _colmap_camera(camera: CameraModel) -> pycolmap.Camera:
+    """The camera as COLMAP's; raises `InputError` for a full panorama."""
+    import pycolmap  # slow to load, and not needed for pinhole images
+
+    size = {"width": camera.width, "height": camera.height}
+    source = pycolmap.Camera(model=camera.name, params=list(camera.params), **size)
+    if source.is_spherical():
+        raise InputError(_no_pinhole(camera))
+    return source
+
+
+def _no_pinhole(camera: CameraModel) -> str:
+    return (
+        f"images of the camera model {camera.name} with parameters {camera.params} cannot be made "
+        "pinhole images: use another camera model"
+    )
+
+
+def undistort(image: NDArray[np.uint8], camera: CameraModel) -> tuple[NDArray[np.uint8], Camera]:
+    """Undistort one image [H, W, 3] of any perspective COLMAP camera model; its size changes.
+
+    Raises `InputError` for a camera without a pinhole image (a full panorama) or with impossible
+    parameters.
+    """
+    import pycolmap
+
+    from gsbench.scene.colmap import plain_camera
+
+    source = _colmap_camera(camera)
+    bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(image))
+    try:
+        flat, pinhole = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, source)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(_no_pinhole(camera)) from error
+    return np.array(flat.to_array()), to_pinhole(plain_camera(pinhole))

@@ -1,0 +1,102 @@
+"""Files beside photographs: masks, thumbnails, smaller copies and other results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gsbench.errors import InputError
+from gsbench.scene.readers import read_photos
+from tests.scene.conftest import smooth_image
+
+COUNT = 5
+
+
+def photographs(folder: Path, pattern: str = "{}.jpg", scale: int = 1, seed: int = 0) -> Path:
+    for k in range(COUNT):
+        file = folder / pattern.format(k)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(smooth_image(80 // scale, 64 // scale, seed + k)).save(file)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("pattern", "scale", "named"),
+    [
+        ("masks/{}.jpg.png", 1, "masks/ (5)"),
+        ("Mask/{}.png", 1, "Mask/ (5)"),
+        ("image_masks_v2/{}.png", 1, "image_masks_v2/"),
+        ("maskImages/{}.png", 1, "maskImages/"),
+        ("@eaDir/{}.jpg/SYNOPHOTO_THUMB_M.jpg", 4, "@eaDir/ (5)"),
+        ("#recycle/old/{}.jpg", 1, "#recycle/"),
+        ("__MACOSX/{}.jpg", 1, "__MACOSX/"),
+        ("previews/{}.webp", 2, "previews/"),
+        ("depth/{}.png", 1, "depth/"),
+        ("depthMaps/cam/{}.png", 1, "depthMaps/"),
+        ("normals/{}.png", 1, "normals/"),
+        ("a/thumbs/{}.jpg", 4, "a/thumbs/"),
+        ("runs/store/scene/x/{}.png", 1, "runs/"),
+        ("{}_mask.png", 1, "…mask.png (5)"),
+        ("{}.jpg.png", 1, "….*.png (5)"),
+        ("depth_{}.png", 1, "…depth.png"),
+        ("SYNOPHOTO_THUMB_{}.jpg", 4, "SYNO….jpg"),
+        (".thumbnails/{}.jpg", 4, ""),
+    ],
+)
+def test_other_files_beside_photographs_change_no_capture(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, pattern: str, scale: int, named: str
+) -> None:
+    alone = read_photos("a", photographs(tmp_path / "alone"))
+    caplog.clear()
+    beside = read_photos("a", photographs(photographs(tmp_path / "beside"), pattern, scale))
+    assert (beside.image_names, beside.fingerprint) == (alone.image_names, alone.fingerprint)
+    assert named in caplog.text
+    assert len(caplog.records) == bool(named)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "kept"),
+    [
+        ({"images_2/{}.jpg": 2, "images_4/{}.jpg": 4}, "images_2/{}.jpg"),
+        ({"images_8/{}.png": 4, "images_4/{}.jpg": 2}, "images_4/{}.jpg"),
+        ({"rgb/{}.jpg": 1, "rgb_2/{}.jpg": 2, "rgb_4/{}.jpg": 4}, "rgb/{}.jpg"),
+        ({"a/photos/{}.jpg": 1, "a/photos-4/{}.jpg": 4}, "a/photos/{}.jpg"),
+    ],
+)
+def test_of_folders_of_several_sizes_the_largest_is_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, patterns: dict[str, int], kept: str
+) -> None:
+    for pattern, scale in patterns.items():
+        photographs(tmp_path, pattern, scale)
+    capture = read_photos("a", tmp_path)
+    assert capture.image_names == tuple(kept.format(k) for k in range(COUNT))
+    assert "smaller copies" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "patterns",
+    [
+        ["cam_2/{}.jpg", "cam_4/{}.jpg"],  # two cameras
+        ["unmasked/{}.jpg"],
+        ["left/{}.jpg", "right/{}.jpg"],
+        ["deep/{}.jpg", "abnormal/{}.jpg"],
+        ["mask_{}.jpg"],  # photographs of a mask: nothing has the rest of the name
+    ],
+)
+def test_photographs_in_folders_of_other_names_are_all_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, patterns: list[str]
+) -> None:
+    for number, pattern in enumerate(patterns):
+        photographs(tmp_path, pattern, seed=COUNT * number)
+    assert len(read_photos("a", tmp_path).image_names) == COUNT * len(patterns)
+    assert not caplog.records
+
+
+def test_a_folder_that_is_named_is_read_whatever_its_name(tmp_path: Path) -> None:
+    photographs(tmp_path, "thumbs/{}.jpg")
+    said = r"all 5 files are masks, thumbnails or the like: thumbs/ \(5\): scene.images=FOLDER"
+    with pytest.raises(InputError, match=said):
+        read_photos("a", tmp_path)
+    assert len(read_photos("a", tmp_path, images="thumbs").image_names) == COUNT
