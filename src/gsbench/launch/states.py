@@ -106,7 +106,10 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
     if state == "damaged":
         return TrialState(
-            folder, state, _changed(folder / RESULTS), TrialFolder(folder).why_not_done({})
+            folder,
+            state,
+            _changed(folder / RESULTS),
+            TrialFolder(folder).change() or TrialFolder(folder).why_not_done({}),
         )
     submission = read_submission(folder)
     lost = ""
