@@ -24,6 +24,7 @@ from gsbench.analysis.tables import build_table, compared_pairs
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
+from gsbench.files import own_output, write_text
 from gsbench.runs.experiments import latest_declaration, read_declarations
 
 INDEX, REPORTS = "index.html", "reports"
@@ -46,7 +47,8 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
         except InputError as error:
             left_out.append(str(error))
             continue
-        (out / REPORTS / f"{key}.html").write_text(report, encoding="utf-8")
+        with own_output(file := out / REPORTS / f"{key}.html"):
+            write_text(file, report)
         sections.append(section)
     if not sections:
         raise InputError(f"no archive can be shown ({left_out[0]})")
@@ -58,7 +60,8 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
         "script": script,
     }
     page = fill("site.html.j2", "gsbench.claims", **values)
-    (out / INDEX).write_text(page, encoding="utf-8")
+    with own_output(out / INDEX):
+        write_text(out / INDEX, page)
     return left_out
 
 
