@@ -84,6 +84,28 @@ def writable_output(out: Path) -> Iterator[None]:
         ) from error
 
 
+OUTPUTS = ".gsbench-outputs"  # in a folder of the user's: the sha256 of what gsbench wrote there
+
+
+@contextmanager
+def own_output(file: Path) -> Iterator[None]:
+    """`writable_output` for a file whose name gsbench chose, as in a folder that the user named.
+
+    Raises InputError if there is such a file that gsbench did not write, or that was edited since.
+    """
+    record = file.parent / OUTPUTS
+    known = record.read_text().split() if record.is_file() and not record.is_symlink() else []
+    if file.exists() and (not file.is_file() or file_sha256(file) not in known):
+        raise InputError(
+            f"{file} is there already, and is not as gsbench wrote it: move it, or give another "
+            "--out"
+        )
+    with writable_output(file):
+        yield
+        if (written := file_sha256(file)) not in known:
+            write_text(record, "\n".join([*known, written]) + "\n")
+
+
 def link_or_copy(source: Path, target: Path) -> None:
     """Make ``target`` a hard link to ``source``, or a copy where hard links do not work.
 

@@ -178,7 +178,7 @@ def test_names_of_experiments_become_plain_names_of_files(tmp_path, name):
     one, other = archive(tmp_path, Plan(experiment=name)), tmp_path / "again.zip"
     other.write_bytes(one.read_bytes())
     site(tmp_path, one, other)
-    reports = sorted(path.name for path in (tmp_path / "site" / "reports").iterdir())
+    reports = sorted(path.name for path in (tmp_path / "site" / "reports").glob("*.html"))
     assert len(reports) == 2
     assert all(re.fullmatch(r"[a-z0-9_-]+\.html", report) for report in reports)
 

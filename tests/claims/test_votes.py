@@ -5,7 +5,7 @@ import json
 import random
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ def prefers(arm: str) -> Chooser:
 
 def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: str = "") -> Ballot:
     votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)
-    finished = f"2026-11-27T00:{minute:02}:00Z"
+    finished = f"2099-11-27T00:{minute:02}:00Z"
     return Ballot(
         round=key.round, person=f"{person:016x}", finished=finished, votes=votes, name=name
     )
@@ -304,17 +304,120 @@ def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, re
     )
 
 
+OTHER_KEYS: dict[str, Callable[[RoundKey], dict[str, Any]]] = {
+    "salt": lambda key: {"salt": "other"},
+    "time": lambda key: {"time": "2026-01-01T00:00:00Z"},
+    "arms": lambda key: {"arms": key.arms[::-1]},
+    "people": lambda key: {"people": 1},
+    "traps_allowed": lambda key: {"traps_allowed": 4},
+    "showings": lambda key: {"showings": key.showings[::-1]},
+}
+OTHER_SHOWINGS = {
+    "id": "x",
+    "kind": "again",
+    "scene": "x",
+    "view": "x",
+    "seed": 7,
+    "left": "x",
+    "right": "x",
+    "chosen": "",
+    "of": "x",
+}
+
+
+def test_every_field_of_the_key_is_sealed_by_the_rounds_name():
+    key = made_up(["sfm-a", "sfm-b"], scenes=2, views=2)
+    key = replace(key, showings=(replace(key.showings[0], chosen="random"), *key.showings[1:]))
+    assert OTHER_KEYS.keys() == {field.name for field in fields(RoundKey)}
+    assert OTHER_SHOWINGS.keys() == {field.name for field in fields(Showing)}
+    for name, change in OTHER_KEYS.items():
+        assert replace(key, **change(key)).round != key.round, name
+    for name, value in OTHER_SHOWINGS.items():
+        edited: Any = replace(key.showings[0], **{name: value})
+        assert replace(key, showings=(edited, *key.showings[1:])).round != key.round, name
+
+
 def test_a_changed_key_is_refused(made, runs, tmp_path, refused):
     key = made()
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
-    first = key.showings[0]
-    swapped = [replace(first, left=first.right, right=first.left), *key.showings[1:]]
-    file.write_text(json.dumps(replace(key, showings=tuple(swapped)).to_json()))
+    file.write_text(json.dumps(replace(key, traps_allowed=4).to_json()))
     assert "was changed after the page was made" in refused(
         "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))
     )
     file.write_text(text)
+
+
+def test_late_files_never_take_the_place_of_counted_ones(made, runs, tmp_path, refused, capsys):
+    key = made("--people", "6")
+    for first in range(0, 12, 6):  # the first six, then six more that finished earlier
+        arm = VOLUMETRIC if first == 0 else ADC
+        own = [ballot(key, first + n, prefers(arm), minute=50 - first - n) for n in range(6)]
+        assert run(["vote", "judge", "exp", *(saved(tmp_path, one) for one in own)]) == 0
+        assert "(72 for it, 0 against it" in capsys.readouterr().out
+    old = replace(ballot(key, 99, prefers(ADC)), finished="1970-01-01T00:00:00Z")
+    assert "before its round was made" in refused("vote", "judge", "exp", saved(tmp_path, old))
+
+
+def _copied(path: Path) -> None:
+    path.with_name(f"{7:016x}.json").write_text(path.read_text())
+
+
+def _edited(path: Path) -> None:
+    path.write_text(path.read_text().replace('"left"', '"right"'))
+
+
+def _without_votes(path: Path) -> None:
+    values = json.loads(path.read_text())
+    path.write_text(json.dumps(values | {"ballot": values["ballot"] | {"votes": []}}))
+
+
+@pytest.mark.parametrize(
+    ("change", "people", "said"),
+    [
+        (_copied, 2, "copy of another file"),
+        (_edited, 1, "was edited"),
+        (_without_votes, 1, "was edited"),
+        (Path.unlink, 1, "no longer as it was handed in"),
+        (lambda path: path.with_name("stray.json").write_text("{}"), 2, "stray.json"),
+        (lambda path: path.with_name("stray.json").write_text("\xff"), 2, "stray.json"),
+    ],
+)
+def test_a_change_of_stored_votes_costs_that_file_and_is_shown(
+    change, people, said, made, runs, tmp_path, capsys
+):
+    key = made("--people", "9")
+    files = [saved(tmp_path, ballot(key, n, prefers(VOLUMETRIC), minute=n)) for n in range(2)]
+    assert run(["vote", "judge", "exp", *files]) == 0
+    change(runs / "exp" / "votes" / key.round / f"{0:016x}.json")
+    capsys.readouterr()
+    assert run(["vote", "judge", "exp", files[1]]) == 0
+    out = capsys.readouterr().out
+    assert f"Round {key.round}: {12 * people} votes of {people} p" in out
+    assert re.search(f"Left out: .*{said}", out)
+    assert said in build_report(load_experiment(runs, "exp"))
+
+
+def test_a_stored_file_of_another_round_does_not_count(made, runs, tmp_path, capsys):
+    one, two = made("--people", "9"), made("--people", "9", out="two")
+    for key in (one, two):
+        assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))]) == 0
+    name = f"{1:016x}.json"
+    folders = [runs / "exp" / "votes" / key.round for key in (one, two)]
+    (folders[1] / name).write_text((folders[0] / name).read_text())
+    assert run(["vote", "judge", "exp"]) == 0
+    assert re.search(f"Left out: {name} .*of another round", capsys.readouterr().out)
+
+
+def test_a_name_cannot_write_lines_of_its_own(made, tmp_path, capsys):
+    key = made("--people", "9")
+    forged = "Ann\nRound 0: 99 votes\u2028x\u202e\x1b[2J"
+    blind = ballot(key, 1, lambda showing: "same", name=forged)
+    assert run(["vote", "judge", "exp", saved(tmp_path, blind)]) == 0
+    out = capsys.readouterr().out
+    assert "\nRound 0" not in out
+    assert {"\u2028", "\u202e", "\x1b"}.isdisjoint(out)
+    assert "Left out: Ann Round 0: 99 votes x[2J (000000) failed" in out
 
 
 def test_html_in_names_of_people_is_escaped(made, runs, tmp_path):
@@ -380,7 +483,7 @@ def test_votes_with_failed_traps_or_after_the_declared_people_are_left_out():
     assert not early.final
     assert early.left_out == {blind.label: "failed 4 of 4 traps, and 0 may fail"}
     late = [ballot(key, 20 + n, prefers("sfm-a"), minute=30 + n) for n in range(5)]
-    full = judge_round(key, [*late, *good, blind])
+    full = judge_round(key, [blind, *good, *late])
     assert full.final
     assert [one.person for one in full.counted] == [one.person for one in (*good, late[0])]
     assert all("came after the 6 people" in full.left_out[one.label] for one in late[1:])

@@ -332,7 +332,7 @@ def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     assert made_of is not None
     # the photographs of a scene that gsbench made are not looked at again
     assert set(made_of.entries) == {"init", "train", "ground_truth", "evaluate"}
-    assert set(made_of.published) == {"init_report.json"}
+    assert set(made_of.published) == {"config.yaml", "init_report.json"}
     label = one.files.label
     assert caplog.messages == [
         f"{label}: 3 training and 2 test views",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,9 @@ from gsbench.runs.ledger import (
     Opened,
     Started,
     append,
+    as_json,
     begin_ledger,
+    chained,
     read_ledger,
 )
 
@@ -111,8 +114,15 @@ def test_beginning_again_keeps_the_ledger(home: Path) -> None:
     assert len(begin_ledger(home, OPENED).entries) == 7
 
 
-@pytest.mark.parametrize("number", range(6))
-@pytest.mark.parametrize("change", ["edit", "drop", "swap", "repeat", "space"])
+LAST = 6
+CHANGES = ("edit", "drop", "swap", "repeat", "space")
+
+
+@pytest.mark.parametrize(
+    ("number", "change"),
+    [(number, change) for number in range(LAST) for change in CHANGES]
+    + [(LAST, change) for change in ("edit", "repeat", "space")],
+)
 def test_a_line_that_was_changed_is_found(home: Path, number: int, change: str) -> None:
     path = home / LEDGER
     lines = path.read_text().splitlines(keepends=True)
@@ -120,7 +130,7 @@ def test_a_line_that_was_changed_is_found(home: Path, number: int, change: str) 
     changes = {
         "edit": [line.replace(TIME, "2026-11-27T05:00:00Z")],
         "drop": [],
-        "swap": [lines[number + 1], line],
+        "swap": [*lines[number + 1 : number + 2], line],
         "repeat": [line, line],
         "space": [line.replace(": ", ":  ", 1)],
     }
@@ -146,3 +156,50 @@ def test_nothing_is_appended_if_there_is_no_entry(home: Path) -> None:
     before = (home / LEDGER).read_bytes()
     assert isinstance(append(home, lambda ledger: None), Ledger)
     assert (home / LEDGER).read_bytes() == before
+
+
+def test_a_lost_last_line_break_destroys_nothing(home: Path) -> None:
+    path = home / LEDGER
+    path.write_bytes(path.read_bytes().rstrip(b"\n"))
+    append(home, lambda ledger: started("c"))
+    assert list(read_ledger(home).entries) == [OPENED, *ENTRIES, started("c")]
+
+
+AFTER_ALL: dict[str, Entry] = {
+    "begins 'a' a second time": started("a"),
+    "compares with 'b', which was not kept": started("c", "b"),
+    "ends 'c', which was not begun": ended("c", KEPT),
+    "decides 'a' a second time": ended("a", FAILED),
+    "has other captures": replace(started("c"), keys={"park": "park/x/1"}),
+    "lacks the baseline": Confirming(time=TIME, seeds=(0, 1), keys={}),
+    "on none": Confirming(time=TIME, seeds=(0, 1), keys={"baseline": {}, "a": {}}),
+    "were not kept": Confirming(time=TIME, seeds=(0, 1), keys={"baseline": {}, "b": {}}),
+    "was not begun": Confirmed(time=TIME, number=1, results={}, differences={}),
+    "or was ended before": Confirmed(time=TIME, number=0, results={"a": KEPT}, differences={}),
+}
+
+
+@pytest.mark.parametrize("fault", AFTER_ALL)
+def test_an_entry_that_cannot_follow_is_refused(home: Path, fault: str) -> None:
+    entries = [*read_ledger(home).entries, AFTER_ALL[fault]]
+    (home / LEDGER).write_text(chained(map(as_json, entries)))
+    with pytest.raises(InputError, match=f"line 8 .*{fault}.*bring back"):
+        read_ledger(home)
+
+
+@pytest.mark.parametrize("place", ["ended", "confirmed"])
+def test_a_relative_difference_that_no_number_holds_is_refused(home: Path, place: str) -> None:
+    huge = Difference(mean=1e30, low=0.0, high=0.0)
+    entries = [replace(OPENED, relative=True), started("a"), replace(ended("a", KEPT), difference=huge)]
+    if place == "confirmed":
+        entries[2:] = [ended("a", KEPT), ENTRIES[4], replace(ENTRIES[5], differences={"a": huge})]  # type: ignore[arg-type,list-item]
+    (home / LEDGER).write_text(chained(map(as_json, entries)))
+    with pytest.raises(InputError, match="difference that cannot be"):
+        read_ledger(home)
+
+
+def test_results_of_ideas_that_were_not_asked_are_refused(home: Path) -> None:
+    other = replace(ENTRIES[5], results={"a": KEPT, "x": KEPT})  # type: ignore[type-var]
+    (home / LEDGER).write_text(chained(map(as_json, [OPENED, *ENTRIES[:5], other])))  # type: ignore[list-item,arg-type]
+    with pytest.raises(InputError, match="results of other ideas"):
+        read_ledger(home)

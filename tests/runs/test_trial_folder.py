@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from gsbench import cli
-from gsbench.analysis.results import load_experiment, read_views
+from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import DamagedError
 from gsbench.runs import trial_folder
 from gsbench.runs.keys import config_hash, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.view.trials import model_file
 from tests.fuzz.records import EXPERIMENT, write_trial
 
 
@@ -70,24 +71,53 @@ def test_results_without_made_of_are_accepted(trial):
     assert TrialFolder(trial).record().metrics == {"psnr": 43.2}
 
 
-def test_changed_views_and_curves_are_not_used(trial, caplog):
-    edit(trial / "per_view.csv", "a,25.5\nb,27.5", "a,24.5\nb,28.5")  # the mean is as it was
+@pytest.mark.parametrize("name", ["per_view.csv", "config.yaml", "point_cloud.ply"])
+@pytest.mark.parametrize("is_large", [False, True])
+def test_a_trial_with_an_edited_file_counts_nowhere(trial, name, is_large, monkeypatch):
+    runs, folder = trial.parents[3], TrialFolder(trial)
+    (trial / "point_cloud.ply").write_bytes(b"ply 25.5 0.03")
+    if is_large:
+        monkeypatch.setattr(trial_folder, "MAX_HASHED_BYTES", 4)
+    folder.write_finished(folder.settings(), folder.record())
+    before = len(load_experiment(runs, EXPERIMENT).trials)
+    assert TrialFolder(trial).state() == "done"
+    edit(trial / name, "25.5" if name != "config.yaml" else "0.03", "0.04")
+    os.utime(trial / name)
+    found = load_experiment(runs, EXPERIMENT)
+    assert len(found.trials) == before - 1
+    assert f"damaged, {name} was changed after results.json was written" in "".join(found.warnings)
+    (state,) = (one for one in states_of_experiment(trial.parents[2]) if one.folder == trial)
+    assert (state.state, name in state.note) == ("damaged", True)
+    (trial / name).unlink()  # models are deleted to make room
+    assert TrialFolder(trial).state() == "done"
+
+
+def test_a_large_file_with_its_old_size_and_time_is_compared_before_it_is_exported(
+    trial, monkeypatch
+):
+    monkeypatch.setattr(trial_folder, "MAX_HASHED_BYTES", 4)
+    model, folder = trial / "point_cloud.ply", TrialFolder(trial)
+    model.write_bytes(b"ply 25.5")
+    folder.write_finished(folder.settings(), folder.record())
+    (one,) = (
+        one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial
+    )
+    assert model_file(one) == model
+    state = model.stat()
+    model.write_bytes(b"ply 26.5")
+    os.utime(model, ns=(state.st_atime_ns, state.st_mtime_ns))
+    with pytest.raises(InputError, match="point_cloud.ply was changed"):
+        model_file(one)
+
+
+def test_changed_curves_are_not_used(trial, caplog):
     edit(trial / "metrics.jsonl", "20.2", "40.2")
     (one,) = (
         one for one in load_experiment(trial.parents[3], EXPERIMENT).trials if one.path == trial
     )
-    with pytest.raises(InputError, match=r"per_view\.csv was changed after it was written"):
-        read_views(one)
     assert one.folder.curves() == []
     assert "metrics.jsonl was changed after it was written" in caplog.text
     assert len(one.folder.curves("events.jsonl")) == 10
-
-
-def test_settings_are_those_that_made_the_results(trial):
-    """Editing the configuration afterwards does not change the trial."""
-    edit(trial / "config.yaml", '"volume_threshold": 0.03', '"volume_threshold": 0.04')
-    for one in load_experiment(trial.parents[3], EXPERIMENT).trials:
-        assert one.config["densify.volume_threshold"] == 0.03
 
 
 def test_a_failed_trial_is_superseded_once_its_mended_class_has_results(trial):
@@ -178,6 +208,7 @@ def test_equal_results_keep_their_time_and_others_do_not(trial):
     assert made_of is not None
     assert made_of.entries == {"train": str(trial)}
     assert set(made_of.published) == {
+        "config.yaml",
         "per_view.csv",
         "metrics.jsonl",
         "events.jsonl",

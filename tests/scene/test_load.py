@@ -282,6 +282,60 @@ def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path
     assert [folder.name for folder in (tmp_path / "cache").iterdir()] == [file.parent.name]
 
 
+def _other_focal(file: Path) -> None:
+    document = json.loads(file.read_text())
+    for view in document["views"].values():
+        view["fx"] *= 1.3
+    file.write_text(json.dumps(document, indent=1))
+
+
+def _other_file(file: Path) -> None:
+    file.write_text(file.read_text().replace('"00000.png"', '"../../../00000.png"'))
+
+
+def _other_pixels(file: Path) -> None:
+    picture = file.with_name("00000.png")
+    Image.new("RGB", Image.open(picture).size).save(picture)
+
+
+def _other_sums(file: Path) -> None:
+    file.with_name("files.json").write_text('{"files": {}}')
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _other_focal,
+        _other_file,
+        _other_pixels,
+        _other_sums,
+        lambda file: file.write_text(file.read_text()[:100]),
+        lambda file: file.write_text("[]"),
+        lambda file: file.with_name("00001.png").unlink(),
+        lambda file: file.with_name("files.json").unlink(),
+    ],
+)
+def test_a_cached_set_that_was_changed_is_prepared_again(
+    change, make_scene, tmp_path: Path, caplog
+):
+    capture = read_colmap("toy", make_scene())
+    first = load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
+    (file,) = (tmp_path / "cache").rglob("cameras.json")
+    before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
+    change(file)
+    again = load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
+    assert "the views are prepared again" in caplog.text
+    assert again.train[0].camera.fx == first.train[0].camera.fx
+    del before["files.json"]  # it has times
+    assert {path.name: path.read_bytes() for path in file.parent.iterdir()} | before == {
+        path.name: path.read_bytes() for path in file.parent.iterdir()
+    }
+    np.testing.assert_array_equal(first.train[0].image, again.train[0].image)
+    caplog.clear()
+    load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
+    assert not caplog.text
+
+
 def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
     capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
     used = load_scene(capture, capture.model, tmp_path)

@@ -94,3 +94,29 @@ def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, ref
     folder = finished_trial(runs, gaussians)
     (runs / "store" / "init" / "abc").rename(runs / "gone")
     assert "no longer in the store" in refused("export", "init", folder, "--out", "model")
+
+
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        (["export", "--results", "exp"], "exp.zip"),
+        (["export", "--results", "exp", "--out", "."], "exp.zip"),
+        (["tables", "exp", "--format", "csv", "--out", "."], "exp.csv"),
+        (["report", "exp", "--out", "."], "exp-report.html"),
+        (["site", "a.zip", "--out", "."], "index.html"),
+        (["site", "a.zip", "--out", "."], "reports/exp.html"),
+    ],
+)
+def test_a_file_that_the_user_did_not_name_is_not_overwritten(
+    words, file, tmp_path, monkeypatch, refused
+):
+    write_runs(tmp_path / "runs", Plan())
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
+    monkeypatch.chdir(tmp_path)
+    assert cli.run(["export", "--results", "exp", "--out", "a.zip"]) == 0
+    for _ in range(2):  # its own file is renewed
+        assert cli.run(words) == 0
+    assert Path(file).is_file()
+    Path(file).write_text("the user's own")
+    assert "not as gsbench wrote it: move it" in refused(*words)
+    assert Path(file).read_text() == "the user's own"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -460,3 +461,38 @@ def test_the_simulated_rule_decides_as_the_ledger_does(
         )
         assert (ended.result == "kept", ended.seeds) == (keep[0], seeds[0])
         kept += bool(keep[0])
+
+
+HOME_OF_ANOTHER = "http://203.0.113.5:5000"
+
+
+def test_an_address_that_only_the_ledger_names_gets_no_results(
+    trainings: Trainings, refused: Any, tmp_path: Path
+) -> None:
+    settings = [word for word in NEW if word != "tracking=none"]
+    assert run(["ledger", *settings, f"tracking.uri={HOME_OF_ANOTHER}"]) == 0
+    for words in (["try", "night", f"{SPLIT}=0.02"], ["try", "night", f"{SPLIT}=0.02", "device=cpu"]):
+        assert f"would send its results to {HOME_OF_ANOTHER}" in refused("ledger", *words)
+    assert not trainings.trained
+    assert len(read_ledger(tmp_path / "runs" / "night").entries) == 1
+    confirm = ["confirm", "night", "scene=courtyard", "scene.name=yard", "seed=7,8"]
+    assert attempt(f"{SPLIT}=0.02", f"tracking.uri={HOME_OF_ANOTHER}") == 0
+    trained = len(trainings.trained)
+    assert "would send its results" in refused("ledger", *confirm)
+    assert len(trainings.trained) == trained
+    assert attempt(f"{SPLIT}=0.03", "tracking=none") == 0
+
+
+def test_a_result_that_its_trials_deny_is_shown(home: Path, caplog: Any) -> None:
+    attempt(f"{SPLIT}=0.04", "--as", "worse")
+    attempt(f"{SPLIT}=0.02", "--as", "good")
+    run(["ledger", "show", "night"])
+    assert "was edited" not in caplog.text
+    forged = [
+        replace(one, result="kept") if isinstance(one, Ended) and one.idea == "worse" else one
+        for one in read_ledger(home).entries
+    ]
+    (home / LEDGER).write_text(records.chained(map(records.as_json, forged)))
+    run(["ledger", "show", "night"])
+    assert "worse: the ledger says kept, but its trials say dropped" in caplog.text
+    assert "good: the ledger says" not in caplog.text

@@ -187,7 +187,7 @@ def test_the_page_is_opened_once_the_server_answers(monkeypatch):
 
     monkeypatch.setattr(servers.requests, "get", get)
     monkeypatch.setattr(time, "sleep", waits.append)
-    monkeypatch.setattr(servers.webbrowser, "open", opened.append)
+    monkeypatch.setattr(servers.subprocess, "run", lambda words, **_: opened.append(words[-1]))
     servers._open(LOCAL, "page")
     assert (waits, opened) == ([1, 1], ["page"])
     failures.extend([True] * servers.SECONDS_TO_START)

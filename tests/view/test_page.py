@@ -22,14 +22,14 @@ for word in "$@"; do
     [ "$previous" = -E ] && settings="$word"; previous="$word"
     case "$word" in *.ply) [ -s "$word" ] || exit 1; esac
 done
-case "$*" in *"{works}"*) cp "$settings" "$previous";; *) {fails};; esac
+case "$*" in *"{works}"*) (echo "<head></head>"; cat "$settings") > "$previous"; {works_too};; *) {fails};; esac
 """
 
 
-def stand_in(folder: Path, works: str, fails: str) -> Path:
+def stand_in(folder: Path, works: str, fails: str, works_too: str = ":") -> Path:
     """Write an npx that copies its settings to the page if its words contain ``works``."""
     folder.mkdir()
-    (folder / "npx").write_text(NPX.replace("{works}", works).replace("{fails}", fails))
+    (folder / "npx").write_text(NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too))
     (folder / "npx").chmod(0o755)
     return folder
 
@@ -42,7 +42,9 @@ def test_the_page_has_every_test_view(
     npx = stand_in(tmp_path / "bin", works, "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 0
-    settings = json.loads((tmp_path / "page.html").read_text())
+    text = (tmp_path / "page.html").read_text()
+    assert text.startswith("<head><meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'n")
+    settings = json.loads(text.rpartition("</head>")[2])
     assert settings == page_settings(find_trial(ADDRESS, small_runs))
     assert settings["background"] == {"color": [0, 0, 0]}
     effects = settings["postEffectSettings"]
@@ -93,14 +95,68 @@ def test_without_npx_the_error_names_the_command_to_type(
 ) -> None:
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     place = f"{stand_in(tmp_path / 'bin', 'never', fails)}:/bin" if fails else str(tmp_path)
+    for suffix in ("ply", "json"):
+        (tmp_path / f"page.{suffix}").write_text("the user's own")
     monkeypatch.setenv("PATH", place)
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 1
     said = capsys.readouterr().err
     assert cause in said
-    model, settings, page = (tmp_path / f"page.{suffix}" for suffix in ("ply", "json", "html"))
+    for suffix in ("ply", "json"):
+        assert (tmp_path / f"page.{suffix}").read_text() == "the user's own"
+    (folder,) = (path for path in tmp_path.glob("page-*") if path.is_dir())
+    model, settings, page = folder / "model.ply", folder / "model.json", tmp_path / "page.html"
     assert "npx @playcanvas/splat-transform" in said
     assert said.endswith(f" {model} -E {settings} {page}\n")
     assert said.count("\n") == 1
     assert model.read_bytes()[:3] == b"ply"
     assert json.loads(settings.read_text())["version"] == 2
     assert not page.exists()
+
+
+def hostile_capture(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Go to a folder whose own npx, packages and settings would run if npm read them."""
+    for name in ("node_modules/.bin/npx", ".npmrc", "package.json", "npx"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(f"#!/bin/sh\ntouch {folder}/exploded\n")
+        (folder / name).chmod(0o755)
+    monkeypatch.chdir(folder)
+
+
+def test_npx_starts_where_no_package_of_the_current_folder_is_found(
+    small_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
+    seen = "(pwd; ls -A; echo $PATH) > $SEEN; d=$(pwd); while [ $d != / ]; do d=$(dirname $d); ls -A $d >> $SEEN; done"
+    npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1", seen)
+    monkeypatch.setenv("SEEN", str(tmp_path / "seen"))
+    own = os.environ["PATH"]
+    monkeypatch.setenv("PATH", os.pathsep.join(["node_modules/.bin", ".", "", str(npx), own]))
+    (tmp_path / "capture").mkdir()
+    hostile_capture(tmp_path / "capture", monkeypatch)
+    assert run(["export", ADDRESS, "--out", "page.html"]) == 0
+    assert not Path("exploded").exists()
+    where, *seen_lines = (tmp_path / "seen").read_text().splitlines()
+    assert Path(where) != tmp_path / "capture"
+    assert not Path(where).exists()
+    assert seen_lines.count("package.json") == 1
+    assert {"node_modules", ".npmrc"}.isdisjoint(seen_lines)
+    assert all(entry.startswith("/") for line in seen_lines if ":" in line for entry in line.split(":"))
+
+
+@pytest.mark.parametrize("name", ["node_modules", ".npmrc", "package.json"])
+def test_a_temporary_folder_below_packages_is_refused(
+    name: str,
+    small_runs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
+    npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1")
+    monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / name).touch()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "a" / "b"))
+    assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 1
+    assert f"{tmp_path / 'a' / name} would be read" in capsys.readouterr().err
+    assert not list((tmp_path / "a" / "b").iterdir())

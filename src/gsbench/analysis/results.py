@@ -402,7 +402,12 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     """Read and check one trial folder; raises `_UnusableError`."""
     try:
         require_no_links(runs_dir, path, below=True)
-        record = TrialFolder(path).record()
+        folder = TrialFolder(path)
+        record = folder.record()
+        if change := folder.change():
+            raise _UnusableError(
+                f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
+            )
     except FileNotFoundError:
         raise _UnusableError(_why_unfinished(path)) from None
     except UnfinishedError as error:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from gsbench.analysis.images import ViewComparison, compare_view
@@ -14,9 +15,8 @@ from gsbench.analysis.votes import PairVotes, RoundVerdict, judge_round, view_ga
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS
 from gsbench.files import require_no_links
-from gsbench.parsing import read_typed
-from gsbench.runs.layout import VOTE_KEY, VOTES
-from gsbench.runs.votes import Ballot, read_key
+from gsbench.runs.layout import VOTES
+from gsbench.runs.votes import read_ballots, read_key
 from gsbench.words import counted, signed
 
 MAX_SHOWN = 3  # views where people and LPIPS disagree that the report shows
@@ -30,10 +30,10 @@ def load_rounds(home: Path) -> list[RoundVerdict]:
     for folder in (home / VOTES).glob("*/"):
         try:
             require_no_links(home.parent, folder, below=True)
-            files = [file for file in sorted(folder.glob("*.json")) if file.name != VOTE_KEY]
-            verdicts.append(
-                judge_round(read_key(folder), [read_typed(file, Ballot) for file in files])
-            )
+            key = read_key(folder)
+            ballots, faults = read_ballots(folder, key)
+            verdict = judge_round(key, list(ballots.values()))
+            verdicts.append(replace(verdict, left_out=faults | dict(verdict.left_out)))
         except InputError as error:
             log.warning("left out: %s", error)
     return sorted(verdicts, key=lambda one: one.key.time)

@@ -22,7 +22,7 @@ from scipy import special
 from gsbench.analysis.results import TrialResult, read_views
 from gsbench.analysis.statistics import ALPHA, Interval, LikeThese, judge_like_these
 from gsbench.errors import InputError
-from gsbench.runs.experiments import Arm, unix_time
+from gsbench.runs.experiments import Arm
 from gsbench.runs.votes import PHOTOGRAPH, SAME, Ballot, RoundKey, Showing
 from gsbench.scene.images import png_name
 
@@ -86,11 +86,14 @@ class RoundVerdict:
 
 
 def judge_round(key: RoundKey, ballots: Sequence[Ballot]) -> RoundVerdict:
-    """A round's verdict: traps first, then at most the declared people in finishing order."""
+    """A round's verdict: traps first, then at most the declared people in the given order.
+
+    The order is that in which ballots were handed in, so later ones never take another's place.
+    """
     left_out: dict[str, str] = {}
     counted = list[Ballot]()
     traps = [one for one in key.showings if one.kind == "trap"]
-    for ballot in sorted(ballots, key=lambda one: (unix_time(one.finished) or 0, one.person)):
+    for ballot in ballots:
         wrong = sum(_preference(trap, ballot, PHOTOGRAPH) != 1 for trap in traps)
         if wrong > key.traps_allowed:
             left_out[ballot.label] = (

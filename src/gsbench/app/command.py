@@ -8,7 +8,7 @@ another (`gsbench.app.other_sweepers`).
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from hydra.errors import HydraException
@@ -30,9 +30,11 @@ from gsbench.launch.batch import check_parts, missing_folders, need_no_check, ru
 from gsbench.launch.jobs import Outcome
 from gsbench.launch.states import describe_plan
 from gsbench.logs import set_up_logging
+from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
 
 # the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
+TRACKER = "tracking.uri"
 HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
 
 log = logging.getLogger(__name__)
@@ -56,6 +58,21 @@ def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
     task = TrialTask(lambda trials: [], look_only=True)
     run_app(words, multirun, task)
     return task.trials
+
+
+def check_trackers(trials: Iterable[Trial], typed: Sequence[str]) -> None:
+    """Raise InputError for a trial that would send results to an address that only a file names.
+
+    The runs folder may be somebody else's, and the address theirs. ``typed`` are the user's words.
+    """
+    typed_uri = next((word.partition("=")[2] for word in typed if key_of(word) == TRACKER), None)
+    for trial in trials:
+        if address := untyped_address(trial.values["tracking"], typed_uri):
+            raise InputError(
+                f"{trial.files.label} would send its results to {address}, an address from a file: "
+                f"to allow it, type {TRACKER}={address} (for a trial in no plan: set "
+                f"{VARIABLE}={address}); tracking=none sends nothing"
+            )
 
 
 def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:

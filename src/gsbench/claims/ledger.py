@@ -20,6 +20,7 @@ from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.ledger import (
     BASELINE,
     DROPPED,
+    FAILED,
     KEPT,
     UNDECIDED,
     Confirmed,
@@ -179,6 +180,27 @@ def reason_of(verdict: Verdict) -> str:
     else:
         words = "not decided by all seeds" if verdict.final else "not decided yet"
     return "; ".join([words, *verdict.notes])
+
+
+def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each idea whose recorded result is not what its trials show.
+
+    It is judged again from the seeds that it was decided by, if all its trials are still there.
+    """
+    lines = []
+    for idea, ended in ledger.ended.items():
+        if ended.result == FAILED:
+            continue
+        seeds = ledger.opened.seeds[: ended.seeds]
+        own = [trial for trial in trials if trial.seed in seeds]
+        verdict = judge_idea(own, declaration_of(ledger, idea))
+        now = result_of(verdict)
+        if verdict.pairs.seeds == ended.seeds and now != ended.result:
+            lines.append(
+                f"{idea}: the ledger says {ended.result}, but its trials say {now}: one of them "
+                "was edited"
+            )
+    return lines
 
 
 def check_unknown_trials(ledger: Ledger, trials: Sequence[TrialResult]) -> None:

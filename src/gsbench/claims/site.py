@@ -4,8 +4,6 @@ Archives may come from strangers: their texts are escaped in pages, and never us
 files.
 """
 
-import base64
-import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -26,6 +24,7 @@ from gsbench.analysis.tables import build_table, compared_pairs
 from gsbench.analysis.verdicts import headline, judge_pairs
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
+from gsbench.files import own_output, write_text
 from gsbench.runs.experiments import latest_declaration, read_declarations
 
 INDEX, REPORTS = "index.html", "reports"
@@ -48,22 +47,21 @@ def write_site(archives: Sequence[Path], out: Path, title: str, scratch: Path) -
         except InputError as error:
             left_out.append(str(error))
             continue
-        (out / REPORTS / f"{key}.html").write_text(report, encoding="utf-8")
+        with own_output(file := out / REPORTS / f"{key}.html"):
+            write_text(file, report)
         sections.append(section)
     if not sections:
         raise InputError(f"no archive can be shown ({left_out[0]})")
     script = files("gsbench.claims").joinpath("site.js").read_text(encoding="utf-8")
-    # The page's Content-Security-Policy runs no script but the one with this hash.
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     values = {
         "title": title,
         "sections": sections,
         "left_out": left_out,
         "script": script,
-        "script_hash": digest,
     }
     page = fill("site.html.j2", "gsbench.claims", **values)
-    (out / INDEX).write_text(page, encoding="utf-8")
+    with own_output(out / INDEX):
+        write_text(out / INDEX, page)
     return left_out
 
 

@@ -27,6 +27,7 @@ from gsbench.runs.keys import determining_settings, sha256_of
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED, TRIAL_GLOB
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
+from gsbench.system.programs import NEUTRAL, safe_environment
 from gsbench.words import counted, readable_time
 
 
@@ -105,7 +106,10 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
     if state == "damaged":
         return TrialState(
-            folder, state, _changed(folder / RESULTS), TrialFolder(folder).why_not_done({})
+            folder,
+            state,
+            _changed(folder / RESULTS),
+            TrialFolder(folder).change() or TrialFolder(folder).why_not_done({}),
         )
     submission = read_submission(folder)
     lost = ""
@@ -236,7 +240,13 @@ def read_queue(users: Iterable[str]) -> Queue | None:
     ]
     try:
         listing = subprocess.run(
-            command, capture_output=True, text=True, timeout=SECONDS_TO_ANSWER, check=True
+            command,
+            cwd=NEUTRAL,
+            env=safe_environment(),
+            capture_output=True,
+            text=True,
+            timeout=SECONDS_TO_ANSWER,
+            check=True,
         )
     except (OSError, subprocess.SubprocessError):
         return None

@@ -1,7 +1,8 @@
 """The ledger of many ideas, ``<runs>/<experiment>/ledger.jsonl``: what was tried, in which order.
 
-The file grows by whole lines. Each line has the sha256 of the line before it, so a line that was
-edited, moved or dropped is found when the file is read (`read_ledger`).
+The file grows by whole lines. Each line has the sha256 of the line before it and one of its own
+content, so a line that was edited or moved is found when the file is read (`read_ledger`), also the
+last one. Nothing here is secret: who writes all hashes anew can write another ledger.
 """
 
 import hashlib
@@ -137,9 +138,10 @@ Entry = Opened | Started | Ended | Confirming | Confirmed
 
 @dataclass(frozen=True, kw_only=True)
 class Line(Record):
-    """An entry with the sha256 of the line before it, "" for the first."""
+    """An entry with the sha256 of the line before it, "" for the first, and its own."""
 
     before: str
+    own: str
     entry: Annotated[Entry, Field(discriminator="kind")]
 
 
@@ -215,7 +217,7 @@ def read_ledger(home: Path) -> Ledger:
     """
     path = home / LEDGER
     try:
-        lines = read_bytes(path).splitlines(keepends=True)
+        lines = _whole(read_bytes(path)).splitlines(keepends=True)
     except FileNotFoundError:
         raise InputError(
             f"{home.name} has no ledger: gsbench ledger new {home.name} --metric … begins one"
@@ -231,6 +233,10 @@ def read_ledger(home: Path) -> Ledger:
                 f"{path}: line {number} does not follow the line before it: one of them was "
                 f"edited, moved or taken out: {MEND}"
             )
+        if content.decode() != _line(head, json.loads(content)["entry"]):
+            raise InputError(f"{path}: line {number} was edited: {MEND}")
+        if fault := _fault(Ledger(tuple(entries), head), line.entry):
+            raise InputError(f"{path}: line {number} {fault}: {MEND}")
         entries.append(line.entry)
         head = hashlib.sha256(content).hexdigest()
     if not entries:
@@ -238,6 +244,50 @@ def read_ledger(home: Path) -> Ledger:
     return Ledger(tuple(entries), head)
 
 
+def _fault(before: Ledger, entry: Entry) -> str:
+    """What makes ``entry`` impossible after the entries ``before``, or ""."""
+    if isinstance(entry, Opened):
+        return "" if entry.keys else "has no captures"
+    if isinstance(entry, Started):
+        if entry.idea in (*before.started, BASELINE):
+            return f"begins {entry.idea!r} a second time"
+        if entry.against not in (BASELINE, *before.kept):
+            return f"compares with {entry.against!r}, which was not kept"
+        same = entry.keys.keys() == before.keys_of(entry.against).keys()
+        return "" if same else f"has other captures than {entry.against!r}"
+    if isinstance(entry, Ended):
+        ended = before.ended.get(entry.idea)
+        if entry.idea not in before.started:
+            return f"ends {entry.idea!r}, which was not begun"
+        if ended is not None and ended.result != FAILED:
+            return f"decides {entry.idea!r} a second time"
+        return _fault_of_size(before.opened, entry.difference)
+    if isinstance(entry, Confirming):
+        known = {BASELINE, *before.kept}
+        if BASELINE not in entry.keys or not entry.keys.keys() <= known:
+            return "confirms ideas that were not kept, or lacks the baseline"
+        scenes = entry.keys[BASELINE].keys()
+        same = bool(scenes) and all(own.keys() == scenes for own in entry.keys.values())
+        return "" if same else "confirms ideas on different captures, or on none"
+    begun = before.confirmations
+    if entry.number >= len(begun) or begun[entry.number][1] is not None:
+        return "ends a confirmation that was not begun, or was ended before"
+    ideas = begun[entry.number][0].keys.keys() - {BASELINE}
+    if entry.results.keys() != ideas or not entry.differences.keys() <= ideas:
+        return "has results of other ideas than its confirmation"
+    faults = (_fault_of_size(before.opened, one) for one in entry.differences.values())
+    return next(filter(None, faults), "")
+
+
+def _fault_of_size(opened: Opened, difference: Difference | None) -> str:
+    """Logarithms of ratios are small; the ratio of a larger one would be no number."""
+    if difference is None or not opened.relative:
+        return ""
+    ends = (difference.mean, difference.low, difference.high)
+    return "" if max(map(abs, ends)) <= LARGEST_LOG else "has a difference that cannot be"
+
+
+LARGEST_LOG = 100.0  # of a relative difference: a factor of 1e43
 MEND = "bring back the file as gsbench wrote it, or begin another ledger"
 
 
@@ -261,8 +311,13 @@ def append(home: Path, make: Callable[[Ledger], Entry | None]) -> Ledger:
         entry = make(ledger)
         if entry is None:
             return ledger
-        _write(home, read_bytes(home / LEDGER).decode(), ledger.head, entry)
+        _write(home, _whole(read_bytes(home / LEDGER)).decode(), ledger.head, entry)
         return read_ledger(home)
+
+
+def _whole(content: bytes) -> bytes:
+    """The content with its last line break, which an editor may have removed."""
+    return content if content.endswith(b"\n") or not content else content + b"\n"
 
 
 def _write(home: Path, text: str, head: str, entry: Entry) -> None:
@@ -285,4 +340,5 @@ def chained(entries: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _line(before: str, entry: Mapping[str, Any]) -> str:
-    return json.dumps({"before": before, "entry": entry}, ensure_ascii=False) + "\n"
+    own = hashlib.sha256(f"{before} {json.dumps(entry)}".encode()).hexdigest()
+    return json.dumps({"before": before, "own": own, "entry": entry}, ensure_ascii=False) + "\n"

@@ -10,7 +10,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,18 +196,8 @@ class Store:
 
 def write_manifest(folder: Path, step: Step, seconds: float) -> None:
     """Write the manifest of ``folder``: checksums of all files, once these are safe on the disk."""
-    scratch = set().union(*map(folder.rglob, step.stage.scratch))
-    outputs = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path not in scratch:
-            sync_to_disk(path)
-            state = path.stat()
-            recorded = {
-                "size": state.st_size,
-                "mtime_ns": state.st_mtime_ns,
-                "sha256": file_sha256(path),
-            }
-            outputs[path.relative_to(folder).as_posix()] = recorded
+    scratch = set[Path]().union(*map(folder.rglob, step.stage.scratch))
+    outputs = record_files(folder, scratch)
     manifest = {
         "stage": step.stage.name,
         "version": step.stage.version,
@@ -219,6 +209,22 @@ def write_manifest(folder: Path, step: Step, seconds: float) -> None:
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     write_json(folder / MANIFEST, manifest)
+
+
+def record_files(folder: Path, without: Collection[Path] = ()) -> dict[str, dict[str, Any]]:
+    """Size, time of change and sha256 of all files in a folder, once these are safe on the disk."""
+    outputs = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path not in without:
+            sync_to_disk(path)
+            state = path.stat()
+            recorded = {
+                "size": state.st_size,
+                "mtime_ns": state.st_mtime_ns,
+                "sha256": file_sha256(path),
+            }
+            outputs[path.relative_to(folder).as_posix()] = recorded
+    return outputs
 
 
 def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) -> Manifest:
@@ -236,12 +242,13 @@ def read_manifest(folder: Path, key: str | None = None, thorough: bool = False) 
     if manifest.key != Stage(manifest.stage, manifest.version).key(manifest.inputs):
         raise ValueError(f"{MANIFEST} does not match its key")
     for name, recorded in manifest.outputs.items():
-        if not _is_sound(folder, name, recorded, thorough):
+        if not is_sound(folder, name, recorded, thorough):
             raise ValueError(f"{name} differs from what was written")
     return manifest
 
 
-def _is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool:
+def is_sound(folder: Path, name: str, recorded: Output, thorough: bool) -> bool:
+    """Return whether a file is as it was recorded; see `read_manifest`."""
     path = folder / name
     try:
         require_no_links(folder, path)

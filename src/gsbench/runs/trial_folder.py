@@ -67,6 +67,7 @@ class TrialFolder:
         self.path = path
         # sha256 of files by name, from the results that were read last
         self._digests: Mapping[str, str] | None = None
+        self._stamps: Mapping[str, Stamp] = {}
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrialFolder:
@@ -114,7 +115,7 @@ class TrialFolder:
             return "running"
         try:
             self.record()
-            return "done"
+            return "damaged" if self.change() else "done"
         except FileNotFoundError:
             pass
         except DamagedError:
@@ -189,7 +190,28 @@ class TrialFolder:
                 )
                 raise DamagedError(path, reason)
         self._digests = {} if made_of is None else made_of.digests
+        self._stamps = {} if made_of is None else made_of.published
         return record
+
+    def change(self, thorough: bool = False) -> str:
+        """What was changed among the files `JUDGED` since the results were written, or "".
+
+        A large file with its recorded size and time counts as unchanged, unless ``thorough``. Files
+        that are gone do not count, since models are deleted to make room.
+        """
+        if self._digests is None:
+            self.sound_record()
+        for name in JUDGED:
+            path, recorded = self.path / name, (self._digests or {}).get(name)
+            if recorded is None or not path.is_file():
+                continue
+            stamp = stamp_of(path)
+            is_large = stamp[0] > MAX_HASHED_BYTES
+            if is_large and not thorough and self._stamps.get(name) == stamp:
+                continue
+            if (file_sha256(path) if is_large else _digest(path)) != recorded:
+                return f"{name} was changed after {layout.RESULTS} was written"
+        return ""
 
     def sound_record(self) -> TrialRecord | None:
         """The same as `record`, but None if the trial has no sound results."""
@@ -234,7 +256,7 @@ class TrialFolder:
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
         files = sorted(
-            {*published, *(self.path / name for name in READ_LATER if (self.path / name).is_file())}
+            {*published, *(self.path / name for name in RECORDED if (self.path / name).is_file())}
         )
         names = {file.relative_to(self.path).as_posix(): file for file in files}
         sources = sorted(sources)
@@ -251,7 +273,7 @@ class TrialFolder:
             digests={
                 name: file_sha256(file)
                 for name, file in names.items()
-                if name in READ_LATER or file.stat().st_size <= MAX_HASHED_BYTES
+                if name in RECORDED or file.stat().st_size <= MAX_HASHED_BYTES
             },
             settings=dict(values),
         )
@@ -354,6 +376,9 @@ def _number(text: str) -> float:
 MADE_OF = "made_of"  # the key in results.json
 # files that tables and reports read
 READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
+# files by which a trial is judged, exported or run again: after an edit it counts nowhere
+JUDGED = (layout.PER_VIEW, layout.CONFIG, layout.POINT_CLOUD)
+RECORDED = {*READ_LATER, *JUDGED}
 # Files up to so many bytes are compared by content, since a flipped bit changes neither size nor
 # time.
 MAX_HASHED_BYTES = 1e6
@@ -388,7 +413,8 @@ def find_changes(
             yield f"files were added to {source_folder}, or removed"
     for name, stamp in made_of.published.items():
         yield from _change_of(folder / name, stamp, stamp_of)
-        if name in made_of.digests and _digest(folder / name) != made_of.digests[name]:
+        is_small = stamp[0] <= MAX_HASHED_BYTES
+        if is_small and name in made_of.digests and _digest(folder / name) != made_of.digests[name]:
             yield f"{folder / name} has changed"
     for name, entry in made_of.entries.items():
         try:

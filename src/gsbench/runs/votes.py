@@ -2,16 +2,20 @@
 
 import hashlib
 import hmac
+import itertools
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
 from pydantic import Field
 
 from gsbench.errors import InputError
-from gsbench.parsing import Amount, Count, Record, Text, read_typed
+from gsbench.files import write_json
+from gsbench.parsing import Amount, Count, Record, Text, one_line, read_typed
 from gsbench.runs.experiments import Arm, unix_time
 from gsbench.runs.layout import VOTE_KEY
 
@@ -64,10 +68,13 @@ class RoundKey(Record):
 
     @cached_property
     def round(self) -> str:
-        """The name of the round: a hash of all commitments, so a changed key has another name."""
-        return hashlib.sha256("".join(map(self.commitment, self.showings)).encode()).hexdigest()[
-            :12
-        ]
+        """The name of the round: a salted hash of the whole key, so a changed key has another."""
+        return self.sign(self.to_json())[:12]
+
+    def sign(self, value: Any) -> str:
+        """The salted hash of a JSON value."""
+        text = json.dumps(value, sort_keys=True)
+        return hmac.new(self.salt.encode(), text.encode(), hashlib.sha256).hexdigest()
 
     @property
     def pairs(self) -> list[Showing]:
@@ -108,11 +115,63 @@ class Ballot(Record):
 
     @property
     def label(self) -> str:
-        return f"{self.name} ({self.person[:6]})" if self.name else self.person[:6]
+        # a name that a stranger typed may hold line breaks and marks that turn the line around
+        name = "".join(filter(str.isprintable, one_line(self.name)))
+        return f"{name} ({self.person[:6]})" if name else self.person[:6]
 
     @cached_property
     def answers(self) -> dict[str, str]:
         return {vote.showing: vote.answer for vote in self.votes}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredBallot(Record):
+    """A ballot as the runs folder keeps it.
+
+    ``place`` counts from 0 in the order of handing in. ``seal`` is the key's signature.
+    """
+
+    place: Count
+    ballot: Ballot
+    seal: Text
+
+    @classmethod
+    def of(cls, key: RoundKey, place: int, ballot: Ballot) -> "StoredBallot":
+        """The sealed ballot."""
+        return cls(place=place, ballot=ballot, seal=key.sign([place, ballot.to_json()]))
+
+
+def read_ballots(folder: Path, key: RoundKey) -> tuple[dict[int, Ballot], dict[str, str]]:
+    """The ballots of a round by place, in its order, and by file what is wrong with others."""
+    found: dict[int, Ballot] = {}
+    faults: dict[str, str] = {}
+    for file in sorted(folder.glob("*.json")):
+        if file.name == VOTE_KEY:
+            continue
+        try:
+            stored = read_typed(file, StoredBallot)
+            if stored != StoredBallot.of(key, stored.place, stored.ballot):
+                raise InputError(f"{file} was edited, or is of another round")
+            if file.stem != stored.ballot.person or stored.place in found:
+                raise InputError(f"{file} is a copy of another file")
+            check_ballot(stored.ballot, key, file)
+        except (InputError, FileNotFoundError) as error:
+            faults[one_line(file.name)] = f"because {one_line(str(error))}"
+        else:
+            found[stored.place] = stored.ballot
+    for place in sorted(set(range(max(found, default=-1))) - found.keys()):
+        faults[f"ballot {place + 1}"] = "because it is no longer as it was handed in"
+    return dict(sorted(found.items())), faults
+
+
+def store_ballots(folder: Path, key: RoundKey, ballots: Iterable[Ballot]) -> None:
+    """Store new ballots, each in the first free place: by finishing time, after earlier ones."""
+    places = set(read_ballots(folder, key)[0])
+    for ballot in sorted(ballots, key=lambda one: (unix_time(one.finished) or 0, one.person)):
+        place = next(place for place in itertools.count() if place not in places)
+        places.add(place)
+        stored = StoredBallot.of(key, place, ballot)
+        write_json(folder / f"{ballot.person}.json", stored.to_json())
 
 
 def read_key(folder: Path) -> RoundKey:
@@ -133,7 +192,14 @@ def read_key(folder: Path) -> RoundKey:
 
 
 def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
-    """Raise InputError unless the ballot answers every showing of the round once."""
+    """Raise InputError unless the ballot answers every showing of the round once, and after it."""
+    if ballot.round != key.round:
+        raise InputError(f"{path} is of the round {ballot.round}, not of {key.round}")
+    if (unix_time(ballot.finished) or 0) < (unix_time(key.time) or 0):
+        raise InputError(
+            f"{path} was finished at {ballot.finished}, before its round was made ({key.time}): "
+            "a vote with a wrong clock does not count"
+        )
     showings = {one.id for one in key.showings}
     if ballot.answers.keys() != showings or len(ballot.votes) != len(showings):
         known = len(ballot.answers.keys() & showings)

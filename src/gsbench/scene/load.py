@@ -2,12 +2,14 @@
 
 Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's
 name is a digest of everything that the pixels depend on. A folder appears by one rename, so a set
-is either complete or absent. Images that need no change are read from the capture.
+is either complete or absent; checksums of its files show later changes. Images that need no change are read from the capture.
 
 Undistortion is COLMAP's, with the defaults of its ``image_undistorter``, which INRIA's
 ``convert.py`` uses too: the largest pinhole image without blank pixels, at the original focal
 length. It runs on pixels in memory, so images are not compressed as JPEG again.
 """
+
+from __future__ import annotations
 
 import hashlib
 import json
@@ -17,15 +19,20 @@ import secrets
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from gsbench.errors import InputError
+from gsbench.files import write_json
 from gsbench.logs import Progress, no_progress
+from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
+from gsbench.runs.store import Output, is_sound, record_files
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
     WHITE,
@@ -50,8 +57,9 @@ from gsbench.words import some_of
 log = logging.getLogger(__name__)
 
 PrincipalPoint = Literal["used", "centred"]
-CACHE_VERSION = 2  # to be raised when prepared pixels or the form of cameras.json change
+CACHE_VERSION = 3  # to be raised when prepared pixels or the form of cameras.json change
 CAMERAS_FILE = "cameras.json"
+SUMS_FILE = "files.json"  # sizes and checksums of the other files
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # images per isolated process: limits what a crash loses, and progress is reported after each chunk
 _CHUNK = 16
@@ -68,6 +76,44 @@ class Downscaling:
     def final_size(self, width: int, height: int) -> tuple[int, int]:
         """The final size in px of an image of ``width`` x ``height`` px."""
         return downscaled_size(width, height, self.downscale, self.max_size)
+
+
+Row = tuple[Number, Number, Number, Number]
+Length = Annotated[float, Field(gt=0, le=MAX_NUMBER)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedView(Record):
+    """A view in `CAMERAS_FILE`: its camera and the ``file`` beside it, "" for the photograph."""
+
+    file: Annotated[str, Field(pattern=r"^([0-9]+[.]png)?$")]
+    pose: tuple[Row, Row, Row]  # world to camera
+    width: Count
+    height: Count
+    fx: Length
+    fy: Length
+    cx: Number
+    cy: Number
+
+    @property
+    def camera(self) -> Camera:
+        pose = np.array(self.pose, dtype=np.float64)  # [3, 4]
+        intrinsics: dict[str, Any] = {key: getattr(self, key) for key in INTRINSICS}
+        return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedViews(Record):
+    """The content of `CAMERAS_FILE`."""
+
+    views: dict[str, PreparedView]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedFiles(Record):
+    """The content of `SUMS_FILE`."""
+
+    files: dict[str, Output]
 
 
 def load_scene(
@@ -96,22 +142,27 @@ def load_scene(
         raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
     downscaling = Downscaling(downscale, max_size, resample)
     folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
-    if not (folder / CAMERAS_FILE).is_file():
+    try:
+        entries = _read_prepared(folder)
+    except (InputError, OSError) as error:
+        if folder.exists():
+            log.warning("store: %s; the views are prepared again", error)
+            shutil.rmtree(folder)
         _prepare_views(folder, capture, Path(model_dir), downscaling, progress)
-    entries = json.loads((folder / CAMERAS_FILE).read_text(encoding="utf-8"))["views"]
+        entries = _read_prepared(folder)
     _report_unregistered(capture, set(entries))
 
     def mask_of(name: str) -> Mask | None:
         if name not in capture.masks:
             return None
-        file = entries[name]["file"]
+        file = entries[name].file
         mask = read_mask(folder / mask_file(file) if file else capture.masks[name])
         return None if mask.all() else mask
 
     def view(name: str) -> View:
         entry = entries[name]
-        image = read_image(folder / entry["file"] if entry["file"] else capture.images / name)
-        camera = _camera(entry)
+        image = read_image(folder / entry.file if entry.file else capture.images / name)
+        camera = entry.camera
         if image.shape[:2] != (camera.height, camera.width):
             raise InputError(
                 f"{folder}: {name} is not as it was prepared: delete this folder and run again"
@@ -159,6 +210,7 @@ def _prepare_views(
             entries[name] |= _intrinsics(camera)
         document = {"version": CACHE_VERSION, "scene": capture.name, "views": entries}
         (work / CAMERAS_FILE).write_text(json.dumps(document, indent=1), encoding="utf-8")
+        write_json(work / SUMS_FILE, {"files": record_files(work)})
         _publish(work, folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -168,10 +220,27 @@ def _publish(work: Path, folder: Path) -> None:
     try:
         os.rename(work, folder)
     except OSError:
-        if (folder / CAMERAS_FILE).is_file():
+        with suppress(InputError, OSError):
+            _read_prepared(folder)
             return  # another process published the same content first
-        shutil.rmtree(folder)  # the existing folder has lost its cameras file, so it is incomplete
+        shutil.rmtree(folder)  # the existing folder is damaged
         os.rename(work, folder)
+
+
+def _read_prepared(folder: Path) -> dict[str, PreparedView]:
+    """The prepared views by name.
+
+    Raises InputError, or FileNotFoundError, unless all files are as they were written.
+    """
+    sums = read_typed(folder / SUMS_FILE, PreparedFiles).files
+    for name, recorded in sums.items():
+        if not is_sound(folder, name, recorded, thorough=True):
+            raise InputError(f"{folder / name} is not as it was prepared")
+    views = read_typed(folder / CAMERAS_FILE, PreparedViews).views
+    files = {CAMERAS_FILE, *(view.file for view in views.values() if view.file)}
+    if missing := sorted(files - sums.keys()):
+        raise InputError(f"{folder / SUMS_FILE} lacks {missing[0]}")
+    return views
 
 
 def _model_cameras(
@@ -216,12 +285,6 @@ def _report_unregistered(capture: Capture, registered: set[str]) -> None:
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
     return {key: getattr(camera, key) for key in INTRINSICS}
-
-
-def _camera(entry: dict[str, object]) -> Camera:
-    pose = np.array(entry["pose"], dtype=np.float64)  # [3, 4] world to camera
-    intrinsics: dict[str, Any] = {key: entry[key] for key in INTRINSICS}
-    return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
 
 
 def _cache_key(

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from gsbench.errors import InputError
+from gsbench.system.programs import NEUTRAL, safe_environment
 
 DISTRIBUTION = "gsbench-3dgs"  # the name on the package index, where "gsbench" is another project
 
@@ -172,7 +173,7 @@ def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> s
     it fails.
     """
     environment = {
-        key: value for key, value in os.environ.items() if key not in REPOSITORY_VARIABLES
+        key: value for key, value in safe_environment().items() if key not in REPOSITORY_VARIABLES
     }
     try:
         return subprocess.run(
@@ -180,9 +181,10 @@ def run_git(folder: Path, *words: str, seconds: float = SECONDS_FOR_A_TREE) -> s
                 "git",
                 *(word for setting in SAFE_SETTINGS for word in ("-c", setting)),
                 "-C",
-                str(folder),
+                os.path.abspath(folder),
                 *words,
             ],
+            cwd=NEUTRAL,
             # read only: no locks, no network
             env=environment | {"GIT_OPTIONAL_LOCKS": "0", "GIT_NO_LAZY_FETCH": "1"},
             capture_output=True,

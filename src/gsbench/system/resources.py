@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import psutil
 
 from gsbench.system.locks import BusyError, hold
+from gsbench.system.programs import NEUTRAL, safe_environment
 
 try:
     import resource
@@ -127,6 +128,8 @@ def nvidia_smi(query: str) -> list[str]:
     try:
         listing = subprocess.run(
             ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
+            cwd=NEUTRAL,
+            env=safe_environment(),
             capture_output=True,
             text=True,
             timeout=60,

@@ -12,7 +12,7 @@ from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.errors import InputError
 from gsbench.eval.protocol import PROTOCOLS
-from gsbench.files import atomic, writable_output
+from gsbench.files import atomic, own_output, writable_output
 from gsbench.normalization import Normalization
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import STORE
@@ -162,7 +162,7 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     file = Path(f"{name}.zip") if out is None else out
     if file.is_dir():
         file = file / f"{name}.zip"
-    with writable_output(file):
+    with writable_output(file) if file == out else own_output(file):
         left_out = write_archive(load_experiment(runs, name), file, pictures)
     for line in left_out:
         log.warning("left out: %s", line)

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledg
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.app.command import compose_trials, require_waiting, run_trials
+from gsbench.app.command import check_trackers, compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
@@ -34,9 +35,21 @@ IDEAS, RATE = 40, 0.1  # the defaults of a night
 MOST_IDEAS = 10_000
 OWN = ("name", "runs", "eval.primary")  # settings that the ledger gives itself
 # An idea may change how a model is made, not what it is measured on.
-OF_IDEAS = ("densify", "init", "train", "raster", "allow_targets", "launch", "device", "threads")
+OF_IDEAS = (
+    "densify",
+    "init",
+    "train",
+    "raster",
+    "allow_targets",
+    "launch",
+    "device",
+    "threads",
+    "tracking",
+)
 
 Trials = dict[KeyAndSeed, Trial]
+
+log = logging.getLogger(__name__)
 
 
 def ledger(argv: Sequence[str], runs: Path) -> int:
@@ -131,6 +144,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
             "back"
         )
     own = _compose(home.name, _merged(start, options.settings))
+    check_trackers([*trials.values(), *own.values()], options.settings)
     idea, book = _start(home, own, against, options)
     if (ended := book.ended.get(idea)) is None or ended.result == FAILED:
         trials |= own
@@ -235,6 +249,7 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
         )
         for idea in (BASELINE, *ideas)
     }
+    check_trackers((one for own in by_idea.values() for one in own.values()), options.settings)
     keys = {idea: _keys(trials, home.name) for idea, trials in by_idea.items()}
     asked = records.Confirming(time=stamp_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
 
@@ -277,8 +292,10 @@ def _run_confirmation(
 
 def show(options: argparse.Namespace, home: Path) -> int:
     """Print the ledger."""
-    book = records.read_ledger(home)
-    rules.check_unknown_trials(book, read_experiment(home).trials)
+    book, trials = records.read_ledger(home), read_experiment(home).trials
+    rules.check_unknown_trials(book, trials)
+    for line in rules.contradictions(book, trials):
+        log.warning("%s", line)
     if options.json:
         ideas = [_facts(book, idea) for idea in book.started]
         confirmations = [one.to_json() for pair in book.confirmations for one in pair if one]
@@ -339,7 +356,7 @@ def _seeds(trials: Trials) -> tuple[int, ...]:
 
 
 def _permitted(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]:
-    """The recorded settings of an idea, or of the baseline.
+    """The recorded settings of an idea, or of the baseline, with what is typed about tracking.
 
     Raises InputError if they would run code that the ``typed`` words do not allow: the ledger is a
     file, and may be somebody else's.
@@ -349,7 +366,10 @@ def _permitted(book: Ledger, idea: str, typed: Sequence[str]) -> tuple[str, ...]
     if needed:
         names = ",".join(sorted(needed | set(typed_permissions(typed))))
         raise InputError(f"{idea} runs code of yours: add allow_targets=[{names}]")
-    return words
+    tracking = [word for word in typed if key_of(word).partition(".")[0] == "tracking"]
+    if any(key_of(word) == "tracking" for word in tracking):  # settings of another tracker
+        words = tuple(word for word in words if not key_of(word).startswith("tracking"))
+    return tuple(_merged(words, tracking))
 
 
 def _merged(words: Sequence[str], changes: Sequence[str]) -> list[str]:

@@ -36,7 +36,7 @@ from gsbench.analysis.tables import (
     with_agreement,
 )
 from gsbench.errors import InputError
-from gsbench.files import writable_output, write_text
+from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.keys import AS_RELEASED
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of
@@ -191,9 +191,10 @@ def _write(texts: Mapping[str, str], out: Path | None, name: str) -> None:
         if out.suffix.lower() == suffix and not out.is_dir():
             part = "" if len(texts) == 1 else end.removesuffix(suffix)
             file = out.with_name(f"{out.stem}{part}{out.suffix}")
+            output = writable_output if file == out else own_output
         else:
-            file = out / f"{name}{end}"
-        with writable_output(file):
+            file, output = out / f"{name}{end}", own_output
+        with output(file):
             write_text(file, text)
         print(file)
 
@@ -218,13 +219,14 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file = experiment.folder / REPORT_NAME
+    file, output = experiment.folder / REPORT_NAME, writable_output
     if options.out is not None:
         file = file_at(options.out, experiment.name)
+        output = writable_output if file == options.out else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
-    with writable_output(file):
+    with output(file):
         write_text(file, text)
     print(file)
     return 0

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-import webbrowser
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +19,7 @@ from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
 from gsbench.system.install import install_command
 from gsbench.system.isolate import end_descendants
+from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking.comparison import addresses, publish
 from gsbench.tracking.mlflow_sink import SETTINGS, default_uri, tracker_uri
@@ -142,8 +142,18 @@ def _open(server: str, page: str) -> None:
         except requests.RequestException:
             time.sleep(1)
             continue
-        webbrowser.open(page)
+        # Its programs start in a folder that is not a stranger's.
+        command = [sys.executable, "-P", "-m", "webbrowser", page]
+        subprocess.run(command, cwd=NEUTRAL, env=safe_environment(), check=False)
         return
+
+
+def absolute_address(uri: str) -> str:
+    """A tracker's address as the server, which starts in another folder, needs it."""
+    place = uri.removeprefix("sqlite:///")
+    if place != uri:
+        return uri if place in ("", ":memory:") else f"sqlite:///{os.path.abspath(place)}"
+    return uri if ":" in uri else os.path.abspath(uri)
 
 
 def serve(uri: str, port: int) -> int:
@@ -153,20 +163,21 @@ def serve(uri: str, port: int) -> int:
     assert mlflow_spec.origin is not None
     # uvicorn imports modules from the current folder first, where a `yaml.py` may lie; MLflow's own
     # folder is safe.
-    folder = shlex.quote(str(Path(mlflow_spec.origin).parents[1]))
+    mlflow_folder = shlex.quote(str(Path(mlflow_spec.origin).parents[1]))
     options = {
-        "--backend-store-uri": uri,
+        "--backend-store-uri": absolute_address(uri),
         "--host": "127.0.0.1",
         "--port": str(port),
         "--workers": "1",
-        "--uvicorn-opts": f"--app-dir={folder}",
+        "--uvicorn-opts": f"--app-dir={mlflow_folder}",
     }
     words = itertools.chain(*options.items())
-    with stop_on_signals():
+    with own_folder() as folder, stop_on_signals():
         # Not `subprocess.run`: it would kill only `mlflow ui`, and its orphaned server would keep
         # the port.
-        command = [sys.executable, "-m", "mlflow", "ui", *words]
-        server = subprocess.Popen(command, env=SETTINGS | LEAN | dict(os.environ))
+        command = [sys.executable, "-P", "-m", "mlflow", "ui", *words]
+        environment = SETTINGS | LEAN | safe_environment()
+        server = subprocess.Popen(command, cwd=folder, env=environment)
         try:
             return server.wait()
         except KeyboardInterrupt:

@@ -31,13 +31,11 @@ from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
 from gsbench.tracking.mirror import MirrorError
 from gsbench.tracking.mirror import sync as send_missing
-from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
 ORDER = ("failed", "damaged", "running", "queued", "partial", "missing", "superseded", "done")
 RETRIED = ("failed", "partial", "damaged", "missing")
-TRACKER = "tracking.uri"
 SECONDS_BETWEEN_LOOKS = 3.0
 
 log = logging.getLogger(__name__)
@@ -179,7 +177,7 @@ def _age(trial: TrialState) -> str:
 
 def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
-    from gsbench.app.command import run_trials
+    from gsbench.app.command import check_trackers, run_trials
 
     parser = ArgumentParser("retry")
     parser.add_argument("experiment")
@@ -209,7 +207,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         recompose(folder, planned.get(folder), runs, options.changes, modules)
         for folder in unfinished
     ]
-    _check_trackers(trials, options.changes)
+    check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -221,21 +219,6 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     code = run_trials(trials)
     forget(home, [old for old in replaced if old in planned])
     return code
-
-
-def _check_trackers(trials: Sequence[Trial], changes: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send results to an address that only a file names.
-
-    The runs folder may be somebody else's, and the address theirs.
-    """
-    typed_uri = next((word.partition("=")[2] for word in changes if key_of(word) == TRACKER), None)
-    for trial in trials:
-        if address := untyped_address(trial.values["tracking"], typed_uri):
-            raise InputError(
-                f"{trial.files.label} would send its results to {address}, an address from a file: "
-                f"to allow it, type {TRACKER}={address} (for a trial in no plan: set "
-                f"{VARIABLE}={address}); tracking=none sends nothing"
-            )
 
 
 def recompose(

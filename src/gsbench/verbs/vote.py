@@ -22,7 +22,7 @@ from gsbench.launch.record import declare_questions
 from gsbench.parsing import read_typed, resolved
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.layout import VOTE_KEY, VOTES
-from gsbench.runs.votes import Ballot, check_ballot, read_key
+from gsbench.runs.votes import Ballot, RoundKey, StoredBallot, check_ballot, read_key, store_ballots
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
 from gsbench.words import counted, some_of
 
@@ -134,13 +134,15 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
 def judge(experiment: Experiment, files: Sequence[Path]) -> None:
     """Take people's files into their rounds, and print the verdicts of these rounds, or all."""
     ballots: dict[str, Ballot] = {}
+    new: dict[Path, tuple[RoundKey, list[Ballot]]] = {}
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} is not there: give the files of votes that people saved")
         ballot = read_typed(resolved(file), Ballot)
         folder = experiment.folder / VOTES / ballot.round
         require_no_links(experiment.folder.parent, folder, below=True)
-        check_ballot(ballot, read_key(folder), file)
+        key = read_key(folder)
+        check_ballot(ballot, key, file)
         if ballot.person in ballots:
             raise InputError(
                 f"{file} is of the same person as another file: give one file for each person"
@@ -149,11 +151,14 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
         place = folder / f"{ballot.person}.json"
         # A person who goes back and saves again would otherwise change votes after seeing a
         # verdict.
-        if place.exists() and read_typed(place, Ballot) != ballot:
+        if not place.exists():
+            new.setdefault(folder, (key, []))[1].append(ballot)
+        elif read_typed(place, StoredBallot).ballot != ballot:
             raise InputError(
                 f"{file}: this person handed in other votes before, which stay ({place})"
             )
-        write_json(place, ballot.to_json())
+    for folder, (key, own) in new.items():
+        store_ballots(folder, key, own)
     verdicts = load_rounds(experiment.folder)
     if not verdicts:
         raise InputError(

@@ -6,6 +6,7 @@ downloads and starts. Its settings, in the viewer's version 2, hold each test vi
 """
 
 import math
+import re
 import shlex
 import shutil
 import subprocess
@@ -18,17 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis.results import TrialResult
-from gsbench.errors import GsbenchError
+from gsbench.errors import GsbenchError, InputError
 from gsbench.files import atomic, write_json
 from gsbench.normalization import Normalization
 from gsbench.scene.colmap import model_points, read_model
 from gsbench.scene.types import View
+from gsbench.system.programs import find_program, own_folder, safe_environment
 from gsbench.view.trials import model_file, model_folder, read_test_views
 
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 # Without a GPU, the colours' spherical harmonics are sorted into groups by one step instead of ten:
 # each takes ten seconds of a core for 20,000 Gaussians.
 WITHOUT_GPU = ("-g", "cpu", "-i", "1")
+# The page may run its own script, and load nothing from anywhere.
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
+    "worker-src blob: data:; style-src 'unsafe-inline'; img-src blob: data:; font-src data:; "
+    "connect-src blob: data:"
+)
 SECONDS_PER_VIEW = 4
 MIN_DEPTH = 0.2  # units: 3DGS's near plane
 
@@ -37,15 +45,16 @@ def write_page(trial: TrialResult, out: Path) -> None:
     """Write the page of ``trial`` to the file ``out``.
 
     Raises GsbenchError with the command to type if npx is missing or fails; then model and settings
-    lie beside ``out``.
+    lie in a new folder beside ``out``.
     """
     # First, so that an error in the trial is raised before anything is downloaded.
     settings = page_settings(trial)
-    npx = shutil.which("npx")
+    npx = find_program("npx")
     if npx is None:
         raise GsbenchError(_by_hand(trial, settings, out, "Node.js (npx) is not installed"))
-    with tempfile.TemporaryDirectory(prefix="gsbench-") as scratch:
-        model, page = Path(scratch) / "model.ply", Path(scratch) / "page.html"
+    with own_folder("node_modules", "package.json", ".npmrc") as scratch:
+        model, page = scratch / "model.ply", scratch / "page.html"
+        write_json(scratch / "package.json", {})  # npm looks for the project's folder no higher
         shutil.copyfile(model_file(trial), model)
         write_json(model.with_suffix(".json"), settings)
         words = [npx, "--yes", PACKAGE, "--overwrite"]
@@ -53,25 +62,44 @@ def write_page(trial: TrialResult, out: Path) -> None:
         said = ""
         for device in ((), WITHOUT_GPU):
             done = subprocess.run(
-                [*words, *device, *files], capture_output=True, text=True, check=False
+                [*words, *device, *files],
+                cwd=scratch,
+                env=safe_environment(),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                encoding="utf-8",
+                errors="replace",
+                check=False,
             )
             if done.returncode == 0 and page.is_file():
+                text = with_policy(page.read_text(encoding="utf-8"))
                 with atomic(out, sync=False) as temporary:
-                    shutil.copyfile(page, temporary)
+                    temporary.write_text(text, encoding="utf-8")
                 return
             said = (done.stderr or done.stdout).strip().rpartition("\n")[2]
     raise GsbenchError(_by_hand(trial, settings, out, f"npx {PACKAGE} failed ({said})"))
 
 
 def _by_hand(trial: TrialResult, settings: dict[str, Any], out: Path, cause: str) -> str:
-    model = out.with_suffix(".ply")
+    # a new folder, since files of the user may have any name
+    folder = Path(tempfile.mkdtemp(prefix=f"{out.stem}-", dir=out.parent))
+    model, extras = folder / "model.ply", folder / "model.json"
     shutil.copyfile(model_file(trial), model)
-    write_json(out.with_suffix(".json"), settings)
-    words = ["npx", PACKAGE, str(model), "-E", str(out.with_suffix(".json")), str(out)]
+    write_json(extras, settings)
+    words = ["npx", PACKAGE, str(model), "-E", str(extras), str(out)]
     return (
-        f"{cause}: model and settings lie in {out.parent}; where it works, type: "
-        f"{shlex.join(words)}"
+        f"{cause}: model and settings lie in {folder}; where it works, type, in a folder of your "
+        f"own: {shlex.join(words)}"
     )
+
+
+def with_policy(page: str) -> str:
+    """The page with `POLICY` as the first words of its head."""
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    text, count = re.subn(r"(<head[^>]*>)", lambda head: head[0] + meta, page, count=1)
+    if not count:
+        raise GsbenchError(f"{PACKAGE} wrote a page without a head: please report it")
+    return text
 
 
 def page_settings(trial: TrialResult) -> dict[str, Any]:
@@ -86,7 +114,7 @@ def page_settings(trial: TrialResult) -> dict[str, Any]:
         "version": 2,
         "tonemapping": "none",
         "highPrecisionRendering": False,
-        "background": {"color": list(trial.config.get("train.background", (0.0, 0.0, 0.0)))},
+        "background": {"color": _background(trial)},
         "postEffectSettings": {name: {"enabled": False, **EFFECTS[name]} for name in EFFECTS},
         "animTracks": [_flight([camera for _, camera in cameras])],
         "cameras": [{"initial": cameras[0][1]}],
@@ -112,8 +140,18 @@ def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _background(trial: TrialResult) -> list[float]:
+    """The training's background, three numbers; raises InputError for anything else."""
+    color = trial.config.get("train.background", (0.0, 0.0, 0.0))
+    if len(color) != 3 or any(type(one) not in (int, float) for one in color):
+        raise InputError(f"{trial.path}: train.background in its configuration is not a colour")
+    return [float(one) for one in color]
+
+
 def _annotation(name: str, camera: dict[str, Any]) -> dict[str, Any]:
-    text = {"title": name, "text": "a test view", "extras": None}
+    # splat-transform writes the settings into a script of the page as they are, where the name of a
+    # stranger's photograph must not end the script.
+    text = {"title": re.sub(r"[<>&]", "_", name), "text": "a test view", "extras": None}
     return {"position": camera["target"], **text, "camera": {"initial": camera}}
 
 

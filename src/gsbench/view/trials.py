@@ -105,9 +105,11 @@ def _trial_in(folder: Path) -> TrialResult:
 
 
 def model_file(trial: TrialResult) -> Path:
-    """The PLY file of a trial's Gaussians; raises InputError for a trial without a model."""
+    """The PLY file of a trial's Gaussians; raises InputError if it has none or it was changed."""
     if trial.from_renders:
         raise InputError(f"{trial.label} was evaluated from renders: it has no model")
+    if change := trial.folder.change(thorough=True):
+        raise InputError(f"{trial.label}: {change}: run this trial again")
     return trial.path / POINT_CLOUD
 
 

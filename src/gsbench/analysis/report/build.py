@@ -5,6 +5,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -70,6 +71,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     volumes, volume_notes = volume_charts(trials, arms)
     return fill(
         "report.html.j2",
+        script=files("gsbench.analysis.report").joinpath("script.js").read_text(encoding="utf-8"),
         name=experiment.name,
         arms=[str(arm) for arm in arms],
         scenes=sorted({trial.scene for trial in trials}),

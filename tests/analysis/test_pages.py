@@ -1,0 +1,161 @@
+"""Every page that gsbench writes, with hostile text in each of its fields."""
+
+from __future__ import annotations
+
+import random
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from markupsafe import Markup
+
+from gsbench.analysis import table_formats
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import load_experiment
+from gsbench.claims.archive import write_archive
+from gsbench.claims.check import to_html
+from gsbench.claims.vote_page import make_round
+from gsbench.cli import run
+from gsbench.runs.experiments import Arm
+from gsbench.view import page as model_page
+from tests.analysis.synthetic import Plan, write_runs
+from tests.claims.test_page import made, page_of
+from tests.view.browser import Browser
+
+ROOT = Path(table_formats.__file__).parents[1]
+HOSTILE = (
+    "'\"></script></style></title></textarea>--><script>document.title='owned'</script>"
+    "<img src=x onerror=\"document.title='owned'\"><svg onload=\"document.title='owned'\">"
+    "{{ 7 * 7 }}"
+)
+LOOK = "[document.title === 'owned', document.scripts.length]"
+
+
+class Parsed(HTMLParser):
+    """The elements of a page with their attributes, in order, and the texts of its scripts."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[str] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.cdata_elem == "script":
+            self.scripts[-1] += data
+
+    @property
+    def shape(self) -> list[tuple[str, tuple[str, ...]]]:
+        return [(tag, tuple(attributes)) for tag, attributes in self.elements]
+
+
+def pages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Each kind of page by its template, written by the verbs or what they call."""
+    runs = folder / "runs"
+    write_runs(runs, Plan(views=7, seeds=(0, 1), pictures=True, effect={"psnr": 1.0}))
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    trials = load_experiment(runs, "exp")
+    arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
+    make_round(trials.trials, arms, 4, 1, folder / "vote", random.Random(0))
+    write_archive(trials, folder / "exp.zip")
+    assert run(["site", str(folder / "exp.zip"), "--out", str(folder / "site")]) == 0
+    assert run(["tables", "exp", "--format", "html", "--out", str(folder / "tables")]) == 0
+    (table, *_) = sorted((folder / "tables").glob("*.html"))
+    return {
+        "report.html.j2": build_report(trials),
+        "site.html.j2": (folder / "site" / "index.html").read_text(),
+        "vote.html.j2": (folder / "vote" / "index.html").read_text(),
+        "table_page.html.j2": table.read_text(),
+        "page.html.j2": to_html(page_of(made(folder / "claims", tuple("abcdef")))),
+    }
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, str], dict[str, str]]:
+    """All pages, as they are and with `HOSTILE` in each field of each template."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sound = pages(tmp_path_factory.mktemp("sound"), monkeypatch)
+        plain = table_formats._environment.__wrapped__
+
+        def hostile(package: str) -> Any:
+            environment = plain(package)
+
+            def finalize(value: Any) -> Any:
+                # Markup is what gsbench itself wrote: a script, its hash, a chart
+                return value if isinstance(value, Markup) else f"{value}{HOSTILE}"
+
+            environment.finalize = finalize
+            return environment
+
+        monkeypatch.setattr(table_formats, "_environment", hostile)
+        return sound, pages(tmp_path_factory.mktemp("hostile"), monkeypatch)
+
+
+def test_every_page_is_among_those_that_are_tried(both: Any) -> None:
+    whole = {
+        file.name
+        for file in ROOT.rglob("*.j2")
+        if "<html" in file.read_text(encoding="utf-8").lower()
+    }
+    assert whole == both[0].keys()
+    written = [file for file in ROOT.rglob("*.py") if "<html" in file.read_text().lower()]
+    assert not written  # and `gsbench export --out page.html`, which is tried below
+
+
+def test_no_text_of_a_page_becomes_an_element_or_a_script(both: Any) -> None:
+    for name, sound in both[0].items():
+        before, after = Parsed(sound), Parsed(both[1][name])
+        assert after.shape == before.shape, name
+        assert "&lt;/script&gt;" in both[1][name], name
+        assert len(after.scripts) == len(before.scripts)
+        for tag, attributes in after.elements:
+            assert not [key for key in attributes if key.startswith("on")], (name, tag)
+            assert "srcdoc" not in attributes
+            target = attributes.get("href") or attributes.get("src") or "#"
+            assert re.match(r"#|data:|reports/|pictures/|https://", target), (name, target)
+
+
+def test_every_page_allows_its_own_script_alone(both: Any) -> None:
+    for name, text in both[0].items():
+        parsed = Parsed(text)
+        head = [tag for tag, _ in parsed.elements]
+        policy = next(
+            attributes["content"] or ""
+            for _, attributes in parsed.elements
+            if attributes.get("http-equiv") == "Content-Security-Policy"
+        )
+        assert head[:4] == ["html", "head", "meta", "meta"], name  # before anything that it rules
+        assert policy.startswith("default-src 'none'; ")
+        run_scripts = [one for one in parsed.scripts if not one.startswith("{")]
+        hashes = [f"'sha256-{table_formats._digest(script)}'" for script in run_scripts]
+        assert re.findall("script-src ([^;]*)", policy) == hashes, name
+        assert "unsafe-inline" not in policy.partition("script-src")[2]
+
+
+@pytest.mark.browser
+def test_no_hostile_text_runs_in_a_browser(both: Any, tmp_path: Path) -> None:
+    for name, text in both[1].items():
+        file = tmp_path / f"{name}.html"
+        file.write_text(text, encoding="utf-8")
+        with Browser(file.as_uri(), tmp_path / f"profile-{name}") as browser:
+            found = browser.call("Runtime.evaluate", expression=LOOK, returnByValue=True)
+            assert found["result"]["value"] == [False, len(Parsed(text).scripts)], name
+
+
+def test_the_name_of_a_photograph_stays_a_text_in_the_page_of_a_model() -> None:
+    annotation = model_page._annotation(f"0{HOSTILE}.png", {"target": [0, 0, 0]})
+    assert not set("<>&") & set(str(annotation))
+    page = model_page.with_policy("<!DOCTYPE html><html><head lang='x'><title>t</title></head>")
+    first = Parsed(page).elements[2]
+    assert first == (
+        "meta",
+        {"http-equiv": "Content-Security-Policy", "content": model_page.POLICY},
+    )
