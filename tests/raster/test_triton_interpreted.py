@@ -32,7 +32,7 @@ from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.launch import Workspace
 from gsbench.scene.types import Camera, Scene, View
 from gsbench.train.adam_triton import TritonAdam
-from gsbench.train.direct import DirectStep
+from gsbench.train.direct import MOST_SIZES, DirectStep
 from gsbench.train.direct_proof import direct_fault
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.loss_triton import TritonLoss
@@ -275,7 +275,7 @@ def test_the_memory_of_a_render_is_the_documented_one(case: Case) -> None:
     output = rasterizer.render(leaves(case), case.camera(), case.sh_degree, BLACK)
     frame = output.footprint.args[0]
     output.image.sum().backward()
-    count, pairs, blocks = case.count, frame.units.pairs, frame.blocks
+    count, pairs, blocks = case.count, frame.lists.room.pairs, frame.blocks
     del output, frame
     free = [
         workspace
@@ -475,6 +475,18 @@ def test_the_footprint_of_a_direct_step_is_that_of_its_own_view() -> None:
         expected = TritonRasterizer().render(model.values, camera, 1, BLACK).require_footprint()
         for own, theirs in zip(vars(found).values(), vars(expected).values(), strict=True):
             assert torch.equal(own, theirs)
+
+
+def test_memory_of_direct_steps_is_kept_for_few_sizes() -> None:
+    steps = FixedViews(True)
+    for width in range(4, 4 + MOST_SIZES + 2):
+        camera = orbit_camera(0.0, width=width, height=4)
+        target = torch.zeros(4, width, 3, dtype=torch.uint8)
+        image = steps.direct.step(steps.trainer.gaussians, camera, target, 0, False, False)[0].image
+        expected = TritonRasterizer().render(steps.trainer.gaussians.values, camera, 0, BLACK).image
+        assert torch.equal(image, expected)
+    assert [size[0] for size in steps.direct._memory] == [6, 7, 8, 9]
+    assert set(steps.direct._plan) == set(steps.direct._memory)
 
 
 def test_direct_steps_pass_their_proof_and_a_fault_of_them_is_found(

@@ -64,8 +64,7 @@ class Shape(NamedTuple):
 class DirectStep:
     """Renders, measures and differentiates training views; applies Adam.
 
-    It can do what `serves` says. ``graphs`` turns recording on; without it, the same launches are
-    made one by one.
+    ``graphs`` turns recording on; without it, the same launches are made one by one.
     """
 
     def __init__(
@@ -82,11 +81,6 @@ class DirectStep:
         self._cameras: dict[int, tuple[Camera, Tensor]] = {}
         self._pool: _GraphPool | None = None
 
-    def serves(self, camera: Camera) -> bool:
-        """Return whether there is memory for images of this size; `MOST_SIZES` sizes have it."""
-        size = camera.width, camera.height
-        return size in self._memory or len(self._memory) < MOST_SIZES
-
     def step(
         self,
         gaussians: TrainableGaussians,
@@ -102,7 +96,7 @@ class DirectStep:
         """
         size = camera.width, camera.height
         shape = Shape(*size, degree, absolute, splitting, target.dtype)
-        memory = self._memory.setdefault(size, _Memory(self.background.device))
+        memory = self._memory_of(size)
         plan = self._plan.get(size)
         if plan is None or not plan.suits(gaussians, shape):
             self._plan.pop(size, None)  # first free the memory of its graphs
@@ -133,6 +127,15 @@ class DirectStep:
         for size, memory in self._memory.items():
             memory.room = room
             self._plan.pop(size, None)
+
+    def _memory_of(self, size: tuple[int, int]) -> _Memory:
+        """The memory for images of ``size``; that of the size not used for longest is freed."""
+        memory = self._memory.pop(size, None) or _Memory(self.background.device)
+        self._memory[size] = memory  # now the last one
+        for oldest in list(self._memory)[:-MOST_SIZES]:
+            del self._memory[oldest]
+            self._plan.pop(oldest, None)
+        return memory
 
     def graph_pool(self) -> _GraphPool:
         if self._pool is None:

@@ -285,14 +285,12 @@ class Trainer:
         cameras, targets = self.scaled_views.at(self.scale)
         target, mask = targets.get(index), targets.mask(index)
         regularizer = self.densifier.regularizer(self.gaussians.values)
-        direct, camera = self.direct, cameras[index]
-        self.is_direct = (
-            direct is not None and mask is None and regularizer is None and direct.serves(camera)
-        )
+        direct = self.direct
+        self.is_direct = direct is not None and mask is None and regularizer is None
         if direct is not None and self.is_direct:
             step = direct.step(
                 self.gaussians,
-                camera,
+                cameras[index],
                 target,
                 self.sh_degree,
                 self.densifier.needs_absolute_gradient,
