@@ -154,4 +154,6 @@ def test_each_setting_that_changes_views_changes_the_key(tmp_path):
         ).key
     )
     assert len(set(keys)) == len(keys) == 8
-    assert ground_truth_step(Views(store, capture, init, replace(base, max_images=9))).key == keys[0]
+    assert (
+        ground_truth_step(Views(store, capture, init, replace(base, max_images=9))).key == keys[0]
+    )
