@@ -82,6 +82,7 @@ def test_of_folders_of_several_sizes_the_largest_is_read(
         ["unmasked/{}.jpg"],
         ["left/{}.jpg", "right/{}.jpg"],
         ["deep/{}.jpg", "abnormal/{}.jpg"],
+        ["normal/{}.jpg", "wide/{}.jpg"],
         ["mask_{}.jpg"],  # photographs of a mask: nothing has the rest of the name
     ],
 )

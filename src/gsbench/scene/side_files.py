@@ -20,10 +20,12 @@ WORDS = frozenset(
     word + ending
     for word in (
         *("mask", "thumb", "thumbnail", "preview", "depth", "depthmap", "disparity", "normal"),
-        *("segmentation", "segment", "seg", "semantic", "label", "matte", "render", "undistorted"),
+        *("segmentation", "seg", "semantic", "matte", "render", "undistorted"),
     )
     for ending in ("", "s")
 )
+# a folder of this name may hold the photographs of a lens that is neither wide nor long
+FOLDER_WORDS = WORDS - {"normal"}
 # folders of file systems: Synology, QNAP, Windows, macOS, Linux
 SYSTEM = frozenset({"@eadir", "#recycle", "@recycle", "$recycle.bin", "__macosx", "lost+found"})
 THUMBNAIL = re.compile(r"SYNO(PHOTO|VIDEO|INDEX)_", re.IGNORECASE)  # files of Synology
@@ -82,7 +84,7 @@ def _parents(name: str) -> Iterator[str]:
 
 
 def _is_side_folder(folder: Path) -> bool:
-    if folder.name.casefold() in SYSTEM or WORDS.intersection(_words(folder.name)):
+    if folder.name.casefold() in SYSTEM or FOLDER_WORDS.intersection(_words(folder.name)):
         return True
     return any((folder / name).is_dir() for name in WORKSPACES)
 
