@@ -190,7 +190,11 @@ def test_an_entry_that_cannot_follow_is_refused(home: Path, fault: str) -> None:
 @pytest.mark.parametrize("place", ["ended", "confirmed"])
 def test_a_relative_difference_that_no_number_holds_is_refused(home: Path, place: str) -> None:
     huge = Difference(mean=1e30, low=0.0, high=0.0)
-    entries = [replace(OPENED, relative=True), started("a"), replace(ended("a", KEPT), difference=huge)]
+    entries = [
+        replace(OPENED, relative=True),
+        started("a"),
+        replace(ended("a", KEPT), difference=huge),
+    ]
     if place == "confirmed":
         entries[2:] = [ended("a", KEPT), ENTRIES[4], replace(ENTRIES[5], differences={"a": huge})]  # type: ignore[arg-type,list-item]
     (home / LEDGER).write_text(chained(map(as_json, entries)))

@@ -471,7 +471,10 @@ def test_an_address_that_only_the_ledger_names_gets_no_results(
 ) -> None:
     settings = [word for word in NEW if word != "tracking=none"]
     assert run(["ledger", *settings, f"tracking.uri={HOME_OF_ANOTHER}"]) == 0
-    for words in (["try", "night", f"{SPLIT}=0.02"], ["try", "night", f"{SPLIT}=0.02", "device=cpu"]):
+    for words in (
+        ["try", "night", f"{SPLIT}=0.02"],
+        ["try", "night", f"{SPLIT}=0.02", "device=cpu"],
+    ):
         assert f"would send its results to {HOME_OF_ANOTHER}" in refused("ledger", *words)
     assert not trainings.trained
     assert len(read_ledger(tmp_path / "runs" / "night").entries) == 1

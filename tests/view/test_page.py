@@ -29,7 +29,9 @@ case "$*" in *"{works}"*) (echo "<head></head>"; cat "$settings") > "$previous";
 def stand_in(folder: Path, works: str, fails: str, works_too: str = ":") -> Path:
     """Write an npx that copies its settings to the page if its words contain ``works``."""
     folder.mkdir()
-    (folder / "npx").write_text(NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too))
+    (folder / "npx").write_text(
+        NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too)
+    )
     (folder / "npx").chmod(0o755)
     return folder
 
@@ -43,7 +45,9 @@ def test_the_page_has_every_test_view(
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
     assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 0
     text = (tmp_path / "page.html").read_text()
-    assert text.startswith("<head><meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'n")
+    assert text.startswith(
+        '<head><meta http-equiv="Content-Security-Policy" content="default-src \'n'
+    )
     settings = json.loads(text.rpartition("</head>")[2])
     assert settings == page_settings(find_trial(ADDRESS, small_runs))
     assert settings["background"] == {"color": [0, 0, 0]}
@@ -140,7 +144,9 @@ def test_npx_starts_where_no_package_of_the_current_folder_is_found(
     assert not Path(where).exists()
     assert seen_lines.count("package.json") == 1
     assert {"node_modules", ".npmrc"}.isdisjoint(seen_lines)
-    assert all(entry.startswith("/") for line in seen_lines if ":" in line for entry in line.split(":"))
+    assert all(
+        entry.startswith("/") for line in seen_lines if ":" in line for entry in line.split(":")
+    )
 
 
 @pytest.mark.parametrize("name", ["node_modules", ".npmrc", "package.json"])

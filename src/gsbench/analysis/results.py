@@ -405,7 +405,9 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         folder = TrialFolder(path)
         record = folder.record()
         if change := folder.change():
-            raise _UnusableError(f"damaged, {change}: `gsbench retry {record.experiment}` repairs it")
+            raise _UnusableError(
+                f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
+            )
     except FileNotFoundError:
         raise _UnusableError(_why_unfinished(path)) from None
     except UnfinishedError as error:

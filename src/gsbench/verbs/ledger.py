@@ -36,7 +36,14 @@ MOST_IDEAS = 10_000
 OWN = ("name", "runs", "eval.primary")  # settings that the ledger gives itself
 # An idea may change how a model is made, not what it is measured on.
 OF_IDEAS = (
-    "densify", "init", "train", "raster", "allow_targets", "launch", "device", "threads",
+    "densify",
+    "init",
+    "train",
+    "raster",
+    "allow_targets",
+    "launch",
+    "device",
+    "threads",
     "tracking",
 )
 
