@@ -32,6 +32,7 @@ from gsbench.files import (
     sync_to_disk,
     writable_output,
     write_json,
+    write_text,
 )
 
 Usage = namedtuple("Usage", "total used free")
@@ -285,3 +286,8 @@ def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(
     for own in (TrainingError("disk is full"), InputError("disk is full")):
         with pytest.raises(type(own), match=r"^disk is full$"), storage_errors(tmp_path):
             raise own
+
+
+def test_a_text_with_a_name_that_is_not_utf_8_is_written(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "a \udcff b")
+    assert (tmp_path / "a.txt").read_text() == "a \\udcff b"

@@ -214,3 +214,13 @@ def test_a_log_on_a_full_disk_stops_nothing(said: Callable[[], str]) -> None:
         with suppress(OSError):
             full.close()
     assert said() == ""
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"), [("latin-1", b"\\u2191 \xe9"), ("ascii", b"\\u2191 \\xe9")]
+)
+def test_what_an_encoding_lacks_is_escaped(encoding: str, shown: bytes) -> None:
+    raw = io.BytesIO()
+    stream = PrintableStream(io.TextIOWrapper(raw, encoding=encoding))
+    print("\u2191 \xe9", end="", file=stream, flush=True)  # type: ignore[call-overload]
+    assert raw.getvalue() == shown

@@ -27,7 +27,10 @@ class _Printable(logging.Formatter):
 
 
 class PrintableStream:
-    """A stream that writes to ``raw`` and makes everything `printable`."""
+    """A stream that writes to ``raw`` and makes everything `printable`.
+
+    Characters that its encoding lacks are escaped too, such as ↑ where only ASCII can be printed.
+    """
 
     def __init__(self, raw: TextIO) -> None:
         self.raw = raw
@@ -36,7 +39,8 @@ class PrintableStream:
         return getattr(self.raw, name)
 
     def write(self, text: str) -> int:
-        self.raw.write(printable(text))
+        encoding = getattr(self.raw, "encoding", None) or "utf-8"
+        self.raw.write(printable(text).encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
     def writelines(self, lines: Sequence[str]) -> None:

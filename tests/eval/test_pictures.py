@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from gsbench.errors import InputError
+from gsbench.eval import pictures
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import PicturePair, measure
 from gsbench.eval.protocol import PAPER
@@ -59,3 +60,12 @@ def test_a_truncated_picture_is_named(pairs: list[PicturePair]) -> None:
     pairs[0].picture.write_bytes(pairs[0].picture.read_bytes()[:500])
     with pytest.raises(InputError, match=r"b_render\.png: the image is damaged"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
+
+
+def test_pictures_too_large_to_be_measured_are_refused_by_their_header(tmp_path, monkeypatch):
+    Image.new("1", (100, 100)).save(tmp_path / "a.png")
+    pair = pictures.PicturePair("a", tmp_path / "a.png", tmp_path / "a.png")
+    pictures.check_picture_sizes([pair])
+    monkeypatch.setattr(pictures, "MAX_PIXELS", 9_999)
+    with pytest.raises(InputError, match="100x100 px: pictures of more than"):
+        pictures.check_picture_sizes([pair])

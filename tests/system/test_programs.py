@@ -50,8 +50,7 @@ def starts_of(file: Path) -> dict[tuple[str, str, str], ast.Call]:
                 or (module == "pty" and attribute == "spawn")
                 or (module == "webbrowser" and attribute.startswith("open"))
                 or attribute.startswith("create_subprocess")
-                or name.endswith((".Process", "ProcessPoolExecutor"))
-                and module != "psutil"
+                or (name.endswith((".Process", "ProcessPoolExecutor")) and module != "psutil")
             ):
                 found[file.relative_to(SRC).as_posix(), function.name, name] = call
     return found

@@ -30,7 +30,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Interval, Predicate, doc
+from annotated_types import Interval, Predicate, doc
 
 from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
@@ -46,6 +46,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,60}")
 KEY = re.compile(r"[+]?\w+([./]\w+)*")  # of a setting
 GIVEN_BY_CHECK = ("name", "seed", "runs", "eval.primary")  # settings that the check sets itself
 MAX_ALPHA = 0.2
+MAX_SEEDS = 1000
 NO_SIZE = "give a difference such as 0.005, or 10% (of the baseline's value)"
 DIRECTIONS = {"higher": 1, "lower": -1, "same": 0}
 
@@ -112,7 +113,7 @@ class ClaimsFile:
 
     name: Name
     paper: Sentence
-    seeds: Annotated[int, Ge(FIRST_LOOK)]
+    seeds: Annotated[int, Interval(ge=FIRST_LOOK, le=MAX_SEEDS)]
     scenes: dict[str, Any]  # the settings of each scene
     arms: dict[str, Any]  # the settings of each arm
     claims: list[Claim]

@@ -173,6 +173,10 @@ _RULES: dict[str, KeyFunction] = {
 }
 
 
+# A view of so many pixels takes half a minute; a file of some kB may claim more.
+MAX_PIXELS = 64_000_000
+
+
 @dataclass(frozen=True)
 class PicturePair:
     """A view with the files of its photograph, its rendered picture and its mask, if any."""
@@ -184,7 +188,7 @@ class PicturePair:
 
 
 def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
-    """Raise `InputError` for a picture whose size differs from its photograph's.
+    """Raise `InputError` for a picture whose size differs from its photograph's, or is too large.
 
     Pictures are never resized.
     """
@@ -196,6 +200,11 @@ def check_picture_sizes(pairs: Sequence[PicturePair]) -> None:
                 f"{pair.picture} is {width}x{height} px, but its photograph {pair.photograph} "
                 f"{wanted_width}x{wanted_height}: sizes are never changed here, so render at the "
                 "photographs' size"
+            )
+        if width * height > MAX_PIXELS:
+            raise InputError(
+                f"{pair.picture} is {width}x{height} px: pictures of more than "
+                f"{MAX_PIXELS / 1e6:g} megapixels are not measured; render and shrink both"
             )
 
 
