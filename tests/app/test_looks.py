@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsbench import cli
-from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
@@ -123,15 +123,13 @@ def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep, runs):
 def test_all_seeds_of_planned_looks_are_declared_beforehand(sweep, runs, psnr):
     assert sweep(Fake(psnr)) == 0
     experiment = read_experiment(runs / "stop")
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert (found.beforehand, found.added) == (True, ())
-    missing = 0 if psnr is noise else 4
-    assert any(
-        f"{missing} of the 8 declared trials are missing" in line
-        for line in found.sentences("PSNR")
-    )
-    assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
+    comparison = compare(experiment)
+    (answer,) = comparison.answers
+    assert answer.beforehand
+    # the sweep's last look and every other surface have the verdict of one function
+    assert answer.primary[0].outcome == verdicts_of(runs)[0].outcome
+    assert answer.primary[0].interval == verdicts_of(runs)[0].interval
+    assert ("4 of the 8 declared trials are not there" in comparison.lines()[-1]) == (psnr is clear)
 
 
 def test_a_decided_pair_gets_no_more_seeds_and_pairs_share_the_error_rate(sweep, runs, caplog):
@@ -201,7 +199,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
     assert [
         (str(v.question.baseline), str(v.question.arm), v.question.least) for v in verdicts
     ] == [
-        (f"random-adc max_gaussians={count}", f"random-volumetric max_gaussians={count}", 0.5)
+        (f"random-adc[max_gaussians={count}]", f"random-volumetric[max_gaussians={count}]", 0.5)
         for count in (1000, 2000)
     ]
     assert cli.run(["report", "stop"]) == 0

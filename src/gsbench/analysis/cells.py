@@ -142,14 +142,17 @@ def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     """The trials, each with its values of the swept settings as `TrialResult.variant`.
 
-    Trials with different values thus belong to different arms.
+    Trials with different values thus belong to different arms. Only settings that were swept for
+    the trial's own initialiser and densifier count, so a further arm renames no other.
     """
-    swept = swept_settings(trials)
-    if not swept:
+    by_densifier = group_by(trials, lambda trial: (trial.init, trial.densify))
+    swept = {key: swept_settings(own) for key, own in by_densifier.items()}
+    if not any(swept.values()):
         return list(trials)
 
     def variant(trial: TrialResult) -> tuple[tuple[str, str], ...]:
-        return tuple((key, str(trial.config.get(key))) for key in swept)
+        own = swept[trial.init, trial.densify]
+        return tuple((key, str(trial.config.get(key))) for key in own)
 
     return [replace(trial, variant=variant(trial)) for trial in trials]
 

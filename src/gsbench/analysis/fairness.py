@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gsbench.analysis.differences import (
-    CODE,
     between_scenes_notes,
     compared_trials,
     differing_keys,
@@ -21,7 +20,7 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read_experiment
+from gsbench.analysis.results import CODE, Arm, TrialResult, canonical, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord

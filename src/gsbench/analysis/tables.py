@@ -19,7 +19,6 @@ from gsbench.analysis.cells import (
     swept_settings,
     with_variants,
 )
-from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.differences import (
     between_scenes_notes,
     conditions_between_scenes,
@@ -27,13 +26,11 @@ from gsbench.analysis.differences import (
     differing_conditions,
 )
 from gsbench.analysis.fairness import caveats
-from gsbench.analysis.pairing import BASELINE, are_equal, choose_pairs, controls_of, pair_trials
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, seeds_words
+from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_words
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.eval.facts import find_metric
 from gsbench.runs.keys import SHOWN
-from gsbench.runs.layout import TUNING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted, some_of
 
@@ -288,6 +285,7 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
     return [
         *doubt_notes(trials),
         *origin_notes(trials),
+        *edited_notes(trials),
         *comparison_notes(experiment),
         *held_out_notes(trials),
         *points_notes(trials),
@@ -359,48 +357,36 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     return notes
 
 
+def edited_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each of the user's modules that was edited after it made some of the trials."""
+    of_module: dict[str, list[TrialResult]] = {}
+    for trial in trials:
+        for module in trial.edited:
+            of_module.setdefault(module, []).append(trial)
+    return [
+        f"{module} was edited since: {counted(len(own), 'trial')} of "
+        f"{some_of(sorted({f'{one.init}-{one.densify}' for one in own}))} are of the old code. "
+        "Give the command again to run the new one."
+        for module, own in of_module.items()
+    ]
+
+
 def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: declared verdict, equality to the last bit, and caveats.
+    """Lines on the compared arms: the verdicts, what no verdict uses, and caveats.
 
     They are about the whole experiment, so choosing the trials that a table shows cannot change a
     verdict.
     """
-    trials, pairs = compared_pairs(experiment)
-    declared = active_declaration(experiment.folder, experiment.trials)
-    notes = []
-    if declared is not None:
-        # here, since SciPy is slow to import
-        from gsbench.analysis.verdicts import declared_lines, judge_pairs
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import compare
 
-        notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
-    by_arm = group_by(trials, lambda trial: trial.arm)
-    for first, second in pairs:
-        both = pair_trials(trials, first, second)
-        if both and all(are_equal(*one) for one in both):
-            names = f"{second} and {first}"
-            notes.append(
-                f"{names} are equal to the last bit in all their trials: the settings that differ "
-                "had no effect."
-            )
+    comparison = compare(experiment)
+    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
     sentences = (
-        caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs
+        caveats([*by_arm[first], *by_arm[second]], first, second)
+        for first, second in comparison.pairs
     )
-    return notes + list(filter(None, sentences))
-
-
-def compared_pairs(
-    experiment: Experiment, baseline: str = BASELINE
-) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
-    """The experiment's trials with their variants, and the pairs of arms to compare.
-
-    A search has no pairs: its points were chosen by results, so no test of them is valid.
-    """
-    trials = with_variants(experiment.trials)
-    if (experiment.folder / TUNING).exists():
-        return trials, []
-    return trials, choose_pairs(
-        sorted({trial.arm for trial in trials}), baseline, controls_of(trials)
-    )
+    return [*comparison.lines(), *filter(None, sentences)]
 
 
 # Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.launch.states import TrialState, states_of_experiment
 from gsbench.runs.experiments import experiment_home
@@ -83,7 +83,7 @@ def progress_of(home: Path) -> Progress:
         cells[names[state.folder]][state.state if state.state in COUNTED else WAITING] += 1
         if state.state == "running":
             speeds[names[state.folder]] += _training(state.folder)[1]
-    trials = [trial for trial in read_experiment(home).trials if trial.path in names]
+    trials = [t for t in newest_code(read_experiment(home)).trials if t.path in names]
     return Progress(
         cells, dict(speeds), _seconds_left(states, names, trials), _leader(home, names, trials)
     )

@@ -14,6 +14,7 @@ import ast
 import hashlib
 import importlib.util
 import json
+import os
 import sys
 import sysconfig
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -400,6 +401,15 @@ def module_digest(name: str, folder: str | None = None) -> str | None:
     return cached[1]
 
 
+def present_digest(name: str) -> str | None:
+    """The digest of a user's module as a command that is given here would find it.
+
+    None if it is not found, or installed: an installed package is identified by its version.
+    """
+    spec = _find_spec(name, os.getcwd())
+    return None if spec is None or _is_installed(spec) else _digest_on_disk(spec)
+
+
 def has_changed_since_import(name: str) -> bool:
     """Return whether a module's files differ from the code that this process has imported."""
     loaded = sys.modules.get(name)
@@ -450,17 +460,26 @@ def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
 
 
 def _digest_on_disk(spec: ModuleSpec) -> str | None:
-    """The sha256 of a module's code: of its one file, else of the list of its files' hashes."""
+    """The sha256 of a module's code: of its one file, else of the list of its files' hashes.
+
+    Python counts by its syntax, so that comments, docstrings and format make no other version.
+    """
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
     if not folders:
         file = Path(spec.origin or "")
-        return file_sha256(file) if spec.has_location and file.is_file() else None
+        return _code_digest(file) if spec.has_location and file.is_file() else None
     parts = []
     for folder in folders:
         for file in sorted(folder.rglob("*")):
             if file.suffix in CODE_SUFFIXES and file.is_file():
-                parts.append(f"{file_sha256(file)}  {file.relative_to(folder).as_posix()}\n")
+                parts.append(f"{_code_digest(file)}  {file.relative_to(folder).as_posix()}\n")
     return hashlib.sha256("".join(parts).encode()).hexdigest() if parts else None
+
+
+def _code_digest(file: Path) -> str:
+    if file.suffix != ".py":
+        return file_sha256(file)
+    return hashlib.sha256(syntax_of(file.read_bytes())).hexdigest()
 
 
 def _is_installed(spec: ModuleSpec) -> bool:

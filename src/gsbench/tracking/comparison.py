@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
 from gsbench.analysis.quantities import metric_keys
-from gsbench.analysis.results import Experiment, TrialResult, read_experiment
+from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
@@ -49,7 +49,7 @@ def publish(home: Path, uri: str | None) -> str:
     """
     client = connect(uri, home.parent)
     experiment_id = ensure_experiment(client, home.name, home.parent)
-    experiment = read_experiment(home)
+    experiment = newest_code(read_experiment(home))
     if experiment.trials:
         _set(
             client,

@@ -10,7 +10,6 @@ from gsbench.analysis.cells import (
     check_averageable,
     make_cell,
     select_trials,
-    swept_settings,
     to_frame,
     with_variants,
 )
@@ -26,12 +25,17 @@ from gsbench.analysis.paper import (
     published_table,
 )
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
+from gsbench.analysis.results import (
+    Arm,
+    Experiment,
+    TrialResult,
+    group_by,
+    load_experiment,
+)
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import (
     DEFAULT_ROWS,
     build_table,
-    compared_pairs,
     format_cell,
     with_agreement,
 )
@@ -115,7 +119,11 @@ def _tables(
 
 def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]:
     """The fairness sheets of all compared pairs of arms, from all trials of the experiment."""
-    trials, pairs = compared_pairs(experiment)
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import pair_arms
+
+    arms = pair_arms(experiment)
+    trials, pairs = arms.trials, arms.pairs
     if not pairs:
         raise InputError(
             f"experiment {experiment.name} has one arm, so there is nothing to compare"
@@ -253,14 +261,11 @@ def explain_cell(address: str, runs: Path) -> str:
     experiment = load_experiment(runs, name)
     trials = _trials_at(experiment, scene, arm)
     shown = quantity(metric, trials)
-    variants = swept_settings(trials)
-    if variants:
-        raise InputError(f"{address} names several cells, which differ in {', '.join(variants)}")
     check_averageable(trials, f"scene={scene} {arm}")
     expected = len(experiment.seeds)
     cell = make_cell(trials, shown, [scene], expected)
     lines = [
-        f"{shown.name} of {trials[0].init}-{trials[0].densify} on {scene} in experiment {name}",
+        f"{shown.name} of {trials[0].arm} on {scene} in experiment {name}",
         f"  {format_cell(cell, shown)}: mean ± deviation (n - 1) over {cell.count} of {expected} "
         "trials",
     ]
@@ -269,25 +274,25 @@ def explain_cell(address: str, runs: Path) -> str:
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
-    folder = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}/"
-    left_out = [line for line in experiment.warnings if line.startswith(folder)]
+    cell = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}"
+    left_out = [line for line in experiment.warnings if line.startswith((f"{cell}/", f"{cell} "))]
     if left_out:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
 
 
-def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
-    """The trials of a scene and an arm: ``<init>-<densify>``, or a densifier that one arm has."""
-    of_scene = [trial for trial in experiment.trials if trial.scene == scene]
+def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
+    """The trials of a scene and of the one arm that ``word`` names (`Arm.answers_to`)."""
+    of_scene = [one for one in with_variants(experiment.trials) if one.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
         raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
-    arms = sorted({(trial.init, trial.densify) for trial in of_scene})
-    chosen = [(init, densify) for init, densify in arms if arm in (f"{init}-{densify}", densify)]
+    by_arm = group_by(of_scene, lambda trial: trial.arm)
+    chosen = [arm for arm in by_arm if arm.answers_to(word)]
     if len(chosen) != 1:
-        names = ", ".join(f"{init}-{densify}" for init, densify in arms)
-        raise InputError(f"{arm!r} names {len(chosen)} arms of {scene}; choose one of {names}")
-    return [trial for trial in of_scene if (trial.init, trial.densify) == chosen[0]]
+        names = ", ".join(str(arm) for arm in sorted(chosen or by_arm))
+        raise InputError(f"{word!r} names {len(chosen)} arms of {scene}; choose one of {names}")
+    return by_arm[chosen[0]]
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:
