@@ -204,8 +204,8 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
     ]
     assert cli.run(["report", "stop"]) == 0
     text = (runs / "stop" / "report.html").read_text()
-    pair = "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000"
-    assert f"{pair}, on this scene: better in PSNR (dB)" in text
+    pair = "random-volumetric[max_gaussians=1000] against random-adc[max_gaussians=1000]"
+    assert f"{pair}: better in PSNR (dB) on this scene" in text
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
     assert "Seeds come in planned looks" in said("tables", "stop")

@@ -105,9 +105,10 @@ class Comparison:
             *self.declaration_lines,
         ]
 
-    def to_json(self) -> list[Mapping[str, Any]]:
-        """The verdicts on each compared pair of arms, for other programs."""
-        return [_as_json(one) for one in self.answers]
+    def to_json(self) -> dict[str, Any]:
+        """The verdicts on each compared pair of arms and what is left out, for other programs."""
+        left_out = [*self.unused, *self.experiment.warnings]
+        return {"pairs": [_as_json(one) for one in self.answers], "left_out": left_out}
 
 
 NOT_PLANNED = "seeds after an undeclared or missing one do not count"

@@ -1,6 +1,7 @@
 """Verbs that show an experiment's results from its files: ``tables``, ``report``, ``explain``."""
 
 import argparse
+import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -49,7 +50,7 @@ ADDRESS = (
     "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or "
     "demo:courtyard:psnr:sfm-adc"
 )
-TRIALS = "trials"
+TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 REPORT_NAME = "report.html"
@@ -67,7 +68,9 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     trials = select_trials(experiment.trials, dict(options.where))
-    if options.format == TRIALS:
+    if options.format == JSON:
+        texts = _verdicts(experiment, options)
+    elif options.format == TRIALS:
         texts = _trials(trials, options)
     else:
         texts = _tables(experiment, trials, options)
@@ -84,13 +87,24 @@ def _format_of(out: Path | None) -> str:
     return "md"
 
 
-def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
-    """A CSV with one row per trial. Raises InputError for options that only a table has."""
+def _verdicts(experiment: Experiment, options: argparse.Namespace) -> dict[str, str]:
+    """The verdicts as JSON. Raises InputError for options that only a table has."""
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import compare
+
+    _refuse_options_of_tables(options, f"--format {JSON} shows the verdicts")
+    return {f".{JSON}": json.dumps(compare(experiment).to_json(), indent=1) + "\n"}
+
+
+def _refuse_options_of_tables(options: argparse.Namespace, what: str) -> None:
     for name in ("rows", "columns", "metrics", "layout", "paper"):
         if getattr(options, name) is not None:
-            raise InputError(
-                f"--format {TRIALS} shows every column of every trial, and takes no --{name}"
-            )
+            raise InputError(f"{what}, and takes no --{name}")
+
+
+def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
+    """A CSV with one row per trial. Raises InputError for options that only a table has."""
+    _refuse_options_of_tables(options, f"--format {TRIALS} shows every column of every trial")
     return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
 
 
@@ -151,8 +165,8 @@ def _tables_parser() -> ArgumentParser:
     )
     parser.add_argument(
         "--format",
-        choices=[*FORMATS, TRIALS],
-        help=f"default: md; {TRIALS}: CSV with one row a trial",
+        choices=[*FORMATS, TRIALS, JSON],
+        help=f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
     )
     parser.add_argument(
         "--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format"
