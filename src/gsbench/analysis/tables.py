@@ -30,7 +30,9 @@ from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_words
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.eval.facts import find_metric
+from gsbench.events import FEWEST_ROUNDS, few_rounds
 from gsbench.runs.keys import SHOWN
+from gsbench.runs.layout import EVENTS
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted, some_of
 
@@ -325,11 +327,27 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
             notes.append(
                 f"{trial.scene}: {left_out} left out, since another one has its name or content."
             )
+    notes += [line for own in group_by(trials, arm_of).values() if (line := rounds_note(own[0]))]
     for trial in trials:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings
         notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
     return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
+
+
+def arm_of(trial: TrialResult) -> str:
+    """The arm's folder with its settings' hash: trials that share it have one schedule."""
+    return trial.key.partition("/")[2]
+
+
+def rounds_note(trial: TrialResult) -> str:
+    """A line if a trial's densifier had too few rounds to be judged by them; else ""."""
+    if trial.program or trial.made_elsewhere or not (trial.path / EVENTS).is_file():
+        return ""
+    rounds = len(trial.folder.curves(EVENTS))
+    if rounds >= FEWEST_ROUNDS or not trial.config.get("densify.interval"):
+        return ""
+    return few_rounds(f"{trial.init}-{trial.densify}", rounds, trial.record.iterations)
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:

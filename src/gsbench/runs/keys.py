@@ -35,7 +35,8 @@ OWN = "gsbench."  # prefix of the import paths of gsbench's own classes
 # the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings that only declare how results are read or what an ablation may turn off.
-DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
+# train.steps_scaler has been applied to the steps.
+DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",), "train": ("steps_scaler",)}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
