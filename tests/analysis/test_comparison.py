@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from gsbench.analysis.comparison import Comparison, compare
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
+from gsbench.analysis.statistics import t_test
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import sentence
 from gsbench.claims.archive import write_archive
@@ -31,6 +32,7 @@ from gsbench.tracking.comparison import description
 from gsbench.verbs.claims import plan
 from gsbench.verbs.results import explain_cell, tables
 from tests.analysis.synthetic import METRICS, Plan, trial_data, write_trial
+from tests.conftest import script
 
 DECLARED_AT = "2026-01-01T00:00:00Z"
 OLD, NEW = "1" * 64, "2" * 64
@@ -385,3 +387,16 @@ def test_the_order_of_commands_does_not_matter(
         finally:
             shutil.rmtree(runs)
     assert found[0] == found[1]
+
+
+def test_the_simulation_of_a_shared_baseline_draws_what_it_says() -> None:
+    shared = script("shared_baseline")
+    one, some = shared.rates(shared.seen(3, 3), 1, False, 20_000, 1)
+    assert one == some == pytest.approx(0.05, abs=0.006)  # Student's test is exact on one scene
+    together = shared.rates(shared.seen(3, 3), 4, True, 4000, 1)
+    apart = shared.rates(shared.seen(3, 3), 4, False, 4000, 1)
+    assert together[1] < 0.06 < apart[1] < 0.2
+    assert shared.rates(shared.seen(12, 3), 1, False, 4000, 1)[0] > 0.1
+    differences = np.random.default_rng(0).normal(size=(5, 3, 3))
+    expected = [t_test(one) for one in differences]
+    assert shared.p_values(differences) == pytest.approx([one.p for one in expected if one])

@@ -448,5 +448,5 @@ def test_all_steps_of_the_schedule_are_scaled(words: list[str], scaled: tuple[in
 
 @pytest.mark.parametrize("value", ["0", "-1", "x", "true"])
 def test_a_scale_that_is_no_number_above_zero_is_refused(value: str) -> None:
-    with pytest.raises(InputError, match="train.steps_scaler must be"):
+    with pytest.raises(InputError, match=r"train\.steps_scaler must be"):
         composed(f"train.steps_scaler={value}")

@@ -192,6 +192,7 @@ def test_defaults_are_those_of_3dgs() -> None:
         "log_every": 10,
         "checkpoint_every": 1000,
         "checkpoint_minutes": 10.0,
+        "steps_scaler": 1.0,
     }
     assert asdict(TrainConfig(name="paper")) == published | others
 

@@ -202,7 +202,10 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
             reason = next(iter(paired.left_out), "they share no scene and seed")
-            print(f"{arm} against {baseline}: no trials can be paired in {metric.name}: {reason}")
+            fault = f"no trials of {baseline} and {arm} can be paired in {metric.name}: {reason}"
+            if len(comparison.pairs) == 1:
+                raise InputError(fault)
+            print(fault)
             continue
         components = estimate_components([row.arm - row.baseline for row in paired.rows])
         print("\n".join([f"{arm} against {baseline}", *_lines(components, metric, difference)]))

@@ -288,8 +288,9 @@ def explain_cell(address: str, runs: Path) -> str:
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
-    cell = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}"
-    left_out = [line for line in experiment.warnings if line.startswith((f"{cell}/", f"{cell} "))]
+    place = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}"
+    of_cell = (f"{place}/", f"{place} ")
+    left_out = [line for line in experiment.warnings if line.startswith(of_cell)]
     if left_out:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
