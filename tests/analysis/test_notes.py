@@ -81,7 +81,12 @@ DEMO, MINE = (
         (
             [*DEMO, "densify=adc"],
             [*DEMO, "densify=volumetric"],
-            "`gsbench -m +experiment=demo densify=adc,volumetric seed=0,1 scene=garden",
+            "`gsbench +experiment=demo scene=garden densify.cap=governor",
+        ),
+        (
+            ["densify=adc"],
+            ["densify=volumetric"],
+            "`gsbench -m densify=adc,volumetric seed=0,1 scene=garden densify.cap=governor",
         ),
         (
             ["densify=adc"],

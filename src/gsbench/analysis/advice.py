@@ -13,6 +13,8 @@ DIGITS = 3  # significant digits of a number of Gaussians
 # what the advice sets itself
 REPLACED = ("name", "densify.cap", "densify.max_gaussians")
 
+EXPERIMENT = "+experiment"
+
 Words = dict[str, list[str]]  # the values of each key of a command, in order
 
 
@@ -34,6 +36,14 @@ def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialRes
     if not all(sides):
         return f"give both arms {added} and another name"
     end = f"{added} name={shlex.quote(f'{home.name}_equal')}"
+    if EXPERIMENT in sides[0] and sides[0][EXPERIMENT] == sides[1].get(EXPERIMENT):
+        # The experiment's file has the arms and seeds; what all trials share was typed.
+        shared = {
+            key: values
+            for key, values in sides[0].items()
+            if sides[1].get(key) == values and len(values) == 1
+        }
+        return f"`gsbench {_joined(shared)} {end}`"
     differing = [key for key in {**sides[0], **sides[1]} if sides[0].get(key) != sides[1].get(key)]
     if len(differing) == 1 and all(differing[0] in own for own in sides):
         values = sides[0][differing[0]] + sides[1][differing[0]]
