@@ -97,11 +97,16 @@ def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
 
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
-    """The trials whose fields have the given values; raises ``InputError`` if there are none."""
+    """The trials whose fields have one of the values, which are given with commas between.
+
+    Raises ``InputError`` if there are none.
+    """
     kept = list(trials)
     check_fields(kept, where)
-    for key, value in where.items():
-        kept = [trial for trial in kept if field_value(trial, key) == value]
+    for key, values in where.items():
+        # a value may have commas itself, as a list has
+        wanted = {values, *values.split(",")}
+        kept = [trial for trial in kept if field_value(trial, key) in wanted]
     if not kept:
         asked = ", ".join(f"{key}={value}" for key, value in where.items())
         raise InputError(f"no trial has {asked}")

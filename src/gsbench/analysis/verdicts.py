@@ -407,17 +407,19 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
     word = words.get(like.outcome, like.outcome)
     least = "" if like.beyond is None else f", by the least that matters in {like.beyond}"
     median = "" if like.median is None else f"; median effect {verdict.shown_interval(like.median)}"
-    needed = "no number of them would" if like.needed is None else f"{like.needed} of them would"
-    seen = (
-        f", which {100 * like.power():.0f} % of sweeps see where nine of ten do"
-        if like.needed
-        else ""
-    )
+    level = f"at {100 * (1 - like.level):.3g} %"
+    if like.needed is None:
+        needed = f"{level}, so few scenes cannot decide it"
+    else:
+        how_many = "all" if like.needed == like.scenes else f"{like.needed} of the"
+        needed = (
+            f"{level}, {how_many} {like.scenes} scenes must agree: if the arm helps on nine scenes "
+            f"in ten, {100 * like.power():.0f} % of such sweeps show it"
+        )
     return (
         f"scenes like these: {word}; {what} in {like.helped} of {like.scenes}{least} (sign test p "
         f"{p_text(like.p)}, {100 * like.share.low:.0f} to {100 * like.share.high:.0f} % of such "
-        f"scenes{median}); "
-        f"{needed} suffice at {100 * (1 - like.level):.3g} %{seen}"
+        f"scenes{median}); {needed}"
     )
 
 

@@ -248,8 +248,8 @@ RELEASED = "released.json"  # in the package: the digests of all rooms at the re
 AS_RELEASED = "released"  # the state of a room that equals the release
 DIGEST_CHARACTERS = 16
 
-# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that only
-# reports, shows, launches or reads is no room. Nor is code that makes objects from settings: keys
+# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that cannot
+# change a number is not listed. Nor is code that makes objects from settings: keys
 # contain the settings themselves. An edit of one densifier changes the room of all densifiers; in
 # return, the table is simple enough to check.
 MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py", "normalization.py")

@@ -42,6 +42,7 @@ from gsbench.analysis.tables import (
 )
 from gsbench.errors import InputError
 from gsbench.files import writable_output, write_text
+from gsbench.runs.experiments import list_experiments
 from gsbench.runs.keys import AS_RELEASED
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of
@@ -61,6 +62,9 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     options = _tables_parser().parse_args(argv)
     options.format = options.format or _format_of(options.out)
+    if options.experiment is None:
+        print("\n".join(list_experiments(runs)) or f"no experiment in {runs} yet")
+        return 0
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in load_paper().contradictions))
         return 0
@@ -161,7 +165,9 @@ def _tables_parser() -> ArgumentParser:
     )
     parser.add_argument(
         "experiment",
-        help="its name; table1, table2 and their _own look as in the paper, with its values",
+        nargs="?",
+        help="its name (without one: lists them); table1, table2 and their _own look as in the "
+        "paper, with its values",
     )
     parser.add_argument(
         "--format",
