@@ -132,6 +132,22 @@ def test_all_seeds_of_planned_looks_are_declared_beforehand(sweep, runs, psnr):
     assert ("4 of the 8 declared trials are not there" in comparison.lines()[-1]) == (psnr is clear)
 
 
+@pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
+def test_looks_over_a_baseline_that_existed_give_one_verdict(sweep, runs, psnr, said, caplog):
+    assert sweep(Fake(psnr)) == 0
+    for file in (runs / "stop").glob("*/random-adc/*/results.json"):
+        text = file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
+        file.write_text(text)
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        assert sweep(Fake(psnr)) == 0
+    (sentence,) = compare(read_experiment(runs / "stop")).sentences
+    assert sentence.endswith("The metric was declared beforehand.")
+    assert sentence in caplog.text  # the sweep's end
+    assert f"Verdict, {sentence}" in said("tables", "stop")
+    assert verdicts_of(runs)[0].late == 0
+
+
 def test_a_decided_pair_gets_no_more_seeds_and_pairs_share_the_error_rate(sweep, runs, caplog):
     fake = Fake(lambda arm, seed: clear(arm, seed) if arm != "mcmc" else noise(arm, seed))
     with caplog.at_level(logging.INFO):
