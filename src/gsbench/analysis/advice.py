@@ -10,7 +10,7 @@ from gsbench.parsing import DamagedError, read_json
 from gsbench.runs.layout import PLAN
 
 DIGITS = 3  # significant digits of a number of Gaussians
-# what the advice sets itself
+# words that the advice gives itself
 REPLACED = ("name", "densify.cap", "densify.max_gaussians")
 
 EXPERIMENT = "+experiment"

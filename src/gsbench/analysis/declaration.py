@@ -1,4 +1,4 @@
-"""What was declared for an experiment, and for each question whether that was in time.
+"""Declarations of an experiment, and for each question whether it was declared in time.
 
 A question (arm against baseline in a metric, on scenes and seeds) counts as declared if it was
 fixed before the first trial of its *arm* was measured. Older trials of the baseline do no harm:
@@ -21,7 +21,7 @@ from gsbench.words import counted
 
 @dataclass(frozen=True)
 class Standing:
-    """How the declaration stands to the question about one arm.
+    """The standing of a declaration to the question about one arm.
 
     ``declaration`` is the one that first named the arm, with its trials up to the arm's first
     result; questions of one such declaration share an error rate. ``seen`` are the arm's trials
@@ -41,7 +41,7 @@ class Standing:
 
     @property
     def doubt(self) -> str:
-        """Why the question does not count as declared, in a few words; "" if it does."""
+        """The reason why the question does not count as declared; "" if it does."""
         if self.seen:
             of_arm = f"{len(self.seen)} of the arm's {counted(self.trials, 'trial')}"
             return f"declared after {of_arm} had been measured"
@@ -73,7 +73,7 @@ class ActiveDeclaration:
         return self.records[0].questions[0].about
 
     def standing(self, baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> Standing:
-        """How the declarations stand to the question about ``arm``, given both arms' trials."""
+        """The standing of the declarations to the question about ``arm``, given both arms' trials."""
         first = min((trial.measured for trial in arm), default=math.inf)
         # times are whole seconds: a declaration of the arm's first second may be later
         before = [one for one in self.records if one is self.records[0] or one.moment < first]

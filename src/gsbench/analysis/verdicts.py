@@ -249,7 +249,7 @@ TOO_FEW = "one trial of each on {}; run more seeds"
 
 
 def no_pairs(judged: PairVerdicts) -> str:
-    """Why no trials of two arms could be compared."""
+    """The reason why no trials of two arms could be compared."""
     return next(
         (note.partition(": ")[2] for note in judged.notes),
         f"no trials of {judged.first} and {judged.second} can be paired",
