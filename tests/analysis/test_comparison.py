@@ -114,6 +114,8 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path: Path) -> None:
     ]
     assert against(after) == [("sfm-absgs", "sfm-adc"), *against(before)]
     assert set(before.sentences) < set(after.sentences)
+    rows = [row.labels[3] for row in build_table(after.experiment).rows]
+    assert rows == ["–", "–", "0.9", "0.99"]  # adc and absgs have no such setting
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
 

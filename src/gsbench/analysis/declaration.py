@@ -73,7 +73,7 @@ class ActiveDeclaration:
         return self.records[0].questions[0].about
 
     def standing(self, baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> Standing:
-        """The standing of the declarations to the question about ``arm``, given both arms' trials."""
+        """The standing to the question about ``arm``, given both arms' trials."""
         first = min((trial.measured for trial in arm), default=math.inf)
         # times are whole seconds: a declaration of the arm's first second may be later
         before = [one for one in self.records if one is self.records[0] or one.moment < first]

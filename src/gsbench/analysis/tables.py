@@ -157,7 +157,9 @@ def _rows(
             text = format_cell(cell, quantity_of[position[2]]) if cell.scenes else "n/a"
             text += f" [{counted(cell.scenes, 'scene')}]" if 0 < cell.scenes != most_scenes else ""
             entries.append(TableEntry(text, position in bold, cell))
-        rows.append(Row(labels, tuple(entries), rule_above=ruled and not rows))
+        # a setting that an arm does not have, or has unset
+        shown = tuple("–" if label == str(None) else label for label in labels)
+        rows.append(Row(shown, tuple(entries), rule_above=ruled and not rows))
     return rows
 
 
