@@ -39,6 +39,18 @@ class Cause(IntEnum):
         return self.name.lower()
 
 
+FEWEST_ROUNDS = 5  # with fewer, a densifier has hardly acted
+
+
+def few_rounds(arm: str, rounds: int, iterations: int) -> str:
+    """The warning that a training had fewer than `FEWEST_ROUNDS` rounds of refinement."""
+    of_refinement = "1 round" if rounds == 1 else f"{rounds} rounds"
+    return (
+        f"{arm}: {of_refinement} of refinement in {iterations} iterations are too few to judge a "
+        "densifier: train longer, or shorten the schedule as a whole, as by train.steps_scaler=0.1."
+    )
+
+
 @dataclass
 class RefineEvent:
     """Counts of one refinement by cause.

@@ -11,7 +11,7 @@ import pytest
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.errors import InputError
+from gsbench.runs.keys import present_digest
 from gsbench.verbs.results import explain_cell
 from tests.analysis.test_tables import one_trial
 
@@ -32,28 +32,73 @@ def finished_at(path: Path, seconds: float) -> Path:
     return path
 
 
-def test_two_versions_of_a_users_class_are_refused_and_both_are_named(tmp_path: Path) -> None:
+def test_the_newest_code_counts_and_older_trials_are_named(tmp_path: Path) -> None:
     for seed in (0, 1):
-        one_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD))
-    one_trial(tmp_path, 2, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW))
-    with pytest.raises(InputError) as refused:
-        build_table(load_experiment(tmp_path, "exp"))
-    words = str(refused.value)
-    for part in (
-        "different versions of mine.Patient: 11111111 (garden seeds 0, 1; ",
-        "22222222 (garden seed 2; ",
-        "status exp --forget-superseded",
-    ):
-        assert part in words
-    with pytest.raises(InputError, match=r"different versions of mine\.Patient"):
-        explain_cell("exp:garden:psnr:adc", tmp_path)
+        finished_at(one_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
+    finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW)), 2000)
+    words = (
+        "exp/garden/sfm-adc seeds 0, 1: left out, made by an earlier mine.Patient (11111111; the "
+        "trials that count have 22222222)"
+    )
+    experiment = load_experiment(tmp_path, "exp")
+    assert experiment.warnings == (words,)
+    assert [trial.seed for trial in experiment.trials] == [1]
+    table = build_table(experiment, metrics=["psnr"])
+    assert table.rows[0].entries[0].text == "28.00"
+    assert f"Left out (1): {words}." in table.notes
+    assert words in explain_cell("exp:garden:psnr:adc", tmp_path)
 
 
-def test_two_versions_of_a_stage_are_refused(tmp_path: Path) -> None:
-    one_trial(tmp_path, 0, psnr=27.0, _code=code())
-    one_trial(tmp_path, 1, psnr=27.0, _code=code(train=2))
-    with pytest.raises(InputError, match=r"different versions of stage train: 1 \(garden seed 0; "):
-        build_table(load_experiment(tmp_path, "exp"))
+def test_older_trials_with_other_settings_still_count(tmp_path: Path) -> None:
+    one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify__views": 5}, psnr=27.0, _code=code(OLD))
+    one_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify__views": 8}, psnr=28.0, _code=code(NEW))
+    experiment = load_experiment(tmp_path, "exp")
+    assert (len(experiment.trials), experiment.older, experiment.warnings) == (2, (), ())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ({"_code": code()}, {"_code": code(train=2)}, "stage train"),
+        (
+            {"_code": {**code(), "rooms": {"train": "released"}}},
+            {"_code": {**code(), "rooms": {"train": "c" * 16}}},
+            "gsbench's train",
+        ),
+    ],
+)
+def test_older_trials_of_gsbench_are_left_out(
+    tmp_path: Path, old: dict[str, Any], new: dict[str, Any], part: str
+) -> None:
+    finished_at(one_trial(tmp_path, 0, psnr=27.0, **old), 1000)
+    finished_at(one_trial(tmp_path, 1, psnr=27.0, **new), 2000)
+    experiment = load_experiment(tmp_path, "exp")
+    assert [trial.seed for trial in experiment.trials] == [1]
+    assert f"made by an earlier {part} (" in experiment.warnings[0]
+
+
+def test_the_code_that_is_here_now_counts_before_what_was_finished_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "patient.py").write_text("x = 1\n")
+    here = present_digest("patient")
+    made = {"sources": {"patient": here}, "stages": STAGES}
+    finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=made), 1000)
+    other = {"sources": {"patient": NEW}, "stages": STAGES}
+    finished_at(one_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _code=other), 2000)
+    assert load_experiment(tmp_path, "exp").trials[0].metrics["psnr"] == 27.0
+    (tmp_path / "patient.py").write_text("# a comment\nx  =  1\n")
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert table.rows[0].entries[0].text == "27.00"
+    assert not any("edited since" in note for note in table.notes)
+    (tmp_path / "patient.py").write_text("x = 2\n")
+    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    assert table.rows[0].entries[0].text == "28.00"
+    assert (
+        "patient was edited since: 1 trial of sfm-adc are of the old code. Give the command again "
+        "to run the new one." in table.notes
+    )
 
 
 def test_arms_that_share_a_class_in_two_versions_are_not_compared(tmp_path: Path) -> None:
@@ -82,22 +127,6 @@ def test_a_scene_in_another_folder_is_no_other_version(tmp_path: Path) -> None:
 
 def of_gsbench(**rooms: str) -> dict[str, Any]:
     return code() | {"rooms": rooms}
-
-
-def test_two_states_of_a_room_of_gsbench_are_refused(tmp_path: Path) -> None:
-    one_trial(
-        tmp_path, 0, psnr=27.0, _code=of_gsbench(train="released", eval="a" * 16, scene="b" * 16)
-    )
-    one_trial(
-        tmp_path, 1, psnr=27.0, _code=of_gsbench(train="c" * 16, eval="d" * 16, scene="b" * 16)
-    )
-    with pytest.raises(InputError) as refused:
-        build_table(load_experiment(tmp_path, "exp"))
-    for part in (
-        "different versions of gsbench's train and 1 more room: released (",
-        "cccccccc (garden seed 1; ",
-    ):
-        assert part in str(refused.value)
 
 
 def test_a_room_that_one_arm_alone_uses_is_no_difference(tmp_path: Path) -> None:

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.comparison import compare
+from gsbench.analysis.declaration import Standing, active_declaration
 from gsbench.analysis.judgement import Verdict
-from gsbench.analysis.pairing import choose_pairs
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import PairVerdicts, families, in_words, judge_pairs, p_text
+from gsbench.analysis.verdicts import PairVerdicts, families, in_words, p_text
 from gsbench.runs.experiments import (
     STAMP,
     Arm,
@@ -49,16 +49,23 @@ def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -
 
 
 def judged(experiment: Experiment) -> list[PairVerdicts]:
-    trials = experiment.trials
-    pairs = choose_pairs(sorted({trial.arm for trial in trials}))
-    return judge_pairs(trials, pairs, active_declaration(experiment.folder, trials))
+    return list(compare(experiment).answers)
+
+
+def standing(experiment: Experiment) -> Standing:
+    """How the declaration stands to the question about the only compared arm."""
+    (one,) = judged(experiment)
+    assert one.standing is not None
+    return one.standing
+
+
+def lines(experiment: Experiment) -> str:
+    return "\n".join(compare(experiment).declaration_lines)
 
 
 def test_a_declaration_about_one_question_says_so(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("psnr@extrapolation", EARLY))
-    declared = active_declaration(experiment.folder, experiment.trials)
-    assert declared is not None
-    assert declared.sentences("PSNR")[0].startswith("PSNR at extrapolation was declared beforehand")
+    assert lines(experiment).startswith("PSNR (dB) at extrapolation was declared beforehand")
 
 
 def test_a_verdict_in_words_has_its_numbers(tmp_path: Path) -> None:
@@ -149,14 +156,12 @@ def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path)
             tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1
         )
     )
-    assert (
-        "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC), before any "
-        "of the 12" in page
-    )
-    assert "on these scenes: better in LPIPS VGG raw, the metric declared beforehand." in page
+    assert "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC)." in page
+    assert "sfm-volumetric against sfm-adc: better in LPIPS VGG raw on these scenes: −" in page
+    assert "The metric was declared beforehand." in page
     assert "Secondary, adjusted for their number: undecided in" in page
     assert "Interval and p are adjusted" in page
-    assert "No metric was declared" not in page
+    assert "no metric was declared" not in page
 
 
 def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(
@@ -166,8 +171,8 @@ def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so
     experiment = load_experiment(tmp_path, "exp")
     page = build_report(experiment)
     assert (
-        "No metric was declared beforehand (eval.primary): all metrics of all pairs of arms are "
-        "one family" in page
+        "Exploratory: no metric was declared (eval.primary), so all metrics count, adjusted for "
+        "their number (4)" in page
     )
     assert "4 tests adjusted by Holm" in page
     (one,) = judged(experiment)
@@ -175,7 +180,8 @@ def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so
     assert all("4 tests)" in in_words(v) for v in one.verdicts)
     least = min(one.verdicts, key=alone)
     assert least.p == pytest.approx(4 * alone(least))
-    assert not any("declared" in note for note in build_table(experiment).notes)
+    (verdict,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
+    assert verdict.removeprefix("Verdict, ") in page
 
 
 def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(
@@ -208,7 +214,7 @@ def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_
     reason = "the declared metric LPIPS Alex has no value (weights file alexnet.pth not found)"
     assert f"no verdict, since {reason}" in build_report(experiment)
     (note,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
-    assert "none, since lpips_alex has no value: weights file alexnet.pth not found" in note
+    assert f"no verdict, since {reason}" in note
 
 
 # --- when it was declared
@@ -221,9 +227,11 @@ def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
     page = build_report(experiment)
-    assert "LPIPS VGG raw was declared too late" in page
-    assert "12 of the 12 trials had been measured" in page
-    assert "all metrics adjusted for their number: better in LPIPS VGG raw" in page
+    assert "on these scenes: better in LPIPS VGG raw (−" in page
+    assert (
+        "LPIPS VGG raw was declared, but declared after 6 of the arm&#39;s 6 trials had been "
+        "measured" in page
+    )
     assert "declared beforehand." not in page
 
 
@@ -240,32 +248,30 @@ def test_a_repeated_declaration_counts_from_its_first_time() -> None:
 
 def test_a_replaced_declaration_is_reported(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("psnr", EARLY), ("flip", LATE))
-    found = active_declaration(experiment.folder, experiment.trials)
+    found = compare(experiment).declared
     assert found is not None
     assert found.metric == "flip"
-    assert any(
-        "Declared before it: psnr (2020-01-01 00:00 UTC)." in line
-        for line in found.sentences("FLIP")
-    )
+    assert "Declared before it: psnr (2020-01-01 00:00 UTC)." in lines(experiment)
+
+
+OLDER = (0, 1, 3)  # two trials of the baseline, which do no harm, and one of the arm
 
 
 def test_the_time_of_measuring_counts_not_that_of_writing_results(
     tmp_path: Path,
 ) -> None:
     """The store gives another experiment the same numbers at once, with their ``measured``."""
-    paths = write_runs(tmp_path, Plan())
+    paths = write_runs(tmp_path, Plan(scenes=("garden",)))
     declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
     after = calendar.timegm(time.strptime("2030-06-02T00:00:00Z", STAMP))
     for place, path in enumerate(paths):
         data = json.loads((path / "results.json").read_text())
-        if place < 2:
+        if place in OLDER:
             data["measured"] = "2030-05-31T00:00:00Z"
         (path / "results.json").write_text(json.dumps(data))
         os.utime(path / "results.json", (after, after))
-    experiment = load_experiment(tmp_path, "exp")
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert {trial.path for trial in found.seen} == set(paths[:2])
+    found = standing(load_experiment(tmp_path, "exp"))
+    assert {trial.path for trial in found.seen} == {paths[3]}
     assert not found.beforehand
 
 
@@ -308,48 +314,45 @@ def planned(
 def test_a_metric_declared_with_all_trials_is_declared_beforehand(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2])))
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert found.beforehand
-    assert len(found.sentences("LPIPS")) == 1
+    assert standing(experiment).beforehand
+    assert lines(experiment).count("\n") == 0
     declare_trials(tmp_path, (EARLY, planned([0])), ("2020-01-02T00:00:00Z", planned([0, 1, 2])))
     # added while no result was there
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert found.beforehand
-    assert found.declaration.when == "2020-01-01 00:00 UTC"
+    assert standing(experiment).beforehand
+    assert "2020-01-01 00:00 UTC" in lines(experiment)
 
 
 WHOLE = planned([0, 1, 2])
 
 
 @pytest.mark.parametrize(
-    ("trials", "words"),
+    ("trials", "added"),  # the baseline's first trials were there before the arm's first result
     [
-        (planned([0, 1]), "4 of the 12 trials were added after"),
-        (planned([0]), "8 of the 12 trials were added after"),
-        (planned([0, 1, 2], ("adc",)), "6 of the 12 trials were added after"),
+        (planned([0, 1]), 3),
+        (planned([0]), 6),
+        (planned([0, 1, 2], ("adc",)), 6),
         (
             {key: seeds for key, seeds in WHOLE.items() if "garden" not in key},
-            "6 of the 12 trials were added after",
+            6,
         ),
-        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, "1 of the 12 trials were added after"),
+        (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, 1),
         (
             {key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()},
-            "12 of the 12 trials were added after",
+            9,
         ),
-        ({}, "12 of the 12 trials were added after"),
+        ({}, 9),
     ],
 )
 @pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
 def test_a_metric_whose_trials_were_added_after_results_is_adjusted_with_all_others(
-    tmp_path: Path, trials: dict[str, list[int]], words: str, recorded: bool
+    tmp_path: Path, trials: dict[str, list[int]], added: int, recorded: bool
 ) -> None:
     """A later command recorded the additions, or the trials came without a record."""
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
+    words = f"{added} trial{'s' * (added > 1)} added after the arm's first result"
     assert any(words in note for note in build_table(experiment).notes)
 
 
@@ -357,20 +360,16 @@ def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, planned([0, 1])))
     page = build_report(experiment)
-    assert "4 of the 12 trials were added after the first result" in page
+    assert "3 trials added after the arm&#39;s first result" in page
     assert "declared beforehand." not in page
-    assert "All metrics of all pairs of arms are one family, 4 tests adjusted by Holm." in page
+    assert "all metrics of a pair of arms are one family, 4 tests adjusted by Holm." in page
 
 
 def test_declared_trials_that_are_missing_are_counted(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert found.beforehand
-    assert any(
-        "4 of the 16 declared trials are still missing" in line for line in found.sentences("LPIPS")
-    )
+    assert standing(experiment).beforehand
+    assert "4 of the 16 declared trials are still missing" in lines(experiment)
 
 
 def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(
@@ -385,18 +384,14 @@ def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(
             json.dumps(data | {"measured": measured, "declared": declared})
         )
     declare_trials(tmp_path, ("2020-06-01T00:00:00Z", planned([0, 1, 2])))
-    experiment = load_experiment(tmp_path, "exp")
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
+    found = standing(load_experiment(tmp_path, "exp"))
     assert len(found.added) == 4
     assert not found.beforehand
 
 
 def test_a_record_may_name_no_trials_and_a_damaged_record_declares_nothing(tmp_path: Path) -> None:
     experiment = declared_experiment(tmp_path, ("psnr", EARLY))
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert found.beforehand
+    assert standing(experiment).beforehand
     for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3}, {"a/b/d": ["x"]}):
         declare_trials(tmp_path, (EARLY, trials), metric="psnr")  # type: ignore[arg-type]
         # a damaged line declares nothing
@@ -422,7 +417,7 @@ def test_declarations_are_read_back_as_they_were_written(tmp_path: Path) -> None
     assert read_declarations(tmp_path) == [one, two]
     assert one.planned == dict.fromkeys(keys, (0, 1, 2))
     assert one.kind == "sweep"
-    assert str(arms[1]) == "sfm-volumetric max_gaussians=30000"
+    assert str(arms[1]) == "sfm-volumetric[max_gaussians=30000]"
 
 
 def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path: Path) -> None:
@@ -449,5 +444,6 @@ def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path: Path) ->
     assert one.verdicts[0].p is None
     assert any("look" in line for line in families([one]))
     page = build_report(experiment)
-    assert "Seeds come in planned looks" in page
     assert page.count("better in LPIPS VGG raw") == 1
+    seeds = one.verdicts[0].pairs.seeds
+    assert f"with {seeds} of at most 3 seeds. The metric was declared beforehand." in page

@@ -151,7 +151,7 @@ def test_trials_measured_before_the_question_divide_its_error_rate(
         judge(trials, Declaration(time=t, questions=(named(trials),), looks=(3,)))[0]
         for t in (EARLY, LATE)
     )
-    assert (one.late, late.late) == (0, 12)
+    assert (one.late, late.late) == (0, 6)  # the baseline's trials may be older
     assert one.answer is not None
     assert late.answer is not None
     # psnr, ssim, flip and one LPIPS

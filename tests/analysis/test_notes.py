@@ -1,5 +1,6 @@
 """Notes below tables, word for word, for made-up trials with known numbers."""
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.analysis.fairness import counts_sentence
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.analysis.tables import (
     build_table,
@@ -26,7 +28,9 @@ from gsbench.runs.trial_record import (
 from tests.analysis.synthetic import Plan, write_runs
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
-COMPARED = "so this does not compare at equal counts; densify.cap=governor makes the counts equal."
+COMPARED = (
+    "so this does not compare at equal counts. To do so: give both arms densify.cap=governor "
+)
 
 
 def trials_of(tmp_path: Path, **plan: object) -> tuple[TrialResult, ...]:
@@ -58,9 +62,80 @@ def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path,
         for trial in made
     ]
     sentence = counts_sentence(trials, ADC, VOLUMETRIC)
-    expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}" if said else ""
-    assert sentence == expected
+    least = min(filter(None, itertools.chain(*counts.values())))
+    words = f"densify.max_gaussians={least} and another name."
+    expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}{words}"
+    assert sentence == (expected if said else "")
     assert counts_sentence(trials, ADC, Arm("sfm", "mcmc")) == ""
+
+
+DEMO, MINE = (
+    ["+experiment=demo"],
+    ["densify=adc", "densify._target_=mine.A", "allow_targets=[mine]"],
+)
+
+
+@pytest.mark.parametrize(
+    ("baseline", "arm", "command"),
+    [
+        (
+            [*DEMO, "densify=adc"],
+            [*DEMO, "densify=volumetric"],
+            "`gsbench +experiment=demo scene=garden densify.cap=governor",
+        ),
+        (
+            ["densify=adc"],
+            ["densify=volumetric"],
+            "`gsbench -m densify=adc,volumetric seed=0,1 scene=garden densify.cap=governor",
+        ),
+        (
+            ["densify=adc"],
+            MINE,
+            "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor "
+            "densify.max_gaussians=12300 name=exp_equal` && `gsbench -m densify=adc "
+            "densify._target_=mine.A 'allow_targets=[mine]' seed=0,1 scene=garden",
+        ),
+        # a stranger's plan: nothing of it reaches the shell
+        (["densify=$(rm x)"], ["densify=y"], "`gsbench -m 'densify=$(rm x),y' seed=0,1"),
+    ],
+)
+def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm, command):
+    made = trials_of(tmp_path, scenes=["garden"], seeds=(0, 1))
+    trials = [
+        with_record(trial, num_gaussians=12_345 + 9000 * (trial.densify == "volumetric"))
+        for trial in made
+    ]
+    words = {"adc": baseline, "volumetric": arm}
+    planned = {
+        trial.path.relative_to(tmp_path / "exp").as_posix(): {
+            "overrides": [
+                *words[trial.densify],
+                f"seed={trial.seed}",
+                "scene=garden",
+                "name=exp",
+                "densify.cap=governor",
+            ]
+        }
+        for trial in trials
+    }
+    (tmp_path / "exp" / "plan.json").write_text(json.dumps({"trials": planned}))
+    sentence = counts_sentence(trials, ADC, VOLUMETRIC)
+    assert f"To do so: {command}" in sentence
+    assert sentence.endswith("densify.cap=governor densify.max_gaussians=12300 name=exp_equal`.")
+
+
+@pytest.mark.parametrize(("rounds", "warns"), [(0, True), (1, True), (4, True), (5, False)])
+def test_a_table_warns_of_too_few_rounds(tmp_path, rounds, warns):
+    (trial,) = trials_of(tmp_path, scenes=["garden"], densifiers=("adc",), seeds=(0,))
+    config = json.loads((trial.path / "config.yaml").read_text())
+    config["densify"]["interval"] = 100
+    (trial.path / "config.yaml").write_text(json.dumps(config))
+    (trial.path / "events.jsonl").write_text('{"step": 100, "cloned": 1}\n' * rounds)
+    words = f"sfm-adc: {rounds} round{'s' * (rounds != 1)} of refinement in 2000 iterations"
+    page = build_report(load_experiment(tmp_path, "exp"))
+    notes = build_table(load_experiment(tmp_path, "exp")).notes
+    assert any(note.startswith(words) for note in notes) == warns
+    assert (words in page) == warns
 
 
 def test_each_way_of_holding_views_out_is_stated_with_scenes_if_there_are_several(tmp_path):

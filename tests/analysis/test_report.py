@@ -35,7 +35,7 @@ from gsbench.analysis.report.build import (
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.analysis.verdicts import by_scene_lines, headline, judge_pairs
+from gsbench.analysis.verdicts import by_scene_lines, judge_pairs, sentence
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import Histogram
@@ -137,7 +137,7 @@ def test_the_page_suits_screen_readers_and_keyboards(page):
 def test_the_verdict_comes_first(page):
     headings = re.findall(r"<h2[^>]*>([^<]+)", page)
     assert headings[:2] == ["Verdict", "Tables"]
-    assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw; " in page
+    assert "sfm-volumetric against sfm-adc, on these scenes: better in LPIPS VGG raw (−" in page
     verdicts = page.split('aria-label="Verdicts, ')[1].split("</table>")[0]
     assert "LPIPS VGG raw" in verdicts
     assert "LPIPS Alex" not in verdicts  # not run: no row
@@ -612,7 +612,7 @@ def test_swept_settings_become_arms_of_their_own(tmp_path):
             (path / "config.yaml").write_text(text)
             path.rename(target)
     page = build_report(load_experiment(tmp_path, "exp"))
-    assert "sfm-volumetric max_gaussians=10000 against sfm-adc max_gaussians=10000" in page
+    assert "sfm-volumetric[max_gaussians=10000] against sfm-adc[max_gaussians=10000]" in page
 
 
 def test_arms_that_never_differ_are_called_equal_and_not_undecided(tmp_path):
@@ -627,7 +627,7 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path):
     write_runs(tmp_path, Plan(scenes=("garden",), effect={"psnr": -2.0}, views=3))
     write_runs(tmp_path, Plan(scenes=("stump",), views=3))
     (judged,) = judge_pairs(load_experiment(tmp_path, "exp").trials, [(ADC, VOLUMETRIC)])
-    assert "too small to matter in PSNR" in headline(judged)
+    assert "too small to matter in PSNR" in sentence(judged)
     line = next(line for line in by_scene_lines(judged.verdicts) if line.startswith("PSNR"))
     assert (
         line == "PSNR (dB) by scene: better on courtyard, worse on garden: the scenes disagree, so "

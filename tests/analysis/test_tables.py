@@ -300,7 +300,7 @@ def test_rows_are_in_the_order_of_numbers_then_of_text(tmp_path):
     for cap in (9, 10, 100, None):
         one_trial(tmp_path, 0, f"{cap or 0:08x}", {"densify__cap": cap}, psnr=20.0)
     table = build_table(load_experiment(tmp_path, "exp"), rows=["densify.cap"], metrics=["psnr"])
-    assert [row.labels for row in table.rows] == [("9",), ("10",), ("100",), ("None",)]
+    assert [row.labels for row in table.rows] == [("9",), ("10",), ("100",), ("–",)]
 
 
 def test_markdown_has_a_line_for_each_row_and_equal_numbers_of_cells(make_experiment):

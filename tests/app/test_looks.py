@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsbench import cli
-from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.results import read_experiment
 from gsbench.config.compose import Trial
@@ -123,15 +123,29 @@ def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep, runs):
 def test_all_seeds_of_planned_looks_are_declared_beforehand(sweep, runs, psnr):
     assert sweep(Fake(psnr)) == 0
     experiment = read_experiment(runs / "stop")
-    found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
-    assert (found.beforehand, found.added) == (True, ())
-    missing = 0 if psnr is noise else 4
-    assert any(
-        f"{missing} of the 8 declared trials are missing" in line
-        for line in found.sentences("PSNR")
-    )
-    assert any("Seeds come in planned looks" in line for line in found.sentences("PSNR"))
+    comparison = compare(experiment)
+    (answer,) = comparison.answers
+    assert answer.beforehand
+    # the sweep's last look and every other surface have the verdict of one function
+    assert answer.primary[0].outcome == verdicts_of(runs)[0].outcome
+    assert answer.primary[0].interval == verdicts_of(runs)[0].interval
+    assert ("4 of the 8 declared trials are not there" in comparison.lines()[-1]) == (psnr is clear)
+
+
+@pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
+def test_looks_over_a_baseline_that_existed_give_one_verdict(sweep, runs, psnr, said, caplog):
+    assert sweep(Fake(psnr)) == 0
+    for file in (runs / "stop").glob("*/random-adc/*/results.json"):
+        text = file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
+        file.write_text(text)
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        assert sweep(Fake(psnr)) == 0
+    (sentence,) = compare(read_experiment(runs / "stop")).sentences
+    assert sentence.endswith("The metric was declared beforehand.")
+    assert sentence in caplog.text  # the sweep's end
+    assert f"Verdict, {sentence}" in said("tables", "stop")
+    assert verdicts_of(runs)[0].late == 0
 
 
 def test_a_decided_pair_gets_no_more_seeds_and_pairs_share_the_error_rate(sweep, runs, caplog):
@@ -201,13 +215,13 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
     assert [
         (str(v.question.baseline), str(v.question.arm), v.question.least) for v in verdicts
     ] == [
-        (f"random-adc max_gaussians={count}", f"random-volumetric max_gaussians={count}", 0.5)
+        (f"random-adc[max_gaussians={count}]", f"random-volumetric[max_gaussians={count}]", 0.5)
         for count in (1000, 2000)
     ]
     assert cli.run(["report", "stop"]) == 0
     text = (runs / "stop" / "report.html").read_text()
-    pair = "random-volumetric max_gaussians=1000 against random-adc max_gaussians=1000"
-    assert f"{pair}, on this scene: better in PSNR (dB)" in text
+    pair = "random-volumetric[max_gaussians=1000] against random-adc[max_gaussians=1000]"
+    assert f"{pair}: better in PSNR (dB) on this scene" in text
     assert "launch.stop_when_decided" in text
     capsys.readouterr()
     assert "Seeds come in planned looks" in said("tables", "stop")

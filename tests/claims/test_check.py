@@ -330,7 +330,7 @@ def test_check_declares_before_it_runs_trials_and_repeats_its_page(
     assert len(measured) == 4
     assert min(measured) >= declared.time
     first = (home / "claims.html").read_text()
-    assert "opacity=0.03 differs from" in first
+    assert "opacity=0.03] differs from" in first
     assert "by init.count and learning rates" in first
     assert first.index("Fairness sheet: ") < first.index("what would refute it")
     assert '<th scope="row">init.count</th><td>200</td><td>300</td><td>≠</td>' in first

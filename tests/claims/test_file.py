@@ -114,7 +114,10 @@ def test_the_question_does_not_depend_on_the_wording_of_the_claim():
         0.005,
         False,
     )
-    assert (str(question.baseline), question.seeds) == ("adc densify=adc", tuple(range(file.seeds)))
+    assert (str(question.baseline), question.seeds) == (
+        "adc[densify=adc]",
+        tuple(range(file.seeds)),
+    )
     assert question.planned == dict.fromkeys(keys, question.seeds)
     other = parse_claims(changed("claims", 0, "says", to="in other words"))
     assert other.question(other.claims[0], {"courtyard": keys}) == question

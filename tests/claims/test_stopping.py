@@ -7,10 +7,9 @@ import pytest
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.statistics import Answer, StudentT, plan_looks
+from gsbench.analysis.statistics import plan_looks
 from gsbench.claims.stopping import (
     KeyAndSeed,
-    headline,
     plan_sweep,
     run_looks,
     trials_of_look,
@@ -64,21 +63,6 @@ def test_looks_end_when_nothing_can_be_decided(finals, looked):
     )
     assert [len(batch) for batch in batches] == looked
     assert [one.final for one in verdicts] == list(finals[min(len(looked), len(finals) - 1)])
-
-
-def test_the_verdict_on_a_pair_is_one_sentence():
-    assert headline(verdict(False)) == "sfm-new against sfm-adc: no verdict yet, trials are missing"
-    assert headline(replace(verdict(True), untestable="no scene")).endswith(
-        "no verdict yet, no scene"
-    )
-    answer = Answer(1.0, StudentT(1.0, 0.0, 3.0), 0.05, 0.05, 0.05, 0.0)
-    waits, decided = (
-        headline(replace(verdict(final), answer=answer, outcome="supported", notes=("a note",)))
-        for final in (0, 1)
-    )
-    assert "sfm-adc: not decided yet, " in waits
-    assert "not decided yet" not in decided
-    assert decided.endswith("with 0 of at most 3 seeds; a note")
 
 
 # ---- the looks of a sweep

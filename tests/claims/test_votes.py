@@ -232,7 +232,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
     declared = [one for one in read_declarations(runs / "exp") if one.vote_round == key.round]
     assert [(one.kind, one.votes, len(one.questions)) for one in declared] == [("votes", 84, 1)]
     page = build_report(load_experiment(runs, "exp"))
-    assert "No metric was declared beforehand" in page
+    assert "no metric was declared (eval.primary)" in page
     archive = str(tmp_path / "exp.zip")
     assert run(["export", "--results", "exp", "--out", archive]) == 0
     assert run(["site", archive, "--out", str(tmp_path / "site")]) == 0

@@ -19,7 +19,7 @@ from gsbench.errors import InputError
 from gsbench.pipeline.parts import build, build_metrics
 from gsbench.runs.keys import config_hash
 from gsbench.system.install import conf_dir
-from gsbench.train.options import TrainConfig
+from gsbench.train.options import STEPS, TrainConfig
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
@@ -420,3 +420,33 @@ def test_a_text_is_kept_as_typed_or_refused(word, is_kept):
     else:
         with pytest.raises(InputError, match="would be read as the number"):
             check_words([word])
+
+
+@pytest.mark.parametrize(
+    ("words", "scaled"),
+    [
+        (["train=paper", "train.steps_scaler=0.1"], (3000, 50, 1500, 10, 300)),
+        (
+            ["train=quick", "train.steps_scaler=0.5", "train.iterations=400"],
+            (200, 100, 500, 50, 350),
+        ),
+        (["train=paper", "train.steps_scaler=2"], (60_000, 1000, 30_000, 200, 6000)),
+        (["train=quick", "train.steps_scaler=1e-6"], (1, 1, 1, 1, 1)),
+    ],
+)
+def test_all_steps_of_the_schedule_are_scaled(words: list[str], scaled: tuple[int, ...]) -> None:
+    values = composed("densify=adc", *words)
+    train, densify = values["train"], values["densify"]
+    keys = ("iterations", "densify_start", "densify_stop", "densify_interval")
+    assert (*(train[key] for key in keys), train["opacity_reset_interval"]) == scaled
+    assert tuple(densify[key] for key in ("start", "stop", "interval")) == scaled[1:4]
+    assert densify["opacity_reset_interval"] == scaled[4]
+    # a schedule that is written out makes the same trial
+    own = [f"train.{key}={json.dumps(train[key])}" for key in STEPS]
+    assert config_hash(composed("densify=adc", words[0], *own)) == config_hash(values)
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "x", "true"])
+def test_a_scale_that_is_no_number_above_zero_is_refused(value: str) -> None:
+    with pytest.raises(InputError, match=r"train\.steps_scaler must be"):
+        composed(f"train.steps_scaler={value}")

@@ -41,7 +41,7 @@ FILE = re.compile(r"^[\w.-]+(/[\w.-]+)+\.(py|yaml|md|sh)$")
 OUR_FILES = ("src/", "conf/", "docs/", "tests/")
 # a choice that is a name, and no placeholder, pattern or expression
 VERBATIM = re.compile(r"^[\w/]+$")
-OWN = {"mine", "mycluster", "NAME"}  # names that examples give to a reader's own
+OWN = {"mine", "mycluster", "opacity", "NAME"}  # names that examples give to a reader's own
 TOP = {"name", "seed", "device", "threads", "runs", "allow_targets"}
 CLASSES: dict[str, tuple[type, ...]] = {
     "scene": (SceneConfig,),

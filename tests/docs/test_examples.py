@@ -184,6 +184,52 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
 
 
+@pytest.mark.parametrize(("module", "name"), [("careful", "Careful"), ("peak", "Peak")])
+def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name):
+    from gsbench.densify import ADC, DensifyContext
+    from gsbench.gaussians.paper_values import LearningRates
+    from gsbench.gaussians.trainable import TrainableGaussians
+    from gsbench.raster.base import RenderOutput
+    from tests.gaussians.helpers import random_gaussians
+
+    (code,) = (
+        block
+        for block in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
+        if block.startswith(f"# {module}.py")
+    )
+    (folder / f"{module}.py").write_text(code)
+    cls = getattr(__import__(module), name)
+
+    def rounds(cls, state, first, last):
+        densifier = cls(start=0, stop=100, interval=2, gradient_threshold=0.5)
+        context, rates = DensifyContext(2.0), LearningRates()
+        rng = torch.Generator()
+        if state is None:
+            initial = random_gaussians(60, seed=1, dtype=torch.float32)
+            gaussians = TrainableGaussians(initial, rates, 2.0)
+            densifier.begin(gaussians.values, context)
+            rng.manual_seed(5)
+        else:
+            gaussians = TrainableGaussians.load(state[0], rates, 2.0)
+            densifier.load_state_dict(state[1], context)
+            rng.set_state(state[2])
+        for step in range(first, last + 1):
+            n, own = len(gaussians), torch.Generator().manual_seed(step)
+            radii = torch.randint(0, 3, (n,), generator=own, dtype=torch.int32)
+            points = torch.zeros(n, 2)
+            points.grad = torch.rand(n, 2, generator=own)
+            densifier.observe(step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, points))
+            densifier.refine(step, gaussians, rng)
+        return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
+
+    whole = rounds(cls, None, 1, 8)
+    resumed = rounds(cls, rounds(cls, None, 1, 5), 6, 8)
+    plain = rounds(ADC, None, 1, 8)
+    for key, tensor in whole[0]["gaussians"].items():
+        assert torch.equal(resumed[0]["gaussians"][key], tensor), key
+    assert len(whole[1]["lineage"]["ids"]) != len(plain[1]["lineage"]["ids"])
+
+
 def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
     from gsbench.densify import DensifyContext
     from gsbench.gaussians.paper_values import LearningRates

@@ -1,9 +1,11 @@
 """One short test of the program for each of its uses; part of ``make test``."""
 
 import csv
+import html
 import json
 import os
 import re
+import shlex
 import sqlite3
 import subprocess
 import sys
@@ -161,6 +163,32 @@ def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
         for trial in (trials_of(runs, "own")["solid-0"], trials_of(runs)["adc-0"])
     ]
     assert counts[0] < counts[1]
+
+
+@pytest.mark.slow
+def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsbench, tmp_path):
+    text = (ROOT / "README.md").read_text()
+    (code,) = re.findall(r"```python\n(# mine\.py\n.*?)```", text, re.DOTALL)
+    (experiment,) = re.findall(r"```yaml\n(# @package.*?)```", text, re.DOTALL)
+    (tmp_path / "mine.py").write_text(code)
+    (tmp_path / "my" / "experiment").mkdir(parents=True)
+    (tmp_path / "my" / "experiment" / "opacity.yaml").write_text(experiment)
+    commands = re.findall(
+        r"^    gsbench (--config-dir my .*?) +#.*$|^    gsbench (report opacity)$", text, re.M
+    )
+    first, second = (shlex.split(one or other) for one, other in commands)
+    tiny = [
+        *("scene.width=96", "scene.height=72", "scene.views=12", "init=random", "init.count=1000"),
+        *("train.steps_scaler=0.1", "densify.max_gaussians=1500", "eval.lpips=[]", "tracking=none"),
+    ]
+    done = gsbench(*first, *tiny, GSBENCH_RUNS=str(tmp_path / "runs"))
+    assert done.returncode == 0, done.stderr
+    (verdict,) = [line for line in done.stderr.splitlines() if " against " in line]
+    assert verdict.startswith("random-solid against random-adc: ")
+    assert verdict.endswith("The metric was declared beforehand.")
+    assert gsbench(*second, GSBENCH_RUNS=str(tmp_path / "runs")).returncode == 0
+    page = (tmp_path / "runs" / "opacity" / "report.html").read_text()
+    assert verdict in html.unescape(page)
 
 
 @pytest.mark.slow

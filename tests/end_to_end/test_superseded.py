@@ -1,4 +1,4 @@
-"""After an edit of a densifier's helper, no table averages both versions of the code."""
+"""After an edit of a densifier's helper, tables show the newest code and name the older trials."""
 
 import json
 import shutil
@@ -59,13 +59,20 @@ def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
     assert ask("status", "edited") == "2 trials: 2 done\n"
     (tmp_path / "unrelated.py").write_text("# new\n")
     assert ask("status", "edited") == "2 trials: 2 done\n"
-    (tmp_path / "helper.py").write_text(HELPER + "# edited\n")
+    (tmp_path / "helper.py").write_text(f"# a comment\n{HELPER}")
+    assert ask("status", "edited") == "2 trials: 2 done\n"
+    assert "iteration" not in train(0, 1)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "helper.py").write_text("said = 2\n")
     assert "2 trials: 2 superseded" in ask("status", "edited")
+    assert "helper was edited since: 2 trials of random-mine are of the old code" in ask(
+        "tables", "edited"
+    )
     train(2)
 
-    refused = ask("tables", "edited", code=2)
-    assert "different versions of helper" in refused
-    assert "courtyard seeds 0, 1" in refused
+    shown = ask("tables", "edited")
+    assert "edited since" not in shown
+    assert "edited/courtyard/random-mine seeds 0, 1: left out, made by an earlier helper" in shown
     listed = json.loads(ask("status", "edited", "--json"))
     states = {Path(trial["folder"]).name.partition("-")[2]: trial["state"] for trial in listed}
     assert states == {"seed0": "superseded", "seed1": "superseded", "seed2": "done"}

@@ -140,7 +140,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
     experiment = load_experiment(tmp_path, "exp")
     found = active_declaration(experiment.folder, experiment.trials)
     assert found is not None
-    assert found.beforehand
+    assert found.standing([], experiment.trials).beforehand
     assert experiment.trials[0].measured >= declared.moment
 
     time.sleep(1.1)  # moments are kept in whole seconds
@@ -150,7 +150,11 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
     found = active_declaration(experiment.folder, load_experiment(tmp_path, "exp").trials)
     assert found is not None
-    assert (found.metric, len(found.seen), [one.primary for one in found.earlier]) == (
+    assert (
+        found.metric,
+        len(found.standing([], experiment.trials).seen),
+        [one.primary for one in found.earlier],
+    ) == (
         "ssim",
         1,
         ["psnr"],
@@ -162,4 +166,4 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
     again = load_experiment(tmp_path, "again")
     found = active_declaration(again.folder, again.trials)
     assert found is not None
-    assert not found.beforehand
+    assert not found.standing([], again.trials).beforehand

@@ -100,13 +100,28 @@ def test_no_arm_leads_before_all_arms_share_a_seed(tmp_path):
     assert (progress.leader, progress.seconds_left) == ("", None)
 
 
-def test_an_arm_of_several_settings_is_named_with_their_hashes(tmp_path):
+@pytest.mark.parametrize("planned", [False, True])
+def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned):
     folders = [begin(tmp_path, "adc", seed) for seed in (0, 1)]
     values = trial_values(tmp_path, 0, "swept") | {"densify": {"name": "adc", "start": 5}}
     other = begin_trial(values | {"scene": {"name": "a_scene"}})
     begin(tmp_path, "mcmc", 0)
+    arms = [f"a_init-adc[{folder.name[:8]}]" for folder in (folders[0], other)]
+    if planned:
+        words = {folder: ["densify=adc", "seed=0"] for folder in folders}
+        words |= {folder: [*own, "densify.start=7"] for folder, own in words.items()}
+        words[other] = ["densify=adc", "seed=0", "+densify.start=5"]
+        trials = {
+            folder.relative_to(tmp_path / "swept").as_posix(): {
+                "overrides": own,
+                "cwd": ".",
+                "time": 0.0,
+            }
+            for folder, own in words.items()
+        }
+        (tmp_path / "swept" / "plan.json").write_text(json.dumps({"trials": trials}))
+        arms = ["a_init-adc[start=7]", "a_init-adc[start=5]"]
     progress = progress_of(tmp_path / "swept")
-    arms = [f"a_init-adc {folder.name[:8]}" for folder in (folders[0], other)]
     assert {name: cell["waiting"] for name, cell in progress.cells.items()} == {
         (arms[0], "a_scene"): 2,
         (arms[1], "a_scene"): 1,

@@ -212,7 +212,7 @@ def home(tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(keys.syntax_of(path.read_bytes())).hexdigest()
 
 
 def values_of(
@@ -248,8 +248,10 @@ def test_a_package_is_hashed_by_all_its_code_files(home):
     first = module_digest("pack")
     (home / "pack" / "notes.txt").write_text("b")
     assert module_digest("pack") == first
-    for name in ("inner/deep.py", "inner/kernel.cu"):
-        (home / "pack" / name).write_text(files[name] + "\n")
+    (home / "pack" / "inner" / "deep.py").write_text('"""A docstring."""\nX  = 1  # a comment\n')
+    assert module_digest("pack") == first
+    for name, other in {"inner/deep.py": "X = 2\n", "inner/kernel.cu": "int x;\n\n"}.items():
+        (home / "pack" / name).write_text(other)
         assert module_digest("pack") != first
         (home / "pack" / name).write_text(files[name])
     assert module_digest("pack") == first
@@ -300,7 +302,7 @@ def test_a_module_whose_file_is_gone_has_no_digest(tmp_path):
     assert spec is not None
     assert keys._digest_on_disk(spec) is None
     (tmp_path / "passing.py").write_text(SOURCE)
-    assert keys._digest_on_disk(spec) == hashlib.sha256(SOURCE.encode()).hexdigest()
+    assert keys._digest_on_disk(spec) == hashlib.sha256(keys.syntax_of(SOURCE.encode())).hexdigest()
 
 
 def test_a_new_file_is_found_even_if_its_folder_keeps_its_time(home):

@@ -118,10 +118,13 @@ def test_only_new_tags_are_sent_and_too_long_ones_are_left_out():
     assert sent == {VIEW: "new"}
 
 
-def test_a_description_without_a_verdict_begins_with_what_is_missing(tmp_path):
+def test_a_description_begins_with_the_verdict_also_without_a_declared_metric(tmp_path):
     write_sweep(tmp_path)
     text = description(read_experiment(tmp_path / "swept"))
-    assert text.startswith("**No verdict: it needs a declared metric (eval.primary), two arms")
+    assert text.startswith(
+        "**a_init-volumetric against a_init-adc, on these scenes: better in PSNR**"
+    )
+    assert "Exploratory: no metric was declared (eval.primary)" in text
 
 
 def test_a_long_description_is_cut_at_a_line(tmp_path):

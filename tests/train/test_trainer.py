@@ -144,11 +144,11 @@ def test_the_learning_rate_of_the_means_is_log_linear() -> None:
     assert rates.position(99_000) == pytest.approx(1.6e-6)
 
 
-def test_a_densifier_that_was_never_due_causes_a_warning(
+def test_too_few_rounds_of_a_densifier_cause_a_warning(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab.train(ADC(start=500), "adc", iterations=15)
-    assert "no refinement was due in 15 iterations" in caplog.text
+    assert "ADC: 0 rounds of refinement in 15 iterations are too few" in caplog.text
     caplog.clear()
     lab.train(NoDensifier(), "none", iterations=15)
     assert "refinement" not in caplog.text
@@ -192,6 +192,7 @@ def test_defaults_are_those_of_3dgs() -> None:
         "log_every": 10,
         "checkpoint_every": 1000,
         "checkpoint_minutes": 10.0,
+        "steps_scaler": 1.0,
     }
     assert asdict(TrainConfig(name="paper")) == published | others
 

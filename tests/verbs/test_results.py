@@ -78,6 +78,21 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "runs"
 
 
+def test_tables_alone_lists_the_experiments(made, capsys):
+    assert tables([], made) == 0
+    assert capsys.readouterr().out.splitlines() == ["alone", "exp"]
+    assert tables([], made / "empty") == 0
+    assert "no experiment in" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("values", "seeds"), [("0,2", 2), ("1", 1), ("2,7", 1), ("0,1,2", 3)])
+def test_where_takes_several_values(made, capsys, values, seeds):
+    assert tables(["exp", "--where", f"seed={values}", "--format", "trials"], made) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1 + 2 * seeds
+    with pytest.raises(InputError, match="no trial has seed=8,9"):
+        tables(["exp", "--where", "seed=8,9"], made)
+
+
 FAIR = ["--layout", "fairness"]
 
 
@@ -91,6 +106,7 @@ FAIR = ["--layout", "fairness"]
         (["--out", "t.csv", "--format", "trials"], ["t.csv"], "experiment,"),
         (["--out", "t.md", "--format", "csv"], ["t.md/exp.csv"], "scene,"),
         (["--out", "t.csv", "--paper", "3dgs"], ["t.csv", "t-3dgs.csv"], ""),
+        (["--out", "new", "--format", "json"], ["new/exp.json"], "{"),
         (["--out", "f.md", *FAIR], ["f.md"], "### "),
         (["--out", "new", *FAIR], ["new/exp-fairness-sfm-volumetric-sfm-adc.md"], "### "),
     ],

@@ -97,11 +97,16 @@ def check_fields(trials: Iterable[TrialResult], names: Iterable[str]) -> None:
 
 
 def select_trials(trials: Iterable[TrialResult], where: Mapping[str, str]) -> list[TrialResult]:
-    """The trials whose fields have the given values; raises ``InputError`` if there are none."""
+    """The trials whose fields have one of the values, which are given with commas between.
+
+    Raises ``InputError`` if there are none.
+    """
     kept = list(trials)
     check_fields(kept, where)
-    for key, value in where.items():
-        kept = [trial for trial in kept if field_value(trial, key) == value]
+    for key, values in where.items():
+        # a value may have commas itself, as a list has
+        wanted = {values, *values.split(",")}
+        kept = [trial for trial in kept if field_value(trial, key) in wanted]
     if not kept:
         asked = ", ".join(f"{key}={value}" for key, value in where.items())
         raise InputError(f"no trial has {asked}")
@@ -142,14 +147,17 @@ def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
 def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     """The trials, each with its values of the swept settings as `TrialResult.variant`.
 
-    Trials with different values thus belong to different arms.
+    Trials with different values thus belong to different arms. Only settings that were swept for
+    the trial's own initialiser and densifier count, so a further arm renames no other.
     """
-    swept = swept_settings(trials)
-    if not swept:
+    by_densifier = group_by(trials, lambda trial: (trial.init, trial.densify))
+    swept = {key: swept_settings(own) for key, own in by_densifier.items()}
+    if not any(swept.values()):
         return list(trials)
 
     def variant(trial: TrialResult) -> tuple[tuple[str, str], ...]:
-        return tuple((key, str(trial.config.get(key))) for key in swept)
+        own = swept[trial.init, trial.densify]
+        return tuple((key, str(trial.config.get(key))) for key in own)
 
     return [replace(trial, variant=variant(trial)) for trial in trials]
 

@@ -1,102 +1,180 @@
-"""The declaration that a sweep's verdict follows.
+"""Declarations of an experiment, and for each question whether it was declared in time.
 
-It comes with the trials that were measured before it, and those that were added later.
+A question (arm against baseline in a metric, on scenes and seeds) counts as declared if it was
+fixed before the first trial of its *arm* was measured. Older trials of the baseline do no harm:
+what was seen of them says nothing about the arm. Trials added after the arm's first result do
+harm, since adding until an effect appears finds effects that do not exist.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
-from gsbench.analysis.results import TrialResult
-from gsbench.runs.experiments import Declaration, read_declarations
+from gsbench.analysis.results import TrialResult, load_flat_config, settings_text
+from gsbench.parsing import DamagedError
+from gsbench.runs.experiments import Declaration, merge_planned, read_declarations
+from gsbench.runs.layout import SEED
 from gsbench.words import counted
 
 
 @dataclass(frozen=True)
-class ActiveDeclaration:
-    """The declaration that holds for a sweep of ``trials`` trials.
+class Standing:
+    """The standing of a declaration to the question about one arm.
 
-    ``declaration`` has the time of the first declaration of the metric, and the trials declared up
-    to the first result. ``seen`` are the trials that were measured before that time; ``added`` are
-    the trials that were not declared before the first result. ``earlier`` are the declarations of
-    other metrics that this one replaced.
+    ``declaration`` is the one that first named the arm, with its trials up to the arm's first
+    result; questions of one such declaration share an error rate. ``seen`` are the arm's trials
+    that were measured before the metric was declared, ``added`` the trials of its pairs that were
+    not declared before its first result. ``trials`` is the number of its trials.
     """
 
     declaration: Declaration
     seen: tuple[TrialResult, ...]
     added: tuple[TrialResult, ...]
     trials: int
+
+    @property
+    def beforehand(self) -> bool:
+        """Return whether the question was fixed before any result of its arm."""
+        return not self.seen and not self.added
+
+    @property
+    def doubt(self) -> str:
+        """The reason why the question does not count as declared; "" if it does."""
+        if self.seen:
+            of_arm = f"{len(self.seen)} of the arm's {counted(self.trials, 'trial')}"
+            return f"declared after {of_arm} had been measured"
+        if self.added:
+            return f"{counted(len(self.added), 'trial')} added after the arm's first result"
+        return ""
+
+
+@dataclass(frozen=True)
+class ActiveDeclaration:
+    """The declarations in force in an experiment: all of the latest metric, the oldest first.
+
+    ``folder`` is the experiment's, ``older`` are trials of earlier code, which do not count but
+    were seen. ``earlier`` are the declarations of other metrics that this one replaced.
+    """
+
+    records: tuple[Declaration, ...]
     earlier: tuple[Declaration, ...]
+    folder: Path
+    older: tuple[TrialResult, ...] = ()
 
     @property
     def metric(self) -> str:
-        return self.declaration.questions[0].metric
+        return self.records[0].questions[0].metric
 
     @property
     def question(self) -> str:
         """The question of the verdict, interpolation or extrapolation; "" if it is about both."""
-        return self.declaration.questions[0].about
+        return self.records[0].questions[0].about
 
-    @property
-    def beforehand(self) -> bool:
-        """Return whether metric and trials were fixed before any result.
-
-        Only then the metric is tested alone.
-        """
-        return not self.seen and not self.added
-
-    def sentences(self, name: str) -> list[str]:
-        """Sentences that say when the metric called ``name`` was declared, and for which trials."""
-        when = self.declaration.when
-        name += f" at {self.question}" if self.question else ""
-        all_trials = counted(self.trials, "trial")
-        if self.seen:
-            lines = [
-                f"{name} was declared too late (eval.primary, {when}): {len(self.seen)} of the "
-                f"{all_trials} had been "
-                "measured. So it is adjusted together with all other metrics. To test it, run "
-                "other seeds under "
-                "another name."
-            ]
-        elif self.added:
-            lines = [
-                f"{name} was declared beforehand (eval.primary, {when}), but {len(self.added)} of "
-                f"the {all_trials} "
-                "were added after the first result. So it is adjusted together with all other "
-                "metrics: adding trials "
-                "until an effect appears finds effects that do not exist. To test it, run other "
-                "seeds under another "
-                "name, all by one command."
-            ]
+    def standing(self, baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> Standing:
+        """The standing to the question about ``arm``, given both arms' trials."""
+        first = min((trial.measured for trial in arm), default=math.inf)
+        # times are whole seconds: a declaration of the arm's first second may be later
+        before = [one for one in self.records if one is self.records[0] or one.moment < first]
+        keys = {trial.key for trial in arm}
+        naming = [one for one in before if keys & one.planned.keys()] or before[:1]
+        in_looks = [one for one in naming if one.looks]
+        old = [one for one in self.older if arm and _is_version_of(one, arm[0])]
+        seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
+        # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
+        # first result could not be chosen by it.
+        places, others = _places(baseline), _places(arm)
+        paired = [trial for trial in arm if (trial.scene, trial.seed) in places]
+        paired += [t for t in baseline if (t.scene, t.seed) in others and t.measured >= first]
+        if before[-1].names_trials:
+            planned = reduce(merge_planned, (one.planned for one in before))
+            added = [one for one in paired if one.seed not in planned.get(one.key, ())]
         else:
-            lines = [
-                f"{name} was declared beforehand (eval.primary, {when}), before any of the "
-                f"{all_trials} was measured."
+            # The record's file may be lost, and results repeat only its metric and time. Then every
+            # trial that was measured after the next record with trials may have been added.
+            named = (one.moment for one in self.records if one.names_trials)
+            next_record = min(named, default=math.inf)
+            added = [one for one in paired if one.measured >= next_record]
+        declaration = in_looks[-1] if in_looks else naming[0]
+        return Standing(declaration, tuple(seen), tuple(added), len(arm))
+
+    def progress(self, trials: Sequence[TrialResult]) -> list[str]:
+        """A sentence on the declared trials that are missing; none if all are there."""
+        planned = reduce(merge_planned, (one.planned for one in self.records))
+        done = {(trial.key, trial.seed) for trial in trials}
+        replaced = {trial.key for trial in self.older}
+        wanted = [
+            (key, seed)
+            for key, seeds in planned.items()
+            for seed in seeds
+            if (key, seed) in done
+            or (key not in replaced and not self._is_replaced(key, seeds, trials))
+        ]
+        missing = sum(one not in done for one in wanted)
+        if not missing:
+            return []
+        counts = f"{missing} of the {counted(len(wanted), 'declared trial')}"
+        if any(one.looks for one in self.records):
+            return [
+                f"Seeds come in planned looks (launch.stop_when_decided); {counts} are not there."
             ]
-        planned = sum(map(len, self.declaration.planned.values()))
-        missing = planned - (self.trials - len(self.added)) if planned else 0
-        if self.declaration.looks:
+        return [
+            f"{counts} are still missing, so this is an early look. Do not stop here because the "
+            "result pleases: that finds effects that do not exist."
+        ]
+
+    def _is_replaced(self, key: str, seeds: Iterable[int], trials: Sequence[TrialResult]) -> bool:
+        """Return whether trials with a planned trial's settings, but other code, have finished.
+
+        That is so if the planned trial failed and its code was repaired.
+        """
+        for seed in seeds:
+            try:
+                config = load_flat_config(self.folder / f"{key}{SEED}{seed}")
+            except (FileNotFoundError, DamagedError):
+                continue
+            place = key.rpartition("/")[0]
+            same_arm = [one for one in trials if one.key.rpartition("/")[0] == place]
+            text = settings_text(config)
+            return any(one.key != key and settings_text(one.config) == text for one in same_arm)
+        return False
+
+    def sentences(self, name: str, standings: Iterable[Standing]) -> list[str]:
+        """Sentences that say when the metric called ``name`` was declared, and for which trials."""
+        name += f" at {self.question}" if self.question else ""
+        when = self.records[0].when
+        doubts = [one.doubt for one in standings if one.doubt]
+        how = "was declared beforehand" if not doubts else "was declared"
+        lines = [f"{name} {how} (eval.primary, {when})."]
+        if doubts:
             lines.append(
-                "Seeds come in planned looks (launch.stop_when_decided), and each interval counts "
-                "all looks; "
-                f"{missing} of the {planned} declared trials are missing."
-            )
-        elif missing:
-            lines.append(
-                f"{missing} of the {planned} declared trials are still missing, so this is an "
-                "early look. Do not stop "
-                "here because the result pleases: that finds effects that do not exist."
+                "An arm whose metric or trials were declared after its first result is judged in "
+                f"all metrics, adjusted for their number. To test {name} alone, run other seeds "
+                "under another name, all by one command."
             )
         return lines + [f"Declared before it: {one.primary} ({one.when})." for one in self.earlier]
 
 
-def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDeclaration | None:
-    """The declaration in force for the sweep in ``folder``; None if nothing was declared.
+def _is_version_of(older: TrialResult, trial: TrialResult) -> bool:
+    """Return whether a trial of earlier code is one of the arm of ``trial``."""
+    values = dict(trial.variant)
+    return (older.init, older.densify) == (trial.init, trial.densify) and all(
+        str(older.config.get(key)) == value for key, value in values.items()
+    )
 
-    ``trials`` are all trials of the sweep. The latest declaration of a metric is in force.
-    Further commands may add trials to it until the first result; a trial that is added later
-    counts as ``added`` as soon as it is measured.
+
+def _places(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:
+    return {(trial.scene, trial.seed) for trial in trials}
+
+
+def active_declaration(
+    folder: Path, trials: Sequence[TrialResult], older: Sequence[TrialResult] = ()
+) -> ActiveDeclaration | None:
+    """The declarations in force for the sweep in ``folder``; None if nothing was declared.
+
+    ``trials`` are the trials of the sweep that count, ``older`` those of earlier code. The latest
+    metric is in force. Further commands may add trials to an arm until its first result.
     """
     recorded = read_declarations(folder, (trial.record.declared for trial in trials))
     declared = [one for one in recorded if one.kind == "sweep"]
@@ -106,24 +184,7 @@ def active_declaration(folder: Path, trials: Sequence[TrialResult]) -> ActiveDec
     current = [
         one
         for one in declared
-        if not others or one.moment > others[-1].moment or one is declared[-1]
+        if one.primary == declared[-1].primary
+        and (not others or one.moment > others[-1].moment or one is declared[-1])
     ]
-    first_result = min((trial.measured for trial in trials), default=math.inf)
-    # Each command's record repeats the trials of the records before it, so the last valid record
-    # names them all.
-    complete = current[0]
-    for later in current[1:]:
-        # times are whole seconds: a declaration of the same second may be later
-        if later.moment < first_result:
-            complete = later
-    declaration = replace(complete, time=current[0].time)
-    seen = tuple(trial for trial in trials if trial.measured < declaration.moment)
-    if declaration.names_trials:
-        planned = declaration.planned
-        added = tuple(trial for trial in trials if trial.seed not in planned.get(trial.key, ()))
-    else:
-        # The record's file may be lost, and the trials' results repeat only its metric and time.
-        # Then every trial that was measured after the next record with trials may have been added.
-        next_record = next((one.moment for one in current if one.names_trials), math.inf)
-        added = tuple(trial for trial in trials if trial.measured >= next_record)
-    return ActiveDeclaration(declaration, seen, added, len(trials), tuple(others))
+    return ActiveDeclaration(tuple(current), tuple(others), folder, tuple(older))

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.results import (
+    CODE,
     Arm,
     TrialPair,
     TrialResult,
@@ -95,8 +96,6 @@ WITHOUT_EFFECT = (
 # among them, so that a note says where it differs. Iterations are a condition already.
 OF_A_SCENE = ("resolution", "data", "budget")
 OWN_SETTINGS = (*WITHOUT_EFFECT, "scene", "init.path", "train.iterations")
-
-CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
 
 FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
 # A fact is one comment line; indented comment lines continue it.

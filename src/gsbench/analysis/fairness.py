@@ -9,8 +9,8 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from gsbench.analysis.advice import equal_counts_command
 from gsbench.analysis.differences import (
-    CODE,
     between_scenes_notes,
     compared_trials,
     differing_keys,
@@ -21,7 +21,7 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read_experiment
+from gsbench.analysis.results import CODE, Arm, TrialResult, canonical, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
@@ -57,9 +57,10 @@ def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> s
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
         return ""
     more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
+    advice = equal_counts_command(baseline, other)
     return (
-        f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts; "
-        "densify.cap=governor makes the counts equal."
+        f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts. "
+        f"To do so: {advice}."
     )
 
 

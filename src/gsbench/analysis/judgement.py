@@ -59,7 +59,7 @@ class Verdict:
     is False while further planned seeds may decide. ``outlying`` trials lie far outside the others
     of their scene and arm; ``outcome_without`` is the outcome without them. If the mean of the
     other trials contradicts the outcome, the verdict ``rests_on_outlying`` trials and is undecided.
-    ``late`` is the number of trials that were measured before the question was asked. If there are
+    ``late`` is the number of the arm's trials that were measured before the question. If there are
     any, each metric could have been chosen by its result, and the error rate is divided by the
     number of metrics.
     """
@@ -180,9 +180,8 @@ def _with_pairs(
 ) -> Verdict:
     """The question with its pairs of trials, not judged yet."""
     pairs = pair(trials, question)
-    # trials of an earlier version alone show no difference, so they may be older
-    new = pairs.trials[1::2] if question.versions else pairs.trials
-    late = sum(trial.measured < declaration.moment for trial in new)
+    # the baseline's trials alone show no difference, so they may be older
+    late = sum(trial.measured < declaration.moment for trial in pairs.trials[1::2])
     quantity = asked_quantity(question.metric, trials)
     notes = pairs.left_out
     if question.scenes:  # other questions are below tables, which say it themselves

@@ -5,12 +5,14 @@ All verdicts pair trials here; `gsbench.analysis.judgement.judge` decides what t
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,34 +246,59 @@ def choose_pairs(
     arms: Sequence[Arm],
     baseline: str = BASELINE,
     controls: Mapping[str, str] = MappingProxyType({}),
+    settings: Mapping[Arm, Mapping[str, Any]] = MappingProxyType({}),
 ) -> list[tuple[Arm, Arm]]:
     """The pairs (baseline, arm) of arms to compare: those with the baseline, then with controls.
 
-    An arm is compared with the baseline densifier of the same initialiser, with the same swept
-    settings if such an arm exists. If no arm has the baseline, all are compared with the first
-    of ``arms``. ``controls`` maps a densifier to a further one that it is compared with
-    (`controls_of`).
+    An arm is compared with every arm that has the baseline densifier, the same initialiser, and
+    the same values of the swept settings that both have. If there is none, it is compared with
+    those that share most of these values. So a further arm never takes another arm's baseline
+    away. If no arm can be compared in this way, all are compared with the first of ``arms``.
+    ``controls`` maps a densifier to a further one that it is compared with (`controls_of`).
+    ``settings`` are the arms' configurations, for swept settings that are not in an arm's name.
     """
 
-    def partner(arm: Arm, densify: str) -> Arm | None:
-        same_settings = replace(arm, densify=densify)
-        return next(
-            (one for one in (same_settings, replace(same_settings, variant=())) if one in arms),
-            None,
-        )
+    def partners(arm: Arm, densify: str) -> list[Arm]:
+        found = [one for one in arms if (one.init, one.densify) == (arm.init, densify)]
+        unlike = {one: _unlike(arm, one, settings) for one in found}
+        return [one for one in found if unlike[one] == min(unlike.values())]
 
     pairs = [
-        (found, arm)
-        for arm in arms
-        if arm.densify != baseline and (found := partner(arm, baseline))
+        (one, arm) for arm in arms if arm.densify != baseline for one in partners(arm, baseline)
     ]
     pairs = pairs or [(arms[0], arm) for arm in arms[1:]]
     for arm in arms:
         control = controls.get(arm.densify, arm.densify)
-        found = None if control == arm.densify else partner(arm, control)
-        if found and (found, arm) not in pairs:
-            pairs.append((found, arm))
+        if control != arm.densify:
+            pairs += [(one, arm) for one in partners(arm, control) if (one, arm) not in pairs]
     return pairs
+
+
+def _unlike(arm: Arm, other: Arm, settings: Mapping[Arm, Mapping[str, Any]]) -> int:
+    """The number of swept settings that both arms have with different values."""
+    one, two = (
+        {key: str(value) for key, value in settings.get(own, {}).items()} | dict(own.variant)
+        for own in (arm, other)
+    )
+    swept = dict([*arm.variant, *other.variant])
+    return sum(key in one and key in two and one[key] != two[key] for key in swept)
+
+
+def uncompared(arms: Sequence[Arm], pairs: Sequence[tuple[Arm, Arm]], baseline: str) -> list[str]:
+    """A line with the reason for each of ``arms`` that is in none of ``pairs``."""
+    compared = set(itertools.chain(*pairs))
+    lines = []
+    for arm in arms:
+        if arm in compared or len(arms) == 1:
+            continue
+        if arm.densify == baseline:
+            reason = "it has the baseline's densifier, and no other arm has its initialiser"
+            if any(one.init == arm.init and one.densify != baseline for one in arms):
+                reason = "other arms have a baseline with settings nearer to theirs"
+        else:
+            reason = f"there is no {replace(arm, densify=baseline, variant=())}"
+        lines.append(f"{arm} is not compared: {reason}.")
+    return lines
 
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:

@@ -16,7 +16,8 @@ from gsbench.eval.protocol import PAPER, protocol_of
 from gsbench.words import signed
 
 MILLION, THOUSAND, MINUTE = 1e6, 1e3, 60.0
-NO_DIRECTION = "no file says whether higher or lower is better"  # the reason of no verdict
+# the reason of no verdict
+NO_DIRECTION = "unknown whether higher is better: set `direction` in the metric's class"
 
 Reader = Callable[[TrialResult], float | None]
 

@@ -9,7 +9,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.keys import flatten, is_hashed
+from gsbench.runs.keys import SHOWN, flatten, is_hashed, present_digest
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
@@ -29,6 +29,9 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
+CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
+# settings in which repetitions of a trial may differ
+UNCOUNTED = ("eval.primary", "eval.controls", "densify.switches", "scene.path", "hydra.")
 GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
 ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
@@ -183,9 +186,19 @@ class TrialResult:
         of gsbench.
         """
         code = self.record.code
-        return {f"code of {module}": digest for module, digest in code.sources.items()} | {
+        return {f"{CODE}{module}": digest for module, digest in code.sources.items()} | {
             f"stage {name}": str(version) for name, version in code.stages.items()
         }
+
+    @cached_property
+    def edited(self) -> tuple[str, ...]:
+        """The user's modules that were edited since; those that are not found are left out."""
+        present = {name: present_digest(name) for name in self.record.code.sources}
+        return tuple(
+            name
+            for name, digest in self.record.code.sources.items()
+            if present[name] not in (None, digest)
+        )
 
     @cached_property
     def rooms(self) -> dict[str, str]:
@@ -289,12 +302,16 @@ TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one o
 
 @dataclass(frozen=True)
 class Experiment:
-    """The usable trials of an experiment, and a line for each trial folder that cannot be used."""
+    """The usable trials of an experiment, and a line for each trial folder that cannot be used.
+
+    ``older`` are trials of earlier code that `newest_code` left out.
+    """
 
     name: str
     folder: Path
     trials: tuple[TrialResult, ...]
     warnings: tuple[str, ...]
+    older: tuple[TrialResult, ...] = ()
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -316,8 +333,11 @@ def seeds_words(trials: Iterable[TrialResult]) -> str:
 
 
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
-    """Read every trial of the experiment ``name``; raises ``InputError`` if none can be used."""
-    experiment = read_experiment(experiment_home(runs_dir, name))
+    """Read the trials of the experiment ``name`` (`newest_code`).
+
+    Raises ``InputError`` if none can be used.
+    """
+    experiment = newest_code(read_experiment(experiment_home(runs_dir, name)))
     if not experiment.trials:
         warnings = experiment.warnings
         first = f" (first: {warnings[0]})" if warnings else ""
@@ -349,6 +369,61 @@ def read_experiment(folder: Path) -> Experiment:
     )
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     return Experiment(folder.name, folder, tuple(usable), tuple(warnings))
+
+
+def newest_code(experiment: Experiment) -> Experiment:
+    """The experiment without trials that later code repeated; a warning names them.
+
+    Trials of one scene, arm and settings that differ only in their code are versions of one thing.
+    Those count whose user's code is what it is now, or else those that were finished last.
+    """
+    older: list[TrialResult] = []
+    lines: list[str] = []
+    for own in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
+        if len({canonical(trial.code | trial.rooms) for trial in own}) < 2:
+            continue
+        # eval.primary, switches and the place of the photographs do not tell trials apart
+        for same in group_by(own, lambda trial: settings_text(trial.config)).values():
+            versions = group_by(same, lambda trial: canonical(trial.code | trial.rooms))
+            newest = max(
+                versions.values(),
+                key=lambda made: (not made[0].edited, max(trial.finished for trial in made)),
+            )
+            for made in versions.values():
+                if made is not newest:
+                    older += made
+                    lines.append(_left_out_words(made, newest[0]))
+    if not older:
+        return experiment
+    left_out = {trial.path for trial in older}
+    kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
+    return replace(
+        experiment, trials=kept, older=tuple(older), warnings=(*experiment.warnings, *lines)
+    )
+
+
+def settings_text(config: Mapping[str, Any]) -> str:
+    """The settings that determine a result, as text that is equal for equal settings."""
+    # A missing key counts as unset: trials from before a setting existed equal later ones.
+    return canonical(
+        {
+            key: value
+            for key, value in config.items()
+            if value is not None and is_hashed(key) and not key.startswith(UNCOUNTED)
+        }
+    )
+
+
+def _left_out_words(made: Sequence[TrialResult], newest: TrialResult) -> str:
+    """``sw/garden/sfm-mine seeds 0, 1: left out, made by an earlier mine (3fa9c1d2, now …)``"""
+    one, now = made[0].code | made[0].rooms, newest.code | newest.rooms
+    part = next(part for part in {**now, **one} if one.get(part) != now.get(part))
+    versions = [version.get(part, "none")[:SHOWN] for version in (one, now)]
+    cell = f"{made[0].experiment}/{made[0].scene}/{made[0].init}-{made[0].densify}"
+    return (
+        f"{cell} {seeds_words(made)}: left out, made by an earlier "
+        f"{part.removeprefix(CODE)} ({versions[0]}; the trials that count have {versions[1]})"
+    )
 
 
 def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> dict[str, str]:

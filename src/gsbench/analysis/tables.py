@@ -19,7 +19,6 @@ from gsbench.analysis.cells import (
     swept_settings,
     with_variants,
 )
-from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.differences import (
     between_scenes_notes,
     conditions_between_scenes,
@@ -27,13 +26,13 @@ from gsbench.analysis.differences import (
     differing_conditions,
 )
 from gsbench.analysis.fairness import caveats
-from gsbench.analysis.pairing import BASELINE, are_equal, choose_pairs, controls_of, pair_trials
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by, seeds_words
+from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_words
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.eval.facts import find_metric
+from gsbench.events import FEWEST_ROUNDS, few_rounds
 from gsbench.runs.keys import SHOWN
-from gsbench.runs.layout import TUNING
+from gsbench.runs.layout import EVENTS
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted, some_of
 
@@ -158,7 +157,9 @@ def _rows(
             text = format_cell(cell, quantity_of[position[2]]) if cell.scenes else "n/a"
             text += f" [{counted(cell.scenes, 'scene')}]" if 0 < cell.scenes != most_scenes else ""
             entries.append(TableEntry(text, position in bold, cell))
-        rows.append(Row(labels, tuple(entries), rule_above=ruled and not rows))
+        # a setting that an arm does not have, or has unset
+        shown = tuple("–" if label == str(None) else label for label in labels)
+        rows.append(Row(shown, tuple(entries), rule_above=ruled and not rows))
     return rows
 
 
@@ -288,6 +289,7 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
     return [
         *doubt_notes(trials),
         *origin_notes(trials),
+        *edited_notes(trials),
         *comparison_notes(experiment),
         *held_out_notes(trials),
         *points_notes(trials),
@@ -327,11 +329,27 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
             notes.append(
                 f"{trial.scene}: {left_out} left out, since another one has its name or content."
             )
+    notes += [line for own in group_by(trials, arm_of).values() if (line := rounds_note(own[0]))]
     for trial in trials:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings
         notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
     return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
+
+
+def arm_of(trial: TrialResult) -> str:
+    """The arm's folder with its settings' hash: trials that share it have one schedule."""
+    return trial.key.partition("/")[2]
+
+
+def rounds_note(trial: TrialResult) -> str:
+    """A line if a trial's densifier had too few rounds to be judged by them; else ""."""
+    if trial.program or trial.made_elsewhere or not (trial.path / EVENTS).is_file():
+        return ""
+    rounds = len(trial.folder.curves(EVENTS))
+    if rounds >= FEWEST_ROUNDS or not trial.config.get("densify.interval"):
+        return ""
+    return few_rounds(f"{trial.init}-{trial.densify}", rounds, trial.record.iterations)
 
 
 def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
@@ -359,48 +377,36 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     return notes
 
 
+def edited_notes(trials: Sequence[TrialResult]) -> list[str]:
+    """A line for each of the user's modules that was edited after it made some of the trials."""
+    of_module: dict[str, list[TrialResult]] = {}
+    for trial in trials:
+        for module in trial.edited:
+            of_module.setdefault(module, []).append(trial)
+    return [
+        f"{module} was edited since: {counted(len(own), 'trial')} of "
+        f"{some_of(sorted({f'{one.init}-{one.densify}' for one in own}))} are of the old code. "
+        "Give the command again to run the new one."
+        for module, own in of_module.items()
+    ]
+
+
 def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: declared verdict, equality to the last bit, and caveats.
+    """Lines on the compared arms: the verdicts, what no verdict uses, and caveats.
 
     They are about the whole experiment, so choosing the trials that a table shows cannot change a
     verdict.
     """
-    trials, pairs = compared_pairs(experiment)
-    declared = active_declaration(experiment.folder, experiment.trials)
-    notes = []
-    if declared is not None:
-        # here, since SciPy is slow to import
-        from gsbench.analysis.verdicts import declared_lines, judge_pairs
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import compare
 
-        notes = declared_lines(declared, judge_pairs(trials, pairs, declared))
-    by_arm = group_by(trials, lambda trial: trial.arm)
-    for first, second in pairs:
-        both = pair_trials(trials, first, second)
-        if both and all(are_equal(*one) for one in both):
-            names = f"{second} and {first}"
-            notes.append(
-                f"{names} are equal to the last bit in all their trials: the settings that differ "
-                "had no effect."
-            )
+    comparison = compare(experiment)
+    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
     sentences = (
-        caveats([*by_arm[first], *by_arm[second]], first, second) for first, second in pairs
+        caveats([*by_arm[first], *by_arm[second]], first, second)
+        for first, second in comparison.pairs
     )
-    return notes + list(filter(None, sentences))
-
-
-def compared_pairs(
-    experiment: Experiment, baseline: str = BASELINE
-) -> tuple[list[TrialResult], list[tuple[Arm, Arm]]]:
-    """The experiment's trials with their variants, and the pairs of arms to compare.
-
-    A search has no pairs: its points were chosen by results, so no test of them is valid.
-    """
-    trials = with_variants(experiment.trials)
-    if (experiment.folder / TUNING).exists():
-        return trials, []
-    return trials, choose_pairs(
-        sorted({trial.arm for trial in trials}), baseline, controls_of(trials)
-    )
+    return [*comparison.lines(), *filter(None, sentences)]
 
 
 # Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA

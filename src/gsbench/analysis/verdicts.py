@@ -1,21 +1,21 @@
 """The verdicts of a sweep: on each compared pair of arms in each metric that has a direction.
 
-Without a declaration (``eval.primary``), all metrics of all pairs are one family, adjusted by Holm
-(1979). With one, there are two families, each with its own 5 %: the declared metric, with one test
-per pair of arms, as Demšar (2006, section 3.2.2) adjusts comparisons of many methods with one
-control; and all other metrics of all pairs, called secondary. A declaration may be about one
-question only (``psnr@extrapolation``).
+If the question about an arm was declared in time (``eval.primary``), the declared metric decides
+it. The arms of one declaration share 5 %, one test per pair of arms, as Demšar (2006, section
+3.2.2) adjusts comparisons of many methods with one control. All other metrics of these pairs are
+secondary, with 5 % of their own. They are tested even if the declared metric shows nothing, so that
+a metric that got worse is seen. A declaration may be about one question only
+(``psnr@extrapolation``).
 
-Secondary metrics are tested even if the declared metric shows nothing, so that a metric that got
-worse is seen. If a metric was declared after results, or seeds or arms were added after results,
-all metrics are one family again.
+Otherwise the question is exploratory: all metrics of its pair of arms are one family, adjusted by
+Holm (1979). So a further arm never changes the verdict on another one.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gsbench.analysis.cells import short_reason
-from gsbench.analysis.declaration import ActiveDeclaration
+from gsbench.analysis.declaration import ActiveDeclaration, Standing
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import (
     NO_DIRECTION,
@@ -24,9 +24,9 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, seeds_needed
+from gsbench.analysis.statistics import ALPHA, TOO_SMALL, UNDECIDED, Outcome, seeds_needed
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
-from gsbench.words import counted, some_of
+from gsbench.words import some_of
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
 VERDICT = "Verdict, "  # prefix of the lines below a table that state verdicts
@@ -49,9 +49,8 @@ SYMBOLS: dict[Outcome, str] = {
 class PairVerdicts:
     """The verdicts on two arms, that on the declared metric first.
 
-    ``notes`` say what could not be compared. ``declared`` is the declared metric,
-    ``beforehand`` whether it was declared before any result. ``missing`` says why it has no
-    verdict for these arms.
+    ``notes`` say what could not be compared. ``declared`` is the declared metric, ``standing``
+    how the declaration stands to this question. ``missing`` says why the metric has no verdict.
     """
 
     first: Arm
@@ -59,8 +58,13 @@ class PairVerdicts:
     verdicts: tuple[Verdict, ...]
     notes: tuple[str, ...]
     declared: Quantity | None = None
-    beforehand: bool = False
+    standing: Standing | None = None
     missing: str = ""
+
+    @property
+    def beforehand(self) -> bool:
+        """Return whether the question was declared before any result of its arm."""
+        return self.standing is not None and self.standing.beforehand
 
     def role(self, verdict: Verdict) -> str:
         """Declared or secondary; "" if all metrics are one family."""
@@ -83,22 +87,25 @@ def judge_pairs(
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primary = None if declared is None else asked_quantity(declared.metric, trials)
-    asked: list[tuple[ArmPair, Quantity]] = []
+    standings: dict[ArmPair, Standing] = {}
+    asked: list[tuple[ArmPair, Quantity, Question]] = []
     for pair in pairs:
         metrics = [
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
         ]
-        if primary is not None:
+        if declared is not None and primary is not None:
+            standings[pair] = declared.standing(*(by_arm.get(arm, []) for arm in pair))
             metrics = [primary, *(metric for metric in metrics if metric.key != primary.key)]
-        asked += [(pair, metric) for metric in metrics if metric.direction]
-    questions = [_question(by_arm, pair, metric, declared) for pair, metric in asked]
-    verdicts = judge(trials, _declaration(questions, declared))
+        for metric in metrics:
+            if metric.direction:
+                question = _question(by_arm, pair, metric, declared, standings.get(pair))
+                asked.append((pair, metric, question))
+    verdicts = _judge_families(trials, [(pair, own) for pair, _, own in asked], standings)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0][0])
-    beforehand = declared is not None and declared.beforehand
     judged = []
     for pair in pairs:
         own, notes, missing = [], list[str](), ""
-        for (_, metric), verdict in by_pair.get(pair, []):
+        for (_, metric, _), verdict in by_pair.get(pair, []):
             if verdict.pairs.rows:
                 own.append(verdict)
                 notes += [f"{metric.name}: {line}" for line in verdict.notes]
@@ -115,8 +122,45 @@ def judge_pairs(
         if primary is not None and not primary.direction:
             missing = NO_DIRECTION
             notes.append(f"{primary.name}: {missing}")
-        judged.append(PairVerdicts(*pair, tuple(own), tuple(notes), primary, beforehand, missing))
+        standing = standings.get(pair)
+        judged.append(PairVerdicts(*pair, tuple(own), tuple(notes), primary, standing, missing))
     return judged
+
+
+def _judge_families(
+    trials: Sequence[TrialResult],
+    asked: Sequence[tuple[ArmPair, Question]],
+    standings: Mapping[ArmPair, Standing],
+) -> list[Verdict]:
+    """Judge each family of questions: those of one declaration, or of one exploratory pair."""
+
+    def family(entry: tuple[int, tuple[ArmPair, Question]]) -> tuple[object, ...]:
+        pair, question = entry[1]
+        standing = standings.get(pair)
+        if standing is None or not standing.beforehand:
+            return pair
+        return standing.declaration.time, standing.declaration.hash, bool(question.seeds)
+
+    verdicts: dict[int, Verdict] = {}
+    for own in group_by(enumerate(asked), family).values():
+        standing, questions = standings.get(own[0][1][0]), tuple(one for _, (_, one) in own)
+        # Without a time no trial is late, so Holm's method alone adjusts for the number of metrics.
+        declaration = Declaration(time=NO_TIME, questions=questions)
+        if standing is not None and standing.beforehand:
+            named = standing.declaration
+            looks = named.looks if questions[0].seeds else ()
+            # an arm without any trial yet keeps its share of the error rate
+            asked_scenes = [one.scenes for one in questions]
+            waiting = [one for one in named.questions if looks and one.scenes not in asked_scenes]
+            declaration = Declaration(
+                time=NO_TIME,
+                questions=(*questions, *waiting),
+                error_rate=named.error_rate,
+                looks=looks,
+            )
+        places = [place for place, _ in own]
+        verdicts |= dict(zip(places, judge(trials, declaration), strict=False))
+    return [verdicts[place] for place in range(len(asked))]
 
 
 def _trials_of(by_arm: Mapping[Arm, Sequence[TrialResult]], pair: ArmPair) -> list[TrialResult]:
@@ -128,6 +172,7 @@ def _question(
     pair: ArmPair,
     metric: Quantity,
     declared: ActiveDeclaration | None,
+    standing: Standing | None,
 ) -> Question:
     """The question about two arms in one metric; in a sweep in looks, about the planned trials."""
     baseline, arm = pair
@@ -138,11 +183,11 @@ def _question(
         baseline=baseline,
         arm=arm,
     )
-    if declared is None or not declared.beforehand:
+    if declared is None or standing is None or not standing.beforehand:
         return question
     split_question = next((trial.question for trial in by_arm.get(baseline, [])), "")
     is_primary = declared.question in ("", split_question) and metric.key == declared.metric
-    for planned in declared.declaration.questions:
+    for planned in standing.declaration.questions:
         keys = [{trial.key for trial in by_arm.get(side, [])} for side in pair]
         if planned.scenes and all(
             a in keys[0] and b in keys[1] for a, b in planned.scenes.values()
@@ -150,18 +195,6 @@ def _question(
             question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
             question = replace(question, least=planned.least) if is_primary else question
     return replace(question, secondary=not is_primary)
-
-
-def _declaration(questions: Sequence[Question], declared: ActiveDeclaration | None) -> Declaration:
-    if declared is None or not declared.beforehand:
-        # No time: the trials then are not late, so Holm's method alone adjusts for the number of
-        # metrics.
-        return Declaration(time=NO_TIME, questions=tuple(questions))
-    recorded = declared.declaration
-    looks = recorded.looks if all(question.seeds for question in questions) else ()
-    return Declaration(
-        time=recorded.time, questions=tuple(questions), error_rate=recorded.error_rate, looks=looks
-    )
 
 
 def seeds_to_resolve(verdict: Verdict) -> int | None:
@@ -174,34 +207,62 @@ def seeds_to_resolve(verdict: Verdict) -> int | None:
     return seeds_needed(verdict.deviation, len(verdict.scenes), verdict.quantity.worthwhile)
 
 
-def headline(judged: PairVerdicts) -> str:
-    """The verdicts on two arms in one sentence.
+def sentence(judged: PairVerdicts) -> str:
+    """The verdict on two arms in one sentence, the same wherever it is shown.
 
-    If a metric was declared beforehand, the sentence has only its verdict.
+    If the question was declared in time, the sentence has only the declared metric's verdict.
     """
     verdicts, against = judged.verdicts, f"{judged.second} against {judged.first}"
-    if not verdicts:
-        return (
-            f"{judged.second} and {judged.first} cannot be compared: no metric has paired trials."
-        )
-    where = _scope(verdicts[0])
-    if all(one.equal for one in verdicts):
-        return (
-            f"{against}, on {where}: equal in every metric, to the last bit. The settings that "
-            "differ had no effect: "
-            "look at the events, and at train.densify_start and densify_stop."
-        )
-    if all(one.interval is None for one in verdicts):
-        return f"{against}: no verdict, one trial of each on {where}; run more seeds."
-    if judged.missing and judged.declared is not None:
+    if judged.missing and judged.declared is not None and judged.beforehand:
         return (
             f"{against}: no verdict, since the declared metric {judged.declared.name} has no "
             f"value ({judged.missing})."
         )
-    if judged.role(verdicts[0]) == DECLARED:
-        return f"{against}, on {where}: {_by_word(verdicts[:1])}, the metric declared beforehand."
-    adjusted = "" if judged.declared is None else ", all metrics adjusted for their number"
-    return f"{against}, on {where}{adjusted}: {_by_word(verdicts)}."
+    if not verdicts:
+        return f"{against}: no verdict, since {no_pairs(judged)}."
+    where = _scope(verdicts[0])
+    if all(one.equal for one in verdicts):
+        return (
+            f"{against}, on {where}: equal in every metric, to the last bit. The settings that "
+            "differ had no effect: look at the events, and at train.densify_start and "
+            "densify_stop."
+        )
+    first = verdicts[0]
+    if judged.role(first) == DECLARED:
+        if first.interval is None:
+            return f"{against}: no verdict yet, {first.untestable or TOO_FEW.format(where)}."
+        waits = "" if first.final else "not decided yet, "
+        seeds = ""
+        if planned := first.question.seeds:
+            seeds = f", with {first.pairs.seeds} of at most {len(planned)} seeds"
+        return f"{against}: {waits}{in_words(first)}{seeds}. The metric was declared beforehand."
+    if all(one.interval is None for one in verdicts):
+        return f"{against}: no verdict, {TOO_FEW.format(where)}."
+    return (
+        f"{against}, on {where}: {_by_word(verdicts, with_numbers=True)}. Exploratory: "
+        f"{_why_exploratory(judged)}, so all metrics count, adjusted for their number "
+        f"({max(one.family for one in verdicts)})."
+    )
+
+
+TOO_FEW = "one trial of each on {}; run more seeds"
+
+
+def no_pairs(judged: PairVerdicts) -> str:
+    """The reason why no trials of two arms could be compared."""
+    return next(
+        (note.partition(": ")[2] for note in judged.notes),
+        f"no trials of {judged.first} and {judged.second} can be paired",
+    )
+
+
+def _why_exploratory(judged: PairVerdicts) -> str:
+    if judged.declared is None:
+        return "no metric was declared (eval.primary)"
+    name = judged.declared.name
+    if judged.standing is not None and judged.standing.doubt:
+        return f"{name} was declared, but {judged.standing.doubt}"
+    return f"the declaration of {name} asks about another split"
 
 
 def secondary(judged: PairVerdicts) -> str:
@@ -211,14 +272,18 @@ def secondary(judged: PairVerdicts) -> str:
     return f"Secondary, adjusted for their number: {_by_word(secondaries)}." if decidable else ""
 
 
-def _by_word(verdicts: Sequence[Verdict]) -> str:
-    """``better in PSNR; undecided in SSIM, FLIP``"""
+def _by_word(verdicts: Sequence[Verdict], with_numbers: bool = False) -> str:
+    """``better in PSNR; undecided in SSIM, FLIP``; with numbers for what is decided."""
+
+    def named(one: Verdict) -> str:
+        name = f"{one.quantity.name}{_known_sign(one)}"
+        if not with_numbers or one.outcome == UNDECIDED or one.interval is None:
+            return name
+        numbers = f"{one.shown(one.mean or 0.0)}, interval {one.shown_interval(one.interval)}"
+        return f"{name} ({numbers})"
+
     names_by_word = {
-        word: [
-            f"{one.quantity.name}{_known_sign(one)}"
-            for one in verdicts
-            if WORDS[one.outcome] == word
-        ]
+        word: [named(one) for one in verdicts if WORDS[one.outcome] == word]
         for word in WORDS.values()
     }
     return "; ".join(
@@ -275,56 +340,40 @@ def by_scene_lines(verdicts: Sequence[Verdict]) -> list[str]:
     return lines
 
 
-def declared_lines(declared: ActiveDeclaration, judged: Sequence[PairVerdicts]) -> list[str]:
-    """Lines below a table: what was declared, and its verdict for each pair of arms."""
-    quantity = judged[0].declared if judged else None
-    lines = declared.sentences(declared.metric if quantity is None else quantity.name)
-    for one in judged:
-        against = f"{one.second} against {one.first}"
-        verdicts = [
-            verdict for verdict in one.verdicts if verdict.question.metric == declared.metric
-        ]
-        if verdicts and verdicts[0].question.secondary:
-            continue  # these arms' split asks another question than the declared one
-        lines += [f"{VERDICT}{against}: {in_words(verdict)}." for verdict in verdicts]
-        if not verdicts:
-            lines.append(
-                f"{VERDICT}{against}: none, since {declared.metric} has no value: {one.missing}."
-            )
-    return lines
-
-
 def families(judged: Sequence[PairVerdicts]) -> list[str]:
     """Lines on the families of tests: their sizes, and how they are adjusted."""
     by_role = group_by(
         ((one.role(verdict), verdict) for one in judged for verdict in one.verdicts),
         lambda entry: entry[0],
     )
-    sizes = {role: max(verdict.family for _, verdict in own) for role, own in by_role.items()}
+    sizes = {role: sorted({one.family for _, one in own}) for role, own in by_role.items()}
     looks = any(verdict.question.seeds for own in by_role.values() for _, verdict in own)
     lines = []
     if DECLARED in sizes:
         how = (
             "not adjusted: it is one test"
-            if sizes[DECLARED] == 1
-            else f"adjusted by Holm for {sizes[DECLARED]} tests"
+            if sizes[DECLARED] == [1]
+            else f"adjusted by Holm for {_or(sizes[DECLARED])} tests"
         )
         lines.append(f"The declared metric is {'judged at each planned look' if looks else how}.")
     if SECONDARY in sizes:
         how = (
             "at each look they share 5 % equally"
             if looks
-            else f"Holm adjusts them for {sizes[SECONDARY]} tests"
+            else f"Holm adjusts them for {_or(sizes[SECONDARY])} tests"
         )
         lines.append(f"All other metrics are secondary and do not decide the verdict; {how}.")
     if "" in sizes:
-        undeclared = any(one.declared is None for one in judged)
-        opening = "No metric was declared beforehand (eval.primary): all" if undeclared else "All"
-        number = counted(sizes[""], "test")
+        number = f"{_or(sizes[''])} {'test' if sizes[''] == [1] else 'tests'}"
         lines.append(
-            f"{opening} metrics of all pairs of arms are one family, {number} adjusted by Holm."
+            "Exploratory verdicts: all metrics of a pair of arms are one family, "
+            f"{number} adjusted by Holm."
         )
     return lines
+
+
+def _or(sizes: Sequence[int]) -> str:
+    return " or ".join(map(str, sizes))
 
 
 def in_words(verdict: Verdict) -> str:
@@ -358,17 +407,19 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
     word = words.get(like.outcome, like.outcome)
     least = "" if like.beyond is None else f", by the least that matters in {like.beyond}"
     median = "" if like.median is None else f"; median effect {verdict.shown_interval(like.median)}"
-    needed = "no number of them would" if like.needed is None else f"{like.needed} of them would"
-    seen = (
-        f", which {100 * like.power():.0f} % of sweeps see where nine of ten do"
-        if like.needed
-        else ""
-    )
+    level = f"at {100 * (1 - like.level):.3g} %"
+    if like.needed is None:
+        needed = f"{level}, so few scenes cannot decide it"
+    else:
+        how_many = "all" if like.needed == like.scenes else f"{like.needed} of the"
+        needed = (
+            f"{level}, {how_many} {like.scenes} scenes must agree: if the arm helps on nine scenes "
+            f"in ten, {100 * like.power():.0f} % of such sweeps show it"
+        )
     return (
         f"scenes like these: {word}; {what} in {like.helped} of {like.scenes}{least} (sign test p "
         f"{p_text(like.p)}, {100 * like.share.low:.0f} to {100 * like.share.high:.0f} % of such "
-        f"scenes{median}); "
-        f"{needed} suffice at {100 * (1 - like.level):.3g} %{seen}"
+        f"scenes{median}); {needed}"
     )
 
 

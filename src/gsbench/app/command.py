@@ -20,6 +20,7 @@ from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.other_sweepers import other_sweeper, prepare_other_sweeper, words_without_sweeper
 from gsbench.app.sweep import OWN, Sweep, TrialTask
+from gsbench.claims.stopping import log_verdicts
 from gsbench.config import compose
 from gsbench.config.command_words import check_words, is_sweep, key_of, parse, parse_word
 from gsbench.config.compose import Trial
@@ -277,6 +278,8 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
         if len(outcomes) == 1:
             advice += f"; renders and model: {outcomes[0].folder}"
     log.info("%d of %d trials done; %s", done, len(outcomes), advice)
+    if len(outcomes) > 1 and done == len(outcomes):
+        log_verdicts(trials)
     if failed and all(outcome.status == "failed" and outcome.bad_input for outcome in outcomes):
         return 2
     return 1 if failed else 0

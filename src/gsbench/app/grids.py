@@ -15,7 +15,7 @@ from hydra.core.override_parser.types import Override
 
 from gsbench.app.sweep import Sweep
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, headline, plan_sweep, run_looks
+from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep, run_looks
 from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
@@ -82,8 +82,9 @@ def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
         if batch:
             sweep.launch(batch)
 
-    for verdict in run_looks(stopping.declaration, stopping.judged, run):
-        log.info("%s", headline(verdict))
+    run_looks(stopping.declaration, stopping.judged, run)
+    if not launched:  # else it is said when the trials' outcomes are
+        log_verdicts(trials)
     spared = [
         trial
         for trial in trials

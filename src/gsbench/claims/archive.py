@@ -38,7 +38,13 @@ import yaml
 from gsbench import __version__
 from gsbench.analysis.images import PixelMeasures, textured_error
 from gsbench.analysis.quantities import TEXTURED
-from gsbench.analysis.results import Experiment, TrialResult, read_experiment, read_views
+from gsbench.analysis.results import (
+    Experiment,
+    TrialResult,
+    newest_code,
+    read_experiment,
+    read_views,
+)
 from gsbench.errors import InputError
 from gsbench.files import atomic
 from gsbench.parsing import read_bytes, read_yaml
@@ -225,7 +231,7 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
                 raise InputError(f"{NO_CONFIGURATION}: export it again")
         except InputError as error:
             raise InputError(f"{file}: {trial.label}: {error}") from None
-    return experiment
+    return newest_code(experiment)
 
 
 def _check_configuration(

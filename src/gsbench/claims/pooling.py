@@ -241,9 +241,7 @@ def _arm_pairs(
 
     def named(init: str, names: Sequence[str]) -> list[Arm]:
         own = [arm for arm in arms if arm.init == init]
-        return [
-            arm for arm in own if {str(replace(arm, init="")), arm.densify, str(arm)} & {*names}
-        ]
+        return [arm for arm in own if any(map(arm.answers_to, names))]
 
     pairs = []
     for init in sorted({arm.init for arm in arms}):

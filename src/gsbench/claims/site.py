@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.cells import swept_settings
-from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import choose_quantities
 from gsbench.analysis.ranks import rank_all
@@ -20,8 +20,7 @@ from gsbench.analysis.report.build import build_report
 from gsbench.analysis.report.charts import rank_plot
 from gsbench.analysis.results import Experiment
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import build_table, compared_pairs
-from gsbench.analysis.verdicts import headline, judge_pairs
+from gsbench.analysis.tables import build_table
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.files import own_output, write_text
@@ -83,8 +82,7 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
         tables = list(_by_quantity(build_table(experiment, rows=rows, columns=("scene",))))
     except InputError as error:
         notes.append(f"No table: {error}")
-    arms, pairs = compared_pairs(experiment)
-    judged = judge_pairs(arms, pairs, active_declaration(experiment.folder, trials))
+    comparison = compare(experiment)
     facts = {
         "trials": str(len(trials)),
         "scenes": ", ".join(sorted({trial.scene for trial in trials})),
@@ -96,15 +94,16 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
             sorted({trial.record.versions.get("gsbench", "unknown") for trial in trials})
         ),
     }
-    lines = [headline(one) for one in judged]
-    ranks = [rank_plot(one) for one in rank_all(arms, choose_quantities(arms))] if pairs else []
+    arms = comparison.trials
+    ranks = [rank_plot(one) for one in rank_all(arms, choose_quantities(arms))]
     shown = {
         "facts": list(facts.items()),
         "claims": claims,
-        "lines": lines,
+        "lines": comparison.sentences,
         "tables": tables,
-        "notes": notes,
+        "notes": [*notes, *comparison.unused, *experiment.warnings],
     }
+    ranks = ranks if comparison.pairs else []
     return {"name": experiment.name, "key": key, "ranks": ranks} | shown
 
 

@@ -13,11 +13,18 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.cells import with_variants
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.pairing import choose_pairs
-from gsbench.analysis.results import Arm, Configurations, TrialResult, group_by, read_experiment
+from gsbench.analysis.results import (
+    Arm,
+    Configurations,
+    TrialResult,
+    group_by,
+    newest_code,
+    read_experiment,
+)
 from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
-from gsbench.analysis.verdicts import in_words
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric
@@ -132,7 +139,8 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
         )
     expected = with_variants([_expected(trial) for trial in trials])
     seeds = _seeds(expected)
-    chosen = choose_pairs(sorted({trial.arm for trial in expected}))
+    settings = {trial.arm: trial.config for trial in expected}
+    chosen = choose_pairs(sorted(settings), settings=settings)
     if not chosen:
         raise InputError(
             "launch.stop_when_decided compares arms, and this sweep has one: give two densifiers"
@@ -174,15 +182,12 @@ def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
     return list(filter(is_done, read_experiment(home).trials))
 
 
-def headline(verdict: Verdict) -> str:
-    """A pair's verdict: ``better in PSNR on this scene: +0.120 (…), with 2 of at most 6 seeds``"""
-    question = verdict.question
-    against = f"{question.arm} against {question.baseline}"
-    if verdict.interval is None:
-        return f"{against}: no verdict yet, {verdict.untestable or 'trials are missing'}"
-    waits = "" if verdict.final else "not decided yet, "
-    seeds = f"with {verdict.pairs.seeds} of at most {len(question.seeds)} seeds"
-    return "; ".join([f"{against}: {waits}{in_words(verdict)}, {seeds}", *verdict.notes])
+def log_verdicts(trials: Iterable[Trial]) -> None:
+    """Log the verdicts of the experiments of ``trials``, and what no verdict uses."""
+    for home in dict.fromkeys(trial.files.home for trial in trials):
+        comparison = compare(newest_code(read_experiment(home)))
+        for line in [*comparison.sentences, *comparison.unused]:
+            log.info("%s", line)
 
 
 def _expected(trial: Trial) -> TrialResult:

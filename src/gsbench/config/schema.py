@@ -37,7 +37,7 @@ from gsbench.settings import (
     is_folder_name,
 )
 from gsbench.system.resources import trials_at_once
-from gsbench.train.options import TrainConfig
+from gsbench.train.options import TrainConfig, scale_steps
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
 
@@ -275,6 +275,10 @@ def plain(values: Any) -> Any:
     if isinstance(values, DictConfig):
         own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
         OmegaConf.copy_cache(values, own)  # keeps ${now:…} the same for all trials of a sweep
+        if OmegaConf.is_dict(own.get("train")) and own.train.get("steps_scaler", 1.0) != 1.0:
+            # before ${train.…} is resolved, by which densifiers get their steps
+            own.train = own.train.copy()
+            scale_steps(own.train)
         return plain(
             OmegaConf.to_container(own, resolve=True, throw_on_missing=True, enum_to_str=True)
         )

@@ -74,10 +74,10 @@ _PLAIN = (  # `gsbench.eval.evaluator.MEASURES` has the class of each
         "psnr", "PSNR", 1, 2, "dB", 0.1, lowest=0.0, words="mean squared error, logarithmic"
     ),
     _bounded("ssim", "SSIM", 1, -1.0, "", "means, contrast and structure in windows of 11 px"),
-    _lpips("vgg_raw", "LPIPS VGG raw", "distance of what vgg sees, fed [0, 1]"),
-    _lpips("vgg", "LPIPS VGG", "distance of what vgg sees"),
-    _lpips("alex", "LPIPS Alex", "distance of what alex sees"),
-    _lpips("squeeze", "LPIPS Squeeze", "distance of what squeeze sees"),
+    _lpips("vgg_raw", "LPIPS VGG raw", "distance between VGG features of images in [0, 1]"),
+    _lpips("vgg", "LPIPS VGG", "distance between VGG features"),
+    _lpips("alex", "LPIPS Alex", "distance between AlexNet features"),
+    _lpips("squeeze", "LPIPS Squeeze", "distance between SqueezeNet features"),
     _bounded("flip", "FLIP", -1, 0.0, "eval.flip", "difference one sees when two images alternate"),
     _structural("ms_ssim", "MS-SSIM", 1, 1.0, "SSIM's structure at five scales"),
     _structural(

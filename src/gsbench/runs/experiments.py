@@ -154,10 +154,17 @@ class Arm:
     variant: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
-        name = f"{self.init}-{self.densify}" if self.init else self.densify
-        return " ".join(
-            [name, *(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)]
-        )
+        return f"{self.init}-{self.short}" if self.init else self.short
+
+    @property
+    def short(self) -> str:
+        """The name without the initialiser: ``momentum[decay=0.9]``"""
+        values = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)
+        return f"{self.densify}[{values}]" if values else self.densify
+
+    def answers_to(self, word: str) -> bool:
+        """Return whether ``word`` names this arm, with or without initialiser and settings."""
+        return word in (str(self), self.short, f"{self.init}-{self.densify}", self.densify)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,8 +180,7 @@ class Question(Record):
     - ``baseline`` and ``arm`` are None in a question about all compared arms, in the metric's own
       direction.
     - ``about``: "interpolation" or "extrapolation", "" for both.
-    - ``versions``: the arms are versions of one trainer, so their code may differ, and the
-      baseline's trials may be older than the question.
+    - ``versions``: the arms are versions of one trainer, so their code may differ.
     """
 
     metric: str

@@ -14,6 +14,7 @@ import ast
 import hashlib
 import importlib.util
 import json
+import os
 import sys
 import sysconfig
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -34,7 +35,8 @@ OWN = "gsbench."  # prefix of the import paths of gsbench's own classes
 # the names otherwise.
 WITHOUT_EFFECT = ("threads", "weights", "download", "time_limit_minutes")
 # Settings that only declare how results are read or what an ablation may turn off.
-DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",)}
+# train.steps_scaler has been applied to the steps.
+DECLARED = {"eval": ("primary", "controls"), "densify": ("switches",), "train": ("steps_scaler",)}
 NOT_HASHED = ("name", "seed", "device", "threads", "runs", "allow_targets", "tracking", "launch")
 
 
@@ -246,8 +248,8 @@ RELEASED = "released.json"  # in the package: the digests of all rooms at the re
 AS_RELEASED = "released"  # the state of a room that equals the release
 DIGEST_CHARACTERS = 16
 
-# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that only
-# reports, shows, launches or reads is no room. Nor is code that makes objects from settings: keys
+# The rooms of each stage: folders and files of gsbench that determine its numbers. Code that cannot
+# change a number is not listed. Nor is code that makes objects from settings: keys
 # contain the settings themselves. An edit of one densifier changes the room of all densifiers; in
 # return, the table is simple enough to check.
 MODEL = ("scene", "gaussians", "densify", "raster", "train", "events.py", "normalization.py")
@@ -400,6 +402,15 @@ def module_digest(name: str, folder: str | None = None) -> str | None:
     return cached[1]
 
 
+def present_digest(name: str) -> str | None:
+    """The digest of a user's module as a command that is given here would find it.
+
+    None if it is not found, or installed: an installed package is identified by its version.
+    """
+    spec = _find_spec(name, os.getcwd())
+    return None if spec is None or _is_installed(spec) else _digest_on_disk(spec)
+
+
 def has_changed_since_import(name: str) -> bool:
     """Return whether a module's files differ from the code that this process has imported."""
     loaded = sys.modules.get(name)
@@ -450,17 +461,26 @@ def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
 
 
 def _digest_on_disk(spec: ModuleSpec) -> str | None:
-    """The sha256 of a module's code: of its one file, else of the list of its files' hashes."""
+    """The sha256 of a module's code: of its one file, else of the list of its files' hashes.
+
+    Python counts by its syntax, so that comments, docstrings and format make no other version.
+    """
     folders = [Path(place) for place in spec.submodule_search_locations or ()]
     if not folders:
         file = Path(spec.origin or "")
-        return file_sha256(file) if spec.has_location and file.is_file() else None
+        return _code_digest(file) if spec.has_location and file.is_file() else None
     parts = []
     for folder in folders:
         for file in sorted(folder.rglob("*")):
             if file.suffix in CODE_SUFFIXES and file.is_file():
-                parts.append(f"{file_sha256(file)}  {file.relative_to(folder).as_posix()}\n")
+                parts.append(f"{_code_digest(file)}  {file.relative_to(folder).as_posix()}\n")
     return hashlib.sha256("".join(parts).encode()).hexdigest() if parts else None
+
+
+def _code_digest(file: Path) -> str:
+    if file.suffix != ".py":
+        return file_sha256(file)
+    return hashlib.sha256(syntax_of(file.read_bytes())).hexdigest()
 
 
 def _is_installed(spec: ModuleSpec) -> bool:

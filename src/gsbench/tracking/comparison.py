@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsbench.analysis.cells import swept_settings
+from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.quantities import metric_keys
-from gsbench.analysis.results import Experiment, TrialResult, read_experiment
+from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
@@ -33,8 +34,7 @@ MAX_TAG = 5000  # characters of an experiment's tag in older versions of MLflow
 TRIED = ("3.17.",)  # versions of MLflow whose page was seen to show the views
 COLUMNS = ("scene", "init", "densify", "seed")  # tags of a run
 ARM = "arm"  # the parameter by which runs are grouped
-VERDICT = "- Verdict, "  # the beginning of notes that belong above the table
-NO_VERDICT = "No verdict: it needs a declared metric (eval.primary), two arms and two seeds."
+NO_VERDICT = "No verdict: it needs two arms."
 OWN_NOTE = "`gsbench report"  # in a description that `publish` wrote
 CHART_HEIGHT = 250  # px
 NAME_WIDTH = 290  # px of the runs' names
@@ -49,7 +49,7 @@ def publish(home: Path, uri: str | None) -> str:
     """
     client = connect(uri, home.parent)
     experiment_id = ensure_experiment(client, home.name, home.parent)
-    experiment = read_experiment(home)
+    experiment = newest_code(read_experiment(home))
     if experiment.trials:
         _set(
             client,
@@ -83,15 +83,16 @@ def addresses(server: str, experiment_id: str, version: str) -> dict[str, str]:
 
 def description(experiment: Experiment) -> str:
     """Verdict, table and its notes in Markdown, cut to what a tag may hold."""
+    sentences = compare(experiment).sentences
+    verdicts = [f"- {line}" for line in sentences]
     try:
         lines = to_markdown(build_table(experiment)).splitlines()
     except InputError as error:  # cells would average unlike trials
-        return f"No table: {error}\n\n{OWN_NOTE} {experiment.name}`"
-    verdicts = [line for line in lines if line.startswith(VERDICT)]
-    rest = [line for line in lines if line not in verdicts and not line.startswith("#")]
+        lines = [f"No table: {error}"]
+    rest = [line for line in lines if not line.startswith((f"- {VERDICT}", "#"))]
     # The page shows only the first line until it is clicked: decided pairs of arms come first
     # there.
-    short = [line.removeprefix(VERDICT).partition(" (")[0] for line in verdicts]
+    short = [line.partition(" (")[0] for line in sentences]
     answer = "; ".join(sorted(short, key=lambda text: "undecided" in text)) or NO_VERDICT
     end = f"\n\n{OWN_NOTE} {experiment.name}` shows more."
     text = "\n".join([f"**{answer}**", "", *verdicts, "", *rest]).strip()

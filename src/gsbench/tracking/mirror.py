@@ -282,7 +282,7 @@ def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> M
     """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
-    return MirrorError(f"{sink_of(options).name} does not take {folder.label} ({reason})")
+    return MirrorError(f"{folder.label} could not be sent to {sink_of(options).name} ({reason})")
 
 
 # for each experiment and tracker, a trial and its settings ``tracking``

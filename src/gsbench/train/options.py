@@ -1,7 +1,8 @@
 """The settings of a training: iterations, learning rates, densification window, checkpoints."""
 
+from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -14,12 +15,27 @@ WITHOUT_EFFECT_ON_MODEL = (
     "checkpoint_every",
     "checkpoint_minutes",
     "volume_histogram",
+    "steps_scaler",
+)
+# the steps that ``steps_scaler`` multiplies; densifiers have theirs from these
+STEPS = (
+    "iterations",
+    "sh_interval",
+    "position_steps",
+    "densify_start",
+    "densify_stop",
+    "densify_interval",
+    "opacity_reset_interval",
+    "mcmc_stop",
+    "volume_histogram",
 )
 
 
 @dataclass
 class TrainConfig(LearningRates):
     name: str = MISSING
+    # all steps of the schedule (`STEPS`) times this, as in gsplat; recorded as 1
+    steps_scaler: PositiveFloat = 1.0
     iterations: NonNegativeInt = 30_000  # 0: evaluate the initial Gaussians without training
     sh_interval: PositiveInt = 1000  # iterations after which spherical harmonics gain a degree
     ssim_weight: Fraction = 0.2  # loss = 0.8 L1 + 0.2 (1 - SSIM)
@@ -45,3 +61,23 @@ class TrainConfig(LearningRates):
 
     def __post_init__(self) -> None:
         check_settings(self, "train")
+
+
+def scale_steps(train: MutableMapping[str, Any]) -> None:
+    """Multiply the steps of a schedule by its ``steps_scaler``, which becomes 1.
+
+    One that is no number above 0 is left for the check of the settings.
+    """
+    scale = train.get("steps_scaler", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale != 1:
+        return
+
+    def scaled(step: Any) -> Any:
+        if isinstance(step, Sequence) and not isinstance(step, str):
+            return [scaled(one) for one in step]
+        # an interval of 0 is none; a step given as 0 stays
+        return max(1, round(step * scale)) if isinstance(step, int) and step else step
+
+    for key in STEPS:
+        train[key] = scaled(train[key])
+    train["steps_scaler"] = 1.0

@@ -20,7 +20,7 @@ from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volumetric import log_volume
 from gsbench.errors import TrainingError
 from gsbench.eval.images import replace_ignored
-from gsbench.events import RefineEvent
+from gsbench.events import FEWEST_ROUNDS, RefineEvent, few_rounds
 from gsbench.files import write_text
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.ply import write_ply
@@ -178,14 +178,9 @@ class Trainer:
                 self._loop(folder, writer, on_status)
         finally:
             writer.close()
-        if not isinstance(self.densifier, NoDensifier) and (folder / EVENTS).stat().st_size == 0:
-            log.warning(
-                "no refinement was due in %d iterations, so the densifier changed nothing (see "
-                "train.densify_start, "
-                "now %d)",
-                self.step,
-                self.options.densify_start,
-            )
+        rounds = (folder / EVENTS).read_bytes().count(b"\n")
+        if not isinstance(self.densifier, NoDensifier) and rounds < FEWEST_ROUNDS:
+            log.warning("%s", few_rounds(type(self.densifier).__name__, rounds, self.step))
         return self.gaussians.values.detach()
 
     def _loop(

@@ -92,8 +92,8 @@ def add_where(parser: argparse.ArgumentParser) -> None:
         type=_condition,
         action="append",
         default=[],
-        metavar="KEY=VALUE",
-        help="only such trials (repeatable)",
+        metavar="KEY=A,B",
+        help="only trials with one of these values (repeatable)",
     )
 
 

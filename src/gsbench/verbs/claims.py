@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.cells import with_variants
-from gsbench.analysis.pairing import BASELINE, choose_pairs, pair
+from gsbench.analysis.comparison import compare
+from gsbench.analysis.pairing import BASELINE, pair
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.statistics import MIN_SCENES, Components, designs_needed, estimate_components
@@ -180,7 +180,9 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
     )
     options = parser.parse_args(argv)
-    trials = with_variants(load_experiment(runs, options.experiment).trials)
+    experiment = load_experiment(runs, options.experiment)
+    comparison = compare(experiment, options.baseline)
+    trials = comparison.trials
     metric = quantity(options.metric, trials)
     if metric.cost:
         raise InputError(
@@ -191,18 +193,20 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--difference is needed: {metric.name} has no usual least difference that matters"
         )
-    pairs = choose_pairs(sorted({trial.arm for trial in trials}), options.baseline)
-    if not pairs:
+    if not comparison.pairs:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    for baseline, arm in pairs:
+    print("\n".join([*comparison.sentences, *comparison.unused, *experiment.warnings]))
+    for baseline, arm in comparison.pairs:
         paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
-            raise InputError(
-                f"no trials of {baseline} and {arm} can be paired in {metric.name}: "
-                f"{paired.left_out[0]}"
-            )
+            reason = next(iter(paired.left_out), "they share no scene and seed")
+            fault = f"no trials of {baseline} and {arm} can be paired in {metric.name}: {reason}"
+            if len(comparison.pairs) == 1:
+                raise InputError(fault)
+            print(fault)
+            continue
         components = estimate_components([row.arm - row.baseline for row in paired.rows])
         print("\n".join([f"{arm} against {baseline}", *_lines(components, metric, difference)]))
     return 0

@@ -1,6 +1,7 @@
 """Verbs that show an experiment's results from its files: ``tables``, ``report``, ``explain``."""
 
 import argparse
+import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,6 @@ from gsbench.analysis.cells import (
     check_averageable,
     make_cell,
     select_trials,
-    swept_settings,
     to_frame,
     with_variants,
 )
@@ -26,17 +26,23 @@ from gsbench.analysis.paper import (
     published_table,
 )
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
+from gsbench.analysis.results import (
+    Arm,
+    Experiment,
+    TrialResult,
+    group_by,
+    load_experiment,
+)
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import (
     DEFAULT_ROWS,
     build_table,
-    compared_pairs,
     format_cell,
     with_agreement,
 )
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
+from gsbench.runs.experiments import list_experiments
 from gsbench.runs.keys import AS_RELEASED
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of
@@ -45,7 +51,7 @@ ADDRESS = (
     "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or "
     "demo:courtyard:psnr:sfm-adc"
 )
-TRIALS = "trials"
+TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
 REPORT_NAME = "report.html"
@@ -56,6 +62,9 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     options = _tables_parser().parse_args(argv)
     options.format = options.format or _format_of(options.out)
+    if options.experiment is None:
+        print("\n".join(list_experiments(runs)) or f"no experiment in {runs} yet")
+        return 0
     if options.experiment == PAPER_NOTES and not (runs / PAPER_NOTES).exists():
         print("\n".join(f"- {line}" for line in load_paper().contradictions))
         return 0
@@ -63,7 +72,9 @@ def tables(argv: Sequence[str], runs: Path) -> int:
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     trials = select_trials(experiment.trials, dict(options.where))
-    if options.format == TRIALS:
+    if options.format == JSON:
+        texts = _verdicts(experiment, options)
+    elif options.format == TRIALS:
         texts = _trials(trials, options)
     else:
         texts = _tables(experiment, trials, options)
@@ -80,13 +91,24 @@ def _format_of(out: Path | None) -> str:
     return "md"
 
 
-def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
-    """A CSV with one row per trial. Raises InputError for options that only a table has."""
+def _verdicts(experiment: Experiment, options: argparse.Namespace) -> dict[str, str]:
+    """The verdicts as JSON. Raises InputError for options that only a table has."""
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import compare
+
+    _refuse_options_of_tables(options, f"--format {JSON} shows the verdicts")
+    return {f".{JSON}": json.dumps(compare(experiment).to_json(), indent=1) + "\n"}
+
+
+def _refuse_options_of_tables(options: argparse.Namespace, what: str) -> None:
     for name in ("rows", "columns", "metrics", "layout", "paper"):
         if getattr(options, name) is not None:
-            raise InputError(
-                f"--format {TRIALS} shows every column of every trial, and takes no --{name}"
-            )
+            raise InputError(f"{what}, and takes no --{name}")
+
+
+def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
+    """A CSV with one row per trial. Raises InputError for options that only a table has."""
+    _refuse_options_of_tables(options, f"--format {TRIALS} shows every column of every trial")
     return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
 
 
@@ -115,7 +137,11 @@ def _tables(
 
 def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]:
     """The fairness sheets of all compared pairs of arms, from all trials of the experiment."""
-    trials, pairs = compared_pairs(experiment)
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import pair_arms
+
+    arms = pair_arms(experiment)
+    trials, pairs = arms.trials, arms.pairs
     if not pairs:
         raise InputError(
             f"experiment {experiment.name} has one arm, so there is nothing to compare"
@@ -139,12 +165,14 @@ def _tables_parser() -> ArgumentParser:
     )
     parser.add_argument(
         "experiment",
-        help="its name; table1, table2 and their _own look as in the paper, with its values",
+        nargs="?",
+        help="its name (without one: lists them); table1, table2 and their _own look as in the "
+        "paper, with its values",
     )
     parser.add_argument(
         "--format",
-        choices=[*FORMATS, TRIALS],
-        help=f"default: md; {TRIALS}: CSV with one row a trial",
+        choices=[*FORMATS, TRIALS, JSON],
+        help=f"default: md; {TRIALS}: CSV with one row a trial; {JSON}: the verdicts",
     )
     parser.add_argument(
         "--out", type=path, metavar="PATH", help="a folder, or a file whose ending says the format"
@@ -255,14 +283,11 @@ def explain_cell(address: str, runs: Path) -> str:
     experiment = load_experiment(runs, name)
     trials = _trials_at(experiment, scene, arm)
     shown = quantity(metric, trials)
-    variants = swept_settings(trials)
-    if variants:
-        raise InputError(f"{address} names several cells, which differ in {', '.join(variants)}")
     check_averageable(trials, f"scene={scene} {arm}")
     expected = len(experiment.seeds)
     cell = make_cell(trials, shown, [scene], expected)
     lines = [
-        f"{shown.name} of {trials[0].init}-{trials[0].densify} on {scene} in experiment {name}",
+        f"{shown.name} of {trials[0].arm} on {scene} in experiment {name}",
         f"  {format_cell(cell, shown)}: mean ± deviation (n - 1) over {cell.count} of {expected} "
         "trials",
     ]
@@ -271,25 +296,26 @@ def explain_cell(address: str, runs: Path) -> str:
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
-    folder = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}/"
-    left_out = [line for line in experiment.warnings if line.startswith(folder)]
+    place = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}"
+    of_cell = (f"{place}/", f"{place} ")
+    left_out = [line for line in experiment.warnings if line.startswith(of_cell)]
     if left_out:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
 
 
-def _trials_at(experiment: Experiment, scene: str, arm: str) -> list[TrialResult]:
-    """The trials of a scene and an arm: ``<init>-<densify>``, or a densifier that one arm has."""
-    of_scene = [trial for trial in experiment.trials if trial.scene == scene]
+def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
+    """The trials of a scene and of the one arm that ``word`` names (`Arm.answers_to`)."""
+    of_scene = [one for one in with_variants(experiment.trials) if one.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
         raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
-    arms = sorted({(trial.init, trial.densify) for trial in of_scene})
-    chosen = [(init, densify) for init, densify in arms if arm in (f"{init}-{densify}", densify)]
+    by_arm = group_by(of_scene, lambda trial: trial.arm)
+    chosen = [arm for arm in by_arm if arm.answers_to(word)]
     if len(chosen) != 1:
-        names = ", ".join(f"{init}-{densify}" for init, densify in arms)
-        raise InputError(f"{arm!r} names {len(chosen)} arms of {scene}; choose one of {names}")
-    return [trial for trial in of_scene if (trial.init, trial.densify) == chosen[0]]
+        names = ", ".join(str(arm) for arm in sorted(chosen or by_arm))
+        raise InputError(f"{word!r} names {len(chosen)} arms of {scene}; choose one of {names}")
+    return by_arm[chosen[0]]
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:

@@ -101,7 +101,7 @@ def ui(argv: Sequence[str], runs: Path) -> int:
             pages = addresses(server, publish(home, uri), version("mlflow"))
         except Exception as error:  # any error of the tracker's client
             raise InputError(
-                f"{uri} does not take {home.name} ({type(error).__name__}: {error})"
+                f"{home.name} could not be sent to {uri} ({type(error).__name__}: {error})"
             ) from error
     for name, address in pages.items():
         print(f"{name:<10} {address}", flush=True)

@@ -41,9 +41,8 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         "gate",
         "It trains this version on scenes and seeds of an archive (gsbench export --results), "
         "seed by seed until it "
-        "is decided. Exit code 0: no (better, or worse by less than what matters), 1: yes, or its "
-        "trials fail, 3: the "
-        "seeds do not tell, 2: bad input (docs/gate.md).",
+        "is decided. Exit code 0: not worse by --least; 1: worse, or a trial failed; 3: undecided; "
+        "2: bad input (docs/gate.md).",
     )
     parser.add_argument("archive", type=path, help="the results of the version that you trust")
     add_question(parser)

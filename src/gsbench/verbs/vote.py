@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.results import Arm, Experiment, load_experiment
 from gsbench.analysis.statistics import ALPHA, sign_test_needs
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.analysis.tables import compared_pairs
-from gsbench.analysis.verdicts import judge_pairs
 from gsbench.analysis.vote_words import describe_round, load_rounds, people_words, vote_table
 from gsbench.analysis.votes import LEAST_PREFERENCE, METRIC
 from gsbench.errors import InputError
@@ -165,8 +163,8 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
             f"{experiment.name} has no round of votes: gsbench vote make {experiment.name} --out "
             "DIR"
         )
-    trials, pairs = compared_pairs(experiment)
-    judged = judge_pairs(trials, pairs, active_declaration(experiment.folder, trials))
+    comparison = compare(experiment)
+    trials, judged = comparison.trials, comparison.answers
     rounds = {ballot.round for ballot in ballots.values()} or {
         verdict.key.round for verdict in verdicts
     }
@@ -186,7 +184,7 @@ def choose_arms(arms: Sequence[Arm], wanted: Sequence[str]) -> list[Arm]:
     """
     chosen: list[Arm] = []
     for word in wanted:
-        own = [arm for arm in arms if word in (str(arm), f"{arm.init}-{arm.densify}", arm.densify)]
+        own = [arm for arm in arms if arm.answers_to(word)]
         if len(own) != 1:
             raise InputError(
                 f"--arms: {word!r} names {len(own)} arms; there are {some_of([*map(str, arms)])}"

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from gsbench.analysis.cells import with_variants
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.densify.volumetric import log_volume
 from gsbench.errors import InputError
@@ -75,21 +76,23 @@ def find_trial(address: str, runs: Path) -> TrialResult:
     if len(parts) not in (3, 4) or not all(parts):
         raise InputError(f"{address!r} is neither a folder nor EXPERIMENT:SCENE:DENSIFY[:SEED]")
     name, scene, densify, *seed = parts
-    experiment = load_experiment(runs, name)
+    trials = with_variants(load_experiment(runs, name).trials)
     matches = [
         trial
-        for trial in experiment.trials
+        for trial in trials
         if trial.scene == scene
-        and densify in (trial.densify, f"{trial.init}-{trial.densify}")
+        and trial.arm.answers_to(densify)
         and (not seed or str(trial.seed) == seed[0])
     ]
     if not matches:
-        arms = {f"{name}:{t.scene}:{t.init}-{t.densify}:{t.seed}" for t in experiment.trials}
+        arms = {f"{name}:{trial.scene}:{trial.arm}:{trial.seed}" for trial in trials}
         raise InputError(f"no complete trial {address}; there are {', '.join(sorted(arms))}")
     first = [trial for trial in matches if trial.seed == matches[0].seed]
     if len(first) > 1:
-        folders = ", ".join(str(trial.path) for trial in first)
-        raise InputError(f"{address} names {len(first)} trials; give a folder: {folders}")
+        arms = {f"{name}:{scene}:{trial.arm}" for trial in first}
+        raise InputError(
+            f"{address} names {len(first)} trials; choose one of {', '.join(sorted(arms))}"
+        )
     return matches[0]
 
 
@@ -98,7 +101,7 @@ def _trial_in(folder: Path) -> TrialResult:
     if len(folder.parents) < 4 or not (folder / RESULTS).is_file():
         raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
     experiment = load_experiment(folder.parents[3], folder.parents[2].name)
-    for trial in experiment.trials:
+    for trial in (*experiment.trials, *experiment.older):
         if trial.path == folder:
             return trial
     raise InputError(f"{folder} is not a complete trial; give {ADDRESS}")

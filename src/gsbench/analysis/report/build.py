@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis import verdicts
-from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.differences import between_scenes_notes, short_version
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
@@ -27,7 +27,7 @@ from gsbench.analysis.ranks import rank_all
 from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, rank_plot
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
-from gsbench.analysis.tables import build_table, compared_pairs, with_agreement
+from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
 from gsbench.analysis.votes import RoundVerdict
@@ -58,11 +58,9 @@ Curve = list[tuple[float, float]]
 
 def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
     """The report as HTML, from files alone; every densifier is compared with ``baseline``."""
-    trials, pairs = compared_pairs(experiment, baseline)
+    comparison = compare(experiment, baseline)
+    trials, pairs, judged = comparison.trials, comparison.pairs, comparison.answers
     arms = sorted({trial.arm for trial in trials})
-    declared = active_declaration(experiment.folder, trials)
-    judged = verdicts.judge_pairs(trials, pairs, declared)
-    quantity = next((one.declared for one in judged if one.declared is not None), None)
     paper_table = layout_of(experiment.name)
     if paper_table is None:
         tables = [build_table(experiment)]
@@ -80,8 +78,8 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         versus=[compare_arms(trials, own) for own in judged],
         ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
-        declared=declared.sentences(quantity.name) if declared and quantity else [],
-        families=verdicts.families(judged),
+        declared=[*comparison.declaration_lines, *verdicts.families(judged)],
+        unused=comparison.unused,
         tables=[_without_verdicts(one) for one in with_agreement(tables)],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
@@ -103,7 +101,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
 
 def _without_verdicts(table: Table) -> Table:
     """The table without the notes on verdicts, which the top of the page has."""
-    notes = [note for note in table.notes if not note.startswith(verdicts.VERDICT)]
+    notes = [note for note in table.notes if not note.startswith(VERDICT)]
     return replace(table, notes=tuple(notes))
 
 

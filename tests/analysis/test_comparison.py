@@ -1,0 +1,404 @@
+"""One question, one answer: what was done before or beside an arm never changes its verdict."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import random
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsbench.analysis.comparison import Comparison, compare
+from gsbench.analysis.report.build import build_report
+from gsbench.analysis.results import load_experiment
+from gsbench.analysis.statistics import t_test
+from gsbench.analysis.tables import build_table
+from gsbench.analysis.verdicts import sentence
+from gsbench.claims.archive import write_archive
+from gsbench.claims.site import write_site
+from gsbench.runs.experiments import Declaration, open_question, record_text
+from gsbench.tracking.comparison import description
+from gsbench.verbs.claims import plan
+from gsbench.verbs.results import explain_cell, tables
+from tests.analysis.synthetic import METRICS, Plan, trial_data, write_trial
+from tests.conftest import script
+
+DECLARED_AT = "2026-01-01T00:00:00Z"
+OLD, NEW = "1" * 64, "2" * 64
+
+
+@dataclass(frozen=True)
+class Made:
+    """A made-up trial: arm, place, day of January 2026, version of the user's code."""
+
+    densify: str
+    options: tuple[tuple[str, Any], ...] = ()
+    init: str = "sfm"
+    scene: str = "a"
+    seed: int = 0
+    day: int = 2
+    code: str = ""
+
+    @property
+    def hash(self) -> str:
+        return sha256(repr((self.options, self.code)).encode()).hexdigest()[:8]
+
+    @property
+    def key(self) -> str:
+        return f"{self.scene}/{self.init}-{self.densify}/{self.hash}"
+
+
+def write(runs: Path, trials: Sequence[Made]) -> None:
+    for one in trials:
+        rng = random.Random(repr(one))
+        views = {m: np.array([20.0 + rng.gauss(0, 0.1)]) for m in METRICS[:2]}
+        data = trial_data(Plan(), one.scene, one.init, one.densify, one.seed, views)
+        data["measured"] = f"2026-01-{one.day:02d}T00:00:00Z"
+        sources = {"mine": one.code} if one.code else {}
+        data["code"] = {"sources": sources, "stages": {"train": 2}}
+        path = write_trial(runs, data, views, one.hash)
+        config = json.loads((path / "config.yaml").read_text())
+        config["densify"] |= dict(one.options)
+        (path / "config.yaml").write_text(json.dumps(config))
+        moment = 1_767_225_600 + 86_400 * one.day
+        os.utime(path / "results.json", (moment, moment))
+
+
+def declare(runs: Path, *records: tuple[int, Sequence[Made]], metric: str = "psnr") -> None:
+    """Write a declaration for each (day, trials of the command); each repeats those before."""
+    entries, trials = [], dict[str, set[int]]()
+    for day, made in records:
+        for one in made:
+            trials.setdefault(one.key, set()).add(one.seed)
+        named = {key: tuple(sorted(seeds)) for key, seeds in trials.items()}
+        time = f"2026-01-{day:02d}T00:00:00Z"
+        entries.append(Declaration(time=time, questions=(open_question(metric),), trials=named))
+    (runs / "exp" / "declared.jsonl").write_text(record_text(entries))
+
+
+def grid(densify: str, seeds: int = 3, day: int = 2, code: str = "", **options: Any) -> list[Made]:
+    named = tuple(options.items())
+    return [Made(densify, named, seed=seed, day=day, code=code) for seed in range(seeds)]
+
+
+def answer(runs: Path) -> Comparison:
+    return compare(load_experiment(runs, "exp"))
+
+
+def against(comparison: Comparison) -> list[tuple[str, str]]:
+    return [(str(second), str(first)) for first, second in comparison.pairs]
+
+
+# ---- the ways in which people work
+
+
+def test_an_arm_stays_compared_when_another_is_added(tmp_path: Path) -> None:
+    write(tmp_path, [*grid("adc"), *grid("momentum", decay=0.9), *grid("momentum", decay=0.99)])
+    before = answer(tmp_path)
+    write(tmp_path, grid("absgs", day=3))
+    after = answer(tmp_path)
+    assert against(before) == [
+        ("sfm-momentum[decay=0.9]", "sfm-adc"),
+        ("sfm-momentum[decay=0.99]", "sfm-adc"),
+    ]
+    assert against(after) == [("sfm-absgs", "sfm-adc"), *against(before)]
+    assert set(before.sentences) < set(after.sentences)
+    rows = [row.labels[3] for row in build_table(after.experiment).rows]
+    assert rows == ["–", "–", "0.9", "0.99"]  # adc and absgs have no such setting
+    assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arms", "pairs", "named"),
+    [
+        # the settings that both have decide
+        (
+            [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 2, "lr": 3})],
+            [("sfm-mine", "sfm-adc[cap=2]")],
+            "sfm-adc[cap=1] is not compared: other arms have a baseline with settings nearer",
+        ),
+        ([("adc", {"cap": 1}), ("mine", {"cap": 2})], [("sfm-mine", "sfm-adc")], ""),
+        (
+            [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 4})],
+            [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]")],
+            "",
+        ),
+        # without a baseline: an external trainer swept over an option, and no densification
+        (
+            [("brush", {"grow": 1}), ("brush", {"grow": 2}), ("none", {})],
+            [("sfm-brush[grow=2]", "sfm-brush[grow=1]"), ("sfm-none", "sfm-brush[grow=1]")],
+            "",
+        ),
+    ],
+)
+def test_every_arm_is_compared_by_the_settings_that_both_have(
+    tmp_path: Path, arms: list[tuple[str, dict[str, int]]], pairs: list[tuple[str, str]], named: str
+) -> None:
+    for densify, options in arms:
+        write(tmp_path, grid(densify, **options))
+    found = answer(tmp_path)
+    assert against(found) == pairs
+    assert named in "\n".join(found.unused)
+
+
+def test_an_arm_without_a_baseline_is_named_everywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone = [replace(one, init="random") for one in grid("mine")]
+    write(tmp_path, [*grid("adc"), *grid("mine"), *alone])
+    reason = "random-mine is not compared: there is no random-adc."
+    experiment = load_experiment(tmp_path, "exp")
+    assert answer(tmp_path).unused == [reason]
+    plan(["exp"], tmp_path)
+    tables(["exp", "--format", "json"], tmp_path)
+    said = capsys.readouterr().out
+    assert said.count(reason) == 2
+    write_archive(experiment, tmp_path / "exp.zip")
+    write_site([tmp_path / "exp.zip"], tmp_path / "site", "title", tmp_path / "scratch")
+    pages = [build_report(experiment), (tmp_path / "site" / "index.html").read_text()]
+    for text in (*pages, description(experiment), "\n".join(build_table(experiment).notes)):
+        assert reason in text
+
+
+@pytest.mark.parametrize(
+    ("records", "trials", "doubt"),
+    [
+        # an idea, the day after the baseline, each by its own command with eval.primary
+        ([(1, "adc"), (5, "mine")], {"adc": 2, "mine": 6}, ""),
+        # the baseline was not declared at all
+        ([(5, "mine")], {"adc": 2, "mine": 6}, ""),
+        # a further arm after the result of another
+        ([(1, "adc mine"), (5, "more")], {"adc": 2, "mine": 2, "more": 6}, ""),
+        ([(5, "adc mine")], {"adc": 2, "mine": 2}, "declared after 3 of the arm's 3 trials"),
+        # further seeds, of the arm or of both
+        ([(1, "adc mine"), (5, "adc+ mine+")], {"adc+": 6, "mine": 2, "mine+": 6}, "2 trials"),
+        # further seeds of the baseline, which the arm had from the start
+        ([(1, "adc mine mine+"), (5, "adc+")], {"adc": 2, "adc+": 6, "mine+": 2}, "1 trial added"),
+        # a further seed of the baseline alone makes no pair
+        ([(1, "adc mine"), (5, "adc+")], {"adc+": 6, "mine": 2}, ""),
+    ],
+)
+def test_a_question_is_declared_if_it_was_fixed_before_the_first_trial_of_its_arm(
+    tmp_path: Path, records: list[tuple[int, str]], trials: dict[str, int], doubt: str
+) -> None:
+    def made(name: str, day: int) -> list[Made]:
+        own = grid(name.rstrip("+"), seeds=4, day=day)
+        return own[3:] if name.endswith("+") else own[:3]
+
+    for name, day in trials.items():
+        write(tmp_path, made(name, day))
+        if name.endswith("+") and name.rstrip("+") not in trials:
+            write(tmp_path, made(name.rstrip("+"), 2))
+    declare(
+        tmp_path,
+        *((day, [t for name in names.split() for t in made(name, 2)]) for day, names in records),
+    )
+    found = {one.second.densify: one for one in answer(tmp_path).answers}
+    standing = found["mine"].standing
+    assert standing is not None
+    assert standing.doubt.startswith(doubt)
+    assert standing.beforehand == (not doubt)
+    assert sentence(found["mine"]).endswith("The metric was declared beforehand.") == (not doubt)
+
+
+def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path: Path) -> None:
+    adc, old, new = (
+        grid("adc"),
+        grid("mine", code=OLD, lr=1),
+        grid("mine", day=6, code=NEW, lr=1),
+    )
+    write(tmp_path, [*adc, *old[:1], *new])
+    declare(tmp_path, (1, [*adc, *old]), (5, new))
+    found = answer(tmp_path)
+    assert found.answers[0].beforehand
+    assert "missing" not in "\n".join(found.declaration_lines)
+    assert "made by an earlier mine" in found.experiment.warnings[0]
+    # the old code failed before any result: its folder has settings, but no results
+    folder = tmp_path / "exp" / old[0].key
+    (folder.parent / f"{folder.name}-seed0" / "results.json").unlink()
+    assert "missing" not in "\n".join(answer(tmp_path).declaration_lines)
+
+
+def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path: Path) -> None:
+    write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
+    declare(tmp_path, (5, [*grid("adc"), *grid("mine", code=NEW)]))
+    assert not answer(tmp_path).answers[0].beforehand
+
+
+# ---- random experiments
+
+ARMS = [
+    ("mine", ()),
+    ("momentum", (("decay", 0.9),)),
+    ("momentum", (("decay", 0.99),)),
+    ("absgs", ()),
+    ("volumetric", (("decay", 0.9), ("cap", 5))),
+]
+
+
+@st.composite
+def experiments(draw: st.DrawFn) -> tuple[list[Made], list[Made]]:
+    """Trials of a baseline and of arms on scenes and seeds, some missing; those declared."""
+    places = draw(
+        st.lists(
+            st.tuples(st.sampled_from("abc"), st.integers(0, 3)),
+            min_size=1,
+            max_size=6,
+            unique=True,
+        )
+    )
+    arms = draw(st.lists(st.sampled_from(ARMS), min_size=1, max_size=4, unique=True))
+    trials = []
+    for densify, options in [("adc", ()), *arms]:
+        own = [Made(densify, options, scene=scene, seed=seed) for scene, seed in places]
+        missing = draw(st.sets(st.sampled_from(own), max_size=1 if len(own) > 1 else 0))
+        day = draw(st.integers(2, 9))
+        trials += [replace(one, day=day) for one in own if one not in missing]
+    return trials, trials[: draw(st.sampled_from([0, len(trials), len(trials) - 1]))]
+
+
+def one_of(trials: Sequence[Made], densify: str) -> list[Made]:
+    return [one for one in trials if one.densify == densify]
+
+
+ADDED = {
+    "an arm": lambda trials: [replace(one, densify="zzz", options=(), day=2) for one in trials[:2]],
+    "an arm that is sorted first": lambda trials: [
+        replace(one, densify="aaa", options=()) for one in one_of(trials, "adc")
+    ],
+    "an arm of another initialiser": lambda trials: [
+        replace(one, init="random", densify="mine", options=(), day=2) for one in trials[:2]
+    ],
+    "a scene that only one arm has": lambda trials: [replace(trials[-1], scene="z")],
+    "a setting of another arm": lambda trials: [
+        replace(one, densify="zzz", options=(("decay", decay), ("lr", 1)))
+        for one in one_of(trials, "adc")
+        for decay in (1, 2)
+    ],
+    "old versions of an arm": lambda trials: [replace(trials[-1], code=OLD, day=1)],
+}
+
+
+def outcomes(comparison: Comparison) -> dict[tuple[str, str], Any]:
+    return {
+        (str(one.second), str(one.first)): (
+            one.beforehand,
+            [(v.question.metric, v.outcome, v.interval, v.p, v.family) for v in one.verdicts],
+        )
+        for one in comparison.answers
+    }
+
+
+@pytest.mark.parametrize("what", ADDED)
+def test_what_is_added_never_changes_another_verdict(what: str) -> None:
+    examples = 500 if os.environ.get("GSBENCH_EXAMPLES") else 12
+
+    @settings(max_examples=examples, deadline=None)
+    @given(experiments())
+    def check(made: tuple[list[Made], list[Made]]) -> None:
+        trials, declared = made
+        runs = Path(tempfile.mkdtemp())
+        try:
+            write(runs, trials)
+            if declared:
+                declare(runs, (1, declared))
+            before = answer(runs)
+            added = set(ADDED[what](trials)) - set(trials)
+            write(runs, sorted(added, key=repr))
+            (runs / "exp" / "d" / "sfm-mine" / "deadbeef-seed0").mkdir(parents=True)  # it failed
+            after = answer(runs)
+            assert before.pairs
+            changed = outcomes(after)
+            for pair, found in outcomes(before).items():
+                assert changed[pair] == found
+            check_all_is_named(after)
+        finally:
+            shutil.rmtree(runs)
+
+    check()
+
+
+def check_all_is_named(comparison: Comparison) -> None:
+    """Each trial is in a verdict, or its arm is named in a sentence with the reason."""
+    used = {
+        trial.path
+        for one in comparison.answers
+        for verdict in one.verdicts
+        for trial in verdict.pairs.trials
+    }
+    without = {str(one.second) for one in comparison.answers if not one.verdicts}
+    without |= {str(one.first) for one in comparison.answers if not one.verdicts}
+    named = "\n".join(comparison.unused)
+    for trial in comparison.trials:
+        label = f"{trial.experiment}/{trial.scene}/{trial.init}-{trial.densify}"
+        known = trial.path in used or str(trial.arm) in without
+        assert known or str(trial.arm) in named or label in named or " more" in named
+
+
+@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
+@given(experiments())
+def test_all_surfaces_state_the_same(made: tuple[list[Made], list[Made]]) -> None:
+    trials, declared = made
+    runs = Path(tempfile.mkdtemp())
+    try:
+        write(runs, trials)
+        if declared:
+            declare(runs, (1, declared))
+        comparison = answer(runs)
+        notes = "\n".join(build_table(comparison.experiment).notes)
+        page = html.unescape(build_report(comparison.experiment))
+        told = description(comparison.experiment)
+        pairs = comparison.to_json()["pairs"]
+        assert [one["sentence"] for one in pairs] == comparison.sentences
+        for sentence in comparison.sentences:
+            assert f"Verdict, {sentence}" in notes
+            assert f"<strong>{sentence}" in page
+            assert sentence in told or len(told) > 4000  # cut to what a tag may hold
+        for line in comparison.unused:
+            assert line in notes
+            assert line in page
+    finally:
+        shutil.rmtree(runs)
+
+
+@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 12, deadline=None)
+@given(experiments(), st.randoms(use_true_random=False))
+def test_the_order_of_commands_does_not_matter(
+    made: tuple[list[Made], list[Made]], shuffler: random.Random
+) -> None:
+    trials, declared = made
+    found = []
+    for order in (trials, shuffler.sample(trials, len(trials))):
+        runs = Path(tempfile.mkdtemp())
+        try:
+            write(runs, order)
+            if declared:
+                declare(runs, (1, sorted(declared, key=order.index)))
+            found.append(outcomes(answer(runs)))
+        finally:
+            shutil.rmtree(runs)
+    assert found[0] == found[1]
+
+
+def test_the_simulation_of_a_shared_baseline_draws_what_it_says() -> None:
+    shared = script("shared_baseline")
+    one, some = shared.rates(shared.seen(3, 3), 1, False, 20_000, 1)
+    assert one == some == pytest.approx(0.05, abs=0.006)  # Student's test is exact on one scene
+    together = shared.rates(shared.seen(3, 3), 4, True, 4000, 1)
+    apart = shared.rates(shared.seen(3, 3), 4, False, 4000, 1)
+    assert together[1] < 0.06 < apart[1] < 0.2
+    assert shared.rates(shared.seen(12, 3), 1, False, 4000, 1)[0] > 0.1
+    differences = np.random.default_rng(0).normal(size=(5, 3, 3))
+    expected = [t_test(one) for one in differences]
+    assert shared.p_values(differences) == pytest.approx([one.p for one in expected if one])
