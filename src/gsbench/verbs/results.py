@@ -247,14 +247,14 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file, output = experiment.folder / REPORT_NAME, writable_output
+    file, named = experiment.folder / REPORT_NAME, True
     if options.out is not None:
         file = file_at(options.out, experiment.name)
-        output = writable_output if file == options.out else own_output
+        named = file == options.out
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
-    with output(file):
+    with writable_output(file) if named else own_output(file):
         write_text(file, text)
     print(file)
     return 0
