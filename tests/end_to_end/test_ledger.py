@@ -91,7 +91,7 @@ def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(
 ) -> None:
     do(gsbench, tmp_path, *NEW, "seed=0,1")
     results = []
-    for body in ("raise RuntimeError('typing error')", "pass", "pass  # again", "return None"):
+    for body in ("raise RuntimeError('typing error')", "pass", "again = 1", "return None"):
         (tmp_path / "mine.py").write_text(CLASS.format(body=body))
         done = do(gsbench, tmp_path, "ledger", "try", "night", *OWN, "--json")
         results.append(json.loads(done.stdout))
