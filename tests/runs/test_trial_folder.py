@@ -106,7 +106,7 @@ def test_a_large_file_with_its_old_size_and_time_is_compared_before_it_is_export
     state = model.stat()
     model.write_bytes(b"ply 26.5")
     os.utime(model, ns=(state.st_atime_ns, state.st_mtime_ns))
-    with pytest.raises(InputError, match="point_cloud.ply was changed"):
+    with pytest.raises(InputError, match=r"point_cloud\.ply was changed"):
         model_file(one)
 
 
