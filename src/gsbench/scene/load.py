@@ -2,7 +2,8 @@
 
 Prepared images are cached below ``cache_dir`` as PNG files, one folder for each set. The folder's
 name is a digest of everything that the pixels depend on. A folder appears by one rename, so a set
-is either complete or absent; checksums of its files show later changes. Images that need no change are read from the capture.
+is either complete or absent; checksums of its files show later changes. Images that need no change
+are read from the capture.
 
 Undistortion is COLMAP's, with the defaults of its ``image_undistorter``, which INRIA's
 ``convert.py`` uses too: the largest pinhole image without blank pixels, at the original focal

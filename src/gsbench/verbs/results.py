@@ -219,10 +219,10 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file, output = experiment.folder / REPORT_NAME, writable_output
+    file = experiment.folder / REPORT_NAME
     if options.out is not None:
         file = file_at(options.out, experiment.name)
-        output = writable_output if file == options.out else own_output
+    output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
