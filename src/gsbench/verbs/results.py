@@ -247,14 +247,14 @@ def report(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"--baseline {options.baseline}: {experiment.name} has {', '.join(densifiers)}"
         )
-    file, named = experiment.folder / REPORT_NAME, True
+    file = experiment.folder / REPORT_NAME
     if options.out is not None:
         file = file_at(options.out, experiment.name)
-        named = file == options.out
+    output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
     text = build_report(experiment, options.baseline or BASELINE)
-    with writable_output(file) if named else own_output(file):
+    with output(file):
         write_text(file, text)
     print(file)
     return 0
