@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.request
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -70,9 +71,10 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
     commands: list[list[str]] = []
 
     class Server:
-        def __init__(self, command: list[str], env: dict[str, str]) -> None:
+        def __init__(self, command: list[str], cwd: Any, env: dict[str, str]) -> None:
             commands.append(command)
             assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
+            assert not list(Path(cwd).iterdir())
 
         def wait(self) -> int:
             return 0
