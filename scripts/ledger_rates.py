@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.statistics import look_levels, plan_looks
 from gsbench.analysis.thresholds import Region, evenness
-from gsbench.claims.ledger import GIVE_UP
+from gsbench.claims.ledger import GIVE_UP, RETRIES
 
 IDEAS, RATE = 40, 0.1
 SCENES, SEEDS = 3, 6
@@ -47,6 +47,7 @@ def in_looks(
     """The ledger's rule, restated for many nights at once; without ``lond`` Bonferroni's levels."""
     count = len(differences)
     level = 2 * RATE / IDEAS * ((kept + 1) if lond else np.ones(count))  # both sides
+    level = level / (RETRIES if differences.shape[1] == 1 else 1.0)
     undecided, keep = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
     seeds = np.full(count, LOOKS[-1])
     for number, look in enumerate(LOOKS):

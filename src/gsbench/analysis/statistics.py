@@ -6,9 +6,11 @@ smallest independent unit.
 
 *These scenes*: the mean over the given scenes, each with the same weight. Scenes are fixed, pairs
 within them are the units, and each scene has its own variance (`gsbench.analysis.thresholds`).
-*Scenes like these*, from ``MIN_SCENES`` scenes on: the sign test of the number of scenes that gain,
-with the exact interval of the median effect. It assumes nothing about the distribution of effects;
-tests of the mean effect fail if one scene in eight differs much from the others.
+*Scenes like these*, from ``MIN_SCENES`` scenes on: the sign test of the number of scenes whose
+measured mean gains. It is exact for `exact_for` and for nothing else: the measured means have the
+noise of trainings, so the median effect without noise can have the other sign. It assumes nothing
+about the distribution of effects; tests of the mean effect fail if one scene in eight differs much
+from the others.
 
 Planning: the paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene
 effect has one deviation between scenes, the noise another one between trainings of a scene. Both
@@ -218,7 +220,7 @@ class LikeThese:
     In ``helped`` of them the difference has the asked sign. In ``beyond`` of them it is at
     least the least that matters; None if that is not known. ``share`` is the exact interval
     (Clopper and Pearson 1934) of the share of such scenes with the sign. ``median`` is the
-    interval of their median effect, from order statistics; None with too few scenes for
+    interval of the median of such means, from order statistics; None with too few scenes for
     ``level``. ``p`` is that of the sign test.
     """
 
@@ -241,6 +243,15 @@ class LikeThese:
         if self.needed is None:
             return 0.0
         return float(special.bdtrc(self.needed - 1, self.scenes, share))
+
+
+def exact_for(seeds: int) -> str:
+    """What "better" about scenes like these says, in words; "worse" says the opposite."""
+    mean = "one training" if seeds == 1 else f"the mean of {seeds} trainings"
+    return f"on a new scene like these, {mean} of the arm would more often be better"
+
+
+EXACT_FOR_PEOPLE = "a new person, asked the same pairs, would more often prefer it"
 
 
 def judge_like_these(

@@ -24,7 +24,7 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, seeds_needed
+from gsbench.analysis.statistics import ALPHA, TOO_SMALL, Outcome, exact_for, seeds_needed
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import counted, some_of
 
@@ -357,7 +357,7 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
         return ""
     word = words.get(like.outcome, like.outcome)
     least = "" if like.beyond is None else f", by the least that matters in {like.beyond}"
-    median = "" if like.median is None else f"; median effect {verdict.shown_interval(like.median)}"
+    median = "" if like.median is None else f"; median {verdict.shown_interval(like.median)}"
     needed = "no number of them would" if like.needed is None else f"{like.needed} of them would"
     seen = (
         f", which {100 * like.power():.0f} % of sweeps see where nine of ten do"
@@ -368,7 +368,8 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
         f"scenes like these: {word}; {what} in {like.helped} of {like.scenes}{least} (sign test p "
         f"{p_text(like.p)}, {100 * like.share.low:.0f} to {100 * like.share.high:.0f} % of such "
         f"scenes{median}); "
-        f"{needed} suffice at {100 * (1 - like.level):.3g} %{seen}"
+        f"{needed} suffice at {100 * (1 - like.level):.3g} %{seen}; exact for: "
+        f"{exact_for(verdict.pairs.seeds)}"
     )
 
 
