@@ -102,7 +102,7 @@ def test_the_gate_passes_fails_or_stays_undecided_by_effect_and_noise(
 
 
 def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_path: Path) -> None:
-    verdict, most = gate(tmp_path, 0.3, 0.02, asked(least="0.35"))
+    verdict, most = gate(tmp_path, 0.15, 0.1, asked(least="0.25"))
     assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
     assert "not worse by 0.35 in PSNR" in describe(verdict)
     assert most < 4

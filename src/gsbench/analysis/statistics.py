@@ -323,22 +323,25 @@ def plan_looks(maximum: int) -> tuple[int, ...]:
 
 
 @cache
-def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[float, ...]:
+def look_levels(
+    scenes: int, looks: tuple[int, ...], alpha: float, draws: int = DRAWS
+) -> tuple[float, ...]:
     """The error rate of the interval at each look; all looks together have the rate ``alpha``.
 
     These are repeated confidence intervals (Jennison and Turnbull 1989): at whichever look one
     stops, and for whatever reason, the chance of a false statement is at most ``alpha``. Looks
     up to the share t of all seeds may spend ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and
-    DeMets 1987). Looks share trials, so their errors overlap: the rates come from `DRAWS`
+    DeMets 1987). Looks share trials, so their errors overlap: the rates come from ``draws``
     simulated sequences of trainings.
     """
     # Equally noisy scenes alone would not do: the test is cautious there, so each look would get
     # all that may be spent.
-    simulated = [_simulate_looks(scenes, looks, noise) for noise in NOISY[: len(NOISY) * (scenes > 1)]]
-    simulated.append(_simulate_looks(1, looks))
+    simulated = [_simulate_looks(1, looks, draws)]
+    if scenes > 1:
+        simulated += [_simulate_looks(scenes, looks, draws, noise) for noise in NOISY]
     # The test itself keeps the level of the first look.
     levels = [alpha * (looks[0] / looks[-1]) ** SPENDING_POWER]
-    error_free = [np.ones(DRAWS, dtype=bool) for _ in simulated]
+    error_free = [np.ones(draws, dtype=bool) for _ in simulated]
     spent = np.full(len(simulated), levels[0])
     for look, seeds in enumerate(looks[1:], 1):
         most = level = alpha * (seeds / looks[-1]) ** SPENDING_POWER
@@ -380,7 +383,9 @@ class _Sequences:
 
 
 @cache
-def _simulate_looks(scenes: int, looks: tuple[int, ...], noise: float = 1.0) -> _Sequences:
+def _simulate_looks(
+    scenes: int, looks: tuple[int, ...], draws: int, noise: float = 1.0
+) -> _Sequences:
     """Sequences in which the first of ``scenes`` is ``noise`` times as noisy as the others.
 
     Two parts of the sequences have a drift, up to the first look or to the last, that makes errors
@@ -390,11 +395,12 @@ def _simulate_looks(scenes: int, looks: tuple[int, ...], noise: float = 1.0) -> 
     rng = np.random.default_rng(0)
     deviations = np.where(np.arange(scenes) == 0, noise, 1.0)
     of_sum = math.sqrt((deviations**2).sum())
-    part = np.arange(DRAWS) % 3  # no drift, until the first look, until the last
-    drift = rng.normal(0, DRIFT, (DRAWS, 1)) * deviations**2 / of_sum
+    part = np.arange(draws) % 3  # no drift, until the first look, until the last
+    drift = rng.normal(0, DRIFT, (draws, 1)) * deviations**2 / of_sum
     # of the differences of each scene
-    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))
-    sizes, even, sums, seeds_before = [], [], [], 0
+    totals, squares = np.zeros((draws, scenes)), np.zeros((draws, scenes))
+    sizes, even, sums = (list[NDArray[np.float64]]() for _ in range(3))
+    seeds_before = 0
     for seeds in looks:
         new = seeds - seeds_before
         drifts = (part == 2) / math.sqrt(looks[-1]) + (part == 1) * (not sizes) / math.sqrt(seeds)
@@ -412,7 +418,7 @@ def _simulate_looks(scenes: int, looks: tuple[int, ...], noise: float = 1.0) -> 
         seeds_before = seeds
     spread = 1 + DRIFT**2
     drifted = [np.exp(one**2 / 2 * (1 - 1 / spread)) / math.sqrt(spread) for one in sums]
-    weights = 3 / (1 + drifted[0] + drifted[-1]) / DRAWS
+    weights = 3 / (1 + drifted[0] + drifted[-1]) / draws
     return _Sequences(scenes, looks, np.array(sizes), np.array(even), weights)
 
 

@@ -219,10 +219,10 @@ def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult
 
 # ---- bisection: the search for the commit that made a trainer worse
 #
-# The last commit is compared with the first. Each other commit is compared with both: it is as good
-# as the first or as bad as the last, so it passes if it is shown to be better than the last, and is
-# worse if it is shown to be worse than the first. Then only one of its two questions can be answered
-# wrongly, and only on one side.
+# The last commit is compared with the first. Each other commit is compared with both. It is as good
+# as the first or as bad as the last. So it passes if it is shown to be better than the last, and is
+# worse if it is shown to be worse than the first. Only one of its two questions can then be
+# answered wrongly, and only on one side.
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,8 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
         "It searches the git repository of this folder: one with a densifier of your own, or "
         "gsbench's checkout. Each "
         "step trains one commit in a work tree of its own and compares it with GOOD and BAD; all "
-        "steps share an error rate of 5 %. The same command goes on after a kill. Exit code 0: found, "
-        "3: not found "
+        "steps share an error rate of 5 %. The same command goes on after a kill. Exit code 0: "
+        "found, 3: not found "
         "(docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
