@@ -153,6 +153,13 @@ def p_values(mean: Array, error: Array, degrees: Shape) -> Array:
     return np.asarray(2 * special.stdtr(degrees, -np.abs(mean) / error))
 
 
+def significant(mean: Array, error: Array, degrees: Shape, level: float) -> NDArray[np.bool_]:
+    """Whether p is below the level [D]; for thresholds without computing p."""
+    if isinstance(degrees, Region):
+        return np.asarray(np.abs(mean) / error > degrees.limits(level))
+    return p_values(mean, error, degrees) < level
+
+
 @lru_cache(maxsize=1)
 def calibration(scenes: int, seeds: int) -> list[Draws]:
     """Draws with equal noise, with a noisy scene, and with noise that is nearly all in one arm."""
@@ -188,8 +195,8 @@ def decide(
     taken = np.full(len(draws.arm), looks[-1])
     for seeds, level in zip(looks, levels, strict=True):
         mean, error, degrees = draws.test(rule, seeds)
-        small = p_values(np.maximum(LEAST - np.abs(mean), 0), error, degrees) < level
-        known = p_values(mean, error, degrees) < level
+        small = significant(np.maximum(LEAST - np.abs(mean), 0), error, degrees, level)
+        known = significant(mean, error, degrees, level)
         signs = np.where(mean > 0, SUPPORTED, REFUTED)
         found = np.where(small, TOO_SMALL, np.where(known, signs, UNDECIDED))
         rest = _without_outlying(draws, seeds) if seeds > 2 else mean
@@ -262,9 +269,13 @@ def false_signs(draws: Draws, rule: Rule) -> float:
     """The share of false signs at the last look alone, or over all looks, whichever is larger."""
     scenes, most = draws.arm.shape[1:]
     looks = tuple(range(2, most + 1))
-    p = np.array([p_values(*draws.test(rule, seeds)) for seeds in looks])
-    levels = np.array(look_levels(rule, scenes, looks, RATE))[:, None]
-    return max(float((p < levels).any(axis=0).mean()), float((p[-1] < RATE).mean()))
+    levels = look_levels(rule, scenes, looks, RATE)
+    found = [
+        significant(*draws.test(rule, seeds), level)
+        for seeds, level in zip(looks, levels, strict=True)
+    ]
+    alone = significant(*draws.test(rule, looks[-1]), RATE)
+    return max(float(np.any(found, axis=0).mean()), float(alone.mean()))
 
 
 def grid(draws: int) -> Iterator[tuple[str, Draws]]:
@@ -291,7 +302,7 @@ def power(rule: Rule, draws: int, scenes: int, seeds: int) -> float:
     """The power at an effect of three standard errors."""
     found = normal(np.random.default_rng(4), np.ones((scenes, 2)), seeds, draws)
     found = replace(found, effect=3 / math.sqrt(scenes * seeds))
-    return float((p_values(*found.test(rule, seeds)) < RATE).mean())
+    return float(significant(*found.test(rule, seeds), RATE).mean())
 
 
 def table(draws: int) -> str:

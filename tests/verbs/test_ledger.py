@@ -405,7 +405,7 @@ def test_show_prints_the_rule_and_a_row_for_each_idea(home: Path, said: Any) -> 
     good, bad = (line.strip("| ").split(" | ") for line in lines if line[:4] in ("| 1 ", "| 2 "))
     assert good[:4] == ["1 good", "baseline", "0.00083", "3"]
     assert good[-3:] == ["×1.00", "kept", "better"]
-    assert bad[:4] == ["2 bad", "baseline", "0.005", "2"]
+    assert bad[:4] == ["2 bad", "baseline", "0.0017", "2"]
     assert bad[-2:] == ["dropped", "a gain of 0.5 is unlikely"]
     assert "2 of 40 planned ideas were tried, and 1 kept" in " ".join(lines)
 
