@@ -45,3 +45,11 @@ def test_draws_of_a_sweep_have_the_stated_noise_and_correlation() -> None:
     assert differences.mean(axis=1) == pytest.approx(0.3, abs=0.03)
     # pairs whose trainings correlate by a half vary half as much
     assert differences.std(axis=1) == pytest.approx(np.array([0.4, 0.1, 0.1]) / 2**0.5, rel=0.05)
+
+
+def test_statements_about_scenes_like_these_share_the_rate_of_named_trials() -> None:
+    """So do those of a ledger's confirmation and of an ablation, which name their trials."""
+    made = promises.arms(np.random.default_rng(0), promises.noise_of(8, 1.0), 3, [0.0] * 4)
+    asked = tuple(promises.question(f"arm{k}", 8, 3) for k in range(4))
+    verdicts = promises.judge(made, promises.Declaration(time=promises.TIME, questions=asked))
+    assert [one.like_these.level for one in verdicts] == pytest.approx([0.05 / 4] * 4)
