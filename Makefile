@@ -21,7 +21,7 @@ HYDRA_PLUGINS := 'hydra-optuna-sweeper==1.3.*' 'optuna<3' cliff cmaes 'hydra-ray
 NEXT_HYDRA_TESTS := tests/app tests/config tests/end_to_end/test_hydra.py
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra hydra-plugins test-hydra-plugins lint docs notebooks picture lock
+.PHONY: help install demo test test-slow test-all test-generic next-hydra test-next-hydra hydra-plugins test-hydra-plugins promises lint docs notebooks picture lock
 
 help: ## show this
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -56,6 +56,9 @@ test-hydra-plugins: hydra-plugins ## run the tests of Hydra's sweepers and launc
 
 test-next-hydra: next-hydra ## run the tests of configurations and sweeps on the next version of Hydra
 	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(PYTEST) $(NEXT_HYDRA_TESTS)
+
+promises: $(VENV)/.stamp-dev ## simulate every promised error rate and power, into docs/promises.md
+	$(BIN)/python scripts/promises.py
 
 lint: $(VENV)/.stamp-dev ## check style and types
 	$(BIN)/ruff check .

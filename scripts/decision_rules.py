@@ -20,13 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from gsbench.analysis import statistics
 from gsbench.analysis.judgement import FEW, OUTLYING
-from gsbench.analysis.statistics import CAUTION, NOISY, SPENDING_POWER
+from gsbench.analysis.statistics import SPENDING_POWER
+from gsbench.analysis.thresholds import Region, evenness
 
 Array = NDArray[np.float64]
+Shape = Array | Region  # of a test's distribution: degrees of freedom [D], or thresholds
 RATE, CLAIMS, LEAST, LOOKS = 0.05, 4, 1.0, (2, 3, 4)  # of a check
 LONG = (2, 3, 4, 5, 6)  # looks of a sweep with one question
 CALIBRATION, MANY = 20_000, 12  # draws for levels; seeds of a large baseline
+NOISY = 10.0  # in a part of the draws for levels, one scene is so many times as noisy
 UNDECIDED, SUPPORTED, REFUTED, TOO_SMALL = range(4)
 ONE_ARM = "one arm fails"
 
@@ -47,12 +51,15 @@ class Rule:
     alike: float = 0.0  # below this ratio of variances, all degrees count
     baseline: int = 0  # seeds, if more than the arm's
     equal_noise: bool = False  # levels of looks from equally noisy scenes alone
+    tabulated: bool = False  # thresholds of the judge, in place of degrees
 
-    def degrees(self, variances: Array, each: Array, seeds: int) -> tuple[Array, Array]:
+    def degrees(self, variances: Array, each: Array, seeds: int) -> tuple[Array, Shape]:
         """The variances to use [D, C], and the degrees of freedom [D] of their sum.
 
         The given variances [D, C] have ``each`` [C] degrees.
         """
+        if self.tabulated:
+            return variances, Region(variances.shape[1], seeds, evenness(variances))
         if self.moderated and len(each) > 1:
             return _moderate(variances, each)
         shift = 2 if self.unbiased else 0
@@ -81,11 +88,12 @@ def by_seeds(more: int) -> Callable[[int], float]:
     return lambda seeds: seeds / (seeds + more)
 
 
-CHOSEN = Rule("pairs", "K/(K+2)", by_seeds(CAUTION))
+CHOSEN = Rule("pairs", "tabulated thresholds", lambda _: 0.0, tabulated=True)
 RULES = [
     Rule("pairs", "1/2, levels from equal noise (before)", lambda _: 0.5, equal_noise=True),
     Rule("pairs", "1/2", lambda _: 0.5),
     CHOSEN,
+    Rule("pairs", "K/(K+2)", by_seeds(2)),
     Rule("pairs", "K/(K+2), levels from equal noise", by_seeds(2), equal_noise=True),
     Rule("pairs", "1 − 1/K", lambda seeds: 1 - 1 / seeds),
     Rule("pairs", "1 (Satterthwaite)", lambda _: 1.0),
@@ -127,7 +135,7 @@ class Draws:
         own = [one.var(axis=2, ddof=1) / one.shape[2] for one in (baseline, arm)]
         return mean, pairs, own[0], own[1]
 
-    def test(self, rule: Rule, seeds: int) -> tuple[Array, Array, Array]:
+    def test(self, rule: Rule, seeds: int) -> tuple[Array, Array, Shape]:
         """Means, standard errors and degrees of freedom [D] of a rule with this many seeds."""
         of_baseline = rule.baseline or seeds
         mean, pairs, *own = self.variances(seeds, of_baseline)
@@ -139,8 +147,17 @@ class Draws:
         return mean, np.sqrt(np.maximum(used.sum(axis=1), least)) / pairs.shape[1], degrees
 
 
-def p_values(mean: Array, error: Array, degrees: Array) -> Array:
+def p_values(mean: Array, error: Array, degrees: Shape) -> Array:
+    if isinstance(degrees, Region):
+        return degrees.p_values(np.abs(mean) / error)
     return np.asarray(2 * special.stdtr(degrees, -np.abs(mean) / error))
+
+
+def significant(mean: Array, error: Array, degrees: Shape, level: float) -> NDArray[np.bool_]:
+    """Whether p is below the level [D]; for thresholds without computing p."""
+    if isinstance(degrees, Region):
+        return np.asarray(np.abs(mean) / error > degrees.limits(level))
+    return p_values(mean, error, degrees) < level
 
 
 @lru_cache(maxsize=1)
@@ -154,7 +171,9 @@ def calibration(scenes: int, seeds: int) -> list[Draws]:
 
 @cache
 def look_levels(rule: Rule, scenes: int, looks: tuple[int, ...], rate: float) -> tuple[float, ...]:
-    """The levels of the looks for any rule, made as in `gsbench.analysis.statistics`."""
+    """The levels of the looks; for the judge's rule, its own."""
+    if rule.tabulated:
+        return statistics.look_levels(scenes, looks, rate)
     simulated = calibration(scenes, looks[-1])[: 1 if rule.equal_noise else 3]
     free, levels = np.ones((len(simulated), CALIBRATION), dtype=bool), list[float]()
     for seeds in looks:
@@ -176,8 +195,8 @@ def decide(
     taken = np.full(len(draws.arm), looks[-1])
     for seeds, level in zip(looks, levels, strict=True):
         mean, error, degrees = draws.test(rule, seeds)
-        small = p_values(np.maximum(LEAST - np.abs(mean), 0), error, degrees) < level
-        known = p_values(mean, error, degrees) < level
+        small = significant(np.maximum(LEAST - np.abs(mean), 0), error, degrees, level)
+        known = significant(mean, error, degrees, level)
         signs = np.where(mean > 0, SUPPORTED, REFUTED)
         found = np.where(small, TOO_SMALL, np.where(known, signs, UNDECIDED))
         rest = _without_outlying(draws, seeds) if seeds > 2 else mean
@@ -250,9 +269,13 @@ def false_signs(draws: Draws, rule: Rule) -> float:
     """The share of false signs at the last look alone, or over all looks, whichever is larger."""
     scenes, most = draws.arm.shape[1:]
     looks = tuple(range(2, most + 1))
-    p = np.array([p_values(*draws.test(rule, seeds)) for seeds in looks])
-    levels = np.array(look_levels(rule, scenes, looks, RATE))[:, None]
-    return max(float((p < levels).any(axis=0).mean()), float((p[-1] < RATE).mean()))
+    levels = look_levels(rule, scenes, looks, RATE)
+    found = [
+        significant(*draws.test(rule, seeds), level)
+        for seeds, level in zip(looks, levels, strict=True)
+    ]
+    alone = significant(*draws.test(rule, looks[-1]), RATE)
+    return max(float(np.any(found, axis=0).mean()), float(alone.mean()))
 
 
 def grid(draws: int) -> Iterator[tuple[str, Draws]]:
@@ -279,7 +302,7 @@ def power(rule: Rule, draws: int, scenes: int, seeds: int) -> float:
     """The power at an effect of three standard errors."""
     found = normal(np.random.default_rng(4), np.ones((scenes, 2)), seeds, draws)
     found = replace(found, effect=3 / math.sqrt(scenes * seeds))
-    return float((p_values(*found.test(rule, seeds)) < RATE).mean())
+    return float(significant(*found.test(rule, seeds), RATE).mean())
 
 
 def table(draws: int) -> str:

@@ -12,6 +12,7 @@ same effect and new trainings.
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
-from gsbench.analysis.statistics import error_and_degrees, look_levels, plan_looks
-from gsbench.claims.ledger import GIVE_UP
+from gsbench.analysis.statistics import look_levels, plan_looks
+from gsbench.analysis.thresholds import Region, evenness
+from gsbench.claims.ledger import GIVE_UP, RETRIES
 
 IDEAS, RATE = 40, 0.1
 SCENES, SEEDS = 3, 6
@@ -46,16 +47,21 @@ def in_looks(
     """The ledger's rule, restated for many nights at once; without ``lond`` Bonferroni's levels."""
     count = len(differences)
     level = 2 * RATE / IDEAS * ((kept + 1) if lond else np.ones(count))  # both sides
+    level = level / (RETRIES if differences.shape[1] == 1 else 1.0)
     undecided, keep = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
     seeds = np.full(count, LOOKS[-1])
     for number, look in enumerate(LOOKS):
         rows = differences[:, :, :look]
-        mean = rows.mean(axis=(1, 2))
-        error, degrees = error_and_degrees(rows.var(axis=2, ddof=1), look)
-        at_look = np.array([look_levels(SCENES, LOOKS, float(one))[number] for one in level])
-        half = special.stdtrit(degrees, 1 - at_look / 2) * error
+        mean, variances = rows.mean(axis=(1, 2)), rows.var(axis=2, ddof=1)
+        scenes = rows.shape[1]
+        error = np.sqrt(variances.sum(axis=1) / look) / scenes
+        region = Region(scenes, look, evenness(variances))
+        half = np.zeros(count)
+        for one in np.unique(level):
+            at_look = look_levels(scenes, LOOKS, float(one))[number]
+            half = np.where(level == one, region.limits(at_look) * error, half)
         within = np.maximum(half - mean, half + mean) < least
-        hopeless = mean + special.stdtrit(degrees, 1 - GIVE_UP) * error < least
+        hopeless = mean + region.limits(2 * GIVE_UP) * error < least
         better = undecided & (mean > half) & ~within
         ends = better | (undecided & ((mean < -half) | within | hopeless))
         keep |= better
@@ -89,24 +95,45 @@ class Rates:
     seeds: float  # trained for an idea
 
 
-def simulate(
-    rule: Rule, least: float, real: float, effect: float, adaptive: bool, nights: int
-) -> Rates:
-    """Simulate nights in which a share ``real`` of the ideas gains ``effect`` times ``least``."""
-    rng = np.random.default_rng([round(100 * real), round(10 * effect), adaptive])
-    baseline = rng.normal(0, 0.5**0.5, (nights, SCENES, SEEDS))
+@dataclass(frozen=True)
+class Night:
+    """A kind of night: how ideas are chosen, and on what.
+
+    A share ``real`` of the ideas gains ``effect`` times ``least``. A share ``retried`` of them are
+    another try of what looked best so far, with the same effect; their noise correlates with that
+    of the first try. ``noise`` has the deviations of the captures.
+    """
+
+    least: float
+    real: float = 0.0
+    effect: float = 0.0
+    retried: float = 0.0
+    correlation: float = 0.0
+    noise: tuple[float, ...] = (1.0,) * SCENES
+
+
+def simulate(rule: Rule, night: Night, nights: int) -> Rates:
+    """Simulate such nights."""
+    rng = np.random.default_rng([round(100 * night.real), round(10 * night.effect)])
+    scale = 0.5**0.5 * np.array(night.noise)[:, None]
+    shape = (nights, len(night.noise), SEEDS)
+    baseline = scale * rng.standard_normal(shape)
     kept, false, good, found, trained = (np.zeros(nights, dtype=np.int64) for _ in range(5))
     best, best_effect = np.full(nights, -np.inf), np.zeros(nights)
+    best_noise, own_part = np.zeros(shape), math.sqrt(1 - night.correlation**2)
     for _ in range(IDEAS):
-        own = np.where(rng.random(nights) < real, effect * least, 0.0)
-        if adaptive:
-            own = np.where((rng.random(nights) < 0.5) & np.isfinite(best), best_effect, own)
-        trainings = rng.normal(0, 0.5**0.5, (nights, SCENES, SEEDS))
-        differences = own[:, None, None] + trainings - baseline
-        keep, seeds = rule(differences, kept, least)
+        own = np.where(rng.random(nights) < night.real, night.effect * night.least, 0.0)
+        noise = rng.standard_normal(shape)
+        retry = (rng.random(nights) < night.retried) & np.isfinite(best)
+        own = np.where(retry, best_effect, own)
+        alike = night.correlation * best_noise + own_part * noise
+        noise = np.where(retry[:, None, None], alike, noise)
+        differences = own[:, None, None] + scale * noise - baseline
+        keep, seeds = rule(differences, kept, night.least)
         mean = differences[:, :, : LOOKS[0]].mean(axis=(1, 2))
         ahead = (mean > best) & ~keep
         best, best_effect = np.where(ahead, mean, best), np.where(ahead, own, best_effect)
+        best_noise = np.where(ahead[:, None, None], noise, best_noise)
         kept += keep
         false += keep & (own == 0)
         good += own > 0
@@ -128,7 +155,7 @@ def table(nights: int) -> str:
         cells = [f"{least:g}", f"{100 * real:.0f} %", f"{effect:g}" if real else ""]
         cells.append("by results" if adaptive else "any")
         for rule in RULES.values():
-            rates = simulate(rule, least, real, effect, adaptive, nights)
+            rates = simulate(rule, Night(least, real, effect, 0.5 * adaptive), nights)
             found = f" · {100 * rates.found:.0f}" if real else ""
             cells.append(f"{100 * rates.false:.1f}{found} · {rates.seeds:.1f}")
         lines.append(f"| {' | '.join(cells)} |")

@@ -37,18 +37,17 @@ def test_the_simulator_decides_as_the_judge_does(row: int) -> None:
             assert found == (verdict.outcome, verdict.pairs.seeds), (name, effect, draw)
 
 
-def test_the_simulator_has_the_test_and_the_levels_of_the_judge() -> None:
+def test_the_simulator_has_the_test_of_the_judge() -> None:
     draws = rules.normal(np.random.default_rng(8), np.ones((3, 2)), 4, 50)
     for seeds in (2, 3, 4):
-        mean, error, degrees = draws.test(rules.CHOSEN, seeds)
+        mean, error, shape = draws.test(rules.CHOSEN, seeds)
+        p = rules.p_values(mean, error, shape)
         for draw in range(50):
             test = t_test(draws.arm[draw, :, :seeds] - draws.baseline[draw, :, :seeds])
             assert test is not None
-            expected = (test.mean, test.error, test.degrees)
-            assert (mean[draw], error[draw], degrees[draw]) == pytest.approx(expected, rel=1e-9)
-    found = rules.look_levels(rules.CHOSEN, 3, (2, 3, 4), 0.05)
-    # two independent simulations of 20,000 and 100,000 draws
-    assert found == pytest.approx(look_levels(3, (2, 3, 4), 0.05), rel=0.15)
+            assert (mean[draw], error[draw], p[draw]) == pytest.approx(
+                (test.mean, test.error, test.p), rel=1e-9
+            )
 
 
 @pytest.mark.parametrize("kind", ["normal", "one scene in eight stands out"])

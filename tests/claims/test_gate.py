@@ -22,12 +22,16 @@ from gsbench.claims.gate import (
     SPARE,
     WORSE,
     Gate,
+    Step,
     declare_gate,
     describe,
+    describe_step,
     deviations,
     first_worse,
     most_steps,
     result_of,
+    step_result,
+    too_small_to_place,
 )
 from gsbench.claims.stopping import run_looks
 from gsbench.cli import run
@@ -102,7 +106,7 @@ def test_the_gate_passes_fails_or_stays_undecided_by_effect_and_noise(
 
 
 def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_path: Path) -> None:
-    verdict, most = gate(tmp_path, 0.3, 0.02, asked(least="0.35"))
+    verdict, most = gate(tmp_path, 0.25, 0.02, asked(least="0.35"))
     assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
     assert "not worse by 0.35 in PSNR" in describe(verdict)
     assert most < 4
@@ -293,3 +297,49 @@ def test_bisecting_skips_commits_that_are_undecided_or_do_not_train() -> None:
     assert len(asked_for) <= most_steps(12)
     # a commit that does not train costs no step
     assert first_worse(12, lambda commit: WORSE if commit == 12 else None) == (0, 12)
+
+
+# ---- steps of a bisection
+
+
+def step(tmp_path: Path, loss: float, place: str, noise: float = 0.01) -> tuple[str, str]:
+    """The result and words of a commit like the first one, the last one, or between both."""
+    losses = {"first": 0.0, "last": loss, "between": loss / 2}
+    good, last = trials(tmp_path / "a", 0.0, noise), trials(tmp_path / "b", -loss, noise)
+    # the same noise would make two versions equal to the last bit
+    new = trials(tmp_path / "c", -losses[place] + 0.0017, noise)
+    asked_step = Step(asked(), 0.05 / 7, lambda: good, lambda: last, lambda: new)
+    verdicts = asked_step.judged()
+    assert len({one.final for one in verdicts}) == 1
+    return step_result(verdicts), describe_step(verdicts)
+
+
+@pytest.mark.parametrize("loss", [0.06, 0.3])
+@pytest.mark.parametrize(("place", "result"), [("first", PASSED), ("last", WORSE)])
+def test_a_loss_below_the_least_that_matters_is_placed_too(
+    tmp_path: Path, loss: float, place: str, result: str
+) -> None:
+    found, words = step(tmp_path, loss, place)
+    assert found == result
+    assert words.startswith(f"{result}; against the first: ")
+    assert "; against the last: " in words
+
+
+def test_a_commit_between_both_ends_or_within_the_noise_is_undecided(tmp_path: Path) -> None:
+    assert step(tmp_path / "x", 0.3, "between")[0] == NOT_DECIDED
+    assert step(tmp_path / "y", 0.06, "first", noise=0.3)[0] == NOT_DECIDED
+
+
+def test_a_commit_that_is_equal_to_an_end_is_like_it(tmp_path: Path) -> None:
+    good, last = trials(tmp_path / "a", 0.0, 0.01), trials(tmp_path / "b", -0.3, 0.01)
+    for new, result in ((good, PASSED), (last, WORSE)):
+        verdicts = Step(asked(), 0.01, lambda: good, lambda: last, lambda new=new: new).judged()
+        assert step_result(verdicts) == result
+        assert "equal to the last bit" in describe_step(verdicts)
+
+
+def test_a_loss_that_steps_cannot_see_is_said_before_they_begin(tmp_path: Path) -> None:
+    good, *bad = (trials(tmp_path / str(loss), -loss, 0.1) for loss in (0.0, 0.1, 0.5))
+    small, large = (Gate(asked(), lambda: good, lambda one=one: one).judged()[0] for one in bad)
+    assert too_small_to_place(large, 0.05 / 7) == ""
+    assert "the search may end with a range" in too_small_to_place(small, 0.05 / 7)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,6 +33,16 @@ def test_plan_names_designs_that_suffice(pilots, capsys):
     assert "sfm-volumetric against sfm-adc" in out
     assert "(from 9 pairs on 3 scenes)" in out
     assert "scenes like these (from 6 scenes on)" in out
+
+
+def test_plan_answers_for_the_command_given(pilots, capsys):
+    trials = {}
+    for words in (("sweep",), ("looks",), ("check", "--questions", "4"), ("ledger",)):
+        assert plan(["exp", "--difference", "0.5", "--for", *words], pilots) == 0
+        out = capsys.readouterr().out
+        trials[words[0]] = int(re.search(r"on these scenes.*?\((\d+) trials", out)[1])
+        assert re.search(r"only within 0\.\d+ to 1\.\d+ times \(80 % of pilots\)", out)
+    assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
 
 
 def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, capsys):

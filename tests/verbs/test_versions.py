@@ -71,6 +71,7 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainings: Trainings)
         ["scene=courtyard"],
         frozenset({"courtyard"}),
         declaration,
+        0.05 / most_steps(2),
         trees,
         COMMITS,
     )
@@ -137,7 +138,8 @@ def test_the_same_question_continues_the_same_search(monkeypatch, tmp_path):
     assert len({first.home, *others}) == 4
     # all gates together err in 5 % at most
     gates = most_steps(2)
-    assert first.declaration.error_rate == pytest.approx(0.05 / gates)
+    assert first.share == pytest.approx(0.05 / gates)
+    assert first.declaration.error_rate == pytest.approx(2 * first.share)
     with pytest.raises(InputError, match="at least 2 seeds, and there is 0"):
         begin("abcd", seeds=-1)
     example.values["scene"]["path"] = "photos"

@@ -240,7 +240,7 @@ def _at_looks(asked: Verdict, looks: tuple[int, ...], rate: float) -> Verdict:
 def _decide(verdict: Verdict, answer: Answer) -> Verdict:
     """The verdict with its outcome; undecided if it rests on outlying trials."""
     question, least, pairs = verdict.question, verdict.least, verdict.pairs
-    level = answer.level if question.scenes else answer.level / verdict.family
+    level = answer.level / verdict.family
     about_like_these = judge_like_these(pairs.differences.mean(axis=1), question.sign, least, level)
     outcome = answer.outcome(question.sign, least)
     outcome_without, rests_on_outlying = None, False

@@ -5,10 +5,12 @@ scenes, each with K pairs of trainings. The views of a trial share its training,
 smallest independent unit.
 
 *These scenes*: the mean over the given scenes, each with the same weight. Scenes are fixed, pairs
-within them are the units, and each scene has its own variance (Welch 1947; Satterthwaite 1946).
-*Scenes like these*, from ``MIN_SCENES`` scenes on: the sign test of the number of scenes that gain,
-with the exact interval of the median effect. It assumes nothing about the distribution of effects;
-tests of the mean effect fail if one scene in eight differs much from the others.
+within them are the units, and each scene has its own variance (`gsbench.analysis.thresholds`).
+*Scenes like these*, from ``MIN_SCENES`` scenes on: the sign test of the number of scenes whose
+measured mean gains. It is exact for `exact_for` and for nothing else: the measured means have the
+noise of trainings, so the median effect without noise can have the other sign. It assumes nothing
+about the distribution of effects; tests of the mean effect fail if one scene in eight differs much
+from the others.
 
 Planning: the paired difference of scene s and seed k is ``mean + scene effect + noise``. The scene
 effect has one deviation between scenes, the noise another one between trainings of a scene. Both
@@ -27,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from gsbench.analysis.thresholds import Region, evenness
 from gsbench.errors import InputError
 from gsbench.runs.experiments import ERROR_RATE
 
@@ -41,13 +44,10 @@ SUPPORTED, REFUTED, TOO_SMALL, UNDECIDED = (
 )
 Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
 
-# K / (K + 2) of Satterthwaite's degrees of freedom count, for K seeds. All of them are too many if
-# one scene is noisier than the others, since its deviation is often underestimated. With this share
-# the test errs in at most 5 %, as simulations show (docs/verdict.md, "Rules that were tried").
-CAUTION = 2
 SPENDING_POWER = 1.5  # exponent of the error-spending function of looks
 DRAWS = 100_000  # simulated sequences of trainings, for the error rates of looks
-NOISY = 10.0  # in a part of these sequences, one scene is so many times as noisy as the others
+NOISY = (1.0, 4.0, 15.0)  # in these sequences, one scene is so many times as noisy as the others
+DRIFT = 3.0  # deviation of a drift in a part of them, so that rare errors are seen more often
 FIRST_LOOK = 2  # seeds: one training of each arm does not show how trainings differ
 # seeds up to which each seed is a look; more looks would save little and make bounds less precise
 EACH_UP_TO = 12
@@ -70,25 +70,36 @@ class Interval:
 
 @dataclass(frozen=True)
 class StudentT:
-    """Student's t test of a mean with a standard error and degrees of freedom."""
+    """Student's t test of a mean with a standard error and degrees of freedom.
+
+    A mean over several scenes has the thresholds of its ``region`` instead.
+    """
 
     mean: float
     error: float
     degrees: float
+    region: Region | None = None
 
     @property
     def p(self) -> float:
         """The two-sided p. Without any spread it is 0, or 1 if the mean is 0."""
         if self.error == 0:
             return 1.0 if self.mean == 0 else 0.0
-        return float(2 * special.stdtr(self.degrees, -abs(self.mean / self.error)))
+        size = abs(self.mean / self.error)
+        if self.region is not None:
+            return float(self.region.p_values(np.array([size]))[0])
+        return float(2 * special.stdtr(self.degrees, -size))
 
     def interval(self, alpha: float = ALPHA) -> Interval:
         """The values that the test with error rate ``alpha`` does not reject.
 
         The interval excludes 0 exactly if p < alpha.
         """
-        half = float(special.stdtrit(self.degrees, 1 - alpha / 2)) * self.error
+        if self.region is not None:
+            threshold = float(self.region.limits(alpha)[0])
+        else:
+            threshold = float(special.stdtrit(self.degrees, 1 - alpha / 2))
+        half = threshold * self.error
         return Interval(self.mean - half, self.mean + half)
 
 
@@ -109,22 +120,9 @@ def t_test(differences: Array) -> StudentT | None:
         )
     # Without the shift, rounding would give equal pairs a tiny variance in place of 0.
     variances = (differences - differences[:, :1]).var(axis=1, ddof=1)
-    error, degrees = error_and_degrees(variances[None], seeds)
-    return StudentT(float(differences.mean()), float(error[0]), float(degrees[0]))
-
-
-def error_and_degrees(variances: Array, seeds: int) -> tuple[Array, Array]:
-    """The standard errors and degrees of freedom [D] of means over scenes.
-
-    ``variances`` [D, S] are those of the scenes; each scene has ``seeds`` pairs.
-    """
-    total, squares = variances.sum(axis=1), (variances**2).sum(axis=1)
-    satterthwaite = np.divide(
-        total**2 * (seeds - 1), squares, out=np.full_like(total, seeds - 1.0), where=squares > 0
-    )
-    return np.sqrt(total / seeds) / variances.shape[1], np.maximum(
-        seeds - 1, seeds / (seeds + CAUTION) * satterthwaite
-    )
+    own = None if scenes == 1 else Region(scenes, seeds, evenness(variances[None]))
+    error = float(np.sqrt(variances.sum() / seeds)) / scenes
+    return StudentT(float(differences.mean()), error, seeds - 1, own)
 
 
 def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
@@ -222,7 +220,7 @@ class LikeThese:
     In ``helped`` of them the difference has the asked sign. In ``beyond`` of them it is at
     least the least that matters; None if that is not known. ``share`` is the exact interval
     (Clopper and Pearson 1934) of the share of such scenes with the sign. ``median`` is the
-    interval of their median effect, from order statistics; None with too few scenes for
+    interval of the median of such means, from order statistics; None with too few scenes for
     ``level``. ``p`` is that of the sign test.
     """
 
@@ -245,6 +243,15 @@ class LikeThese:
         if self.needed is None:
             return 0.0
         return float(special.bdtrc(self.needed - 1, self.scenes, share))
+
+
+def exact_for(seeds: int) -> str:
+    """What "better" about scenes like these says, in words; "worse" says the opposite."""
+    mean = "one training" if seeds == 1 else f"the mean of {seeds} trainings"
+    return f"on a new scene like these, {mean} of the arm would more often be better"
+
+
+EXACT_FOR_PEOPLE = "a new person, asked the same pairs, would more often prefer it"
 
 
 def judge_like_these(
@@ -316,59 +323,103 @@ def plan_looks(maximum: int) -> tuple[int, ...]:
 
 
 @cache
-def look_levels(scenes: int, looks: tuple[int, ...], alpha: float) -> tuple[float, ...]:
+def look_levels(
+    scenes: int, looks: tuple[int, ...], alpha: float, draws: int = DRAWS
+) -> tuple[float, ...]:
     """The error rate of the interval at each look; all looks together have the rate ``alpha``.
 
     These are repeated confidence intervals (Jennison and Turnbull 1989): at whichever look one
     stops, and for whatever reason, the chance of a false statement is at most ``alpha``. Looks
     up to the share t of all seeds may spend ``alpha t^1.5`` of it (Lan and DeMets 1983; Kim and
-    DeMets 1987). Looks share trials, so their errors overlap: the rates come from `DRAWS`
+    DeMets 1987). Looks share trials, so their errors overlap: the rates come from ``draws``
     simulated sequences of trainings.
     """
     # Equally noisy scenes alone would not do: the test is cautious there, so each look would get
-    # all that may be spent. The looks err most if one scene is so noisy that it hides the others.
-    simulated = [_p_at_looks(scenes, looks, noise) for noise in (1.0, NOISY)]
-    simulated += [_p_at_looks(1, looks)]
-    error_free = np.ones((len(simulated), DRAWS), dtype=bool)
-    levels: list[float] = []
-    for look, seeds in enumerate(looks):
-        level = spendable = alpha * (seeds / looks[-1]) ** SPENDING_POWER
-        for p, free in zip(simulated, error_free, strict=True):
-            errors_left = round(spendable * DRAWS) - int(np.count_nonzero(~free))
-            highest = (
-                np.partition(p[look][free], errors_left)[errors_left] if errors_left > 0 else 0.0
-            )
-            level = min(level, float(highest))
-        for p, free in zip(simulated, error_free, strict=True):
-            free &= p[look] >= level
-        levels.append(level)
+    # all that may be spent.
+    simulated = [_simulate_looks(1, looks, draws)]
+    if scenes > 1:
+        simulated += [_simulate_looks(scenes, looks, draws, noise) for noise in NOISY]
+    # The test itself keeps the level of the first look.
+    levels = [alpha * (looks[0] / looks[-1]) ** SPENDING_POWER]
+    error_free = [np.ones(draws, dtype=bool) for _ in simulated]
+    spent = np.full(len(simulated), levels[0])
+    for look, seeds in enumerate(looks[1:], 1):
+        most = level = alpha * (seeds / looks[-1]) ** SPENDING_POWER
+        new = []
+        for one, free, used in zip(simulated, error_free, spent, strict=True):
+            free &= one.sizes[look - 1] <= one.limits(look - 1, levels[-1])
+            errors = np.flatnonzero(free & (one.sizes[look] > one.limits(look, most)))
+            p = one.p_values(look, errors)
+            order = np.argsort(p)
+            p, weights = p[order], one.weights[errors][order]
+            new.append((p, weights))
+            over = np.searchsorted(weights.cumsum(), most - used, side="right")
+            level = min(level, p[over] if over < len(p) else most)
+        spent += [weights[p < level].sum() for p, weights in new]
+        levels.append(float(level))
     return tuple(levels)
 
 
-@cache
-def _p_at_looks(scenes: int, looks: tuple[int, ...], noise: float = 1.0) -> NDArray[np.float64]:
-    """The p at each look [L, DRAWS] of simulated sequences without an effect.
+@dataclass(frozen=True, eq=False)
+class _Sequences:
+    """Simulated sequences of trainings without an effect, with ``weights`` [D] that sum to 1.
 
-    The first of ``scenes`` is ``noise`` times as noisy as the others.
+    ``sizes`` [L, D] are means in standard errors at each look; ``even`` [L, D] say how evenly the
+    scenes share the variance.
+    """
+
+    scenes: int
+    looks: tuple[int, ...]
+    sizes: NDArray[np.float64]
+    even: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+    def limits(self, look: int, level: float) -> NDArray[np.float64]:
+        return Region(self.scenes, self.looks[look], self.even[look]).limits(level)
+
+    def p_values(self, look: int, which: NDArray[np.int64]) -> NDArray[np.float64]:
+        found = Region(self.scenes, self.looks[look], self.even[look, which])
+        return found.p_values(self.sizes[look, which])
+
+
+@cache
+def _simulate_looks(
+    scenes: int, looks: tuple[int, ...], draws: int, noise: float = 1.0
+) -> _Sequences:
+    """Sequences in which the first of ``scenes`` is ``noise`` times as noisy as the others.
+
+    Two parts of the sequences have a drift, up to the first look or to the last, that makes errors
+    more frequent. Weights undo it (importance sampling). The drift of a scene is proportional to
+    its variance, so that the weights follow from the sum over scenes alone.
     """
     rng = np.random.default_rng(0)
-    # of the differences of each scene
-    totals, squares = np.zeros((DRAWS, scenes)), np.zeros((DRAWS, scenes))
     deviations = np.where(np.arange(scenes) == 0, noise, 1.0)
-    p_values = []
+    of_sum = math.sqrt((deviations**2).sum())
+    part = np.arange(draws) % 3  # no drift, until the first look, until the last
+    drift = rng.normal(0, DRIFT, (draws, 1)) * deviations**2 / of_sum
+    # of the differences of each scene
+    totals, squares = np.zeros((draws, scenes)), np.zeros((draws, scenes))
+    sizes, even, sums = (list[NDArray[np.float64]]() for _ in range(3))
     seeds_before = 0
     for seeds in looks:
         new = seeds - seeds_before
+        drifts = (part == 2) / math.sqrt(looks[-1]) + (part == 1) * (not sizes) / math.sqrt(seeds)
         # The sum of the new seeds' differences, and the sum of their squares: drawing each seed
         # would be slower.
         added = deviations * rng.normal(0, math.sqrt(new), totals.shape)
+        added += new * drifts[:, None] * drift
         within = rng.chisquare(new - 1, totals.shape) if new > 1 else 0.0
         totals += added
         squares += added**2 / new + deviations**2 * within
-        error, degrees = error_and_degrees((squares - totals**2 / seeds) / (seeds - 1), seeds)
-        p_values.append(2 * special.stdtr(degrees, -np.abs(totals.mean(axis=1) / seeds / error)))
+        variances = np.maximum(squares - totals**2 / seeds, 0) / (seeds - 1)
+        sums.append(totals.sum(axis=1) / of_sum / math.sqrt(seeds))
+        sizes.append(np.abs(totals.sum(axis=1)) / np.sqrt(seeds * variances.sum(axis=1)))
+        even.append(evenness(variances))
         seeds_before = seeds
-    return np.array(p_values)
+    spread = 1 + DRIFT**2
+    drifted = [np.exp(one**2 / 2 * (1 - 1 / spread)) / math.sqrt(spread) for one in sums]
+    weights = 3 / (1 + drifted[0] + drifted[-1]) / draws
+    return _Sequences(scenes, looks, np.array(sizes), np.array(even), weights)
 
 
 @dataclass(frozen=True)
@@ -443,8 +494,10 @@ def power(design: Design, difference: float, components: Components, like_these:
     return float(special.bdtrc(needed - 1, design.scenes, chance))
 
 
-def power_of_mean(deviation: float, design: Design, difference: float) -> float:
-    """The chance that the t test of these scenes sees ``difference``.
+def power_of_mean(
+    deviation: float, design: Design, difference: float, level: float = ALPHA
+) -> float:
+    """The chance that the t test of these scenes sees ``difference`` at ``level``.
 
     Trainings differ by ``deviation``. The test estimates each scene's variance and its own
     degrees of freedom. Given these, the power is that of a normal mean; the result is its
@@ -453,19 +506,19 @@ def power_of_mean(deviation: float, design: Design, difference: float) -> float:
     if deviation == 0:
         return 1.0 if difference else 0.0
     shift = abs(difference) / deviation * math.sqrt(design.scenes * design.seeds)
-    return float(special.ndtr(shift - _thresholds(design)).mean())
+    return float(special.ndtr(shift - _thresholds(design, level)).mean())
 
 
 @cache
-def _thresholds(design: Design) -> NDArray[np.float64]:
+def _thresholds(design: Design, level: float) -> NDArray[np.float64]:
     """The smallest means [DESIGN_DRAWS] that are significant, in true standard errors.
 
     Each belongs to one draw of simulated variances of the scenes.
     """
     freedom = design.seeds - 1
     variances = np.random.default_rng(0).chisquare(freedom, (DESIGN_DRAWS, design.scenes)) / freedom
-    error, degrees = error_and_degrees(variances, design.seeds)
-    return special.stdtrit(degrees, 1 - ALPHA / 2) * error * math.sqrt(design.scenes * design.seeds)
+    error = np.sqrt(variances.mean(axis=1))
+    return Region(design.scenes, design.seeds, evenness(variances)).limits(level) * error
 
 
 def seeds_needed(deviation: float, scenes: int, difference: float) -> int | None:

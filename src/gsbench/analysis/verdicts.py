@@ -24,7 +24,14 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import ALPHA, TOO_SMALL, UNDECIDED, Outcome, seeds_needed
+from gsbench.analysis.statistics import (
+    ALPHA,
+    TOO_SMALL,
+    UNDECIDED,
+    Outcome,
+    exact_for,
+    seeds_needed,
+)
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import some_of
 
@@ -406,7 +413,7 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
         return ""
     word = words.get(like.outcome, like.outcome)
     least = "" if like.beyond is None else f", by the least that matters in {like.beyond}"
-    median = "" if like.median is None else f"; median effect {verdict.shown_interval(like.median)}"
+    median = "" if like.median is None else f"; median {verdict.shown_interval(like.median)}"
     level = f"at {100 * (1 - like.level):.3g} %"
     if like.needed is None:
         needed = f"{level}, so few scenes cannot decide it"
@@ -419,7 +426,7 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
     return (
         f"scenes like these: {word}; {what} in {like.helped} of {like.scenes}{least} (sign test p "
         f"{p_text(like.p)}, {100 * like.share.low:.0f} to {100 * like.share.high:.0f} % of such "
-        f"scenes{median}); {needed}"
+        f"scenes{median}); {needed}; exact for: {exact_for(verdict.pairs.seeds)}"
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from gsbench.analysis.images import ViewComparison, compare_view
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import TrialResult
-from gsbench.analysis.statistics import UNDECIDED, LikeThese
+from gsbench.analysis.statistics import EXACT_FOR_PEOPLE, UNDECIDED, LikeThese
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.verdicts import WORDS, PairVerdicts, p_text
 from gsbench.analysis.votes import PairVotes, RoundVerdict, judge_round, view_gains
@@ -79,7 +79,8 @@ def _describe_pair(pair: PairVotes, final: bool) -> list[str]:
     return [
         f"{pair.arm} against {pair.baseline}: {_share(pair)} ({pair.wins} for it, {pair.losses} "
         f"against it, {pair.ties} without a difference{parts}).",
-        f"People like these, on these views: {_statement(pair.people, 'people', final)}.",
+        f"People like these, on these views: {_statement(pair.people, 'people', final)}; exact "
+        f"for: {EXACT_FOR_PEOPLE}.",
         f"Scenes like these, for these people: {_statement(pair.scenes, 'scenes', final)}.",
     ]
 

@@ -13,7 +13,17 @@ from typing import Any
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import FIRST_LOOK, REFUTED, SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.analysis.statistics import (
+    FIRST_LOOK,
+    POWER,
+    REFUTED,
+    SUPPORTED,
+    TOO_SMALL,
+    Design,
+    look_levels,
+    plan_looks,
+    power_of_mean,
+)
 from gsbench.claims.file import LeastEffect, read_least
 from gsbench.claims.stopping import facts_for
 from gsbench.errors import InputError
@@ -22,7 +32,7 @@ from gsbench.runs.experiments import ERROR_RATE, Declaration, Question, declared
 from gsbench.words import counted, did_you_mean, least_text, listed
 
 # replace the configuration hash in trials' keys, since versions may share settings
-BASELINE, NEW = "baseline", "new"
+BASELINE, NEW, LAST = "baseline", "new", "last"
 PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
 
 ReadTrials = Callable[[], Iterable[TrialResult]]
@@ -207,7 +217,101 @@ def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult
     return [replace(trial, config_hash=version) for trial in trials]
 
 
-# ---- bisection: the search for the commit that made a trainer worse, in which each step is a gate
+# ---- bisection: the search for the commit that made a trainer worse
+#
+# The last commit is compared with the first. Each other commit is compared with both. It is as good
+# as the first or as bad as the last. So it passes if it is shown to be better than the last, and is
+# worse if it is shown to be worse than the first. Only one of its two questions can then be
+# answered wrongly, and only on one side.
+
+
+@dataclass(frozen=True)
+class Step:
+    """A commit between a first one and a worse last one.
+
+    ``gate`` is the declaration of the last commit; ``share`` is the chance that a step is wrong.
+    """
+
+    gate: Declaration
+    share: float
+    good: ReadTrials
+    last: ReadTrials
+    new: ReadTrials
+
+    @property
+    def declaration(self) -> Declaration:
+        """The questions against the first and the last commit."""
+        (question,) = self.gate.questions
+        of_last = {
+            scene: (old.removesuffix(BASELINE) + LAST, new)
+            for scene, (old, new) in question.scenes.items()
+        }
+        against_last = replace(question, baseline=Arm("", LAST), scenes=of_last, name="last")
+        # The two share the error rate, and half of a share is that of one side.
+        questions = (question, against_last)
+        return replace(self.gate, questions=questions, error_rate=4 * self.share)
+
+    def judged(self) -> list[Verdict]:
+        """The two verdicts so far; both are final as soon as the step has a result."""
+        sides = {BASELINE: self.good, LAST: self.last, NEW: self.new}
+        trials = [trial for side, read in sides.items() for trial in _as_version(side, read())]
+        verdicts = judge(trials, self.declaration)
+        known = step_result(verdicts) != NOT_DECIDED
+        return [replace(one, final=one.final or known) for one in verdicts]
+
+
+def step_result(verdicts: Sequence[Verdict]) -> str:
+    """``passed`` or ``worse``; ``undecided`` also for a commit that is between both ends."""
+    first, last = verdicts
+    if first.equal or last.equal:
+        return NOT_DECIDED if first.equal and last.equal else PASSED if first.equal else WORSE
+    worse = first.outcome == REFUTED or _known_side(first) < 0
+    better = last.outcome == SUPPORTED or _known_side(last) > 0
+    return NOT_DECIDED if worse == better else WORSE if worse else PASSED
+
+
+def describe_step(verdicts: Sequence[Verdict]) -> str:
+    """The result with both verdicts in a sentence."""
+    parts = [
+        f"{end}: {_size(one)}"
+        for end, one in zip(("against the first", "against the last"), verdicts, strict=True)
+    ]
+    return f"{step_result(verdicts)}; {'; '.join(parts)}"
+
+
+def too_small_to_place(verdict: Verdict, share: float) -> str:
+    """A warning if steps will often not see the loss of the last commit; "" else."""
+    deviation, most = verdict.deviation, len(verdict.question.seeds)
+    if not deviation or verdict.mean is None:
+        return ""
+    looks = plan_looks(most)
+    level = look_levels(len(verdict.pairs.rows), looks, 2 * share)[-1]
+    chance = power_of_mean(deviation, Design(len(verdict.pairs.rows), most), verdict.mean, level)
+    if chance >= POWER:
+        return ""
+    return (
+        f"the last commit differs by {verdict.shown(verdict.mean)}, which a step with "
+        f"{counted(most, 'seed')} shows in only {100 * chance:.0f} of 100 cases: the search may "
+        "end with a range; allow more --seeds or scenes"
+    )
+
+
+def _known_side(verdict: Verdict) -> int:
+    """1 or -1 if a difference too small to matter is known to be better or worse; 0 else."""
+    interval, sign = verdict.interval, verdict.question.sign
+    if verdict.outcome != TOO_SMALL or interval is None or not interval.excludes_zero():
+        return 0
+    return sign if interval.low > 0 else -sign
+
+
+def _size(verdict: Verdict) -> str:
+    if verdict.equal:
+        return "equal to the last bit"
+    if verdict.mean is None or verdict.interval is None:
+        return "; ".join(("trials are missing", *verdict.notes))
+    interval = verdict.shown_interval(verdict.interval)
+    return f"{verdict.shown(verdict.mean)} ({interval}), {counted(verdict.pairs.seeds, 'seed')}"
+
 
 SPARE = 2  # undecided commits that the search skips before it ends with a range
 
@@ -228,8 +332,8 @@ def first_worse(count: int, result: Callable[[int], str | None]) -> tuple[int, i
     """The last good and the first worse of the commits 0 to ``count``, as (good, worse).
 
     Commits between the two remain unknown. Commit 0 is good, and quality is assumed to change
-    once. ``result`` gives a commit's result against commit 0: ``PASSED``, ``WORSE``,
-    ``NOT_DECIDED``, or None if it does not train, which is no step. Returns None if the last
+    once. ``result`` gives a commit's result: ``PASSED``, ``WORSE``, ``NOT_DECIDED``, or
+    None if it does not train, which is no step. Returns None if the last
     commit is not worse.
 
     Examples:

@@ -11,13 +11,21 @@ from typing import Any
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.pairing import BASELINE, pair
+from gsbench.analysis.planning import COMMANDS, UNSURE, Purpose, deviation_range
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment, read_experiment
-from gsbench.analysis.statistics import MIN_SCENES, Components, designs_needed, estimate_components
+from gsbench.analysis.statistics import (
+    MIN_SCENES,
+    Components,
+    Design,
+    designs_needed,
+    estimate_components,
+)
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
 from gsbench.claims.check import Check, make_page, prepare, recheck, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
+from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, RETRIES
 from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
@@ -27,14 +35,15 @@ from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch
 from gsbench.launch.record import declare_questions
 from gsbench.launch.states import describe_plan
-from gsbench.runs.experiments import Question, read_declarations
+from gsbench.runs.experiments import ERROR_RATE, Question, read_declarations
 from gsbench.runs.layout import SEED
-from gsbench.verbs.arguments import ArgumentParser, names, path
+from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
 from gsbench.words import counted
 
 HTML = "claims.html"
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 DEFAULT_METRIC = "psnr"
+MOST_QUESTIONS = 10_000
 
 
 def check(argv: Sequence[str], runs: Path) -> int:
@@ -169,6 +178,19 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("plan", "An estimate from an experiment's trials, for 80 % power.")
     parser.add_argument("experiment")
     parser.add_argument(
+        "--for",
+        dest="command",
+        choices=COMMANDS,
+        default=COMMANDS[0],
+        help="what is planned: a sweep (the default), a sweep that stops when decided (looks), a "
+        "check of claims, a gate, or a ledger of ideas",
+    )
+    parser.add_argument(
+        "--questions",
+        type=whole_number(MOST_QUESTIONS),
+        help="pairs of arms, claims, or planned ideas that share the error rate (1; ledger: 40)",
+    )
+    parser.add_argument(
         "--metric", default="psnr", help="such as psnr (the default), ssim, lpips_squeeze"
     )
     parser.add_argument(
@@ -208,11 +230,23 @@ def plan(argv: Sequence[str], runs: Path) -> int:
             print(fault)
             continue
         components = estimate_components([row.arm - row.baseline for row in paired.rows])
-        print("\n".join([f"{arm} against {baseline}", *_lines(components, metric, difference)]))
+        purpose = _purpose(options.command, options.questions)
+        lines = _lines(components, metric, difference, purpose)
+        print("\n".join([f"{arm} against {baseline}", *lines]))
     return 0
 
 
-def _lines(components: Components, metric: Quantity, difference: float) -> list[str]:
+def _purpose(command: str, questions: int | None) -> Purpose:
+    """What a command asks of its trials; ideas share a rate of which each takes one side."""
+    if command == "ledger":
+        rate = 2 * RATE / (questions or IDEAS)
+        return Purpose(rate, looks=True, give_up=GIVE_UP, alone=RETRIES)
+    return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
+
+
+def _lines(
+    components: Components, metric: Quantity, difference: float, purpose: Purpose
+) -> list[str]:
     digits = f".{metric.decimals + 1}f"
     between = ""
     if components.between is not None:
@@ -227,7 +261,11 @@ def _lines(components: Components, metric: Quantity, difference: float) -> list[
         if like_these and components.between is None:
             lines.append(f"  for {group}: run pilot trials on a second scene")
             continue
-        designs = designs_needed(difference, components, like_these)
+        designs = (
+            designs_needed(difference, components, like_these)
+            if like_these
+            else purpose.designs(difference, components.within)
+        )
         designs.sort(key=lambda design: (design.trials, design.scenes))
         shown = ", ".join(
             f"{design.scenes} × {design.seeds} ({design.trials} trials)"
@@ -235,7 +273,20 @@ def _lines(components: Components, metric: Quantity, difference: float) -> list[
         )
         what = f"  to see {difference:g} on {group}, scenes × seeds"
         lines.append(f"{what}: {shown or 'none that can be run'}")
+        if designs and not like_these:
+            lines.append(_unsure(components, difference, purpose, designs[0]))
     return lines
+
+
+def _unsure(components: Components, difference: float, purpose: Purpose, design: Design) -> str:
+    """How the power of the first design depends on what the pilot does not know."""
+    low, high = deviation_range(components)
+    least, most = (100 * purpose.power(design, difference, one) for one in (high, low))
+    return (
+        f"  the pilot knows the variation between seeds only within {low / components.within:.2f} "
+        f"to {high / components.within:.2f} times ({100 * UNSURE:.0f} % of pilots): so "
+        f"{design.scenes} × {design.seeds} sees it in {least:.0f} to {most:.0f} of 100 cases"
+    )
 
 
 def _above_zero(text: str) -> float:

@@ -15,6 +15,7 @@ from gsbench.analysis.table_formats import to_markdown
 from gsbench.app.command import check_trackers, compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
+from gsbench.claims.ledger import IDEAS, RATE
 from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
 from gsbench.config.command_words import key_of, typed_permissions
 from gsbench.config.compose import Trial
@@ -31,7 +32,6 @@ from gsbench.verbs.arguments import ArgumentParser, names, whole_number
 from gsbench.words import did_you_mean, listed
 
 EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
-IDEAS, RATE = 40, 0.1  # the defaults of a night
 MOST_IDEAS = 10_000
 OWN = ("name", "runs", "eval.primary")  # settings that the ledger gives itself
 # An idea may change how a model is made, not what it is measured on.

@@ -133,10 +133,9 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
         "bisect",
         "It searches the git repository of this folder: one with a densifier of your own, or "
         "gsbench's checkout. Each "
-        "step trains one commit in a work tree of its own and compares it with GOOD, as gsbench "
-        "gate does; all steps "
-        "share an error rate of 5 %. The same command goes on after a kill. Exit code 0: found, "
-        "3: not found "
+        "step trains one commit in a work tree of its own and compares it with GOOD and BAD; all "
+        "steps share an error rate of 5 %. The same command goes on after a kill. Exit code 0: "
+        "found, 3: not found "
         "(docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
@@ -164,37 +163,52 @@ class CommitSearch:
     settings: Sequence[str]
     scenes: frozenset[str]
     declaration: Declaration
+    share: float  # the chance that a step is wrong
     trees: WorkTrees
     commits: Sequence[tuple[str, str, str]]
     # results so far, by the commit's index
     answers: dict[int, str] = field(default_factory=dict)
 
     def result(self, number: int) -> str | None:
-        """The result of a commit against the first one; None if it does not train.
+        """The result of a commit; None if it does not train.
 
-        What is missing is trained.
+        The last commit is compared with the first one, any other with both. What is missing is
+        trained.
         """
-        good, new = (
-            self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}"
-            for k in (0, number)
+        last = len(self.commits) - 1
+        places = {gates.BASELINE: 0, gates.LAST: last, gates.NEW: number}
+        homes = {
+            version: self.home.parent / f"{self.home.name}_{self.commits[k][0][:HASH_LENGTH]}"
+            for version, k in places.items()
+        }
+        good, bad, new = (lambda home=home: _trials(home) for home in homes.values())
+        asked: gates.Gate | gates.Step = (
+            gates.Gate(self.declaration, good, new)
+            if number == last
+            else gates.Step(self.declaration, self.share, good, bad, new)
         )
-        gate = gates.Gate(self.declaration, lambda: _trials(good), lambda: _trials(new))
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
-            for version, commit, home in ((gates.BASELINE, 0, good), (gates.NEW, number, new)):
-                self._train(
-                    commit, home, [seed for key, seed in planned if key.endswith(f"/{version}")]
-                )
+            for version, place in places.items():
+                seeds = [seed for key, seed in planned if key.endswith(f"/{version}")]
+                self._train(place, homes[version], seeds)
 
         try:
-            (verdict,) = run_looks(self.declaration, gate.judged, run)
+            verdicts = run_looks(asked.declaration, asked.judged, run)
         except TrainingError as error:
-            if number == len(self.commits) - 1 or not _trials(good):
+            if number == last or not good():
                 raise
             self.answers[number] = f"does not train: {error}"
             return None
+        if number < last:
+            self.answers[number] = gates.describe_step(verdicts)
+            return gates.step_result(verdicts)
+        (verdict,) = verdicts
         self.answers[number] = gates.describe(verdict)
-        return gates.result_of(verdict)
+        result = gates.result_of(verdict)
+        if result == gates.WORSE and (warning := gates.too_small_to_place(verdict, self.share)):
+            print(warning, file=sys.stderr)
+        return result
 
     def _train(self, number: int, home: Path, seeds: Sequence[int]) -> None:
         """Train a commit with the seeds that are not done, by the code in its work tree."""
@@ -243,11 +257,12 @@ def _begin(
                 f"scene.path={place}: commits are trained in other folders, so give the whole path"
             )
     arms = {scene: (trial.folder.parent.name,) * 2 for scene, trial in by_scene.items()}
-    # of each step, so that all together err in 5 % at most
+    # of each step, so that all together err in 5 % at most; only "worse" can be wrong, so the
+    # interval with both sides has twice the share
     share = ERROR_RATE / gates.most_steps(len(commits) - 1)
     seeds = range(max(0, options.seeds))
     declaration = gates.declare_gate(
-        options.metric, options.least, arms, seeds, example.values, share
+        options.metric, options.least, arms, seeds, example.values, 2 * share
     )
     settings = [word for word in options.settings if not word.startswith(("name=", "runs="))]
     runs = checked_runs_folder(str(example.files.runs))
@@ -256,7 +271,7 @@ def _begin(
     question = sha256_of([commits[0][0], commits[-1][0], *settings])[:HASH_LENGTH]
     home = runs / f"{example.values['name']}_{question}"
     declaration = declare_questions(home, declaration)
-    return CommitSearch(home, settings, frozenset(by_scene), declaration, trees, commits)
+    return CommitSearch(home, settings, frozenset(by_scene), declaration, share, trees, commits)
 
 
 def _trials(home: Path) -> tuple[TrialResult, ...]:

@@ -1,0 +1,547 @@
+"""Simulate every error rate and power that the documents promise (docs/promises.md).
+
+    python scripts/promises.py                write the table into the page (under an hour)
+    python scripts/promises.py --share 0.05   print it from a twentieth of the draws
+    python scripts/promises.py --only bisect  print the promises whose names have this word
+
+Trials' results with known truth go in where results of trials go in: `judge`, looks, gate, bisect
+and ledger decide as in the verbs; only the training and the files are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.planning import Purpose, deviation_range
+from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, estimate_components, plan_looks
+from gsbench.analysis.votes import judge_votes
+from gsbench.claims import gate as gates
+from gsbench.claims import ledger as rules
+from gsbench.claims.pooling import Study, pool
+from gsbench.claims.stopping import NO_RESULTS, KeyAndSeed, run_looks
+from gsbench.runs import ledger as records
+from gsbench.runs.experiments import Declaration, Question, trial_key
+from gsbench.runs.trial_record import TrialRecord
+
+PAGE = Path(__file__).parents[1] / "docs" / "promises.md"
+SECTION = re.compile(r"(<!-- promises -->\n).*?(<!-- end -->)", re.DOTALL)
+TIME, MEASURED = "2020-01-01T00:00:00Z", "2021-01-01T00:00:00Z"
+METRIC, LEAST = "psnr", 0.1
+
+Array = NDArray[np.float64]
+Rng = np.random.Generator
+Draw = Callable[[Rng], float]  # whether one simulated use is counted
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What is promised: ``limit`` is the most, or (``at_least``) the least, that holds.
+
+    ``draw`` simulates one use.
+    """
+
+    name: str
+    where: str
+    limit: float
+    draws: int
+    draw: Draw
+    at_least: bool = False
+
+    def measure(self, share: float) -> tuple[float, float]:
+        """The mean of the draws, and its standard error."""
+        rng = np.random.default_rng(sum(map(ord, self.name)))
+        found = np.array([self.draw(rng) for _ in range(max(20, round(share * self.draws)))])
+        mean = float(found.mean())
+        # A rate of 0 or 1 in n draws is not known without error.
+        spread = max(float(found.std(ddof=1)), 1 / math.sqrt(len(found)))
+        return mean, spread / math.sqrt(len(found))
+
+    def holds(self, mean: float, error: float) -> bool:
+        """Return whether the promise holds within three standard errors."""
+        side = 1 if self.at_least else -1
+        return side * (mean - self.limit) > -3 * error
+
+
+# ---- trials with known truth
+
+
+def trials(arm: str, values: Array, version: str = "aaaa") -> list[TrialResult]:
+    """Trials of an arm on scenes and seeds with these ``values`` [S, K]."""
+    found = []
+    for place, row in enumerate(values):
+        for seed, value in enumerate(row):
+            scene = f"scene{place}"
+            about: dict[str, Any] = {"scene": scene, "init": "sfm", "densify": arm, "seed": seed}
+            filled = NO_RESULTS | {"metrics": {METRIC: float(value)}, "measured": MEASURED}
+            record = TrialRecord(status="complete", experiment="simulated", **about, **filled)
+            folder = Path("runs", "simulated", scene, f"sfm-{arm}", f"{version}-seed{seed}")
+            found.append(TrialResult(folder, version, record))
+    return found
+
+
+def question(arm: str, scenes: int, seeds: int, least: float = LEAST, **more: Any) -> Question:
+    """Is ``arm`` better than the baseline?"""
+    keys = {
+        f"scene{k}": (
+            trial_key(f"scene{k}", "sfm-adc", "aaaa"),
+            trial_key(f"scene{k}", f"sfm-{arm}", "aaaa"),
+        )
+        for k in range(scenes)
+    }
+    both = {"baseline": Arm("sfm", "adc"), "arm": Arm("sfm", arm)}
+    return Question(
+        metric=METRIC, least=least, scenes=keys, seeds=tuple(range(seeds)), **both, **more
+    )
+
+
+def noise_of(scenes: int, ratio: float) -> Array:
+    """Deviations [S, 1] of pairs; the first scene is ``ratio`` times as noisy."""
+    return np.where(np.arange(scenes) == 0, ratio, 1.0)[:, None] * 0.1
+
+
+def arms(
+    rng: Rng, noise: Array, seeds: int, effects: Sequence[float], correlation: float = 0.0
+) -> list[TrialResult]:
+    """Trials of the baseline and of arms with these effects."""
+    shape = (len(noise), seeds)
+    baseline = rng.standard_normal(shape)
+    found = trials("adc", 25 + noise * math.sqrt(0.5) * baseline)
+    for number, effect in enumerate(effects):
+        own = correlation * baseline
+        own += math.sqrt(1 - correlation**2) * rng.standard_normal(shape)
+        found += trials(f"arm{number}", 25 + effect + noise * math.sqrt(0.5) * own)
+    return found
+
+
+# ---- sweeps and checks
+
+
+def sweep(
+    scenes: int, seeds: int, ratio: float, effect: float, count: int = 1, **more: float
+) -> Draw:
+    """Judge a sweep; 1 if any sign is false, or with an effect if it is found."""
+
+    def draw(rng: Rng) -> float:
+        noise = noise_of(scenes, ratio)
+        error = float(np.sqrt((noise**2).sum() / seeds)) / scenes
+        made = arms(rng, noise, seeds, [effect * error] * count, **more)
+        asked = tuple(question(f"arm{k}", scenes, seeds, 1e-9) for k in range(count))
+        verdicts = judge(made, Declaration(time=TIME, questions=asked))
+        return float(
+            any(
+                one.outcome in ((SUPPORTED,) if effect else (SUPPORTED, REFUTED))
+                for one in verdicts
+            )
+        )
+
+    return draw
+
+
+def in_looks(declaration: Declaration, made: Sequence[TrialResult]) -> list[Verdict]:
+    """The verdicts after all looks; trials are there from the look on that trains them."""
+    by_key = {(one.key, one.seed): one for one in made}
+    done: dict[KeyAndSeed, TrialResult] = {}
+
+    def run(planned: Iterable[KeyAndSeed]) -> None:
+        done.update({key: by_key[key] for key in planned})
+
+    return run_looks(declaration, lambda: judge(list(done.values()), declaration), run)
+
+
+def check(scenes: int, seeds: int, ratio: float, effect: float, claims: int) -> Draw:
+    """A check of claims in looks; 1 if any is false, or with an effect if the first is found."""
+
+    def draw(rng: Rng) -> float:
+        made = arms(rng, noise_of(scenes, ratio), seeds, [effect] * claims)
+        asked = tuple(question(f"arm{k}", scenes, seeds, 1e-9) for k in range(claims))
+        looks = plan_looks(seeds)
+        verdicts = in_looks(Declaration(time=TIME, questions=asked, looks=looks), made)
+        if effect:
+            return float(verdicts[0].outcome == SUPPORTED)
+        return float(any(one.outcome in (SUPPORTED, REFUTED) for one in verdicts))
+
+    return draw
+
+
+def like_these(scenes: int) -> Draw:
+    """Skewed effects with noise: 1 if the statement on a new scene like these is false.
+
+    12 % of scenes gain three deviations of a pair, the others lose a tenth; three seeds. So the
+    median effect is a loss, but of measured means just as many gain.
+    """
+    rng = np.random.default_rng(0)
+    many = np.where(rng.random(400_000) < 0.12, 0.3, -0.01) + rng.normal(0, 0.1 / 3**0.5, 400_000)
+    gains = (many > 0).mean() > 0.5
+
+    def draw(rng: Rng) -> float:
+        effects = np.where(rng.random((scenes, 1)) < 0.12, 0.3, -0.01)
+        shape, part = (scenes, 3), 0.1 * math.sqrt(0.5)
+        made = trials("adc", rng.normal(25, part, shape))
+        made += trials("arm0", 25 + effects + rng.normal(0, part, shape))
+        (verdict,) = judge(
+            made, Declaration(time=TIME, questions=(question("arm0", scenes, 3, 1e-9),))
+        )
+        assert verdict.like_these is not None
+        return float(verdict.like_these.outcome == (REFUTED if gains else SUPPORTED))
+
+    return draw
+
+
+def people_like_these(people: int) -> Draw:
+    """The same of people: 20 % prefer by 90:10, the others the other arm by 52.5:47.5; 45 pairs."""
+    many = np.random.default_rng(0).binomial(45, [[0.9], [0.475]], (2, 400_000)) / 45
+    gains = 0.2 * (many[0] > 0.5).mean() + 0.8 * (many[1] > 0.5).mean() > 0.5
+
+    def draw(rng: Rng) -> float:
+        chance = np.where(rng.random((people, 1)) < 0.2, 0.9, 0.475)
+        votes = np.where(rng.random((people, 45)) < chance, 1, -1)
+        found, _ = judge_votes(votes, [f"{k % 9}" for k in range(45)], 0.05)
+        assert found is not None
+        return float(found.outcome == (REFUTED if gains else SUPPORTED))
+
+    return draw
+
+
+def pooled(rng: Rng) -> float:
+    """Three studies with effects and errors of their own: 1 if the interval misses the mean."""
+    effects = rng.normal(0.2, 0.1, 3) + rng.normal(0, 0.1, 3)
+    studies = [Study(f"study{k}", float(one), None, "paper-1") for k, one in enumerate(effects)]
+    test = pool(studies).test
+    assert test is not None
+    interval = test.interval()
+    return float(not interval.low <= 0.2 <= interval.high)
+
+
+# ---- gate and bisect
+
+
+def gate_question(scenes: int, seeds: int, rate: float = 0.05) -> Declaration:
+    names = {f"scene{k}": ("sfm-adc", "sfm-adc") for k in range(scenes)}
+    values: Mapping[str, Any] = {"eval": {"extra": {}}}
+    found = gates.declare_gate(METRIC, str(LEAST), names, range(seeds), values, rate)
+    return replace(found, time=TIME)
+
+
+def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
+    """A gate of a version with this loss; 1 if its result is the ``counted`` one."""
+    asked = gate_question(scenes, seeds)
+
+    def draw(rng: Rng) -> float:
+        noise = 0.1 * math.sqrt(0.5)
+        old = trials("adc", rng.normal(25, noise, (scenes, seeds)))
+        new = trials("adc", rng.normal(25 - loss, noise, (scenes, seeds)))
+        most = 0
+
+        def run(planned: Iterable[KeyAndSeed]) -> None:
+            nonlocal most
+            most = 1 + max(seed for _, seed in planned)
+
+        found = gates.Gate(
+            asked,
+            lambda: [one for one in old if one.seed < most],
+            lambda: [one for one in new if one.seed < most],
+        )
+        (verdict,) = run_looks(asked, found.judged, run)
+        return float(gates.result_of(verdict) == counted)
+
+    return draw
+
+
+def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -> Draw:
+    """A bisection of ``count`` commits; 1 if it names one that is not the first worse one.
+
+    The loss is in units of the least difference that matters, the deviation that of a pair.
+    """
+    share = 0.05 / gates.most_steps(count)
+    asked = gate_question(scenes, seeds, 2 * share)
+
+    def draw(rng: Rng) -> float:
+        worse = int(rng.integers(1, count + 1))
+        made: dict[int, list[TrialResult]] = {}
+        most: dict[int, int] = {}
+
+        def read(number: int) -> list[TrialResult]:
+            return [one for one in made.get(number, []) if one.seed < most[number]]
+
+        def result(number: int) -> str:
+            for one in (0, count, number):
+                if one not in made:
+                    level = 25 - loss * LEAST * (one >= worse)
+                    noise = deviation * LEAST * math.sqrt(0.5)
+                    made[one] = trials("adc", rng.normal(level, noise, (scenes, seeds)))
+                    most[one] = 0
+            places = {gates.BASELINE: 0, gates.LAST: count, gates.NEW: number}
+
+            def run(planned: Sequence[KeyAndSeed]) -> None:
+                for version, place in places.items():
+                    own = [seed for key, seed in planned if key.endswith(f"/{version}")]
+                    most[place] = max([most[place], *(seed + 1 for seed in own)])
+
+            good, last, new = (lambda place=place: read(place) for place in places.values())
+            if number == count:
+                (verdict,) = run_looks(asked, gates.Gate(asked, good, new).judged, run)
+                return gates.result_of(verdict)
+            step = gates.Step(asked, share, good, last, new)
+            return gates.step_result(run_looks(step.declaration, step.judged, run))
+
+        found = gates.first_worse(count, result)
+        named = found is not None and found[1] - found[0] == 1
+        return float(named and found != (worse - 1, worse))
+
+    return draw
+
+
+# ---- ledger
+
+
+def attempt(declaration: Declaration, made: Sequence[TrialResult]) -> Verdict:
+    """The verdict on an idea after its looks."""
+    most = 0
+
+    def run(planned: Iterable[KeyAndSeed]) -> None:
+        nonlocal most
+        most = 1 + max(seed for _, seed in planned)
+
+    def judged() -> list[Verdict]:
+        return [rules.judge_idea([one for one in made if one.seed < most], declaration)]
+
+    (verdict,) = run_looks(declaration, judged, run)
+    return verdict
+
+
+def night(
+    captures: int, retried: float, correlation: float, ideas: int = 40, seeds: int = 6
+) -> Draw:
+    """A night of ideas without any effect; 1 if an idea is kept.
+
+    A share of them are other tries of what looked best so far, with correlated noise.
+    """
+    keys = {
+        name: {f"scene{k}": trial_key(f"scene{k}", f"sfm-{name}", "aaaa") for k in range(captures)}
+        for name in ("adc", *(f"idea{k}" for k in range(ideas)))
+    }
+    opened = records.Opened(
+        time=TIME,
+        metric=METRIC,
+        sign=1,
+        least=0.05,
+        ideas=ideas,
+        rate=0.1,
+        seeds=tuple(range(seeds)),
+        words=(),
+        keys=keys["adc"],
+    )
+
+    def draw(rng: Rng) -> float:
+        entries: list[records.Entry] = [opened]
+        noise, shape = 0.1 * math.sqrt(0.5), (captures, seeds)
+        baseline = trials("adc", 25 + noise * rng.standard_normal(shape))
+        best, best_noise = -math.inf, np.zeros(shape)
+        for number in range(ideas):
+            name, own = f"idea{number}", rng.standard_normal(shape)
+            if math.isfinite(best) and rng.random() < retried:
+                own = correlation * best_noise + math.sqrt(1 - correlation**2) * own
+            book = records.Ledger(tuple(entries), "")
+            started = records.Started(
+                time=TIME,
+                idea=name,
+                against=records.BASELINE,
+                level=rules.next_level(book),
+                identity=name,
+                words=(),
+                keys=keys[name],
+            )
+            entries.append(started)
+            book = records.Ledger(tuple(entries), "")
+            made = [*baseline, *trials(name, 25 + noise * own)]
+            verdict = attempt(rules.declaration_of(book, name), made)
+            entries.append(rules.end_of(name, verdict, TIME))
+            if rules.result_of(verdict) == records.KEPT:
+                return 1.0  # of ideas without an effect, the first one kept makes the share 1
+            if (mean := float(own[:, :2].mean())) > best:
+                best, best_noise = mean, own
+        return 0.0
+
+    return draw
+
+
+# ---- plans
+
+
+def planned(command: str, difference: float) -> Draw:
+    """A command with the design that `plan` names; 1 if it shows the difference.
+
+    The deviation of trainings is known, and two scenes have it.
+    """
+    claims = 4 if command == "check" else 1
+    seeds = min(one.seeds for one in PURPOSES[command].designs(difference, 0.1) if one.scenes == 3)
+    if command == "sweep":
+        return sweep(3, seeds, 1.0, difference / 0.1 * math.sqrt(3 * seeds))
+    if command == "gate":
+        return gate(3, seeds, difference, gates.WORSE)
+    return check(3, seeds, 1.0, difference, claims)
+
+
+PURPOSES = {
+    "sweep": Purpose(),
+    "looks": Purpose(looks=True),
+    "check": Purpose(0.05 / 4, looks=True),
+    "gate": Purpose(looks=True),
+}
+
+
+def unsure(rng: Rng) -> float:
+    """A pilot of 3 × 3 pairs: 1 if the real deviation lies in the range that `plan` gives."""
+    low, high = deviation_range(estimate_components(list(rng.normal(0, 0.1, (3, 3)))))
+    return float(low <= 0.1 <= high)
+
+
+# ---- the page
+
+
+def promises() -> Iterator[Promise]:
+    judged = "`judge`"
+    for scenes, seeds, ratio in (
+        (1, 3, 1.0),
+        (3, 3, 1.0),
+        (3, 3, 4.0),
+        (3, 3, 100.0),
+        (13, 2, 20.0),
+        (30, 2, 20.0),
+    ):
+        name = f"false signs, {scenes} × {seeds}, one scene {ratio:g} times as noisy"
+        yield Promise(name, judged, 0.05, 8000, sweep(scenes, seeds, ratio, 0.0))
+    yield Promise(
+        "false signs, 8 × 6, trainings of a seed correlate by −.17",
+        judged,
+        0.05,
+        4000,
+        sweep(8, 6, 1.0, 0.0, correlation=-0.17),
+    )
+    yield Promise("false signs of four arms, 3 × 3", judged, 0.05, 3000, sweep(3, 3, 1.0, 0.0, 4))
+    yield Promise(
+        "power at three standard errors, 3 × 3", judged, 0.5, 4000, sweep(3, 3, 1.0, 3.0), True
+    )
+    for scenes, seeds, ratio in ((1, 6, 1.0), (3, 4, 4.0), (20, 4, 30.0)):
+        name = (
+            f"a false sign of four claims in looks, {scenes} × {seeds}, one scene {ratio:g} × noise"
+        )
+        yield Promise(name, "`run_looks`", 0.05, 3000, check(scenes, seeds, ratio, 0.0, 4))
+    for count in (6, 9, 20):
+        yield Promise(
+            f"scenes like these, {count} scenes, skewed effects with noise",
+            "`judge_like_these`",
+            0.05,
+            3000,
+            like_these(count),
+        )
+    for count in (9, 30):
+        yield Promise(
+            f"people like these, {count} people, skewed preferences",
+            "`judge_votes`",
+            0.05,
+            8000,
+            people_like_these(count),
+        )
+    yield Promise("pooled interval of three studies misses", "`pool`", 0.05, 8000, pooled)
+    yield Promise(
+        "gate: worse although nothing changed, 2 × 6",
+        "`Gate`",
+        0.025,
+        3000,
+        gate(2, 6, 0.0, gates.WORSE),
+    )
+    yield Promise(
+        "gate: passed although the loss is the least that matters, 2 × 6",
+        "`Gate`",
+        0.025,
+        3000,
+        gate(2, 6, LEAST, gates.PASSED),
+    )
+    for case in (
+        (4, 1, 12, 0.6, 0.3),
+        (16, 3, 6, 0.6, 0.3),
+        (16, 3, 6, 0.3, 0.1),
+        (16, 2, 6, 2.0, 1.0),
+        (64, 8, 2, 1.0, 0.3),
+        (64, 1, 6, 1.0, 0.5),
+        (16, 3, 6, 0.0, 0.3),
+    ):
+        count, scenes, seeds, loss, deviation = case
+        name = f"bisect of {count} commits: wrong name, {scenes} × {seeds}, "
+        name += f"loss {loss:g}, deviation {deviation:g}"
+        yield Promise(name, "`first_worse`, `Step`", 0.05, 600, bisect(*case))
+    for captures, correlation in ((1, 0.0), (1, 0.39), (1, 0.7), (1, 0.95), (3, 0.7)):
+        name = f"ledger: false discoveries, captures: {captures}, retries correlate by "
+        name += f"{correlation:g}"
+        yield Promise(
+            name, "`next_level`, `judge_idea`", 0.1, 250, night(captures, 0.7, correlation)
+        )
+    for command in PURPOSES:
+        name = f"plan for a {command}: shows the difference on three scenes"
+        yield Promise(name, "`Purpose`", 0.8, 800, planned(command, 0.1), True)
+    yield Promise(
+        "plan: range of the deviation from a 3 × 3 pilot",
+        "`deviation_range`",
+        0.8,
+        8000,
+        unsure,
+        True,
+    )
+
+
+def rows(share: float, word: str = "") -> Iterator[tuple[Promise, float, float]]:
+    for promise in promises():
+        if word in promise.name:
+            yield promise, *promise.measure(share)
+
+
+def table(share: float, word: str = "") -> str:
+    """The table in Markdown."""
+    lines = [
+        "| promise | decided by | promised | simulated | draws | holds |",
+        "|---|---|---|---|---|---|",
+    ]
+    for promise, mean, error in rows(share, word):
+        limit = f"{'≥' if promise.at_least else '≤'} {100 * promise.limit:g} %"
+        draws = max(20, round(share * promise.draws))
+        lines.append(
+            f"| {promise.name} | {promise.where} | {limit} "
+            f"| {100 * mean:.1f} ± {100 * error:.1f} % "
+            f"| {draws} | {'yes' if promise.holds(mean, error) else '**no**'} |"
+        )
+        print(lines[-1], file=sys.stderr, flush=True)
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--share", type=float, help="print from this share of the draws")
+    parser.add_argument("--only", default="", help="print those whose names have this word")
+    options = parser.parse_args()
+    made = table(options.share or 1.0, options.only)
+    if options.share or options.only:
+        print(made, end="")
+        return
+    text = SECTION.sub(lambda match: match[1] + made + match[2], PAGE.read_text(encoding="utf-8"))
+    PAGE.write_text(text, encoding="utf-8")
+    if "**no**" in made:
+        sys.exit("a promise does not hold")
+
+
+if __name__ == "__main__":
+    main()

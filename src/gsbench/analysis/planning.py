@@ -1,0 +1,121 @@
+"""How many scenes and seeds a command needs to show a difference.
+
+The commands differ in their error rate and in their looks, so the same trials have other chances.
+Trainings are simulated with equally noisy scenes, and decided by the thresholds of the judge.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from gsbench.analysis.statistics import (
+    ALPHA,
+    DESIGN_DRAWS,
+    MAX_SCENES,
+    MAX_SEEDS,
+    POWER,
+    Components,
+    Design,
+    look_levels,
+    plan_looks,
+    power_of_mean,
+)
+from gsbench.analysis.thresholds import Region, evenness
+
+COMMANDS = ("sweep", "looks", "check", "gate", "ledger")
+LEVEL_DRAWS = 10_000  # for the levels of looks: fewer than in verdicts, since there are many plans
+# seeds and scenes of designs with looks, whose levels take a second each
+LOOK_SEEDS, LOOK_SCENES = 12, (1, 2, 3, 4, 5, 6, 8, 10, 13)
+UNSURE = 0.8  # of pilots have the real deviation within the stated range
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What the trials are for.
+
+    ``rate`` is the error rate of one question, divided by ``alone`` on a single scene. ``looks``
+    says whether it is judged in looks, and ``give_up`` is the chance at each look that an idea with
+    just the difference is given up.
+    """
+
+    rate: float = ALPHA
+    looks: bool = False
+    give_up: float = 0.0
+    alone: float = 1.0
+
+    def power(self, design: Design, difference: float, deviation: float) -> float:
+        """The chance that the command shows ``difference``; pairs differ by ``deviation``."""
+        if deviation == 0:
+            return 1.0 if difference else 0.0
+        rate = self.rate / (self.alone if design.scenes == 1 else 1.0)
+        if not self.looks:
+            return power_of_mean(deviation, design, difference, rate)
+        shown = np.zeros(DESIGN_DRAWS, dtype=bool)
+        open_ = ~shown
+        size = abs(difference) / deviation
+        for mean, error, region, level in _looks(design, rate):
+            reach = region.limits(level) * error
+            better = open_ & (size + mean > reach)
+            shown |= better
+            ends = better | (size + mean < -reach)
+            if self.give_up:
+                ends |= mean + region.limits(2 * self.give_up) * error < 0
+            open_ &= ~ends
+        return float(shown.mean())
+
+    def designs(self, difference: float, deviation: float) -> list[Design]:
+        """The designs with a power of `POWER`, one per number of scenes, with the fewest seeds.
+
+        A number of scenes is left out if it needs no fewer seeds than fewer scenes do.
+        """
+        chosen: list[Design] = []
+        for scenes in LOOK_SCENES if self.looks else range(1, MAX_SCENES + 1):
+            low, high = (
+                2,
+                chosen[-1].seeds - 1 if chosen else LOOK_SEEDS if self.looks else MAX_SEEDS,
+            )
+            if high < 2 or self.power(Design(scenes, high), difference, deviation) < POWER:
+                continue
+            while low < high:  # the power rises with the number of seeds
+                middle = (low + high) // 2
+                enough = self.power(Design(scenes, middle), difference, deviation) >= POWER
+                low, high = (low, middle) if enough else (middle + 1, high)
+            chosen.append(Design(scenes, high))
+        return chosen
+
+
+def deviation_range(components: Components) -> tuple[float, float]:
+    """The deviations between which that of trainings lies in `UNSURE` of such pilots."""
+    degrees = components.trials - components.scenes
+    tails = (1 - (1 - UNSURE) / 2, (1 - UNSURE) / 2)
+    low, high = (math.sqrt(degrees / special.chdtri(degrees, 1 - one)) for one in tails)
+    return components.within * low, components.within * high
+
+
+def _looks(
+    design: Design, rate: float
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], Region, float]]:
+    """Means and standard errors [DESIGN_DRAWS] at each look, thresholds, and the level."""
+    looks = plan_looks(design.seeds)
+    levels = _levels(design.scenes, looks, rate)
+    draws = np.random.default_rng(0).standard_normal((DESIGN_DRAWS, design.scenes, design.seeds))
+    for seeds, level in zip(looks, levels, strict=True):
+        pairs = draws[:, :, :seeds]
+        variances = pairs.var(axis=2, ddof=1)
+        error = np.sqrt(variances.sum(axis=1) / seeds) / design.scenes
+        yield (
+            pairs.mean(axis=(1, 2)),
+            error,
+            Region(design.scenes, seeds, evenness(variances)),
+            level,
+        )
+
+
+@cache
+def _levels(scenes: int, looks: tuple[int, ...], rate: float) -> tuple[float, ...]:
+    return look_levels(scenes, looks, rate, LEVEL_DRAWS)
