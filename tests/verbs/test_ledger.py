@@ -374,6 +374,20 @@ def test_report_and_archive_have_the_ledger(home: Path, trainings: Trainings) ->
     assert 'id="ledger"' in page
     assert "1 larger splits" in page
     assert "1 of 40 planned ideas were tried, and 1 kept" in page
+    assert "level: the chance that this test keeps an idea that is no better" in page
+    assert "no metric was declared" not in page
+    assert "the ledger&#39;s tests decide (gsbench ledger show night)" in page
+
+
+def test_a_kept_idea_with_more_gaussians_says_so(
+    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainings.effects[0.8] = 3.0  # of 1,800 Gaussians
+    assert attempt(f"{SPLIT}=0.8") == 0
+    words = "better; with 1.78 times the Gaussians, so not at equal counts"
+    assert f"adc: kept: {words}; psnr +" in capsys.readouterr().out
+    assert run(["ledger", "show", "night"]) == 0
+    assert words in capsys.readouterr().out
 
 
 def test_an_archived_ledger_names_no_folder_and_no_server(
@@ -407,7 +421,9 @@ def test_show_prints_the_rule_and_a_row_for_each_idea(home: Path, said: Any) -> 
     assert good[:4] == ["1 good", "baseline", "0.00083", "3"]
     assert good[-3:] == ["×1.00", "kept", "better"]
     assert bad[:4] == ["2 bad", "baseline", "0.0017", "2"]
-    assert bad[-2:] == ["dropped", "a gain of 0.5 is unlikely"]
+    assert bad[-2] == "dropped"
+    words = "a gain of 0.5 is unlikely; with 1.03 times the Gaussians, so not at equal counts"
+    assert bad[-1] == words
     assert "2 of 40 planned ideas were tried, and 1 kept" in " ".join(lines)
 
 

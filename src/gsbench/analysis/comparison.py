@@ -5,7 +5,7 @@ arms, and a line for each arm and trial that no verdict uses.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
 from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of, uncompared
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs, sentence
-from gsbench.runs.layout import TUNING
+from gsbench.runs.layout import LEDGER, TUNING
 from gsbench.words import some_of
 
 VERDICT = "Verdict, "  # prefix of the lines below a table that state verdicts
@@ -143,6 +143,10 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment.folder, arms.trials, experiment.older)
-    return Comparison(
-        experiment, arms, declared, tuple(judge_pairs(arms.trials, arms.pairs, declared))
-    )
+    answers = judge_pairs(arms.trials, arms.pairs, declared)
+    if (experiment.folder / LEDGER).exists():
+        answers = [replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers]
+    return Comparison(experiment, arms, declared, tuple(answers))
+
+
+LEDGER_DECIDES = "the ledger's tests decide (gsbench ledger show {}), and this is none of them"

@@ -2,9 +2,10 @@
 
 import math
 
+from gsbench.analysis.fairness import EQUAL_COUNTS
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.runs.experiments import display_time
-from gsbench.runs.ledger import Confirmed, Confirming, Difference, Ledger, Opened
+from gsbench.runs.ledger import Confirmed, Confirming, Difference, Ended, Ledger, Opened
 from gsbench.words import least_text, signed
 
 HEADS = ("against", "level", "seeds", "difference", "Gaussians", "time", "result", "why")
@@ -36,13 +37,28 @@ def ledger_tables(ledger: Ledger) -> list[Table]:
                 _times(ended.gaussians),
                 _times(ended.seconds),
                 ended.result,
-                ended.reason,
+                why(ended),
             )
         cells = (started.against, f"{started.level:.2g}", *known)
         rows.append(Row((f"{number} {idea}",), tuple(map(TableEntry, cells))))
     columns = tuple(Column("", head, ("ledger", head)) for head in HEADS)
-    tables = [Table("Ideas in the order of their tests", ("idea",), columns, tuple(rows))]
+    title = "Ideas in the order of their tests"
+    tables = [Table(title, ("idea",), columns, tuple(rows), (LEVEL,))]
     return tables + [_confirmation_table(ledger.opened, *one) for one in ledger.confirmations]
+
+
+LEVEL = (
+    "level: the chance that this test keeps an idea that is no better. All levels follow from the "
+    "share above; each kept idea raises those after it."
+)
+
+
+def why(ended: Ended) -> str:
+    """The reason of a result; with unequal numbers of Gaussians it says so."""
+    ratio = ended.gaussians
+    if ratio is None or abs(ratio - 1) <= EQUAL_COUNTS:
+        return ended.reason
+    return f"{ended.reason}; with {ratio:.2f} times the Gaussians, so not at equal counts"
 
 
 def _confirmation_table(opened: Opened, asked: Confirming, results: Confirmed | None) -> Table:

@@ -57,7 +57,8 @@ class PairVerdicts:
     """The verdicts on two arms, that on the declared metric first.
 
     ``notes`` say what could not be compared. ``declared`` is the declared metric, ``standing``
-    how the declaration stands to this question. ``missing`` says why the metric has no verdict.
+    how the declaration stands to this question. ``missing`` says why the metric has no verdict,
+    ``undeclared`` why the question is exploratory if no metric was declared.
     """
 
     first: Arm
@@ -67,6 +68,7 @@ class PairVerdicts:
     declared: Quantity | None = None
     standing: Standing | None = None
     missing: str = ""
+    undeclared: str = "no metric was declared (eval.primary)"
 
     @property
     def beforehand(self) -> bool:
@@ -265,7 +267,7 @@ def no_pairs(judged: PairVerdicts) -> str:
 
 def _why_exploratory(judged: PairVerdicts) -> str:
     if judged.declared is None:
-        return "no metric was declared (eval.primary)"
+        return judged.undeclared
     name = judged.declared.name
     if judged.standing is not None and judged.standing.doubt:
         return f"{name} was declared, but {judged.standing.doubt}"

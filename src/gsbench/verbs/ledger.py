@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.judgement import judge
-from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables
+from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
@@ -402,13 +402,10 @@ def _print_idea(book: Ledger, idea: str, as_json: bool) -> None:
         return
     ended = book.ended[idea]
     difference = difference_text(book.opened, ended.difference)
-    costs = [
-        f"{ratio:.2f} times the {what}"
-        for ratio, what in ((ended.gaussians, "Gaussians"), (ended.seconds, "training time"))
-        if ratio is not None
-    ]
-    facts = [f"{book.opened.metric} {difference}"] * bool(difference) + costs
-    print("; ".join([f"{idea}: {ended.result}: {ended.reason}", *facts]))
+    facts = [f"{book.opened.metric} {difference}"] * bool(difference)
+    if ended.seconds is not None:
+        facts.append(f"{ended.seconds:.2f} times the training time")
+    print("; ".join([f"{idea}: {ended.result}: {why(ended)}", *facts]))
     print(describe_ledger(book)[1])
 
 
