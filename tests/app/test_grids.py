@@ -85,6 +85,20 @@ def test_a_typed_setting_reaches_every_grid_that_has_it():
         arms("+experiment=threshold", "densify=mcmc")
 
 
+def test_a_setting_that_one_arm_lacks_is_answered_by_the_grids_that_work():
+    words = ["densify=adc,mcmc,volumetric", "densify.volume_threshold=0.01,0.03"]
+    with pytest.raises(InputError) as caught:
+        compose_trials([*words, "seed=4"], multirun=True)
+    advice = str(caught.value)
+    assert advice.startswith(
+        "adc and mcmc have no densify.volume_threshold: in place of "
+        "densify=adc,mcmc,volumetric densify.volume_threshold=0.01,0.03 give "
+    )
+    grids = advice.partition("give ")[2].strip("'")
+    trials = compose_trials([grids, "seed=4"], multirun=True)
+    assert [trial.values["densify"]["name"] for trial in trials] == ["adc", "mcmc", "volumetric", "volumetric"]
+
+
 def test_grids_in_a_users_own_experiment(tmp_path):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     file = tmp_path / "own" / "experiment" / "mine.yaml"

@@ -145,7 +145,9 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     declared = active_declaration(experiment.folder, arms.trials, experiment.older)
     answers = judge_pairs(arms.trials, arms.pairs, declared)
     if (experiment.folder / LEDGER).exists():
-        answers = [replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers]
+        answers = [
+            replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers
+        ]
     return Comparison(experiment, arms, declared, tuple(answers))
 
 

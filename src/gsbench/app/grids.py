@@ -12,16 +12,25 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import Sweep
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep, run_looks
-from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
+from gsbench.config.command_words import (
+    GROUPS,
+    bare_key,
+    grid_points,
+    is_interval,
+    key_of,
+    value_text,
+)
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions
 from gsbench.runs.layout import RESULTS
+from gsbench.words import listed
 
 GRIDS = "hydra.sweeper.grids"
 
@@ -54,7 +63,13 @@ def run_sweep(
             if is_interval(override)
         }
         intervals += [searched] * len(points)
-    trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
+    try:
+        trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
+    except InputError as error:
+        typed = {bare_key(one.get_key_element()): one for one in sweep.parse(words)}
+        if grids or not (advice := _advise_grids(sweep, typed)):
+            raise
+        raise InputError(advice) from error
     if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
         _run_until_decided(sweep, trials)
     else:
@@ -140,6 +155,54 @@ def words_of_grids(
         words = [f"{key}={value}" for key, value in (*grid.items(), *shared.items())]
         jobs.append([*words, *(word for word in given if key_of(word) not in listed - own)])
     return jobs
+
+
+def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:
+    """The grids for choices of which only some have a typed setting; "" if that is no fault here.
+
+    ``typed`` are the typed words by their keys.
+    """
+    for group in GROUPS:
+        choices = typed.get(group)
+        own = [
+            key
+            for key, word in typed.items()
+            if key.startswith(f"{group}.") and not word.is_add() and not word.is_delete()
+        ]
+        if choices is None or not choices.is_discrete_sweep() or not own:
+            continue
+        lacking: dict[tuple[str, ...], list[str]] = {}  # {settings: the choices that lack them}
+        for choice in map(str, choices.sweep_string_iterator()):
+            node = sweep.loader.load_sweep_config(sweep.config, [f"{group}={choice}"])
+            lacking.setdefault(tuple(key for key in own if not _has(node, key)), []).append(choice)
+        words = [choices.input_line, *(typed[key].input_line for key in own)]
+        if len(lacking) == 1 or any(mark in str(word) for word in words for mark in "'\""):
+            continue
+        arms = []
+        for missing, names in lacking.items():
+            values = {group: ",".join(names)}
+            values |= {
+                key: str(typed[key].input_line).partition("=")[2]
+                for key in own
+                if key not in missing
+            }
+            arms.append(", ".join(f'{key}: "{value}"' for key, value in values.items()))
+        faults = [
+            f"{listed(names)} {'has' if len(names) == 1 else 'have'} no {listed(keys)}"
+            for keys, names in lacking.items()
+            if keys
+        ]
+        return (
+            f"{'; '.join(faults)}: in place of {' '.join(map(str, words))} give "
+            f"'{GRIDS}=[{', '.join(f'{{{arm}}}' for arm in arms)}]'"
+        )
+    return ""
+
+
+def _has(config: DictConfig, key: str) -> bool:
+    parent, _, name = key.rpartition(".")
+    node = OmegaConf.select(config, parent)
+    return OmegaConf.is_dict(node) and name in node
 
 
 def _text(key: object, value: object) -> str:
