@@ -96,7 +96,12 @@ def test_a_setting_that_one_arm_lacks_is_answered_by_the_grids_that_work():
     )
     grids = advice.partition("give ")[2].strip("'")
     trials = compose_trials([grids, "seed=4"], multirun=True)
-    assert [trial.values["densify"]["name"] for trial in trials] == ["adc", "mcmc", "volumetric", "volumetric"]
+    assert [trial.values["densify"]["name"] for trial in trials] == [
+        "adc",
+        "mcmc",
+        "volumetric",
+        "volumetric",
+    ]
 
 
 def test_grids_in_a_users_own_experiment(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.launch import batch
+from gsbench.launch import batch, dry_run
 from gsbench.launch.batch import (
     begin_for_another_launcher,
     borrowed_names,
@@ -200,8 +200,8 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
 
     parts = SimpleNamespace(make_evaluator=make_evaluator)
     monkeypatch.setitem(sys.modules, "gsbench.pipeline.parts", parts)
-    batch._unavailable.cache_clear()
+    dry_run.unavailable_now.cache_clear()
     for options in ('{"flip": false}', '{"flip": true}', '{"flip": false}'):
-        assert batch._unavailable(options) == {"lpips_vgg"}
+        assert dry_run.unavailable_now(options) == {"lpips_vgg"}
     assert [options.flip for options in asked] == [False, True]
-    batch._unavailable.cache_clear()
+    dry_run.unavailable_now.cache_clear()

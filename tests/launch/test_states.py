@@ -13,12 +13,11 @@ import pytest
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch import states
+from gsbench.launch.dry_run import FinishedTrials, describe_plan
 from gsbench.launch.record import PlanFile, PlannedTrial, add_to_plan, read_plan, remove
 from gsbench.launch.states import (
-    FinishedTrials,
     QueuedJob,
     current_user,
-    describe_plan,
     read_queue,
     record_submission,
     states_of_experiment,

@@ -5,12 +5,14 @@ import fcntl
 import json
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import GROUPS, options, parse
@@ -18,11 +20,12 @@ from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError
-from gsbench.launch import jobs
+from gsbench.launch import dry_run, jobs
 from gsbench.launch.batch import run_batch
+from gsbench.launch.dry_run import FinishedTrials, describe_plan
 from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import add_to_plan, forget, read_plan
-from gsbench.launch.states import FinishedTrials, describe_plan, states_of_experiment
+from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
 from gsbench.runs.keys import TRAIN, Step, config_hash
 from gsbench.runs.store import Store
@@ -55,6 +58,7 @@ def why_not_done(values: dict[str, Any]) -> str:
 def finish(
     values: dict[str, Any],
     seconds: float = 100.0,
+    awaited: Sequence[str] = (),
 ) -> TrialRecord:
     """Make the files of a finished trial, with one stage in the store and one source file."""
     folder = TrialFolder.of(values)
@@ -67,12 +71,13 @@ def finish(
         Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))
     )
     (folder.path / "table.csv").write_text("a,b")
-    (folder.path / "config.yaml").write_text("")
+    (folder.path / "config.yaml").write_text(yaml.safe_dump(values))
     results = record_of(
         values,
         seconds={"init": 1.0, "train": seconds, "evaluate": 0.0},
         hashes={"config": config_hash(values)},
         resolution=(400, 300),
+        awaited=list(awaited),
     )
     folder.write_finished(
         values, results, [source], {"train": entry.path}, [folder.path / "table.csv"]
@@ -310,6 +315,38 @@ def test_a_dry_run_says_what_has_changed(runs):
     assert describe_plan([trial])[0].endswith(
         f"  will be checked: {runs.parent / 'photos' / 'a.jpg'} has changed"
     )
+
+
+def test_a_dry_run_tells_arms_and_their_changes_apart(runs):
+    words = ["densify=adc", "densify.split_size=0.01,0.02"]
+    trials = compose_trials(words, multirun=True)
+    finish(trials[0].values)
+    first, second, *_ = describe_plan(trials)
+    assert first.startswith("done     courtyard/sfm-adc[split_size=0.01] seed 0 (")
+    # what another arm of the same command has is no change
+    assert second.endswith(f"({trials[1].folder.name.partition('-')[0]})")
+    line, *_ = describe_plan(trials[1:])
+    done = trials[0].folder.name.partition("-")[0]
+    assert line.endswith(f"  since {done} changed: densify.split_size 0.01 → 0.02")
+
+
+@pytest.mark.parametrize(
+    ("missing", "download", "note"),
+    [
+        (["lpips_squeeze"], False, ""),
+        (["lpips_squeeze"], True, "  will be checked: it lacks lpips_squeeze, which can be "),
+        ([], False, "  will be checked: it lacks lpips_squeeze, which can be computed now"),
+    ],
+)
+def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missing, download, note):
+    monkeypatch.setattr(dry_run, "unavailable_now", lambda options: missing)
+    values = trial_values()
+    values = values | {"eval": values["eval"] | {"download": download}}
+    finish(values, awaited=["lpips_squeeze"])
+    trial = replace(composed([])[0], values=values)
+    line = describe_plan([trial])[0]
+    assert note in line
+    assert ("checked" in line) == bool(note)
 
 
 # ---- plan and states

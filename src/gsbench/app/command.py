@@ -28,8 +28,8 @@ from gsbench.config.trust import PERMISSIONS, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.launch.batch import check_parts, missing_folders, need_no_check, run_batch
+from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.states import describe_plan
 from gsbench.logs import set_up_logging
 from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
 

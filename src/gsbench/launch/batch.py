@@ -5,7 +5,6 @@ import json
 import logging
 import re
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
 from gsbench.config.command_words import options
@@ -13,6 +12,7 @@ from gsbench.config.compose import Trial
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
+from gsbench.launch.dry_run import unavailable_now
 from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial, run_slurm
 from gsbench.launch.record import add_to_plan, declare, declared_metrics
 from gsbench.runs.keys import OWN, STAGES
@@ -89,20 +89,8 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
 
 def _why_not_done(trial: Trial) -> str:
     return trial.files.why_not_done(
-        trial.values, lambda options: _unavailable(json.dumps(options, sort_keys=True))
+        trial.values, lambda options: unavailable_now(json.dumps(options, sort_keys=True))
     )
-
-
-@cache
-def _unavailable(options: str) -> frozenset[str]:
-    """The metrics that cannot be computed now.
-
-    The cache searches for (and downloads) weights once per sweep.
-    """
-    from gsbench.eval.options import EvalConfig
-    from gsbench.pipeline.parts import make_evaluator
-
-    return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
 
 
 # ---- checks before any trial starts: wrong options of components, missing folders and devices

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialResult, group_by, newest_code, read_experiment
+from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.errors import InputError
-from gsbench.launch.record import PlannedTrial, read_plan
-from gsbench.launch.states import TrialState, states_of_experiment
+from gsbench.launch.states import TrialState, planned_names, states_of_experiment
 from gsbench.runs.experiments import experiment_home
-from gsbench.runs.layout import CURVES, SEED
+from gsbench.runs.layout import CURVES
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import read_rows
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 Name = tuple[str, str]  # arm, scene
 COUNTED = ("done", "running", "failed")  # all other states are waiting
 WAITING = "waiting"
-OF_A_PLACE = ("seed", "scene", "scene.path", "name")  # words that tell no arms apart
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
 def progress_of(home: Path) -> Progress:
     """The progress of the experiment in ``home``, from its files."""
     states = [state for state in states_of_experiment(home) if state.state != "superseded"]
-    names = _names([state.folder for state in states], read_plan(home))
+    names = planned_names([state.folder for state in states])
     cells: dict[Name, dict[str, int]] = {
         name: dict.fromkeys((*COUNTED, WAITING), 0) for name in sorted(names.values())
     }
@@ -89,30 +87,6 @@ def progress_of(home: Path) -> Progress:
     return Progress(
         cells, dict(speeds), _seconds_left(states, names, trials), _leader(home, names, trials)
     )
-
-
-def _names(folders: Sequence[Path], plan: Mapping[Path, PlannedTrial]) -> dict[Path, Name]:
-    """Arm and scene of each trial's folder.
-
-    If an arm's folder has several settings, the words that differ in their commands are added:
-    ``sfm-momentum[decay=0.9]``. Without such words it is the settings' hash.
-    """
-    names = {}
-    for arm, own in group_by(folders, lambda folder: folder.parent.name).items():
-        words = {folder: _words(plan.get(folder)) for folder in own}
-        shared = set.intersection(*words.values())
-        several = len({folder.name.partition(SEED)[0] for folder in own}) > 1
-        for folder in own:
-            values = ", ".join(sorted(words[folder] - shared)) or folder.name.partition(SEED)[0]
-            names[folder] = (f"{arm}[{values}]" if several else arm, folder.parents[1].name)
-    return names
-
-
-def _words(planned: PlannedTrial | None) -> set[str]:
-    """The settings in a trial's command by their last names, without its place."""
-    words = () if planned is None else planned.overrides
-    given = (word.lstrip("+~").partition("=") for word in words)
-    return {f"{key.rpartition('.')[2]}={value}" for key, _, value in given if key not in OF_A_PLACE}
 
 
 def _kinds(name: Name) -> tuple[Name, ...]:

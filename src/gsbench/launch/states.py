@@ -1,4 +1,4 @@
-"""The states of trials, from their folders and from Slurm's queue, and the listing of a dry run.
+"""The states of trials, from their folders and from Slurm's queue, and the names of their arms.
 
 A file in a trial's folder names its Slurm job. Loads no torch.
 """
@@ -6,29 +6,24 @@ A file in a trial's folder names its Slurm job. Loads no torch.
 from __future__ import annotations
 
 import subprocess
-from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 from typing import Annotated, Any, Literal
 
 import psutil
 from pydantic import Field
 
-from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.launch.record import read_plan
-from gsbench.parsing import DamagedError, Record, read_if_sound
+from gsbench.parsing import Record, read_if_sound
 from gsbench.runs.experiments import trial_folders
-from gsbench.runs.keys import determining_settings, sha256_of
-from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED, TRIAL_GLOB
+from gsbench.runs.keys import determining_settings
+from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
 from gsbench.system.programs import NEUTRAL, safe_environment
-from gsbench.words import counted, readable_time
 
 
 @dataclass(frozen=True)
@@ -259,100 +254,46 @@ def current_user() -> str:
     return psutil.Process().username()
 
 
-# ---- a dry run: all finished trials are read once, to compare ten thousand planned ones with them
+# ---- the names of arms
 
-# in the order of a summary
-STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")
-
-
-class FinishedTrials:
-    """The finished trials below the folder ``runs``."""
-
-    def __init__(self, runs: Path) -> None:
-        self._folders: dict[str, list[Path]] = defaultdict(list)
-        # seconds per iteration, by `_similarities`
-        self._seconds: dict[str, list[float]] = defaultdict(list)
-        for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
-            files = TrialFolder(path.parent)
-            record = files.sound_record()
-            if record is None:
-                continue
-            self._folders[path.parent.name].append(path.parent)
-            if record.iterations:
-                seconds = sum(record.seconds.get(step, 0.0) for step in ("train", "evaluate"))
-                with suppress(FileNotFoundError, DamagedError, KeyError, TypeError):
-                    for similarity in _similarities(files.settings()):
-                        self._seconds[similarity].append(seconds / record.iterations)
-
-    def elsewhere(self, trial: TrialFolder) -> str | None:
-        """Another experiment that has finished the same trial, whose stages are reused, or None."""
-        others = (
-            folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path
-        )
-        return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
-
-    def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
-        """Seconds for the trial with ``values``, and the number of trials that this rests on.
-
-        These trials have the same scene at the same size, the same rasterizer and, if possible, the
-        same densifier. Times are taken per iteration. Returns ``(0, 0)`` without such trials.
-        """
-        for similarity in _similarities(values):
-            if seconds := self._seconds.get(similarity):
-                return fmean(seconds) * values["train"]["iterations"], len(seconds)
-        return 0.0, 0
+OF_A_PLACE = ("seed", "scene", "scene.path", "name")  # words that tell no arms apart
 
 
-def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
-    """Hashes of scene, rasterizer and densifier, and of scene and rasterizer.
+def arm_names(words: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, str]]:
+    """Arm and scene of each trial's folder, from the words of its command.
 
-    Trials that share one of them take similar times.
+    If an arm's folder has several settings, the words that differ in their commands are added:
+    ``sfm-momentum[decay=0.9]``. Without such words it is the settings' hash.
     """
-    shared = [settings["scene"], settings["raster"]["name"]]
-    return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
+    by_arm: dict[str, list[Path]] = {}
+    for folder in words:
+        by_arm.setdefault(folder.parent.name, []).append(folder)
+    names = {}
+    for arm, own in by_arm.items():
+        given = {folder: _settings_of(words[folder]) for folder in own}
+        shared = set.intersection(*given.values())
+        several = len({folder.name.partition(SEED)[0] for folder in own}) > 1
+        for folder in own:
+            values = ", ".join(sorted(given[folder] - shared)) or folder.name.partition(SEED)[0]
+            names[folder] = (f"{arm}[{values}]" if several else arm, folder.parents[1].name)
+    return names
 
 
-def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
-    """Lines for ``--dry-run``: each trial with its state, and the time for the unfinished ones."""
-    lines: list[str] = []
-    remaining, without_estimate, learned_from = 0.0, 0, 0
-    counts: Counter[str] = Counter()
-    finished = FinishedTrials(trials[0].files.runs)
-    queue = ask_queue(trial.folder for trial in trials)
-    for trial in trials:
-        folder = trial.files
-        state: str = folder.state()
-        if state not in ("done", "running"):
-            state = state_in_queue(folder.path, queue) or state
-        note = ""
-        if state == "done":
-            if reason := folder.why_not_done(trial.values):
-                note = f"  will be checked: {reason}"
-        elif experiment := finished.elsewhere(folder):
-            note = f"  as in {experiment}: nothing to compute"
-        else:
-            seconds, known_from = finished.estimate(trial.values)
-            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
-            remaining += seconds * (1 - min(1.0, done))
-            learned_from = max(learned_from, known_from)
-            without_estimate += known_from == 0
-        counts[state] += 1
-        lines.append(f"{state:<8} {folder.label}{note}")
-    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
-    if counts["done"] == len(trials):
-        return lines
-    if without_estimate:
-        time = (
-            "no estimate: no finished trial of this scene with this rasterizer tells how long "
-            "one takes here"
-        )
-    elif learned_from == 0:
-        time = "seconds, since other experiments have the results"
-    else:
-        at_once = f", {parallel} at once" if parallel > 1 else ""
-        duration = readable_time(remaining / parallel)
-        time = (
-            f"about {duration}{at_once}, estimated from {counted(learned_from, 'finished trial')}"
-        )
-    return [*lines, f"time: {time}"]
+def planned_names(folders: Sequence[Path]) -> dict[Path, tuple[str, str]]:
+    """`arm_names` of trials from the plans of their experiments."""
+    homes = dict.fromkeys(folder.parents[2] for folder in folders)
+    plan = {folder: planned for home in homes for folder, planned in read_plan(home).items()}
+    return arm_names({one: plan[one].overrides if one in plan else () for one in folders})
+
+
+def label_of(folder: Path, names: Mapping[Path, tuple[str, str]]) -> str:
+    """``TrialFolder.label`` with the arm's name of `arm_names`."""
+    (arm, scene), (hash8, _, seed) = names[folder], folder.name.partition(SEED)
+    arm = arm.removesuffix(f"[{hash8}]")
+    return f"{scene}/{arm} seed {seed} ({hash8})"
+
+
+def _settings_of(words: Iterable[str]) -> set[str]:
+    """The settings in a command by their last names, without a trial's place."""
+    given = (word.lstrip("+~").partition("=") for word in words)
+    return {f"{key.rpartition('.')[2]}={value}" for key, _, value in given if key not in OF_A_PLACE}

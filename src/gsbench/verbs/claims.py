@@ -33,8 +33,8 @@ from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch
+from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import declare_questions
-from gsbench.launch.states import describe_plan
 from gsbench.runs.experiments import ERROR_RATE, Question, read_declarations
 from gsbench.runs.layout import SEED
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number

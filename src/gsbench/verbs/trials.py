@@ -21,9 +21,10 @@ from gsbench.config.command_words import key_of, makes_other_trials, typed_permi
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
+from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
-from gsbench.launch.states import TrialState, describe_plan, states_of_experiment
+from gsbench.launch.states import TrialState, label_of, planned_names, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.keys import module_digest
 from gsbench.runs.trial_folder import TrialFolder
@@ -142,10 +143,10 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
-    lines = []
+    lines, names = [], planned_names([trial.folder for trial in trials])
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
-            label = TrialFolder(trial.folder).label
+            label = label_of(trial.folder, names)
             lines.append(f"{trial.state:<8} {label:<50} {_age(trial):>12}  {trial.note}".rstrip())
     lines.append(summary_of(trials))
     return lines

@@ -1,0 +1,167 @@
+"""The listing of a dry run: each trial with its state, what changed, and the time that is left."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from gsbench.config.compose import Trial
+from gsbench.errors import InputError
+from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue
+from gsbench.parsing import DamagedError
+from gsbench.runs.keys import determining_settings, flatten, sha256_of
+from gsbench.runs.layout import RESULTS, SEED, TRIAL_GLOB
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.words import counted, readable_time, some_of
+
+# in the order of a summary
+STATES = ("done", "partial", "missing", "running", "queued", "failed", "damaged")
+
+
+class FinishedTrials:
+    """The finished trials below the folder ``runs``.
+
+    All are read once, to compare ten thousand planned ones with them.
+    """
+
+    def __init__(self, runs: Path) -> None:
+        self._folders: dict[str, list[Path]] = defaultdict(list)
+        # seconds per iteration, by `_similarities`
+        self._seconds: dict[str, list[float]] = defaultdict(list)
+        for path in runs.glob(f"*/{TRIAL_GLOB}/{RESULTS}"):
+            files = TrialFolder(path.parent)
+            record = files.sound_record()
+            if record is None:
+                continue
+            self._folders[path.parent.name].append(path.parent)
+            if record.iterations:
+                seconds = sum(record.seconds.get(step, 0.0) for step in ("train", "evaluate"))
+                with suppress(FileNotFoundError, DamagedError, KeyError, TypeError):
+                    for similarity in _similarities(files.settings()):
+                        self._seconds[similarity].append(seconds / record.iterations)
+
+    def elsewhere(self, trial: TrialFolder) -> str | None:
+        """Another experiment that has finished the same trial, whose stages are reused, or None."""
+        others = (
+            folder for folder in self._folders.get(trial.path.name, ()) if folder != trial.path
+        )
+        return next((folder.relative_to(trial.runs).parts[0] for folder in others), None)
+
+    def estimate(self, values: Mapping[str, Any]) -> tuple[float, int]:
+        """Seconds for the trial with ``values``, and the number of trials that this rests on.
+
+        These trials have the same scene at the same size, the same rasterizer and, if possible, the
+        same densifier. Times are taken per iteration. Returns ``(0, 0)`` without such trials.
+        """
+        for similarity in _similarities(values):
+            if seconds := self._seconds.get(similarity):
+                return fmean(seconds) * values["train"]["iterations"], len(seconds)
+        return 0.0, 0
+
+
+def _similarities(settings: Mapping[str, Any]) -> tuple[str, str]:
+    """Hashes of scene, rasterizer and densifier, and of scene and rasterizer.
+
+    Trials that share one of them take similar times.
+    """
+    shared = [settings["scene"], settings["raster"]["name"]]
+    return sha256_of([*shared, settings["densify"]["name"]]), sha256_of(shared)
+
+
+def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
+    """Lines for ``--dry-run``: each trial with its state, and the time for the unfinished ones."""
+    lines: list[str] = []
+    remaining, without_estimate, learned_from = 0.0, 0, 0
+    counts: Counter[str] = Counter()
+    finished = FinishedTrials(trials[0].files.runs)
+    queue = ask_queue(trial.folder for trial in trials)
+    arms = arm_names({trial.folder: trial.overrides for trial in trials})
+    for trial in trials:
+        folder = trial.files
+        state: str = folder.state()
+        if state not in ("done", "running"):
+            state = state_in_queue(folder.path, queue) or state
+        note = ""
+        if state == "done":
+            if reason := folder.why_not_done(trial.values, unavailable_in_dry_run):
+                note = f"  will be checked: {reason}"
+        elif experiment := finished.elsewhere(folder):
+            note = f"  as in {experiment}: nothing to compute"
+        else:
+            seconds, known_from = finished.estimate(trial.values)
+            done = folder.stage_and_step()[1] / max(1, trial.values["train"]["iterations"])
+            remaining += seconds * (1 - min(1.0, done))
+            learned_from = max(learned_from, known_from)
+            without_estimate += known_from == 0
+        if state == "missing" and (change := _change_since_last(trial, arms)):
+            note += f"  {change}"
+        counts[state] += 1
+        lines.append(f"{state:<8} {label_of(folder.path, arms)}{note}")
+    summary = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
+    lines.append(f"{counted(len(trials), 'trial')}: {summary}")
+    if counts["done"] == len(trials):
+        return lines
+    if without_estimate:
+        time = (
+            "no estimate: no finished trial of this scene with this rasterizer tells how long "
+            "one takes here"
+        )
+    elif learned_from == 0:
+        time = "seconds, since other experiments have the results"
+    else:
+        at_once = f", {parallel} at once" if parallel > 1 else ""
+        duration = readable_time(remaining / parallel)
+        time = (
+            f"about {duration}{at_once}, estimated from {counted(learned_from, 'finished trial')}"
+        )
+    return [*lines, f"time: {time}"]
+
+
+def _change_since_last(trial: Trial, planned: Collection[Path]) -> str:
+    """What differs from the arm's last finished trial of this scene and seed; "" if none is left.
+
+    A trial that is ``planned`` too is another arm of this sweep, not an earlier form of this one.
+    """
+    pattern = f"*{SEED}{trial.values['seed']}/{RESULTS}"
+    earlier = [
+        path.parent for path in trial.folder.parent.glob(pattern) if path.parent not in planned
+    ]
+    if not earlier:
+        return ""
+    last = TrialFolder(max(earlier, key=lambda folder: (folder / RESULTS).stat().st_mtime))
+    try:
+        before = flatten(determining_settings(last.configuration()))
+    except (InputError, OSError):
+        return ""
+    now, hash8 = flatten(determining_settings(trial.values)), last.path.name.partition(SEED)[0]
+    keys = [key for key in {**now, **before} if now.get(key) != before.get(key)]
+    if not keys:
+        return f"since {hash8} the code changed"
+    changes = [f"{key} {before.get(key, 'unset')} → {now.get(key, 'unset')}" for key in keys]
+    return f"since {hash8} changed: {some_of(changes)}"
+
+
+def unavailable_in_dry_run(options: dict[str, Any]) -> Collection[str]:
+    """The metrics that a run could not compute either, by the ``eval`` settings.
+
+    Downloads nothing.
+    """
+    return () if options["download"] else unavailable_now(json.dumps(options, sort_keys=True))
+
+
+@cache
+def unavailable_now(options: str) -> frozenset[str]:
+    """The metrics that cannot be computed now, by the ``eval`` settings as JSON.
+
+    The cache searches for (and downloads) weights once per sweep.
+    """
+    from gsbench.eval.options import EvalConfig
+    from gsbench.pipeline.parts import make_evaluator
+
+    return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
