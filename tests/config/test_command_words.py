@@ -212,6 +212,15 @@ def test_special_characters_are_shown_quoted(word: str, said: str) -> None:
         parse_word(word)
 
 
+@pytest.mark.parametrize(("group", "word"), [("experiment", "experiment=a"), ("init", "init=[a]")])
+def test_choices_of_the_users_folder_are_listed_too(tmp_path: Path, group: str, word: str) -> None:
+    (tmp_path / group).mkdir()
+    (tmp_path / group / "of_mine.yaml").touch()
+    words, *_ = parse(["--config-dir", str(tmp_path), word])
+    with pytest.raises(InputError, match=r"\bof_mine\b"):
+        check_words(words)
+
+
 def test_a_word_that_is_a_choice_gets_a_hint(tmp_path: Path) -> None:
     assert hint_for("raster").startswith("; raster is a group: choose one by raster=NAME (")
     assert hint_for("mcmc") == "; did you mean densify=mcmc?"

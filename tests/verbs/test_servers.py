@@ -92,10 +92,12 @@ def served(runs, monkeypatch) -> list[Any]:
 
     class Thread:
         def __init__(self, target: Any, args: Any, daemon: bool) -> None:
-            served.append((*args, daemon))
+            self.args, self.daemon = args, daemon
 
-        def start(self) -> None:
-            pass
+        def start(self) -> None:  # the server answers at once
+            server, lines, page = self.args
+            print(lines)
+            served.extend([(server, page, self.daemon)] * bool(page))
 
     runs.mkdir()
     (runs / "mlflow.db").touch()
@@ -177,10 +179,10 @@ def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
     assert not servers._serves(LOCAL, "x", f"{LOCAL}/#/experiments/12")
 
 
-def test_the_page_is_opened_once_the_server_answers(monkeypatch):
-    waits: list[float] = []
+def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, capsys):
+    waits: list[str] = []
     opened: list[str] = []
-    failures = [True, True, False]
+    failures = [True, True, False, False]
 
     def get(server: str, timeout: float) -> None:
         assert server == LOCAL
@@ -188,13 +190,15 @@ def test_the_page_is_opened_once_the_server_answers(monkeypatch):
             raise servers.requests.ConnectionError
 
     monkeypatch.setattr(servers.requests, "get", get)
-    monkeypatch.setattr(time, "sleep", waits.append)
     monkeypatch.setattr(servers.subprocess, "run", lambda words, **_: opened.append(words[-1]))
-    servers._open(LOCAL, "page")
-    assert (waits, opened) == ([1, 1], ["page"])
+    monkeypatch.setattr(servers.time, "sleep", lambda s: waits.append(capsys.readouterr().out))
+    servers._announce(LOCAL, "dashboard page", "page")
+    assert (waits, opened, capsys.readouterr().out) == (["", ""], ["page"], "dashboard page\n")
+    servers._announce(LOCAL, "dashboard page", "")  # no browser
+    assert (opened, capsys.readouterr().out) == (["page"], "dashboard page\n")
     failures.extend([True] * servers.SECONDS_TO_START)
-    servers._open(LOCAL, "page")
-    assert (opened, failures) == (["page"], [])
+    servers._announce(LOCAL, "dashboard page", "page")
+    assert (opened, failures, capsys.readouterr().out) == (["page"], [], "")
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,7 @@ def check_words(words: Sequence[str]) -> None:
                     f"{word}: Hydra's own settings apply to all trials, so choose one value"
                 )
         elif key == "experiment" or key.startswith(("experiment/", "experiment@", "experiment.")):
-            _check_experiment_word(word, override)
+            _check_experiment_word(word, override, searched_folders(words))
         elif "@" in key:
             raise InputError(
                 f"{word!r}: a group has one place, so leave out the @ and what follows it"
@@ -135,7 +135,8 @@ def check_words(words: Sequence[str]) -> None:
         elif override.is_delete():
             check_removal(override)
         elif key in GROUPS and not _is_choice(override):
-            raise InputError(f"{word!r}: choose one by its name: {key}={', '.join(options(key))}")
+            choices = ", ".join(options(key, searched_folders(words)))
+            raise InputError(f"{word!r}: choose one by its name: {key}={choices}")
         elif key.rpartition(".")[2] in TEXTS:
             check_text(word)
 
@@ -385,13 +386,13 @@ def searched_folders(words: Sequence[str]) -> list[Path]:
     ]
 
 
-def _check_experiment_word(word: str, override: Override) -> None:
+def _check_experiment_word(word: str, override: Override, folders: Sequence[Path]) -> None:
     several = override.is_sweep_override() or isinstance(override.value(), list)
     if several and word.startswith("+experiment="):
         raise InputError(f"{word}: two experiments are two sweeps: give a command for each")
     if several or not word.startswith("+experiment=") or not _is_choice(override):
         raise InputError(
-            f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment'))})"
+            f"{word}: write +experiment=NAME (choose: {', '.join(options('experiment', folders))})"
         )
 
 

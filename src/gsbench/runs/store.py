@@ -116,7 +116,9 @@ class Store:
         # An existing result may become the input of further steps, so its checksums are compared
         # once in each process: a flipped bit changes neither size nor time of change.
         with suppress(ValueError):
-            return self._read_verified(final)
+            found = self._read_verified(final)
+            log.debug("store: %s %s is there", step.stage.name, step.key[:8])
+            return found
         with storage_errors(self.root.parent):
             require_no_links(self.root.parent, self.partial(step.stage, step.key))
             final.parent.mkdir(parents=True, exist_ok=True)
@@ -128,6 +130,7 @@ class Store:
                     except ValueError as error:
                         log.warning("store: %s is damaged (%s) and is built again", final, error)
                         _remove(final)
+                log.debug("store: %s %s is computed", step.stage.name, step.key[:8])
                 return self._build(step)
 
     def _read_verified(self, path: Path) -> StoredResult:

@@ -240,6 +240,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
         help=f"folder or .html file; default: the experiment's {REPORT_NAME}",
     )
     parser.add_argument("--baseline", help=f"the densifier to compare with ({BASELINE})")
+    add_where(parser)
     options = parser.parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     densifiers = sorted({trial.densify for trial in experiment.trials})
@@ -253,7 +254,7 @@ def report(argv: Sequence[str], runs: Path) -> int:
     output = writable_output if options.out in (None, file) else own_output
     for warning in experiment.warnings:
         print(f"left out: {warning}", file=sys.stderr)
-    text = build_report(experiment, options.baseline or BASELINE)
+    text = build_report(experiment, options.baseline or BASELINE, dict(options.where))
     with output(file):
         write_text(file, text)
     print(file)

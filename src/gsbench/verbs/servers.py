@@ -103,12 +103,13 @@ def ui(argv: Sequence[str], runs: Path) -> int:
             raise InputError(
                 f"{home.name} could not be sent to {uri} ({type(error).__name__}: {error})"
             ) from error
-    for name, address in pages.items():
-        print(f"{name:<10} {address}", flush=True)
+    lines = "\n".join(f"{name:<10} {address}" for name, address in pages.items())
     first = next(iter(pages.values()))
     is_served = is_served or (home is not None and _serves(server, home.name, first))
-    if not options.no_browser and sys.stdout.isatty() and _has_screen():
-        threading.Thread(target=_open, args=(server, first), daemon=not is_served).start()
+    opens = not options.no_browser and sys.stdout.isatty() and _has_screen()
+    threading.Thread(
+        target=_announce, args=(server, lines, first if opens else ""), daemon=not is_served
+    ).start()
     return 0 if is_served else serve(uri, options.port)
 
 
@@ -134,14 +135,17 @@ def _has_screen() -> bool:
     )
 
 
-def _open(server: str, page: str) -> None:
-    """Open the page once the server answers."""
+def _announce(server: str, lines: str, page: str) -> None:
+    """Print the addresses once the server answers, and open the page unless it is empty."""
     for _ in range(SECONDS_TO_START):
         try:
             requests.get(server, timeout=SECONDS_TO_ANSWER)
         except requests.RequestException:
             time.sleep(1)
             continue
+        print(lines, flush=True)
+        if not page:
+            return
         # Its programs start in a folder that is not a stranger's.
         command = [sys.executable, "-P", "-m", "webbrowser", page]
         subprocess.run(command, cwd=NEUTRAL, env=safe_environment(), check=False)

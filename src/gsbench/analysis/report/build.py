@@ -3,17 +3,19 @@
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.analysis import verdicts
+from gsbench.analysis.cells import select_trials
 from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.differences import between_scenes_notes, short_version
 from gsbench.analysis.fairness import caveats, fairness_table
@@ -56,16 +58,29 @@ BIN_WIDTH = 0.25  # decades of volume
 Curve = list[tuple[float, float]]
 
 
-def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
-    """The report as HTML, from files alone; every densifier is compared with ``baseline``."""
+def build_report(
+    experiment: Experiment,
+    baseline: str = BASELINE,
+    where: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """The report as HTML, from files alone; every densifier is compared with ``baseline``.
+
+    With ``where`` (`select_trials`) it shows only these trials and their arms. The verdicts stay
+    those of all trials: the choice may have been made after seeing results. Raises InputError if
+    no trial is left.
+    """
     comparison = compare(experiment, baseline)
-    trials, pairs, judged = comparison.trials, comparison.pairs, comparison.answers
+    trials = select_trials(comparison.trials, where)
+    shown = {trial.arm for trial in trials}
+    judged = [one for one in comparison.answers if {one.first, one.second} <= shown]
+    pairs = [pair for pair in comparison.pairs if set(pair) <= shown]
+    chosen = ", ".join(f"{key}={values}" for key, values in where.items())
     arms = sorted({trial.arm for trial in trials})
     paper_table = layout_of(experiment.name)
     if paper_table is None:
-        tables = [build_table(experiment)]
+        tables = [build_table(experiment, trials if where else None)]
     else:
-        tables = paper_tables(experiment, paper_table)
+        tables = paper_tables(experiment, paper_table, trials if where else None)
     volumes, volume_notes = volume_charts(trials, arms)
     return fill(
         "report.html.j2",
@@ -79,7 +94,7 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=[*comparison.declaration_lines, *verdicts.families(judged)],
-        unused=comparison.unused,
+        unused=[*[CHOSEN.format(chosen)] * bool(where), *comparison.unused],
         tables=[_without_verdicts(one) for one in with_agreement(tables)],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
@@ -97,6 +112,9 @@ def build_report(experiment: Experiment, baseline: str = BASELINE) -> str:
         provenance=provenance(trials),
         warnings=experiment.warnings,
     )
+
+
+CHOSEN = "Tables, curves and pictures show only trials with {}; verdicts rest on all trials."
 
 
 def _without_verdicts(table: Table) -> Table:
