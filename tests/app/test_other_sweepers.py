@@ -85,3 +85,22 @@ def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(caps
         found = words_without_sweeper(config_of(sweeper=sweeper), words, "optuna")
         assert found == (["densify=adc", "hydra/sweeper=gsbench"], False)
         assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            RuntimeError("study is\ngone"),
+            r"^hydra/sweeper=basic raised RuntimeError: study is gone$",
+        ),
+        (InputError("the trial's own line"), "^the trial's own line$"),
+    ],
+)
+def test_what_another_sweeper_raises_is_named_as_its_own(monkeypatch, error, said):
+    def run_main(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(command.compose, "run_main", run_main)
+    with pytest.raises(InputError, match=said):
+        command.run_app(["hydra/sweeper=basic", "densify=adc,mcmc"], True, TrialTask(done))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -126,6 +127,18 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(
 def test_photographs_are_found_by_trial_folder_and_address(
     trial: Path, runs: Path, tmp_path: Path, refused: Any, said: Any
 ) -> None:
+    other = trial.with_name("deadbeef-seed0")  # the same arm with another setting
+    shutil.copytree(trial, other)
+    config = json.loads((other / "config.yaml").read_text())
+    config["densify"] |= {"split_size": 0.02}
+    (other / "config.yaml").write_text(json.dumps(config))
+    for arm, folder in (("adc[split_size=0.02]", other), ("sfm-adc[split_size=0.02]", other)):
+        truth = find_reference_images(f"exp:garden:{arm}", [], runs)
+        assert truth.photographs["view001"] == folder / "ground_truth" / "view001.png"
+    assert "choose one of exp:garden:sfm-adc[split_size=" in refused(
+        "evaluate", trial / "renders", "--truth", "exp:garden:adc"
+    )
+    shutil.rmtree(other)
     for place in (trial, trial / "ground_truth", trial / "renders", "exp:garden:adc"):
         truth = find_reference_images(str(place), [], runs)
         assert (truth.scene, truth.init, truth.resolution) == ("garden", "sfm", (400, 300))

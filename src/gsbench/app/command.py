@@ -142,9 +142,18 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         log.info(
             "hydra.job.chdir: paths still start in %s, where the command was given", task.folder
         )
-    # Another sweeper may raise any error for its settings.
-    with compose.explained(words, Exception if other else HYDRA_ERRORS):
-        compose.run_main(task, [*argv, _mode_word(multirun)], config)
+    with compose.explained(words, HYDRA_ERRORS):
+        try:
+            compose.run_main(task, [*argv, _mode_word(multirun)], config)
+        except (GsbenchError, *HYDRA_ERRORS):
+            raise
+        except Exception as error:
+            if not other:
+                raise
+            message = " ".join(str(error).split())  # it may raise any error for its settings
+            raise InputError(
+                f"hydra/sweeper={other} raised {type(error).__name__}: {message}"
+            ) from error
     if other and not task.trials:
         name = config.name
         log.info(

@@ -50,7 +50,7 @@ def _evaluate_parser() -> ArgumentParser:
     parser.add_argument(
         "--truth",
         metavar="PLACE",
-        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or a "
+        help="the photographs: a folder, a trial (folder or EXPERIMENT:SCENE:ARM), or a "
         "scene's name, whose test views are taken as a trial sees them; not needed for predictions",
     )
     parser.add_argument(

@@ -1,3 +1,3 @@
 """The viewer of trained models: reading and drawing (``trials``), serving (``server``)."""
 
-ADDRESS = "a trial's folder, or EXPERIMENT:SCENE:DENSIFY[:SEED] such as demo:courtyard:volumetric:0"
+ADDRESS = "a trial's folder, or EXPERIMENT:SCENE:ARM[:SEED] such as demo:courtyard:volumetric:0"
