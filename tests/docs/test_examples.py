@@ -47,7 +47,7 @@ def folder(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("mine", "shell", "untiled"):  # of other tests, or of another document
+    for name in ("mine", "shell", "told", "untiled"):  # of other tests, or of another document
         monkeypatch.delitem(sys.modules, name, raising=False)
     before = set(sys.modules)
     yield tmp_path
@@ -123,6 +123,19 @@ def test_the_initialiser_of_its_document_runs(folder, capsys):
     values = json.loads(results.read_text())
     assert values["num_init_points"] == 500
     assert values["init_report"]["init"] == "shell"
+
+
+def test_the_tracker_of_its_document_gets_every_trial(folder, capsys):
+    found = run_blocks(ROOT / "docs" / "hydra.md", folder)
+    assert found["status"] == 0, capsys.readouterr().err
+    labels = [line.rpartition(",") for line in Path("told.csv").read_text().splitlines()]
+    results = sorted(Path("runs").glob("told/courtyard/random-none/*/results.json"))
+    assert [label for label, *_ in labels] == [
+        f"told/courtyard/random-none/{p.parent.name}" for p in results
+    ]
+    values = [json.loads(path.read_text())["metrics"]["psnr"] for path in results]
+    assert [float(value) for *_, value in labels] == pytest.approx(values, abs=1e-3)
+    assert len(values) == 2
 
 
 def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
