@@ -142,7 +142,7 @@ def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, en
     ]
     first = Trial(trials[0].values | {"name": "tuning"}, ())
     assert summarize(outcomes, [first, *trials]) == code
-    (said,) = caplog.messages
+    (said,) = [one.getMessage() for one in caplog.records if one.name == command.__name__]
     assert said == advice + (str(trials[0].folder) if len(ends) == 1 else "")
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: ")]
     assert said == [
