@@ -154,7 +154,7 @@ def p_values(mean: Array, error: Array, degrees: Shape) -> Array:
 
 
 def significant(mean: Array, error: Array, degrees: Shape, level: float) -> NDArray[np.bool_]:
-    """Whether p is below the level [D]; for thresholds without computing p."""
+    """True where p is below the level [D]; for thresholds without computing p."""
     if isinstance(degrees, Region):
         return np.asarray(np.abs(mean) / error > degrees.limits(level))
     return p_values(mean, error, degrees) < level

@@ -47,7 +47,7 @@ Draw = Callable[[Rng], float]  # whether one simulated use is counted
 
 @dataclass(frozen=True)
 class Promise:
-    """What is promised: ``limit`` is the most, or (``at_least``) the least, that holds.
+    """A promise: ``limit`` is the most, or (``at_least``) the least, that holds.
 
     ``draw`` simulates one use.
     """
@@ -92,7 +92,7 @@ def trials(arm: str, values: Array, version: str = "aaaa") -> list[TrialResult]:
 
 
 def question(arm: str, scenes: int, seeds: int, least: float = LEAST, **more: Any) -> Question:
-    """Is ``arm`` better than the baseline?"""
+    """Ask if ``arm`` is better than the baseline."""
     keys = {
         f"scene{k}": (
             trial_key(f"scene{k}", "sfm-adc", "aaaa"),

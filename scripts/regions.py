@@ -128,7 +128,7 @@ class Problem:
         return size, self._slope(density * reach * np.log(student / normal), slice(None))
 
     def bounds(self, level: float, most: float) -> Array:
-        """What the sizes [C] may reach in these draws: ``most`` times the level.
+        """The sizes [C] that may be reached in these draws: ``most`` times the level.
 
         Without f the test is Student's and keeps the level; what the draws have above it is theirs.
         """

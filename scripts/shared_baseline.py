@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
-from gsbench.analysis.statistics import ALPHA, error_and_degrees
+from gsbench.analysis.statistics import ALPHA
+from gsbench.analysis.thresholds import Region, evenness
 
 SCENES = (1, 3)
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict.md"
@@ -33,10 +33,11 @@ Baseline = Callable[[np.random.Generator, int, int], Array]
 
 def p_values(differences: Array) -> Array:
     """The two-sided p [D] of differences [D, S, K], by the test of the verdicts."""
-    seeds = differences.shape[2]
-    error, degrees = error_and_degrees(differences.var(axis=2, ddof=1), seeds)
-    t = np.abs(differences.mean(axis=(1, 2))) / error
-    return 2 * np.asarray(stdtr(degrees, -t))
+    _, scenes, seeds = differences.shape
+    variances = differences.var(axis=2, ddof=1)  # [D, S]
+    errors = np.sqrt(variances.sum(axis=1) / seeds) / scenes
+    sizes = np.abs(differences.mean(axis=(1, 2))) / errors
+    return Region(scenes, seeds, evenness(variances)).p_values(sizes)
 
 
 def seen(seeds: int, kept: int) -> Baseline:

@@ -29,9 +29,7 @@ def test_tables_show_trials_with_and_without_the_metric(runs):
     table = build_table(experiment)
     assert table.row_headings == ("scene", "init", "densify", KEY)
     shown = {(row.labels[2], row.labels[3]) for row in table.rows if row.labels[0] == "garden"}
-    assert shown == {
-        (arm, value) for arm in ("adc", "volumetric") for value in ("None", "mine.Mae")
-    }
+    assert shown == {(arm, value) for arm in ("adc", "volumetric") for value in ("–", "mine.Mae")}
     assert len(select_trials(experiment.trials, {KEY: "mine.Mae"})) == 4
     assert len(select_trials(experiment.trials, {KEY: "None"})) == 4
 

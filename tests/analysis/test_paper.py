@@ -203,7 +203,8 @@ def test_the_tables_verb_prints_and_writes_files(tmp_path, capsys):
     assert "### Table 1, measured" in out
     assert "### Table 1, difference" in out
     assert tables(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+    written = (tmp_path / "out").glob("[!.]*")
+    assert sorted(p.name for p in written) == [
         "table1-difference.tex",
         "table1.tex",
     ]

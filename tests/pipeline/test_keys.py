@@ -32,11 +32,11 @@ BARE = Capture(
 KEYS = [
     ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
     # of the reference cameras
-    ("init", "b5ba65df7105e9263ad05addef8425d35e29fe982775d730fbe604647ec2a9ae"),
-    ("init", "cad201af4f604b328caa8c2ed8aca73b64062872f7f0a7b2461e97dbd362a442"),
-    ("train", "7a176da93dc7e68fd25ee10044cf3183c8cb124d04f8db5675e00a55f16c0f6c"),
-    ("ground_truth", "25bd2fff6458d0bf7b5f3c85e52eea1f097cf4fa10c2f93e6be1429d23b17af4"),
-    ("evaluate", "69ed8884d31466e846c86a05ad11f0b2918b9739822a680d08a8389b04c93395"),
+    ("init", "e1e2cc0ffbc07319732fed7422ab68b11ed01ff824860ad4a65d461a0ecf95e4"),
+    ("init", "38db22c2a2523f5c5cc4f47e7aaffbb1327018bcc9211b8f1ae05ed29e39c37b"),
+    ("train", "8f6e851193877c649550b05cb2477f28ff6b3638ed7a7b504c3518a3d758f871"),
+    ("ground_truth", "47c5600464d4eb387175d3ff8484e73c41678360da8a9c7155674afcaef84a65"),
+    ("evaluate", "c832c3ae6a6d906f56a3c3ad09afe5aa63a1f576bb5f0b99f016b8fdb02f8cdc"),
 ]
 
 

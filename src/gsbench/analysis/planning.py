@@ -1,4 +1,4 @@
-"""How many scenes and seeds a command needs to show a difference.
+"""Numbers of scenes and seeds that a command needs to show a difference.
 
 The commands differ in their error rate and in their looks, so the same trials have other chances.
 Trainings are simulated with equally noisy scenes, and decided by the thresholds of the judge.
@@ -36,7 +36,7 @@ UNSURE = 0.8  # of pilots have the real deviation within the stated range
 
 @dataclass(frozen=True)
 class Purpose:
-    """What the trials are for.
+    """The purpose of the trials.
 
     ``rate`` is the error rate of one question, divided by ``alone`` on a single scene. ``looks``
     says whether it is judged in looks, and ``give_up`` is the chance at each look that an idea with

@@ -246,7 +246,7 @@ class LikeThese:
 
 
 def exact_for(seeds: int) -> str:
-    """What "better" about scenes like these says, in words; "worse" says the opposite."""
+    """The meaning of "better" about scenes like these, in words; "worse" says the opposite."""
     mean = "one training" if seeds == 1 else f"the mean of {seeds} trainings"
     return f"on a new scene like these, {mean} of the arm would more often be better"
 

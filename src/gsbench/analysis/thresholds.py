@@ -1,4 +1,4 @@
-"""How many standard errors a mean over scenes must have to be significant at a level.
+"""Thresholds: standard errors that a mean over scenes needs to be significant at a level.
 
 With one scene it is Student's threshold with K - 1 degrees of freedom, for K seeds. With several
 scenes it is lower, the more evenly they share the variance: ``student ** (1 - f) * normal ** f``,
@@ -119,7 +119,7 @@ def _place(level: Array | float) -> tuple[NDArray[np.int64], Array]:
 
 
 def evenness(variances: Array) -> Array:
-    """How evenly scenes share the sum of their estimated ``variances`` [..., S], from 0 to 1."""
+    """The evenness, 0 to 1, with which scenes share their estimated ``variances`` [..., S]."""
     scenes = variances.shape[-1]
     total, largest = variances.sum(axis=-1), variances.max(axis=-1)
     if scenes == 1:

@@ -194,7 +194,7 @@ class TrialFolder:
         return record
 
     def change(self, thorough: bool = False) -> str:
-        """What was changed among the files `JUDGED` since the results were written, or "".
+        """The change among the files `JUDGED` since the results were written, or "".
 
         A large file with its recorded size and time counts as unchanged, unless ``thorough``. Files
         that are gone do not count, since models are deleted to make room.

@@ -1,4 +1,4 @@
-"""Where programs of others start: never in the current folder, which may be a stranger's.
+"""Folders in which programs of others start: never the current folder, which may be a stranger's.
 
 npm reads ``node_modules`` and ``.npmrc`` in the folder where it starts and in each folder above
 it; other programs have similar habits. `tests/system/test_programs.py` lists all starts.
@@ -18,7 +18,7 @@ NEUTRAL = Path(__file__).resolve().parent
 
 
 def safe_environment() -> dict[str, str]:
-    """This process's environment; PATH has no relative folder such as ``node_modules/.bin``."""
+    """The environment of this process, without relative folders such as ``node_modules/.bin``."""
     entries = os.environ.get("PATH", os.defpath).split(os.pathsep)
     return os.environ | {"PATH": os.pathsep.join(filter(os.path.isabs, entries))}
 
