@@ -271,7 +271,7 @@ def zipped(*names: str) -> bytes:
         ("a.bin", zipped("a/version", "a/data.pkl"), "a checkpoint of PyTorch: give the PLY"),
         ("a.bin", b"\x80\2}q\0.", "a checkpoint of PyTorch: give the PLY"),
         ("a.npz", zipped("means.npy"), "a ZIP archive: unpack it, and give the PLY in it"),
-        ("a.ply.gz", gzip.compress(b"ply\n"), "a PLY compressed by gzip: gunzip a.ply.gz"),
+        ("a.ply.gz", gzip.compress(b"ply\n", mtime=0), "a PLY compressed by gzip: gunzip a.ply.gz"),
         ("a.json", b'{"frames": []}', "JSON: give the PLY of a model"),
     ],
 )

@@ -36,6 +36,12 @@ def gaussians() -> Gaussians:
     return random_gaussians(60, seed=3, dtype=torch.float32)
 
 
+def test_results_of_an_experiment_without_trials_are_not_exported(runs: Path) -> None:
+    (runs / "empty").mkdir(parents=True)
+    with pytest.raises(InputError, match="'empty' has no complete trial among 0 folders"):
+        exchange.export_results("empty", runs, None)
+
+
 def test_export_of_the_model_and_the_initial_cloud(
     runs: Path, gaussians: Gaussians, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

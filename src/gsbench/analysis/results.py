@@ -333,11 +333,16 @@ def seeds_words(trials: Iterable[TrialResult]) -> str:
 
 
 def load_experiment(runs_dir: Path, name: str) -> Experiment:
-    """Read the trials of the experiment ``name`` (`newest_code`).
+    """Read the trials of the experiment ``name`` that count (`newest_code`).
 
     Raises ``InputError`` if none can be used.
     """
-    experiment = newest_code(read_experiment(experiment_home(runs_dir, name)))
+    return newest_code(load_all_trials(runs_dir, name))
+
+
+def load_all_trials(runs_dir: Path, name: str) -> Experiment:
+    """The same as `load_experiment`, with the trials of earlier code."""
+    experiment = read_experiment(experiment_home(runs_dir, name))
     if not experiment.trials:
         warnings = experiment.warnings
         first = f" (first: {warnings[0]})" if warnings else ""

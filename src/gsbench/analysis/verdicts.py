@@ -36,7 +36,6 @@ from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import some_of
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
-VERDICT = "Verdict, "  # prefix of the lines below a table that state verdicts
 DECLARED, SECONDARY = "declared", "secondary"
 WORDS: dict[Outcome, str] = {
     "supported": "better",

@@ -128,7 +128,7 @@ def _is_number(word: str) -> bool:
 
 
 def _columns(table: Array, header: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Which columns are x, y, z and red, green, blue, by their names, else by `LAYOUTS`."""
+    """The columns that are x, y, z and red, green, blue, by their names, else by `LAYOUTS`."""
     # CloudCompare writes "Rf", surveyors "X [m]"
     names = [re.sub(r"[\[(].*|[^a-z_]", "", word.lower()) for word in header]
     names = [word[0] if word in ("rf", "gf", "bf") else word for word in names]

@@ -124,9 +124,10 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
 
 
 def _change_since_last(trial: Trial, planned: Collection[Path]) -> str:
-    """What differs from the arm's last finished trial of this scene and seed; "" if none is left.
+    """A line on what changed since the arm's last finished trial of this scene and seed.
 
-    A trial that is ``planned`` too is another arm of this sweep, not an earlier form of this one.
+    It is "" if there is none. A trial that is ``planned`` too is another arm of this sweep, not an
+    earlier form of this one.
     """
     pattern = f"*{SEED}{trial.values['seed']}/{RESULTS}"
     earlier = [

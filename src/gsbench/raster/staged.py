@@ -1,6 +1,7 @@
 """Code that executors share: checks of inputs, asynchronous reads, autograd for compiled stages."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -107,6 +108,13 @@ def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> 
     if short.any():
         index = int(short.nonzero()[0])
         raise ValueError(f"quaternions: length 0 at Gaussian {index} ({int(short.sum())} in all)")
+
+
+def upload(numbers: Sequence[float], device: torch.device) -> Tensor:
+    """The ``numbers`` as float32 on ``device``; the host does not wait for the copy."""
+    host = torch.tensor(numbers, dtype=torch.float32)
+    # A copy is asynchronous only from page-locked memory.
+    return (host.pin_memory() if device.type == "cuda" else host).to(device, non_blocking=True)
 
 
 class Readback:

@@ -245,7 +245,7 @@ def read_ledger(home: Path) -> Ledger:
 
 
 def _fault(before: Ledger, entry: Entry) -> str:
-    """What makes ``entry`` impossible after the entries ``before``, or ""."""
+    """The reason that makes ``entry`` impossible after the entries ``before``, or ""."""
     if isinstance(entry, Opened):
         return "" if entry.keys else "has no captures"
     if isinstance(entry, Started):

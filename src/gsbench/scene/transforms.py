@@ -293,7 +293,7 @@ class _FileFinder:
             raise InputError(f"{path}: {error}") from error
 
     def remedy(self, missing: Collection[str]) -> str:
-        """What to set if one folder has files with the last parts of the ``missing`` names."""
+        """Advice, if one folder has files with the last parts of the ``missing`` names; else ""."""
         wanted = {stem_of(PurePosixPath(name).name).casefold() for name in missing}
         folders = Counter(
             file.rpartition("/")[0]

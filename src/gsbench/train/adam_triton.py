@@ -11,6 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from gsbench.gaussians.trainable import ADAM_BETAS, ADAM_EPSILON, AdamState
+from gsbench.raster.staged import upload
 from gsbench.raster.triton.launch import launch_grid
 
 NUMBERS = 1024  # of a parameter per program
@@ -76,17 +77,8 @@ class TritonAdam:
         active: int | None = None,
     ) -> None:
         """Apply step ``state.step``; the host does not wait."""
-        numbers = torch.tensor(adam_factors(state.rate, state.step), dtype=torch.float32)
-        if parameter.device.type == "cuda":
-            numbers = numbers.pin_memory()
-        self.launch(
-            parameter,
-            gradient,
-            state,
-            numbers.to(parameter.device, non_blocking=True),
-            seen,
-            active,
-        )
+        factors = upload(adam_factors(state.rate, state.step), parameter.device)
+        self.launch(parameter, gradient, state, factors, seen, active)
 
     def launch(
         self,

@@ -16,11 +16,11 @@ from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.lists import Room
 from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.direct import DirectStep
+from gsbench.train.loss import SSIM_WEIGHT
 from gsbench.train.loss_triton import TritonLoss
 
 STEPS = 10
 CRAMPED_STEP = 6  # the step before which lists lose their room, so that the render is repeated
-SSIM_WEIGHT = 0.2
 
 
 def direct_fault(rasterizer: TritonRasterizer, device: torch.device, case: Case) -> str:

@@ -9,6 +9,7 @@ after each row.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import torch
@@ -34,6 +35,7 @@ W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in window()[WINDOW_RAD
 F_C1, F_C2 = tl.constexpr(C1), tl.constexpr(C2)
 
 
+@cache
 def rows_of_program(height: int, numbers: int) -> int:
     """The number of rows per program, for an image of ``height`` rows of ``numbers`` each.
 

@@ -237,7 +237,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
 
 
 def _purpose(command: str, questions: int | None) -> Purpose:
-    """What a command asks of its trials; ideas share a rate of which each takes one side."""
+    """The purpose of a command's trials; ideas share a rate of which each takes one side."""
     if command == "ledger":
         rate = 2 * RATE / (questions or IDEAS)
         return Purpose(rate, looks=True, give_up=GIVE_UP, alone=RETRIES)
@@ -279,7 +279,7 @@ def _lines(
 
 
 def _unsure(components: Components, difference: float, purpose: Purpose, design: Design) -> str:
-    """How the power of the first design depends on what the pilot does not know."""
+    """A line on the power of the first design, given what the pilot does not know."""
     low, high = deviation_range(components)
     least, most = (100 * purpose.power(design, difference, one) for one in (high, low))
     return (

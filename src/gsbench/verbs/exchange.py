@@ -9,12 +9,11 @@ from pathlib import Path
 
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import TrialResult, load_all_trials
 from gsbench.errors import InputError
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.files import atomic, own_output, writable_output
 from gsbench.normalization import Normalization
-from gsbench.runs.experiments import experiment_home
 from gsbench.runs.keys import INIT
 from gsbench.runs.layout import STORE
 from gsbench.settings import is_folder_name
@@ -164,7 +163,7 @@ def export_results(name: str, runs: Path, out: Path | None, pictures: bool = Fal
     if file.is_dir():
         file = file / f"{name}.zip"
     with writable_output(file) if file == out else own_output(file):
-        left_out = write_archive(read_experiment(experiment_home(runs, name)), file, pictures)
+        left_out = write_archive(load_all_trials(runs, name), file, pictures)
     for line in left_out:
         log.warning("left out: %s", line)
     print(f"{file}: results of {name}, {readable_bytes(file.stat().st_size)}")

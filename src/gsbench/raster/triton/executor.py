@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from gsbench.raster.staged import (
     RenderRequest,
     StagedRasterizer,
     raise_for_values,
+    upload,
 )
 from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
@@ -64,7 +65,7 @@ class Started:
     order: Tensor  # [N] int64 Gaussians by depth
     unit_ends: Tensor  # [N] int64
     flags: Tensor  # [1] int32
-    units: Units
+    units: Units = field(init=False)  # of the last `find_units`
 
     @property
     def blocks_x(self) -> int:
@@ -75,7 +76,7 @@ class Started:
         return self.blocks_x * -(-self.request.camera.height // BLOCK_HEIGHT.value)
 
     def find_units(self, capacity: int) -> None:
-        """Find the units again, with room for ``capacity``."""
+        """Find the units, with room for ``capacity``."""
         self.units = find_all_units(
             self.memory,
             self.scratch,
@@ -173,14 +174,12 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         allocate: Allocate,
     ) -> Started:
         """Project all Gaussians, sort them by depth, and find up to ``capacity`` units."""
-        count, device = len(gaussians), gaussians.means.device
+        count = len(gaussians)
         radii = allocate("radii", (count,), torch.int32)
         flags = scratch.take("flags", 1, torch.int32).zero_()
         keys = scratch.take("depth_keys", count, torch.int32)
         projected = _project(memory, gaussians, view, request.degree, keys, radii, flags)
         order, unit_ends = sort_by_depth(scratch, projected, keys)
-        nothing = torch.empty(0, device=device)
-        units = Units(nothing, nothing, nothing, nothing, nothing, nothing)
         started = Started(
             request,
             view,
@@ -192,7 +191,6 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             order,
             unit_ends,
             flags,
-            units,
         )
         started.find_units(capacity)
         return started
@@ -405,10 +403,7 @@ def zeros_like_all(gaussians: Gaussians) -> list[Tensor]:
 
 def camera_numbers(camera: Camera, device: torch.device) -> Tensor:
     """`CameraNumbers` of ``camera``, [24] float32 on ``device``; the host does not wait."""
-    numbers = torch.tensor([*map(float, CameraNumbers.of(camera))], dtype=torch.float32)
-    if device.type == "cuda":
-        numbers = numbers.pin_memory()
-    return numbers.to(device, non_blocking=True)
+    return upload([*map(float, CameraNumbers.of(camera))], device)
 
 
 def _project(

@@ -137,15 +137,19 @@ def summarise(unit_ends, count, pair_ends, capacity, flags, background, status):
 
 
 @triton.jit
-def units_that_fit(status, units, pairs):
-    """The number of units in ``status``; 0 if there is no room for all units and pairs.
+def lists_fit(status, units, pairs):
+    """True if ``status`` has at most as many units and pairs as these capacities.
 
-    ``units`` and ``pairs`` are the capacities. Without room, all kernels behind behave as if no
-    Gaussian were seen, so they stay within their memory. The host looks at ``status``, makes room,
-    and repeats the render.
+    If not, all kernels behind behave as if no Gaussian were seen, so they stay within their memory.
+    The host looks at ``status``, makes room, and repeats the render.
     """
-    number = tl.load(status)
-    return tl.where((number <= units) & (tl.load(status + 1) <= pairs), number, 0)
+    return (tl.load(status) <= units) & (tl.load(status + 1) <= pairs)
+
+
+@triton.jit
+def units_that_fit(status, units, pairs):
+    """The number of units in ``status``; 0 if the lists do not fit (`lists_fit`)."""
+    return tl.where(lists_fit(status, units, pairs), tl.load(status), 0)
 
 
 @triton.jit(do_not_specialize=["units", "pairs"])

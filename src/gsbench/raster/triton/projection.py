@@ -59,7 +59,7 @@ from gsbench.raster.triton.layout import (
     SHEAR,
     TILE,
 )
-from gsbench.raster.triton.lists import units_that_fit
+from gsbench.raster.triton.lists import lists_fit, units_that_fit
 
 NEAR = tl.constexpr(CONSTANTS.near)
 SIGMA_EXTENT = tl.constexpr(CONSTANTS.sigma_extent)
@@ -356,13 +356,13 @@ def backproject(
     """Write the gradients of Gaussians that are seen: those with a row in ``row_counts``.
 
     Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_splitting``
-    become 0. See `units_that_fit` for ``status``, ``units`` and ``pairs``.
+    become 0. See `lists_fit` for ``status``, ``units`` and ``pairs``.
     """
     v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = index < count
-    fits = (tl.load(status) <= units) & (tl.load(status + 1) <= pairs)
-    row_count = tl.load(row_counts + index, mask=inside & fits, other=0)
+    seeable = inside & lists_fit(status, units, pairs)
+    row_count = tl.load(row_counts + index, mask=seeable, other=0)
     seen = row_count > 0
     sums = sum_rows(index, row_count, first_units, pair_ends, unit_widths, rows, 9 + 2 * ABSOLUTE)
     h, h_t, h_y, h_tt, h_ty, h_yy, red, green, blue = sums[:9]
