@@ -21,7 +21,7 @@ STARTS = {
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "python",
     ("system/resources.py", "nvidia_smi", "subprocess.run"): "neutral",
     ("tracking/mirror.py", "_start", "subprocess.Popen"): "python",
-    ("verbs/servers.py", "_open", "subprocess.run"): "neutral",
+    ("verbs/servers.py", "_announce", "subprocess.run"): "neutral",
     ("verbs/servers.py", "serve", "subprocess.Popen"): "own",
     ("view/page.py", "write_page", "subprocess.run"): "own",
 }
