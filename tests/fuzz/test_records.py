@@ -93,14 +93,13 @@ def test_every_kind_of_file_is_damaged_in_turn(places: dict[str, Path]) -> None:
 READS_ITSELF = {
     "analysis/paper.py",
     "datasets/catalog.py",  # of the package
-    "launch/batch.py",
+    "launch/dry_run.py",  # text of this process
     "init/base.py",
     "runs/keys.py",  # text of this very process
     "analysis/differences.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py",  # text of this process
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
-    "scene/load.py",  # prepared views, beside the store
     "parsing.py",
 }
 LOADERS = {

@@ -84,7 +84,11 @@ def test_the_real_program_trains_with_it_and_records_its_source(folder: Path) ->
 
     assert "already done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
     with (folder / "untiled.py").open("a") as stream:
-        stream.write("# another version\n")
+        stream.write("# a comment makes no other version\n")
+    same = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
+    assert "missing" not in same.stdout
+    with (folder / "untiled.py").open("a") as stream:
+        stream.write("VERSION = 2\n")
     changed = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
     assert "missing" in changed.stdout
 

@@ -16,7 +16,7 @@ pytest.importorskip("triton")
 
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import AdamState
+from gsbench.gaussians.trainable import AdamState, Update
 from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
 from gsbench.raster.triton import composite, executor, lists
@@ -86,10 +86,9 @@ def adam_step(case: Case) -> None:
     seen = torch.zeros(case.count, dtype=torch.int32)
     for tensor in case.gaussians().map(lambda tensor: tensor.float()).tensors().values():
         state = AdamState(0.1, 1, torch.zeros_like(tensor), torch.zeros_like(tensor))
-        TritonAdam()(
-            tensor, torch.zeros_like(tensor), state, seen, 24 if tensor.dim() == 3 else None
-        )
-        TritonAdam()(tensor, torch.zeros_like(tensor), state)
+        gradient, active = torch.zeros_like(tensor), 24 if tensor.dim() == 3 else None
+        TritonAdam()([Update(tensor, gradient, state, active)], seen)
+        TritonAdam()([Update(tensor, gradient, state)])
 
 
 @pytest.mark.parametrize("target", TARGETS, ids="sm_{}".format)

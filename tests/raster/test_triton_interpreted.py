@@ -22,7 +22,7 @@ from triton.runtime.interpreter import interpreter_builder
 from gsbench.densify import ADC
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import AdamState
+from gsbench.gaussians.trainable import AdamState, Update
 from gsbench.raster import staged
 from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
@@ -496,10 +496,11 @@ def test_direct_steps_pass_their_proof_and_a_fault_of_them_is_found(
     assert direct_fault(TritonRasterizer(), cpu, TINY) == ""
     real = TritonAdam.launch
 
-    def late(self: TritonAdam, parameter: Tensor, *rest: object) -> None:
-        real(self, parameter, *rest)  # type: ignore[arg-type]
-        if rest[3] is not None:  # the gradients of Gaussians that are not seen are undefined
-            parameter.detach().mul_(1 + 1e-6)
+    def late(self: TritonAdam, updates: list[Update], factors: Tensor, seen: Tensor | None) -> None:
+        real(self, updates, factors, seen)
+        if seen is not None:  # as in direct steps alone
+            for update in updates:
+                update.parameter.detach().mul_(1 + 1e-6)
 
     monkeypatch.setattr(TritonAdam, "launch", late)
     assert "has other bits after 10 direct steps" in direct_fault(TritonRasterizer(), cpu, TINY)
@@ -520,5 +521,5 @@ def test_adam_matches_that_of_torch_and_reads_no_undefined_gradient(active: int 
         optimizer.step()
         state.step += 1
         undefined = torch.where(read.view(30, 15, 3), gradient, torch.nan)
-        TritonAdam()(values, undefined, state, seen, active)
+        TritonAdam()([Update(values, undefined, state, active)], seen)
     assert torch.allclose(values.double(), theirs.detach(), rtol=0, atol=1e-6)

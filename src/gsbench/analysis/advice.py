@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, group_by
@@ -18,23 +18,39 @@ EXPERIMENT = "+experiment"
 Words = dict[str, list[str]]  # the values of each key of a command, in order
 
 
+Advice = Callable[[Sequence[TrialResult], Sequence[TrialResult]], str]
+
+
+def equal_counts_words(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:
+    """The words for arms that all end with the count of the smallest trial; "" without counts."""
+    counts = [trial.record.num_gaussians for trial in (*baseline, *arm)]
+    known = [count for count in counts if count]
+    if not known:
+        return ""
+    unit = 10 ** max(0, math.floor(math.log10(min(known))) + 1 - DIGITS)
+    return f"densify.cap=governor densify.max_gaussians={min(known) // unit * unit}"
+
+
+def equal_counts_settings(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:
+    """The advice to add `equal_counts_words` where the arms are written; "" without counts."""
+    words = equal_counts_words(baseline, arm)
+    return words and f"give both arms {words} and another name"
+
+
 def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:
     """The command for arms that all end with the count of the smallest trial; "" without counts.
 
     It repeats the words of the trials' own commands, as the experiment's plan records them. If
     the plan does not have them, only the words to add are named.
     """
-    counts = [trial.record.num_gaussians for trial in (*baseline, *arm)]
-    known = [count for count in counts if count]
-    if not known:
+    added = equal_counts_words(baseline, arm)
+    if not added:
         return ""
-    unit = 10 ** max(0, math.floor(math.log10(min(known))) + 1 - DIGITS)
-    added = f"densify.cap=governor densify.max_gaussians={min(known) // unit * unit}"
     home = baseline[0].path.parents[2]
     planned = _planned_words(home)
     sides = [_words_of([planned.get(trial.path, ()) for trial in own]) for own in (baseline, arm)]
     if not all(sides):
-        return f"give both arms {added} and another name"
+        return equal_counts_settings(baseline, arm)
     end = f"{added} name={shlex.quote(f'{home.name}_equal')}"
     if EXPERIMENT in sides[0] and sides[0][EXPERIMENT] == sides[1].get(EXPERIMENT):
         # The experiment's file has the arms and seeds; what all trials share was typed.

@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from gsbench.analysis.advice import equal_counts_command
+from gsbench.analysis.advice import Advice, equal_counts_command
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
@@ -42,25 +42,37 @@ NOTHING = (
 VIEWS = "validation views"  # every search judges its points on them
 
 
-def caveats(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
-    """Sentences on unequal counts, several differing ingredients and unequal tuning, or ""."""
+def caveats(
+    trials: Sequence[TrialResult],
+    first: Arm,
+    second: Arm,
+    advise: Advice = equal_counts_command,
+) -> str:
+    """Sentences on unequal counts, several differing ingredients and unequal tuning, or "".
+
+    ``advise`` says how to compare at equal counts.
+    """
     names = ingredients_between(trials, first, second)
     mixed = ingredients_sentence(names, first, second) if is_mixed(names) else ""
-    counts = counts_sentence(trials, first, second)
+    counts = counts_sentence(trials, first, second, advise)
     return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
 
 
-def counts_sentence(trials: Sequence[TrialResult], first: Arm, second: Arm) -> str:
+def counts_sentence(
+    trials: Sequence[TrialResult],
+    first: Arm,
+    second: Arm,
+    advise: Advice = equal_counts_command,
+) -> str:
     """Say how many more Gaussians the second arm has over common scenes; "" if counts are equal."""
     baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
     change = relative_change(baseline, other, COSTS["gaussians"][1])
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
         return ""
     more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
-    advice = equal_counts_command(baseline, other)
     return (
         f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts. "
-        f"To do so: {advice}."
+        f"To do so: {advise(baseline, other)}."
     )
 
 

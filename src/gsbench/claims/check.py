@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import Verdict, judge
@@ -405,7 +406,8 @@ def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
         (baseline.arm, new.arm) for baseline, new in zip(trials[::2], trials[1::2], strict=True)
     )
     pairs = [(baseline, arm) for baseline, arm in arms if baseline != arm]
-    sentences = dict.fromkeys(caveats(trials, *pair) for pair in pairs)
+    # The arms are written in the claims file, so no command alone would change them.
+    sentences = dict.fromkeys(caveats(trials, *pair, equal_counts_settings) for pair in pairs)
     return tuple(fairness_table(trials, *pair) for pair in pairs), " ".join(filter(None, sentences))
 
 

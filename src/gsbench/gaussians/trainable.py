@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -27,28 +28,32 @@ class AdamState:
     second: Tensor
 
 
-class StepAll(Protocol):
-    """Applies Adam to a whole parameter [N, ...] in place, for step ``state.step`` (1, 2, …).
+class Update(NamedTuple):
+    """A parameter [N, ...] to update with its ``gradient`` and Adam's ``state``.
 
-    With ``seen`` [N], or ``active`` columns of a parameter with more, the gradient is 0 where
-    ``seen`` is 0, and from column ``active`` on. There ``gradient`` may be undefined.
+    The gradient is 0 from column ``active`` on (None: nowhere), where it may be undefined.
     """
 
-    def __call__(
-        self,
-        parameter: Tensor,
-        gradient: Tensor,
-        state: AdamState,
-        seen: Tensor | None = None,
-        active: int | None = None,
-    ) -> None: ...
+    parameter: Tensor
+    gradient: Tensor
+    state: AdamState
+    active: int | None = None
+
+
+class StepAll(Protocol):
+    """Applies Adam to whole parameters in place, for their step ``state.step`` (1, 2, …).
+
+    With ``seen`` [N], gradients are 0 where it is 0, and may be undefined there.
+    """
+
+    def __call__(self, updates: Sequence[Update], seen: Tensor | None = None) -> None: ...
 
 
 @dataclass(frozen=True)
 class KnownGradients:
     """Gradients by ``parameters``, in their order, computed without autograd.
 
-    They are those of a step with harmonics up to ``sh_degree``. See `StepAll` for ``seen``.
+    They are those of a step with harmonics up to ``sh_degree``. See `StepAll` for ``seen`` [N].
     """
 
     parameters: list[Tensor]
@@ -56,10 +61,13 @@ class KnownGradients:
     seen: Tensor  # [N] int32
     sh_degree: int
 
-    def active(self, k: int) -> int | None:
-        """The columns with a gradient of parameter ``k``; None: all."""
-        is_rest = k == len(self.parameters) - 1
-        return 3 * ((self.sh_degree + 1) ** 2 - 1) if is_rest else None
+    def updates(self, states: Sequence[AdamState | None]) -> list[Update]:
+        """The updates of the parameters with a state; None leaves one out."""
+        # Harmonics, the last parameter, have gradients up to the degree.
+        rest = 3 * ((self.sh_degree + 1) ** 2 - 1)
+        active = [None] * (len(self.parameters) - 1) + [rest]
+        found = zip(self.parameters, self.gradients, states, active, strict=True)
+        return [Update(*one[:2], state, one[3]) for one in found if (state := one[2]) is not None]
 
 
 class TrainableGaussians:
@@ -131,17 +139,18 @@ class TrainableGaussians:
         if sh_degree == 0 and self.values.means.grad is not None:
             self.values.sh_rest.grad = None
             self.adam["sh_rest"].step += 1
-        index = None if visible is None else visible.nonzero().squeeze(-1)  # [V]
+        updates = []
         for name, parameter in self.values.tensors().items():
-            if parameter.grad is None:
-                continue
-            state = self.adam[name]
-            state.step += 1
-            if index is None:
-                self.step_all(parameter, parameter.grad, state)
-            else:
-                _step_rows(parameter, parameter.grad, state, index)
-            parameter.grad = None
+            if parameter.grad is not None:
+                self.adam[name].step += 1
+                updates.append(Update(parameter, parameter.grad, self.adam[name]))
+                parameter.grad = None
+        if visible is None:
+            self.step_all(updates)
+        else:
+            index = visible.nonzero().squeeze(-1)  # [V]
+            for update in updates:
+                _step_rows(update, index)
 
     def advance(self, known: KnownGradients) -> list[AdamState | None]:
         """Count a step with ``known`` gradients; return the state of each parameter to update.
@@ -163,11 +172,7 @@ class TrainableGaussians:
     @torch.no_grad()
     def apply(self, known: KnownGradients, states: list[AdamState | None]) -> None:
         """Apply Adam with ``known`` gradients to the parameters with a state from `advance`."""
-        for k, state in enumerate(states):
-            if state is not None:
-                self.step_all(
-                    known.parameters[k], known.gradients[k], state, known.seen, known.active(k)
-                )
+        self.step_all(known.updates(states), known.seen)
 
     @torch.no_grad()
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
@@ -230,40 +235,36 @@ class TrainableGaussians:
         return trainable
 
 
-def torch_adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    state: AdamState,
-    seen: Tensor | None = None,
-    active: int | None = None,
-) -> None:
-    """Apply Adam (Kingma and Ba 2015) to a whole parameter, by torch's fused kernel."""
-    if seen is not None or active is not None:
-        raise NotImplementedError("torch_adam: gradients must be defined everywhere")
-    fused = parameter.device.type in ("cpu", "cuda")
-    # torch counts the step itself.
-    step = torch.tensor(state.step - 1.0, device=parameter.device if fused else "cpu")
-    adam(
-        [parameter],
-        [gradient],
-        [state.first],
-        [state.second],
-        [],
-        [step],
-        fused=fused,
-        amsgrad=False,
-        beta1=ADAM_BETAS[0],
-        beta2=ADAM_BETAS[1],
-        lr=state.rate,
-        weight_decay=0.0,
-        eps=ADAM_EPSILON,
-        maximize=False,
-    )
+def torch_adam(updates: Sequence[Update], seen: Tensor | None = None) -> None:
+    """Apply Adam (Kingma and Ba 2015) to whole parameters, by torch's fused kernel."""
+    for parameter, gradient, state, active in updates:
+        if seen is not None or active is not None:
+            raise NotImplementedError("torch_adam: gradients must be defined everywhere")
+        fused = parameter.device.type in ("cpu", "cuda")
+        # torch counts the step itself. `full` makes the number on the device, without an upload.
+        step = torch.full((), state.step - 1.0, device=parameter.device if fused else "cpu")
+        adam(
+            [parameter],
+            [gradient],
+            [state.first],
+            [state.second],
+            [],
+            [step],
+            fused=fused,
+            amsgrad=False,
+            beta1=ADAM_BETAS[0],
+            beta2=ADAM_BETAS[1],
+            lr=state.rate,
+            weight_decay=0.0,
+            eps=ADAM_EPSILON,
+            maximize=False,
+        )
 
 
-def _step_rows(parameter: Tensor, gradients: Tensor, state: AdamState, index: Tensor) -> None:
+def _step_rows(update: Update, index: Tensor) -> None:
     """Apply Adam to the rows ``index`` [V] only. All rows share one step count."""
     beta1, beta2 = ADAM_BETAS
+    parameter, gradients, state, _ = update
     step, gradient = state.step, gradients[index]
     # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
     # m' = m / (1 - b1^step) and v' = v / (1 - b2^step). As in torch, eps is outside the root.

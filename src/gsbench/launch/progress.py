@@ -13,7 +13,7 @@ from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import TrialResult, newest_code, read_experiment
 from gsbench.errors import InputError
-from gsbench.launch.states import TrialState, planned_names, states_of_experiment
+from gsbench.launch.states import TrialState, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES
 from gsbench.runs.trial_folder import TrialFolder
@@ -74,7 +74,7 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
 def progress_of(home: Path) -> Progress:
     """The progress of the experiment in ``home``, from its files."""
     states = [state for state in states_of_experiment(home) if state.state != "superseded"]
-    names = planned_names([state.folder for state in states])
+    names = names_of(states)
     cells: dict[Name, dict[str, int]] = {
         name: dict.fromkeys((*COUNTED, WAITING), 0) for name in sorted(names.values())
     }

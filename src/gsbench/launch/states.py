@@ -16,7 +16,7 @@ from pydantic import Field
 
 from gsbench.errors import InputError
 from gsbench.files import write_json
-from gsbench.launch.record import read_plan
+from gsbench.launch.record import PlannedTrial, read_plan
 from gsbench.parsing import Record, read_if_sound
 from gsbench.runs.experiments import trial_folders
 from gsbench.runs.keys import determining_settings
@@ -28,7 +28,7 @@ from gsbench.system.programs import NEUTRAL, safe_environment
 
 @dataclass(frozen=True)
 class TrialState:
-    """A trial's state, the time at which it began (Unix time), and a note.
+    """A trial's state, the time at which it began (Unix time), a note, and its entry in the plan.
 
     A ``queued`` trial waits in Slurm's queue. A finished trial is ``superseded`` if its code is no
     longer the present code; a failed one if a trial of later code has the same settings.
@@ -38,19 +38,21 @@ class TrialState:
     state: State | Literal["queued", "superseded"]
     since: float | None
     note: str
+    planned: PlannedTrial | None = None
 
 
 def states_of_experiment(home: Path) -> list[TrialState]:
     """The states of all trials of the experiment in ``home``, planned or with a folder."""
-    planned = {folder: trial.time for folder, trial in read_plan(home).items()}
+    plan = read_plan(home)
     begun = {
         path
         for path in map(Path, trial_folders(home))
         if SEED in path.name and (path / CONFIG).exists()
     }
-    folders = sorted({*planned, *begun})
+    folders = sorted({*plan, *begun})
     queue = ask_queue(folders)
-    return _mark_superseded([_state(folder, planned.get(folder), queue) for folder in folders])
+    states = [_state(folder, plan.get(folder), queue) for folder in folders]
+    return _mark_superseded([replace(one, planned=plan.get(one.folder)) for one in states])
 
 
 def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
@@ -86,8 +88,8 @@ def _settings(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialState:
-    """The state of the trial in ``folder``; ``planned`` is the time of its plan."""
+def _state(folder: Path, planned: PlannedTrial | None, queue: Queue | None) -> TrialState:
+    """The state of the trial in ``folder``; ``planned`` is its entry in the plan."""
     state = TrialFolder(folder).state()
     if state == "done":
         return TrialState(
@@ -123,7 +125,8 @@ def _state(folder: Path, planned: float | None, queue: Queue | None) -> TrialSta
         return TrialState(
             folder, state, _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost
         )
-    return TrialState(folder, state, planned, "never started" + lost)
+    since = None if planned is None else planned.time
+    return TrialState(folder, state, since, "never started" + lost)
 
 
 def _progress(folder: Path) -> str:
@@ -279,11 +282,9 @@ def arm_names(words: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, str]
     return names
 
 
-def planned_names(folders: Sequence[Path]) -> dict[Path, tuple[str, str]]:
-    """`arm_names` of trials from the plans of their experiments."""
-    homes = dict.fromkeys(folder.parents[2] for folder in folders)
-    plan = {folder: planned for home in homes for folder, planned in read_plan(home).items()}
-    return arm_names({one: plan[one].overrides if one in plan else () for one in folders})
+def names_of(states: Sequence[TrialState]) -> dict[Path, tuple[str, str]]:
+    """`arm_names` of trials from their entries in the plan."""
+    return arm_names({one.folder: one.planned.overrides if one.planned else () for one in states})
 
 
 def label_of(folder: Path, names: Mapping[Path, tuple[str, str]]) -> str:

@@ -112,9 +112,10 @@ def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> 
 
 def upload(numbers: Sequence[float], device: torch.device) -> Tensor:
     """The ``numbers`` as float32 on ``device``; the host does not wait for the copy."""
-    host = torch.tensor(numbers, dtype=torch.float32)
     # A copy is asynchronous only from page-locked memory.
-    return (host.pin_memory() if device.type == "cuda" else host).to(device, non_blocking=True)
+    host = torch.empty(len(numbers), pin_memory=device.type == "cuda")
+    host.numpy()[:] = numbers
+    return host.to(device, non_blocking=True)
 
 
 class Readback:

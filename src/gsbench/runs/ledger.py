@@ -233,7 +233,7 @@ def read_ledger(home: Path) -> Ledger:
                 f"{path}: line {number} does not follow the line before it: one of them was "
                 f"edited, moved or taken out: {MEND}"
             )
-        if content.decode() != _line(head, json.loads(content)["entry"]):
+        if content.decode() != _line(head, as_json(line.entry)):
             raise InputError(f"{path}: line {number} was edited: {MEND}")
         if fault := _fault(Ledger(tuple(entries), head), line.entry):
             raise InputError(f"{path}: line {number} {fault}: {MEND}")

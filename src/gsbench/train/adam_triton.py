@@ -5,12 +5,14 @@ torch's fused kernel reaches half of the memory's throughput on an H100 (docs/me
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from gsbench.gaussians.trainable import ADAM_BETAS, ADAM_EPSILON, AdamState
+from gsbench.gaussians.trainable import ADAM_BETAS, ADAM_EPSILON, Update
 from gsbench.raster.staged import upload
 from gsbench.raster.triton.launch import launch_grid
 
@@ -68,30 +70,20 @@ def adam_factors(rate: float, step: int) -> tuple[float, float]:
 class TritonAdam:
     """Adam for `TrainableGaussians` on a GPU; see `gsbench.gaussians.trainable.StepAll`."""
 
-    def __call__(
-        self,
-        parameter: Tensor,
-        gradient: Tensor,
-        state: AdamState,
-        seen: Tensor | None = None,
-        active: int | None = None,
-    ) -> None:
-        """Apply step ``state.step``; the host does not wait."""
-        factors = upload(adam_factors(state.rate, state.step), parameter.device)
-        self.launch(parameter, gradient, state, factors, seen, active)
+    def __call__(self, updates: Sequence[Update], seen: Tensor | None = None) -> None:
+        """Apply Adam; the host does not wait."""
+        if updates:
+            factors = [x for one in updates for x in adam_factors(one.state.rate, one.state.step)]
+            self.launch(updates, upload(factors, updates[0].parameter.device).view(-1, 2), seen)
 
-    def launch(
-        self,
-        parameter: Tensor,
-        gradient: Tensor,
-        state: AdamState,
-        factors: Tensor,
-        seen: Tensor | None,
-        active: int | None,
-    ) -> None:
-        """Apply Adam with ``factors`` [2] in the memory of the device."""
-        count = len(parameter)
-        if count:
+    def launch(self, updates: Sequence[Update], factors: Tensor, seen: Tensor | None) -> None:
+        """Apply Adam with ``factors`` [updates, 2] in the memory of the device."""
+        for (parameter, gradient, state, active), own in zip(
+            updates, factors.unbind(), strict=True
+        ):
+            count = len(parameter)
+            if not count:
+                continue
             width = parameter.numel() // count
             with torch.cuda.device_of(parameter):
                 launch_grid(adam_step, triton.cdiv(parameter.numel(), NUMBERS))(
@@ -99,7 +91,7 @@ class TritonAdam:
                     gradient,
                     state.first,
                     state.second,
-                    factors,
+                    own,
                     gradient if seen is None else seen,
                     count,
                     WIDTH=width,

@@ -261,7 +261,7 @@ class _Plan:
         assert self.adam_graph is not None
         host = self.factors_on_host[self.adam[0].step % FACTORS_KEPT]
         rows = [(0.0, 0.0) if x is None else adam_factors(x.rate, x.step) for x in states]
-        host.copy_(torch.tensor(rows, dtype=torch.float32))
+        host.numpy()[:] = rows
         self.factors.copy_(host, non_blocking=True)
         self.adam_graph()
 
@@ -309,18 +309,10 @@ class _Plan:
         self.known = KnownGradients(self.parameters, self.gradients, seen, self.shape.degree)
 
     def _third(self) -> None:
-        adam = TritonAdam()
-        for k, state in enumerate(self.adam):
-            active = self.known.active(k)
-            if active != 0:
-                adam.launch(
-                    self.parameters[k],
-                    self.gradients[k],
-                    state,
-                    self.factors[k],
-                    self.known.seen,
-                    active,
-                )
+        # At degree 0, the harmonics, the last parameter, have no gradient.
+        states = [*self.adam[:-1], self.adam[-1] if self.shape.degree else None]
+        updates = self.known.updates(states)
+        TritonAdam().launch(updates, self.factors[: len(updates)], self.known.seen)
 
     def _measure_room(self) -> None:
         """Find the sizes of the lists of this view, and make room for them."""

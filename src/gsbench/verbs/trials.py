@@ -24,7 +24,7 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
-from gsbench.launch.states import TrialState, label_of, planned_names, states_of_experiment
+from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.keys import module_digest
 from gsbench.runs.trial_folder import TrialFolder
@@ -126,7 +126,8 @@ def _cell(counts: dict[str, int]) -> str:
 
 def progress_with_superseded(home: Path) -> list[TrialState]:
     """The state of every trial in ``home``; those that older code made are ``superseded``."""
-    folders = {folder: trial.cwd for folder, trial in read_plan(home).items()}
+    states = states_of_experiment(home)
+    folders = {one.folder: one.planned.cwd for one in states if one.planned is not None}
 
     # The user's modules are read in the folder where the trial's command was given: another may
     # have a namesake.
@@ -134,7 +135,6 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
         return module_digest(module, folders[trial.path]) if trial.path in folders else None
 
     reasons = find_superseded(read_experiment(home).trials, present_digest)
-    states = states_of_experiment(home)
     for place, trial in enumerate(states):
         if trial.state == "done" and trial.folder in reasons:
             states[place] = replace(trial, state="superseded", note=reasons[trial.folder])
@@ -143,7 +143,7 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
 
 def lines_of(trials: list[TrialState], with_done: bool) -> list[str]:
     """A line for each trial not done or in doubt (``with_done``: for each), and a summary."""
-    lines, names = [], planned_names([trial.folder for trial in trials])
+    lines, names = [], names_of(trials)
     for trial in sorted(trials, key=lambda trial: ORDER.index(trial.state)):
         if trial.state != "done" or trial.note or with_done:
             label = label_of(trial.folder, names)
