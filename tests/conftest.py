@@ -1,13 +1,9 @@
 """Fixtures that all tests share."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 # before torch is imported, as the program itself does
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -27,7 +23,7 @@ settings.load_profile("gsbench")
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def script(name: str) -> Any:
+def script(name):
     """Load a file of scripts/ as a module."""
     specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     assert specification is not None
@@ -39,7 +35,7 @@ def script(name: str) -> Any:
 
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
+def shared():
     """The folder with development data beside the checkout; skips if it is absent."""
     folder = ROOT.parent / "shared"
     if not (folder / "data").is_dir():
@@ -48,7 +44,7 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared_weights(shared: Path) -> Path:
+def shared_weights(shared):
     """The folder with small network weights; skips if it is absent."""
     if not (shared / "weights").is_dir():
         pytest.skip(f"needs the weights in {shared / 'weights'}")
@@ -56,14 +52,14 @@ def shared_weights(shared: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
+def _own_search_path(monkeypatch):
     """Restore PYTHONSAFEPATH after each test: the program sets it for its children."""
     monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that monkeypatch knows it, and restores it
     monkeypatch.delenv("PYTHONSAFEPATH")
 
 
 @pytest.fixture
-def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+def caplog(caplog):
     """Catch gsbench's log lines, too: its logger does not propagate them once a command has run."""
     from gsbench.logs import LOGGER, set_up_logging
 
@@ -76,7 +72,7 @@ def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixtur
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def runs(tmp_path, monkeypatch):
     """The runs folder of a test that works in its own folder; it is not made yet."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
@@ -88,7 +84,7 @@ def said(capsys):
     """A function that runs a command line, which must succeed, and returns what it prints."""
     from gsbench.cli import run
 
-    def call(*words: object) -> str:
+    def call(*words):
         capsys.readouterr()
         assert run([*map(str, words)]) == 0
         return capsys.readouterr().out
@@ -101,7 +97,7 @@ def refused(capsys):
     """A function that runs a command line, which must be refused, and returns the error's line."""
     from gsbench.cli import run
 
-    def call(*words: object) -> str:
+    def call(*words):
         capsys.readouterr()
         assert run([*map(str, words)]) == 2
         (line,) = capsys.readouterr().err.splitlines()

@@ -1,19 +1,15 @@
 """Progress in a log: some lines, and always the last one."""
 
-from __future__ import annotations
-
 import io
 import logging
 import sys
-
-import pytest
 
 from gsbench.logs import SECONDS_BETWEEN_LINES, no_progress, progress
 
 
 def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    caplog,
+):
     caplog.set_level(logging.INFO, "gsbench")
     with progress("train") as report:
         for done in range(1, 5):
@@ -27,9 +23,7 @@ def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
     ]
 
 
-def test_a_log_gets_a_line_from_time_to_time(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_gets_a_line_from_time_to_time(caplog, monkeypatch):
     caplog.set_level(logging.INFO, "gsbench")
     now = 1000.0
     monkeypatch.setattr("time.monotonic", lambda: now)
@@ -50,10 +44,10 @@ def test_a_log_gets_a_line_from_time_to_time(
 
 
 def test_a_terminal_gets_a_bar_without_control_characters_of_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     class Terminal(io.StringIO):
-        def isatty(self) -> bool:
+        def isatty(self):
             return True
 
     monkeypatch.setenv("TERM", "xterm")
@@ -63,7 +57,7 @@ def test_a_terminal_gets_a_bar_without_control_characters_of_others(
     with progress("fetch") as report:
         report("a", 1, 2)
         report("b", 1, 2, "[red]\x07 of 5")
-    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    shown = sys.stderr.getvalue()
     assert "fetch: b" in shown
     assert "[red]\\x07 of 5" in shown
     assert "\x07" not in shown

@@ -3,13 +3,12 @@
 import itertools
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from gsbench.analysis.fairness import counts_sentence
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import (
     build_table,
     doubt_notes,
@@ -33,12 +32,12 @@ COMPARED = (
 )
 
 
-def trials_of(tmp_path: Path, **plan: object) -> tuple[TrialResult, ...]:
+def trials_of(tmp_path, **plan):
     write_runs(tmp_path, Plan(**plan))
     return load_experiment(tmp_path, "exp").trials
 
 
-def with_record(trial: TrialResult, **values: object) -> TrialResult:
+def with_record(trial, **values):
     return replace(trial, record=replace(trial.record, **values))
 
 

@@ -30,7 +30,7 @@ from tests.analysis.synthetic import Plan, write_runs
 from tests.analysis.test_tables import one_trial, texts
 
 
-def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
+def cell(mean, std=None, count=3):
     return Cell(mean, std, count, 3, 1, ())
 
 

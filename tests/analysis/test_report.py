@@ -8,7 +8,6 @@ import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,7 +32,7 @@ from gsbench.analysis.report.build import (
     trial_figures,
 )
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
-from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdicts import by_scene_lines, judge_pairs, sentence
 from gsbench.errors import InputError
@@ -47,7 +46,7 @@ ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Path:
+def runs(tmp_path_factory):
     """Two scenes with pictures, in which "volumetric" differs only by a clearly better LPIPS."""
     folder = tmp_path_factory.mktemp("runs")
     write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1))
@@ -55,12 +54,12 @@ def runs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def experiment(runs) -> Experiment:
+def experiment(runs):
     return load_experiment(runs, "exp")
 
 
 @pytest.fixture(scope="module")
-def page(experiment) -> str:
+def page(experiment):
     return build_report(experiment)
 
 
@@ -85,24 +84,24 @@ class Elements(HTMLParser):
 
     VOID = ("meta", "link", "img", "input", "br")
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
+        self.found = []
+        self.open = []
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))
         if tag not in self.VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag, f"{tag} closes out of order at {self.getpos()}"
 
-    def all(self, tag: str) -> list[dict[str, str | None]]:
+    def all(self, tag):
         return [attrs for name, attrs in self.found if name == tag]
 
 

@@ -9,7 +9,6 @@ import statistics
 import subprocess
 from collections.abc import Callable
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from gsbench.analysis.quantities import (
 )
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.table_formats import (
-    Table,
     escape_latex,
     to_csv,
     to_html_page,
@@ -38,12 +36,12 @@ Make = Callable[..., Experiment]
 
 
 def one_trial(
-    runs: Path,
-    seed: int,
-    config_hash: str = "c0ffee00",
-    settings: dict | None = None,
-    **values: object,
-) -> Path:
+    runs,
+    seed,
+    config_hash="c0ffee00",
+    settings=None,
+    **values,
+):
     """A trial of one scene; ``psnr=…`` gives a metric, ``_iterations=…`` a key of results.json."""
     metrics = {key: value for key, value in values.items() if not key.startswith("_")}
     plan = Plan()
@@ -55,7 +53,7 @@ def one_trial(
     return write_trial(runs, data, views, config_hash, **(settings or {}))
 
 
-def texts(table: Table) -> list[list[str]]:
+def texts(table):
     return [
         [*row.labels, *(f"*{e.text}*" if e.bold else e.text for e in row.entries)]
         for row in table.rows
@@ -330,12 +328,12 @@ def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment):
 class Balance(HTMLParser):
     """Counts cells by row and checks that tags close in order."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.open: list[str] = []
-        self.rows: list[int] = []
+        self.open = []
+        self.rows = []
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         if tag not in ("meta", "br"):
             self.open.append(tag)
         if tag == "tr":
@@ -343,7 +341,7 @@ class Balance(HTMLParser):
         if tag in ("td", "th"):
             self.rows[-1] += int(dict(attrs).get("colspan") or 1)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
 
@@ -363,7 +361,7 @@ def test_latex_escapes_what_is_special():
     assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 ? \\#1"
 
 
-def has_latex() -> bool:
+def has_latex():
     """Whether pdflatex and booktabs are installed."""
     if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
         return False

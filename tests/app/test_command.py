@@ -2,8 +2,6 @@
 
 import copy
 import logging
-from collections.abc import Sequence
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -21,7 +19,7 @@ from gsbench.launch.jobs import Outcome
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
 
-OWN_FILES: dict[str, Any] = {
+OWN_FILES = {
     **{"run": {"dir": "."}, "sweep": {"dir": ".", "subdir": "."}},
     **{"output_subdir": None, "job_logging": {}},
 }
@@ -134,7 +132,7 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 )
 def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
     caplog.set_level(logging.INFO, "gsbench")
-    status: Any = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
+    status = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
     trials = [trial(tmp_path, seed) for seed in range(len(ends))]
     outcomes = [
         Outcome(one.folder, status[end], "why", end == "b")
@@ -160,10 +158,10 @@ def test_the_failure_of_a_single_trial_is_raised(tmp_path):
 
 
 def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatch):
-    asked: list[Any] = []
+    asked = []
     made = [trial(tmp_path, scene={"name": name}) for name in ("a", "b")]
 
-    def compose_trials(words: Sequence[str], multirun: bool) -> list[Trial]:
+    def compose_trials(words, multirun):
         asked.append((words, multirun))
         return made
 
@@ -203,7 +201,7 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
 def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
     made = [trial(tmp_path, seed) for seed in range(trials)]
 
-    def run_app(words: Sequence[str], multirun: bool, task: Any) -> None:
+    def run_app(words, multirun, task):
         assert task.look_only == (task.handle is command.list_trials)
         task.trials = made
 
@@ -213,7 +211,7 @@ def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trial
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):
-    asked: list[Any] = []
+    asked = []
     monkeypatch.setattr(command, "set_up_logging", asked.append)
     command.compose_trials(["hydra.verbose=true"])
     command.compose_trials(["hydra.verbose=[gsbench.scene]", "seed=0,1"], multirun=True)

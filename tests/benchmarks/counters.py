@@ -1,13 +1,9 @@
 """For work on speed: the time of a step by kernel, and its number of waits for a GPU."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -37,13 +33,13 @@ MAKING = "lift_fresh"  # a tensor of Python numbers: an upload if it is for a de
 
 
 @contextmanager
-def timed_kernels() -> Iterator[Counter[str]]:
+def timed_kernels():
     """Measure the processor time, ms, of each compiled kernel within the block, over all threads.
 
     Until the block ends, every kernel in a module of gsbench is replaced by one that is timed.
     """
-    times: Counter[str] = Counter()
-    replaced: list[tuple[dict[str, Any], str, Any]] = []
+    times = Counter()
+    replaced = []
     for module, contents in [
         (name, vars(found)) for name, found in sys.modules.items() if found is not None
     ]:
@@ -60,19 +56,19 @@ def timed_kernels() -> Iterator[Counter[str]]:
             contents[name] = value
 
 
-def _timed_call(kernel: Any, times: Counter[str]) -> Callable[..., Any]:
-    def call(*arguments: Any, **options: Any) -> Any:
+def _timed_call(kernel, times):
+    def call(*arguments, **options):
         begin = time.thread_time()
         try:
             return kernel(*arguments, **options)
         finally:
-            times[kernel.py_func.__name__] += 1e3 * (time.thread_time() - begin)  # type: ignore[assignment]
+            times[kernel.py_func.__name__] += 1e3 * (time.thread_time() - begin)
 
     return call
 
 
 @contextmanager
-def counting_waits(pretend: bool = False) -> Iterator[Counter[str]]:
+def counting_waits(pretend=False):
     """Count the operations within the block that would make the host wait for a CUDA device.
 
     These read a value, need a size that depends on values (``nonzero``, an index that is a mask),
@@ -80,7 +76,7 @@ def counting_waits(pretend: bool = False) -> Iterator[Counter[str]]:
     ``pretend``, every tensor on the CPU counts as one on a device, so that a tensor of Python
     numbers is an upload.
     """
-    counts: Counter[str] = Counter()
+    counts = Counter()
     before = Readback.waits
     with _CountingMode(counts, pretend):
         yield counts
@@ -89,14 +85,12 @@ def counting_waits(pretend: bool = False) -> Iterator[Counter[str]]:
 
 
 class _CountingMode(TorchDispatchMode):
-    def __init__(self, counts: Counter[str], pretend: bool) -> None:
+    def __init__(self, counts, pretend):
         super().__init__()
         self._counts = counts
         self._pretend = pretend
 
-    def __torch_dispatch__(
-        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         name = function.overloadpacket.__name__
         result = function(*args, **kwargs)
@@ -117,17 +111,17 @@ class _CountingMode(TorchDispatchMode):
         return result
 
 
-def _is_mask(index: Any) -> bool:
+def _is_mask(index):
     return isinstance(index, torch.Tensor) and index.dtype in (torch.bool, torch.uint8)
 
 
-def _crosses(args: Any, result: Any) -> bool:
+def _crosses(args, result):
     """Return whether a copy goes from one type of device to another."""
     types = {tensor.device.type for tensor in (*args, result) if isinstance(tensor, torch.Tensor)}
     return len(types) > 1
 
 
-def _is_asynchronous(name: str, args: Any, kwargs: Any) -> bool:
+def _is_asynchronous(name, args, kwargs):
     if kwargs.get("non_blocking"):
         return True
     return name == "copy_" and len(args) > 2 and bool(args[2])

@@ -10,12 +10,9 @@ serial. Effects of threads on each other (memory, caches, scheduling) are left o
 upper bounds.
 """
 
-from __future__ import annotations
-
 import heapq
 import sys
 import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from unittest import mock
 
@@ -25,7 +22,6 @@ import torch
 from gsbench.bench.measure import NEVER, SH_DEGREE, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.trial import TrialSteps
@@ -43,7 +39,7 @@ TILE_SHARDS = (8, 16, 32)
 STEPS = 9
 
 
-def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
+def trained(folder, width):
     """A trial's model, and its first training view, ``width`` px wide, with noise as photograph."""
     values = TrialFolder(folder).configuration()
     steps = TrialSteps(Parts(values), Store(Path(values["runs"]) / STORE))
@@ -62,7 +58,7 @@ class Timed:
     ``stages`` are the stages of the last step in order: the name, and the ms of each shard.
     """
 
-    def __init__(self, gaussians: Gaussians, scene: Scene) -> None:
+    def __init__(self, gaussians, scene):
         densifier = ADC(
             start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None
         )
@@ -70,13 +66,13 @@ class Timed:
             scene, gaussians, densifier, CpuRasterizer(threads=1), constant_scene_options(), 0
         )
         self.trainer.step = SH_DEGREE
-        self.stages: list[tuple[str, list[float]]] = []
+        self.stages = []
 
-    def step(self) -> tuple[list[tuple[str, list[float]]], float, float]:
+    def step(self):
         """The stages of a step, ms of torch's Adam, and ms of all else."""
         self.stages = []
 
-        def timed(runner: ShardRunner, shards: int, work: Callable[[int, int], None]) -> None:
+        def timed(runner, shards, work):
             times = []
             for shard in range(shards):
                 begin = time.process_time()
@@ -96,7 +92,7 @@ class Timed:
         return self.stages, adam, 1e3 * (end - begin) - in_shards - adam
 
 
-def makespan(times: Sequence[float], threads: int) -> float:
+def makespan(times, threads):
     """The time until the last shard ends, if each goes to the first thread that is free."""
     free = [0.0] * threads
     for ms in times:
@@ -104,7 +100,7 @@ def makespan(times: Sequence[float], threads: int) -> float:
     return max(free)
 
 
-def simulate(title: str, gaussians: Gaussians, scene: Scene) -> None:
+def simulate(title, gaussians, scene):
     """Print the simulated times of a step, by number of threads and of shards of tiles."""
     for shards in TILE_SHARDS:
         with mock.patch.object(executor, "TILE_SHARDS", shards):

@@ -9,7 +9,6 @@ from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import plan_looks
 from gsbench.claims.stopping import (
-    KeyAndSeed,
     plan_sweep,
     run_looks,
     trials_of_look,
@@ -33,7 +32,7 @@ DECLARATION = Declaration(
 )
 
 
-def verdict(final: bool) -> Verdict:
+def verdict(final):
     return Verdict(BOTH, asked_quantity("psnr"), Pairs(()), final=final)
 
 
@@ -56,7 +55,7 @@ def test_trials_of_a_look_are_ordered_by_seed_and_each_is_listed_once():
     ],
 )
 def test_looks_end_when_nothing_can_be_decided(finals, looked):
-    batches: list[list[KeyAndSeed]] = []
+    batches = []
     answers = iter(finals)
     verdicts = run_looks(
         DECLARATION, lambda: [verdict(final) for final in next(answers)], batches.append

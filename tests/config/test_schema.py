@@ -5,11 +5,10 @@ import json
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
 from gsbench.config.command_words import check_words, key_of, parse_word
@@ -24,12 +23,12 @@ from gsbench.train.options import STEPS, TrainConfig
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
 
-def options(group: str) -> list[str]:
+def options(group):
     return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
 
 
 @cache
-def composed(*overrides: str) -> dict[str, Any]:
+def composed(*overrides):
     """The values of a configuration, which tests share and do not change."""
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
@@ -38,14 +37,14 @@ def composed(*overrides: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def base() -> DictConfig:
+def base():
     """A composed configuration, for changes of single values: a composition takes long."""
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return compose("config")
 
 
-def changed(base: DictConfig, changes: dict[str, Any]) -> dict[str, Any]:
+def changed(base, changes):
     config = base.copy()
     OmegaConf.set_struct(config, False)
     for key, value in changes.items():
@@ -53,7 +52,7 @@ def changed(base: DictConfig, changes: dict[str, Any]) -> dict[str, Any]:
     return checked_values(config)
 
 
-def checked(base: DictConfig, *words: str) -> dict[str, Any]:
+def checked(base, *words):
     return changed(base, {key_of(word): parse_word(word).value() for word in words})
 
 
@@ -77,7 +76,7 @@ PROGRAMS = {
 PLACES = {option: ["init.path=/data/model.ply"] for option in ("ply", "points")}
 
 
-def needs(option: str) -> list[str]:
+def needs(option):
     return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
 
 
@@ -132,7 +131,7 @@ def test_the_paper_schedule_is_the_class_default():
     }
 
 
-def sweep_size(experiment: str) -> int:
+def sweep_size(experiment):
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose(
@@ -434,7 +433,7 @@ def test_a_text_is_kept_as_typed_or_refused(word, is_kept):
         (["train=quick", "train.steps_scaler=1e-6"], (1, 1, 1, 1, 1)),
     ],
 )
-def test_all_steps_of_the_schedule_are_scaled(words: list[str], scaled: tuple[int, ...]) -> None:
+def test_all_steps_of_the_schedule_are_scaled(words, scaled):
     values = composed("densify=adc", *words)
     train, densify = values["train"], values["densify"]
     keys = ("iterations", "densify_start", "densify_stop", "densify_interval")
@@ -447,6 +446,6 @@ def test_all_steps_of_the_schedule_are_scaled(words: list[str], scaled: tuple[in
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "x", "true"])
-def test_a_scale_that_is_no_number_above_zero_is_refused(value: str) -> None:
+def test_a_scale_that_is_no_number_above_zero_is_refused(value):
     with pytest.raises(InputError, match=r"train\.steps_scaler must be"):
         composed(f"train.steps_scaler={value}")

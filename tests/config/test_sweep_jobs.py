@@ -37,9 +37,9 @@ SWEEPS = {  # words, and how often Hydra composes for them
 
 
 @pytest.fixture
-def compositions(monkeypatch) -> list[list[str]]:
+def compositions(monkeypatch):
     """The words of each of Hydra's compositions of a job."""
-    asked: list[list[str]] = []
+    asked = []
     compose = ConfigLoaderImpl.load_sweep_config
 
     def counted(self, master_config, sweep_overrides):

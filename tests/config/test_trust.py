@@ -7,7 +7,6 @@ makes a folder.
 import importlib.util
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -28,13 +27,13 @@ MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
 LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
 
 
-def calls(**settings: Any) -> dict[str, Any]:
+def calls(**settings):
     """Settings of one of Hydra's own callbacks, with a stranger's further ``settings``."""
     return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
 
 
 # settings of a file, and a part of the line that refuses them
-STRANGE: dict[str, tuple[dict[str, Any], str]] = {
+STRANGE = {
     "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "allow_targets=[os]"),
     "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
     "in a list below a callback": (calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."),
@@ -242,7 +241,7 @@ def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     assert not Path("exploded").exists()
 
 
-JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep gives its jobs
+JOBS = {  # the words that a file's sweep gives its jobs
     "a callback": ({"+hydra.callbacks.x._target_": "os.mkdir"}, "cannot differ from job to job"),
     "a search path": ({"hydra.searchpath": "[pkg://bombs]"}, "cannot differ from job to job"),
     "a variable": ({"+hydra.job.env_set.PYTHONPATH": "/strange"}, "cannot differ from job to job"),

@@ -1,16 +1,12 @@
 """Run the real program as a user does: in a subprocess, in an empty folder."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 from filelock import FileLock
@@ -43,14 +39,14 @@ SMALL = [
 FINISHED = "finished"  # the name of the experiment that all tests may copy
 
 
-def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def common_folder(tmp_path_factory):
     """The temporary folder of this run of the tests, which is the same for all of its workers."""
     base = tmp_path_factory.getbasetemp()
     return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
 
 @pytest.fixture(scope="session")
-def finished_runs(environment, tmp_path_factory) -> Path:
+def finished_runs(environment, tmp_path_factory):
     """A runs folder with an experiment of four trials, trained once for all workers of the tests.
 
     Tests must not change it.
@@ -84,13 +80,13 @@ SWEEP = ["-m", *SMALL, "name=attacked", "densify=adc,volumetric", "tracking=none
 
 
 @pytest.fixture
-def runs(finished_runs, tmp_path) -> Path:
+def runs(finished_runs, tmp_path):
     """A copy of the finished experiment's runs folder, with its scene and initial cloud."""
     return shutil.copytree(finished_runs, tmp_path / "runs", symlinks=True)
 
 
 @pytest.fixture(scope="session")
-def environment(tmp_path_factory) -> dict[str, str]:
+def environment(tmp_path_factory):
     """The environment of the program: its own runs folder, no weights, no settings of the user."""
     kept = {
         key: value
@@ -104,7 +100,7 @@ def environment(tmp_path_factory) -> dict[str, str]:
 
 
 @pytest.fixture
-def gsbench(environment, tmp_path) -> Run:
+def gsbench(environment, tmp_path):
     """Call ``gsbench`` with arguments; returns the finished process with its output as text."""
 
     def run(*arguments, timeout=240, cwd=tmp_path, **changes):
@@ -121,7 +117,7 @@ def gsbench(environment, tmp_path) -> Run:
     return run
 
 
-def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) -> Path:
+def trial_of(settings, runs, capture, *words):
     """Run one trial of the capture in a folder within this process; returns the trial's folder."""
     assert (
         run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words])
@@ -136,9 +132,7 @@ def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) ->
 CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
-def start(
-    environment: dict[str, str], cwd: Path, runs: Path, *arguments: str, new_group: bool = False
-) -> subprocess.Popen[str]:
+def start(environment, cwd, runs, *arguments, new_group=False):
     """Start the program.
 
     With ``new_group``, it and all that it starts are a group, which can be sent Ctrl-C as by a
@@ -156,9 +150,9 @@ def start(
     )
 
 
-def results_of(runs: Path, name: str) -> dict[str, Any]:
+def results_of(runs, name):
     """The results of a sweep without times, with checksums of models, pictures and tables."""
-    found: dict[str, Any] = {}
+    found = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
         results = {
             key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED
@@ -179,7 +173,7 @@ def results_of(runs: Path, name: str) -> dict[str, Any]:
 
 
 @pytest.fixture
-def undisturbed(finished_runs) -> dict[str, Any]:
+def undisturbed(finished_runs):
     """The results of the trials of ``SWEEP`` from an undisturbed run."""
     return {
         trial: found

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from typing import Any
 
 import pytest
 
@@ -37,7 +36,7 @@ def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
 
     def results():
         (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
-        found: dict[str, Any] = json.loads(path.read_text())
+        found = json.loads(path.read_text())
         return found
 
     train()

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ SCENE = ["scene.views=12", "scene.width=96", "scene.height=72"]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, environment) -> Path:
+def trained(tmp_path_factory, environment):
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
     changed = environment | {"GSBENCH_RUNS": str(runs)}
@@ -45,25 +44,25 @@ def trained(tmp_path_factory, environment) -> Path:
 
 
 @pytest.fixture
-def runs(trained, tmp_path) -> Path:
+def runs(trained, tmp_path):
     """A copy of the runs folder that the test may change."""
     return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
 
 
-def trial(runs: Path, arm: str = "random-adc", seed: int = 0) -> Path:
+def trial(runs, arm="random-adc", seed=0):
     return next(runs.glob(f"small/courtyard/{arm}/*-seed{seed}"))
 
 
-def results(folder: Path) -> dict[str, Any]:
+def results(folder):
     return json.loads((folder / "results.json").read_text())
 
 
-def views(folder: Path) -> dict[str, dict[str, str]]:
+def views(folder):
     with (folder / "per_view.csv").open() as stream:
         return {row.pop("view"): row for row in csv.DictReader(stream)}
 
 
-def better_renders(runs: Path, folder: Path, seed: int) -> Path:
+def better_renders(runs, folder, seed):
     """Renders nearer to the photographs than those of the arm, with names of another program."""
     folder.mkdir()
     own = trial(runs, seed=seed)

@@ -5,24 +5,23 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 
 import pytest
 
 from gsbench.datasets.catalog import read_catalog
 from tests.datasets.conftest import archive_content, write_archive
-from tests.datasets.server import Manners, Server, serve
+from tests.datasets.server import Manners, serve
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def server(tmp_path) -> Iterator[Server]:
+def server(tmp_path):
     folder = tmp_path / "archives"
     folder.mkdir()
     for dataset in read_catalog().values():
         for archive in dataset.archives:
-            content: dict[str, bytes] = {}
+            content = {}
             for place in archive.scenes.values():
                 content |= archive_content(place, photos=2)
             write_archive(folder / archive.name, content)

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -53,7 +52,7 @@ WORDS = [
 ]
 
 
-def write_class(folder: Path, step: int, worse: bool) -> None:
+def write_class(folder, step, worse):
     (folder / "mine.py").write_text(CLASS.format(step=step, worse=worse))
 
 

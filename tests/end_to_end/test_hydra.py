@@ -2,7 +2,6 @@
 
 import json
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 
@@ -65,7 +64,7 @@ hydra:
 """
 
 
-def results_below(folder: Path) -> list[dict[str, float]]:
+def results_below(folder):
     return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
 
 

@@ -7,9 +7,7 @@ test-hydra-plugins`` installs them into a folder of their own. Without it these 
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Iterator
 from importlib.util import find_spec
-from typing import Any
 
 import psutil
 import pytest
@@ -21,7 +19,7 @@ from tests.end_to_end.test_hydra import SECONDS, TINY, results_below
 pytestmark = pytest.mark.slow
 
 
-def need(package: str) -> None:
+def need(package):
     if find_spec(f"hydra_plugins.{package}") is None:
         pytest.skip(f"needs {package.replace('_', '-')}: make test-hydra-plugins (or group dev)")
 
@@ -96,7 +94,7 @@ def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench, tmp_path):
 
 
 @pytest.fixture
-def cluster() -> Iterator[Any]:
+def cluster():
     """A Ray cluster of two nodes on this machine, each with one worker."""
     need("hydra_ray_launcher")
     from ray.cluster_utils import Cluster
@@ -108,7 +106,7 @@ def cluster() -> Iterator[Any]:
     cluster.shutdown()
 
 
-def ray_workers() -> list[psutil.Process]:
+def ray_workers():
     """The processes of the cluster that run a job now."""
     found = []
     for process in psutil.Process().children(recursive=True):

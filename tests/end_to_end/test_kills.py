@@ -28,16 +28,14 @@ TRIALS = 2
 PATIENCE = 240.0
 
 
-def wait_for(
-    runs: Path, pattern: str, process: subprocess.Popen[str], seconds: float = 120
-) -> None:
+def wait_for(runs, pattern, process, seconds=120):
     deadline = time.monotonic() + seconds
     while not list(runs.glob(pattern)) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     assert list(runs.glob(pattern)), f"{pattern} did not appear"
 
 
-def training_log_size(runs: Path) -> int:
+def training_log_size(runs):
     return bytes_written(runs, "store/train/.*.partial/metrics.jsonl")
 
 
@@ -122,7 +120,7 @@ LOCAL = [
 ]
 
 
-def holders(runs: Path) -> dict[str, int]:
+def holders(runs):
     found = {}
     for path in runs.glob("local/*/*/*/.lock.holder"):
         try:
@@ -180,7 +178,7 @@ TUNED = [
 ]
 
 
-def views(arm: Path) -> set[str]:
+def views(arm):
     """The names of the views on which the trials of an arm are measured."""
     return {
         line.split(",")[0]
@@ -229,7 +227,7 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
     assert "tuning was unequal" not in sheet.stdout
 
 
-def page_of(runs: Path) -> list[str]:
+def page_of(runs):
     """The lines of the page without the time of the declaration, and without times and memory."""
     lines = (runs / "check_it" / "claims.html").read_text().splitlines()
     assert sum(" were declared " in line for line in lines) == 1
@@ -238,7 +236,7 @@ def page_of(runs: Path) -> list[str]:
     return [line for line in lines if not any(words in line for words in measured)]
 
 
-def count_done(runs: Path) -> int:
+def count_done(runs):
     return len(list(runs.glob("check_it/*/*/*/results.json")))
 
 

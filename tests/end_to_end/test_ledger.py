@@ -1,19 +1,15 @@
 """A ledger with real trainings: two ideas at once, a kill in the middle, and a user's class."""
 
-from __future__ import annotations
-
 import json
 import signal
-import subprocess
 import time
 import zipfile
-from pathlib import Path
 
 import pytest
 
 from gsbench.claims.ledger import RETRIES
 from gsbench.runs.ledger import Ended, Started, read_ledger
-from tests.end_to_end.conftest import SMALL, Run, start
+from tests.end_to_end.conftest import SMALL, start
 
 pytestmark = pytest.mark.slow
 
@@ -42,17 +38,15 @@ class Idea(ADC):
 OWN = ["densify._target_=mine.Idea", "densify.name=mine", "allow_targets=[mine]"]
 
 
-def do(gsbench: Run, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def do(gsbench, folder, *words):
     return gsbench(*words, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
 
 
-def attempt(environment: dict[str, str], folder: Path, *words: str) -> subprocess.Popen[str]:
+def attempt(environment, folder, *words):
     return start(environment, folder, folder / "runs", "ledger", "try", "night", *words)
 
 
-def test_two_ideas_at_once_share_the_baseline(
-    gsbench: Run, environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_two_ideas_at_once_share_the_baseline(gsbench, environment, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
     words = (["densify=volumetric"], ["densify.split_size=0.1"])
     both = [attempt(environment, tmp_path, *own) for own in words]
@@ -69,9 +63,7 @@ def test_two_ideas_at_once_share_the_baseline(
     assert len(baselines) == 2  # that of the ledger, and that of the second idea
 
 
-def test_a_killed_try_continues_with_its_level(
-    gsbench: Run, environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_killed_try_continues_with_its_level(gsbench, environment, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
     home = tmp_path / "runs" / "night"
     killed = attempt(environment, tmp_path, "densify=volumetric")
@@ -89,9 +81,7 @@ def test_a_killed_try_continues_with_its_level(
     assert len([one for one in entries if isinstance(one, Ended)]) == 1
 
 
-def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(
-    gsbench: Run, tmp_path: Path
-) -> None:
+def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(gsbench, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1")
     results = []
     for body in ("raise RuntimeError('typing error')", "pass", "again = 1", "return None"):
@@ -104,7 +94,7 @@ def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(
     assert [one["idea"] for one in results] == ["mine", "mine-2", "mine-3", "mine-4"]
 
 
-def test_the_ledger_is_in_the_archive(gsbench: Run, tmp_path: Path) -> None:
+def test_the_ledger_is_in_the_archive(gsbench, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1")
     do(gsbench, tmp_path, "ledger", "try", "night", "densify=none")
     do(gsbench, tmp_path, "export", "--results", "night")

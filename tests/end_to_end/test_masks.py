@@ -5,7 +5,6 @@ import hashlib
 import json
 import shutil
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -47,7 +46,7 @@ SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory) -> tuple[Path, Path]:
+def captures(tmp_path_factory):
     """A COLMAP folder with masks of a moving disc and a margin; the same with noise below them."""
     folder = tmp_path_factory.mktemp("masked")
     clean, noisy = folder / "clean", folder / "noisy"
@@ -74,7 +73,7 @@ def captures(tmp_path_factory) -> tuple[Path, Path]:
 trial = partial(trial_of, QUICK)
 
 
-def bits(folder: Path) -> dict[str, str]:
+def bits(folder):
     names = [
         *SAME,
         *(
@@ -114,7 +113,7 @@ def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, wor
     assert all(0.5 < share < 0.9 for share in shares)
 
 
-def _points(folder: Path) -> dict[str, str]:
+def _points(folder):
     """The digests of the trial's initial cloud and cameras."""
     key = json.loads((folder / "results.json").read_text())["hashes"]["init"]
     model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER

@@ -26,7 +26,6 @@ from gsbench.cli import run
 from gsbench.files import file_sha256
 from gsbench.scene.colmap import write_model
 from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard
-from gsbench.scene.types import Camera
 from tests.end_to_end.conftest import trial_of
 
 pytestmark = pytest.mark.slow
@@ -53,7 +52,7 @@ Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory) -> Path:
+def good(tmp_path_factory):
     """A COLMAP folder of the courtyard with exact cameras and a coloured cloud."""
     folder = tmp_path_factory.mktemp("made") / "good"
     render_courtyard(folder, VIEWS, WIDTH, HEIGHT)
@@ -63,7 +62,7 @@ def good(tmp_path_factory) -> Path:
     return folder
 
 
-def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, np.ndarray]:
+def surroundings(cameras, images):
     """Points [P, 3] of the ground and a round wall, and their colours [P, 3] in a photograph."""
     random = np.random.default_rng(0)
     angles, heights = random.uniform(0, 2 * np.pi, 1500), random.uniform(0, 6, 1500)
@@ -86,22 +85,22 @@ def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, 
 
 
 @pytest.fixture(scope="module")
-def original(good, tmp_path_factory) -> list[Path]:
+def original(good, tmp_path_factory):
     """Trials of the capture as it is, one for each seed."""
     runs = tmp_path_factory.mktemp("runs")
     return [train(runs / str(seed), good, COLMAP, f"seed={seed}") for seed in range(SEEDS)]
 
 
-def psnr_of(trial: Path) -> float:
+def psnr_of(trial):
     return float(json.loads((trial / "results.json").read_text())["metrics"]["psnr"])
 
 
-def require_same_up_to_a_seed(trial: Path, original: list[Path]) -> None:
+def require_same_up_to_a_seed(trial, original):
     values = [psnr_of(one) for one in original]
     assert abs(psnr_of(trial) - statistics.fmean(values)) < 4 * statistics.stdev(values), values
 
 
-def copy_of(good: Path, folder: Path, change: Change, text: bool = False) -> Path:
+def copy_of(good, folder, change, text=False):
     """Copy the capture ``good``, and change the photographs and the model of the copy."""
     shutil.copytree(good / "images", folder / "images")
     model = pycolmap.Reconstruction(good / "sparse/0")
@@ -126,9 +125,7 @@ def test_a_similarity_changes_a_result_no_more_than_a_seed_does(
         require_given_coordinates(trial, original[0], similarity, Path(scratch) / "exported", moved)
 
 
-def require_given_coordinates(
-    trial: Path, untouched: Path, similarity: pycolmap.Sim3d, exported: Path, capture: Path
-) -> None:
+def require_given_coordinates(trial, untouched, similarity, exported, capture):
     """Check that the trial's Gaussians and cameras lie where the given model lies."""
     own, before = (
         PlyData.read(str(one / "point_cloud.ply"))["vertex"].data for one in (trial, untouched)
@@ -158,7 +155,7 @@ def require_given_coordinates(
         np.testing.assert_allclose(center, image.projection_center(), atol=100 * resolution)
 
 
-def rename(folder: Path, model: pycolmap.Reconstruction) -> None:
+def rename(folder, model):
     """Give each image another name of the same order, in a folder of its own."""
     (folder / "images/a").mkdir()
     for image in model.images.values():
@@ -167,7 +164,7 @@ def rename(folder: Path, model: pycolmap.Reconstruction) -> None:
         image.name = new
 
 
-def convert(suffix: str, folder: Path, model: pycolmap.Reconstruction) -> None:
+def convert(suffix, folder, model):
     """Write each photograph in another lossless format; the model keeps its names."""
     for file in sorted((folder / "images").iterdir()):
         Image.open(file).save(
@@ -176,14 +173,14 @@ def convert(suffix: str, folder: Path, model: pycolmap.Reconstruction) -> None:
         file.unlink()
 
 
-def as_opencv(folder: Path, model: pycolmap.Reconstruction) -> None:
+def as_opencv(folder, model):
     """Write PINHOLE cameras as OPENCV with zero distortion, as many exporters do."""
     for camera in model.cameras.values():
         params = [*camera.params, 0.0, 0.0, 0.0, 0.0]
         camera.model, camera.params = pycolmap.CameraModelId.OPENCV, params
 
 
-def as_distorted(name: str, zeros: int, folder: Path, model: pycolmap.Reconstruction) -> None:
+def as_distorted(name, zeros, folder, model):
     """Write cameras with one focal length under a model with zero coefficients."""
     for camera in model.cameras.values():
         fx, _, cx, cy = camera.params
@@ -193,7 +190,7 @@ def as_distorted(name: str, zeros: int, folder: Path, model: pycolmap.Reconstruc
         )
 
 
-def other_place(folder: Path, model: pycolmap.Reconstruction) -> None:
+def other_place(folder, model):
     """Put files into the folder that are no part of the capture."""
     (folder / "notes.txt").write_text("not a photograph")
     (folder / "images/.DS_Store").write_text("")

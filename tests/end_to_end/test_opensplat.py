@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def trial(tmp_path_factory) -> Path:
+def trial(tmp_path_factory):
     """The folder of a short trial of OpenSplat on a small courtyard, with a schedule of growth."""
     runs = tmp_path_factory.mktemp("runs")
     scene = [
@@ -57,7 +56,7 @@ def trial(tmp_path_factory) -> Path:
     return next(runs.glob("default/courtyard/*/*-seed0"))
 
 
-def error(picture: np.ndarray, truth: np.ndarray) -> float:
+def error(picture, truth):
     return float(np.square(picture.astype(float) - truth).mean())
 
 

@@ -9,9 +9,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -60,7 +58,7 @@ COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 
 @pytest.fixture(scope="module")
-def trainers(tmp_path_factory) -> Path:
+def trainers(tmp_path_factory):
     """A folder of configurations with the two trainers: a user's own YAML files."""
     folder = tmp_path_factory.mktemp("conf")
     (folder / "densify").mkdir()
@@ -70,7 +68,7 @@ def trainers(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory, environment, trainers) -> Path:
+def home(tmp_path_factory, environment, trainers):
     """A folder with a fetched scene, and a sweep of an arm of gsbench and two of other programs."""
     home = tmp_path_factory.mktemp("home")
     courtyard = home / "courtyard"
@@ -95,7 +93,7 @@ def home(tmp_path_factory, environment, trainers) -> Path:
     return home
 
 
-def program(environment: dict[str, str], home: Path, *words: str) -> str:
+def program(environment, home, *words):
     done = subprocess.run(
         [sys.executable, "-m", "gsbench.cli", *words],
         cwd=home,
@@ -109,15 +107,15 @@ def program(environment: dict[str, str], home: Path, *words: str) -> str:
     return done.stdout
 
 
-def trial(home: Path, arm: str, seed: int = 0) -> Path:
+def trial(home, arm, seed=0):
     return next((home / "runs").glob(f"three/garden/random-{arm}/*-seed{seed}"))
 
 
-def results(folder: Path) -> dict[str, Any]:
+def results(folder):
     return json.loads((folder / "results.json").read_text())
 
 
-def pixels(path: Path) -> str:
+def pixels(path):
     return hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
 
 
@@ -316,7 +314,7 @@ def test_a_program_that_hangs_is_ended_with_its_child(trainers, tmp_path, monkey
 
 
 @pytest.fixture
-def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+def hanging(environment, trainers, tmp_path):
     """gsbench with a trainer that hangs and ignores SIGTERM; ids of the trainer and its child."""
     words = [
         "--config-dir",
@@ -333,7 +331,7 @@ def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[
         text=True,
         preexec_fn=heed_interrupts,
     )
-    pids: list[int] = []
+    pids = []
     deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:
         for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):

@@ -9,7 +9,6 @@ import shlex
 import sqlite3
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ class Mortal(ADC):
 """
 
 
-def trials_of(runs: Path, name: str = FINISHED) -> dict[str, Path]:
+def trials_of(runs, name=FINISHED):
     """The folders of finished trials by densifier and seed, such as ``adc-0``."""
     found = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):

@@ -5,8 +5,6 @@ import hashlib
 import json
 import shutil
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +34,7 @@ TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory) -> tuple[Path, Path]:
+def captures(tmp_path_factory):
     """A COLMAP folder with points from all views; a copy with noise as every eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")
     clean, noisy = folder / "clean", folder / "noisy"
@@ -58,7 +56,7 @@ def captures(tmp_path_factory) -> tuple[Path, Path]:
 trial = partial(trial_of, QUICK)
 
 
-def bits(folder: Path) -> dict[str, str]:
+def bits(folder):
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in TRAINED}
 
 
@@ -106,7 +104,7 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_p
         "scene.sector=3",
     ]
     folder = trial(tmp_path, captures[0], *words)
-    results: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    results = json.loads((folder / "results.json").read_text())
     assert results["split"] == "sector 3 of 4"
     assert "principal axis" in results["held_out"]
     assert (results["train_views"], results["test_views"]) == (9, 3)

@@ -4,8 +4,6 @@ import hashlib
 import json
 import math
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -20,7 +18,6 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap
-from gsbench.scene.types import Scene
 
 pytestmark = pytest.mark.slow
 
@@ -39,9 +36,9 @@ QUICK = [
 ]
 
 
-def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
+def as_nerfstudio(model, folder):
     """Write the model's cameras and points to ``folder`` as nerfstudio's documents describe."""
-    frames: list[dict[str, Any]] = []
+    frames = []
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
         focal, cx, cy, *radial = (
@@ -79,7 +76,7 @@ def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
+def scene(tmp_path_factory):
     """A folder with a COLMAP model with points, and the same as transforms.json."""
     folder = tmp_path_factory.mktemp("transforms") / "yard"
     render_courtyard(folder, views=10, width=192, height=144)
@@ -91,7 +88,7 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
+def trial(runs, kind, folder, *words):
     assert (
         run(
             [
@@ -155,7 +152,7 @@ def test_without_points_the_error_names_other_initialisers(scene, tmp_path, capf
     assert trial(tmp_path / "runs", "transforms", folder, "init=random", "init.count=500")
 
 
-def _scene(capture: Any, cache: Path) -> Scene:
+def _scene(capture, cache):
     return load_scene(capture, capture.model, cache, max_size=300)
 
 

@@ -4,8 +4,6 @@ import importlib.metadata
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +15,7 @@ BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\
 
 
 @pytest.fixture
-def capture(tmp_path) -> Path:
+def capture(tmp_path):
     """A folder with modules that leave a mark, named like the standard and the installed ones."""
     folder, mark = tmp_path / "capture", tmp_path / "exploded"
     folder.mkdir()
@@ -38,9 +36,7 @@ def capture(tmp_path) -> Path:
     return folder
 
 
-def gsbench(
-    folder: Path, *words: str, start: Sequence[str] = ("../gsbench",)
-) -> subprocess.CompletedProcess[str]:
+def gsbench(folder, *words, start=("../gsbench",)):
     kept = {
         key: value
         for key, value in os.environ.items()

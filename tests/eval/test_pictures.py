@@ -1,9 +1,6 @@
 """Pictures are measured without changes, in the given order, or refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ from gsbench.eval.protocol import PAPER
 
 
 @pytest.fixture
-def pairs(tmp_path: Path) -> list[PicturePair]:
+def pairs(tmp_path):
     rng = np.random.default_rng(0)
     made = []
     for view in ("b", "a"):
@@ -28,13 +25,13 @@ def pairs(tmp_path: Path) -> list[PicturePair]:
     return made
 
 
-def test_metrics_are_computed_from_the_pixels_of_the_files(pairs: list[PicturePair]) -> None:
+def test_metrics_are_computed_from_the_pixels_of_the_files(pairs):
     counts = np.zeros((40, 50), np.uint8)
     counts[5:30, :20] = 255
     mask = pairs[1].picture.with_name("mask.png")
     Image.fromarray(counts).save(mask)
     pairs[1] = replace(pairs[1], mask=mask)
-    told: list[tuple[object, ...]] = []
+    told = []
     evaluator = Evaluator(PAPER, lpips=(), flip=False)
     per_view = measure(pairs, evaluator, lambda *what: told.append(what))
     assert list(per_view) == ["b", "a"]
@@ -48,7 +45,7 @@ def test_metrics_are_computed_from_the_pixels_of_the_files(pairs: list[PicturePa
         assert per_view[pair.view]["psnr"] == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_picture_of_another_size_is_refused(pairs: list[PicturePair]) -> None:
+def test_a_picture_of_another_size_is_refused(pairs):
     Image.open(pairs[1].picture).resize((25, 20)).save(pairs[1].picture)
     with pytest.raises(
         InputError, match=r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"
@@ -56,7 +53,7 @@ def test_a_picture_of_another_size_is_refused(pairs: list[PicturePair]) -> None:
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 
-def test_a_truncated_picture_is_named(pairs: list[PicturePair]) -> None:
+def test_a_truncated_picture_is_named(pairs):
     pairs[0].picture.write_bytes(pairs[0].picture.read_bytes()[:500])
     with pytest.raises(InputError, match=r"b_render\.png: the image is damaged"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))

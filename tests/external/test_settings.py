@@ -1,10 +1,6 @@
 """Settings of another program that are refused before it runs."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -12,7 +8,7 @@ from gsbench.errors import InputError
 from gsbench.external.settings import External
 
 
-def external(result: str, **options: Any) -> External:
+def external(result, **options):
     return External(command=["train", "{data}"], result=result, version="1", **options)
 
 
@@ -26,7 +22,7 @@ def external(result: str, **options: Any) -> External:
         ({"lr": {"a": 1}}, "densify.options.lr: an option is one value"),
     ],
 )
-def test_an_option_is_one_value_with_a_name_of_its_own(options: dict[str, Any], said: str) -> None:
+def test_an_option_is_one_value_with_a_name_of_its_own(options, said):
     with pytest.raises(InputError, match=re.escape(said)):
         external("a.ply", options=options)
 
@@ -34,13 +30,13 @@ def test_an_option_is_one_value_with_a_name_of_its_own(options: dict[str, Any], 
 @pytest.mark.parametrize(
     "settings", [{"version": ""}, {"version": "???"}, {"time_limit_minutes": 0}, {"command": 3}]
 )
-def test_a_setting_of_the_wrong_kind_is_refused_by_its_name(settings: dict[str, Any]) -> None:
+def test_a_setting_of_the_wrong_kind_is_refused_by_its_name(settings):
     sound = {"command": "train {data}", "result": "a.ply", "version": "1"}
     with pytest.raises(InputError, match=rf"densify\.{next(iter(settings))}"):
         External(**(sound | settings))
 
 
-def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed() -> None:
+def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed():
     for command, result in (("train {data} {lr}", "a.ply"), ("train {data}", "{lr}.ply")):
         key = "command" if "lr" in command else "result"
         with pytest.raises(InputError, match=rf"densify\.{key}: unknown placeholder \{{lr\}}"):
@@ -51,9 +47,7 @@ def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed() -> No
     assert External(command=command, result="a.ply", version="1").needs_test_cameras
 
 
-def test_the_program_is_found_on_its_own_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_program_is_found_on_its_own_path(tmp_path, monkeypatch):
     for place in ("one", "two"):
         (tmp_path / place).mkdir()
         (tmp_path / place / "train").touch(0o755)
@@ -83,7 +77,7 @@ def test_the_program_is_found_on_its_own_path(
         "[ab].ply",
     ],
 )
-def test_patterns_below_the_output_folder_are_accepted(result: str) -> None:
+def test_patterns_below_the_output_folder_are_accepted(result):
     assert external(result, options={"kind": "deep"}).result == result
 
 
@@ -103,7 +97,7 @@ def test_patterns_below_the_output_folder_are_accepted(result: str) -> None:
         ("x" * 300, "not a pattern of files"),
     ],
 )
-def test_patterns_that_fit_no_file_below_the_folder_are_refused(result: str, words: str) -> None:
+def test_patterns_that_fit_no_file_below_the_folder_are_refused(result, words):
     with pytest.raises(InputError, match=words) as refused:
         external(result, options={"kind": "/abs"})
     assert "densify.result" in str(refused.value)

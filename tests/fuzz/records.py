@@ -9,8 +9,6 @@ how many cases were noticed and how many were read as sound. A case with any oth
 number is in ``FOLDER/current``.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import logging
@@ -19,10 +17,8 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.fairness import tuning_lines
@@ -67,7 +63,7 @@ NAMES = (
     "mlflow.json",
     ".lock.holder",
 )
-STRANGE: tuple[str, ...] = (
+STRANGE = (
     "null",
     "{}",
     "[]",
@@ -99,7 +95,7 @@ STRANGE: tuple[str, ...] = (
 )
 
 
-def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str, Any]:
+def values_of(runs, densify, seed, threshold):
     """A configuration as a trial writes it, with the settings that readers use."""
     return {
         "name": EXPERIMENT,
@@ -130,7 +126,7 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
     }
 
 
-def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:
+def write_trial(runs, densify, seed, threshold=0.03):
     """Write a trial with every file that its readers look for."""
     values = values_of(runs, densify, seed, threshold)
     folder = TrialFolder.of(values).path
@@ -168,7 +164,7 @@ def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) ->
     return folder
 
 
-def write_original(runs: Path) -> dict[str, Path]:
+def write_original(runs):
     """Write a small experiment; return the files that are damaged in turn, by name."""
     home = runs / EXPERIMENT
     done, *_ = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)]
@@ -232,7 +228,7 @@ def write_original(runs: Path) -> dict[str, Path]:
     return places_of
 
 
-def damage(path: Path, sound: bytes, rng: Random) -> str:
+def damage(path, sound, rng):
     """Damage the file; return the kind of damage in one word."""
     kind = rng.choice(("shape",) * 6 + ("bytes",) * 3 + ("place",))
     if kind == "bytes":
@@ -256,7 +252,7 @@ def damage(path: Path, sound: bytes, rng: Random) -> str:
     return kind
 
 
-def _misshapen(sound: bytes, rng: Random) -> bytes:
+def _misshapen(sound, rng):
     """The JSON with one or two values, keys or whole lines replaced by strange ones."""
     lines = sound.decode().splitlines() if sound.count(b"\n{") else [sound.decode()]
     at = rng.randrange(len(lines))
@@ -264,7 +260,7 @@ def _misshapen(sound: bytes, rng: Random) -> bytes:
         tree = json.loads(lines[at])
     except ValueError:  # per_view.csv is not JSON
         return rng.choice(STRANGE).encode().join(sound.split(b",", rng.randint(1, 3)))
-    marks: dict[str, str] = {}
+    marks = {}
     for _ in range(rng.choice((1, 1, 2))):
         tree = _replaced(tree, rng, marks)
     text = json.dumps(tree)
@@ -274,7 +270,7 @@ def _misshapen(sound: bytes, rng: Random) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
+def _replaced(tree, rng, marks):
     if isinstance(tree, dict) and tree and rng.random() < 0.85:
         key = rng.choice(list(tree))
         how = rng.random()
@@ -291,7 +287,7 @@ def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
     return mark
 
 
-def look(runs: Path, places: dict[str, Path]) -> int:
+def look(runs, places):
     """Read everything as the verbs do; return how much was refused or left out.
 
     Raises any error that is not an InputError.
@@ -299,7 +295,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     home = runs / EXPERIMENT
     refused = 0
 
-    def attempt(read: Callable[[], object]) -> None:
+    def attempt(read):
         nonlocal refused
         try:
             read()
@@ -308,7 +304,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
                 raise RuntimeError("more than a line") from error
             refused += 1
 
-    def tables() -> None:
+    def tables():
         experiment = load_experiment(runs, EXPERIMENT)
         assert all(len(line.splitlines()) == 1 for line in experiment.warnings)
         nonlocal refused
@@ -320,9 +316,9 @@ def look(runs: Path, places: dict[str, Path]) -> int:
         attempt(lambda: event_charts(experiment.trials, arms))
         attempt(lambda: volume_charts(experiment.trials, arms))
         for first, second in itertools.pairwise(arms):
-            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))  # type: ignore[misc]
+            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))
         for trial in experiment.trials:
-            attempt(lambda trial=trial: read_views(trial))  # type: ignore[misc]
+            attempt(lambda trial=trial: read_views(trial))
 
     attempt(tables)
     attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
@@ -332,15 +328,15 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: read_declarations(home))
     attempt(lambda: search_summary(home))
     for folder in {path.parent for path in places.values()} - {home}:
-        attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]
-        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())  # type: ignore[misc]
-        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", MirrorState))  # type: ignore[misc]
-        attempt(lambda folder=folder: _mirror(folder))  # type: ignore[misc]
+        attempt(lambda folder=folder: TrialFolder(folder).configuration())
+        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())
+        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", MirrorState))
+        attempt(lambda folder=folder: _mirror(folder))
     attempt(lambda: TrialFolder.of(v := values_of(runs, "adc", 0, 0.03)).why_not_done(v))
     return refused
 
 
-def _mirror(folder: Path) -> None:
+def _mirror(folder):
     trial = TrackedTrial(TrialFolder(folder), TrialFolder(folder).configuration())
     assert trial.params()
     assert trial.tags()
@@ -353,16 +349,16 @@ def _mirror(folder: Path) -> None:
 class Noticed(logging.Handler):
     """Counts warnings, each of which must be one line."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(logging.WARNING)
         self.count = 0
 
-    def emit(self, record: logging.LogRecord) -> None:
+    def emit(self, record):
         assert len(record.getMessage().splitlines()) == 1
         self.count += 1
 
 
-def main(folder: Path, first: int, count: int, only: str | None) -> None:
+def main(folder, first, count, only):
     """Run the cases; ``FOLDER/current`` has the number of the present one."""
     runs = folder / "runs"
     shutil.rmtree(runs, ignore_errors=True)
@@ -373,8 +369,8 @@ def main(folder: Path, first: int, count: int, only: str | None) -> None:
     logging.getLogger("gsbench").propagate = False
     assert look(runs, places) == 0
     assert warnings.count == 0
-    found: Counter[str] = Counter()
-    kinds: Counter[str] = Counter()
+    found = Counter()
+    kinds = Counter()
     for case in range(first, first + count):
         rng = Random(case)
         name = only or NAMES[case % len(NAMES)]

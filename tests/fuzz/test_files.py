@@ -3,12 +3,9 @@
 They never cause a crash, a hang or nonsense.
 """
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CASES = 240  # in CI; `python -m tests.fuzz.models FOLDER 0 10000` tries more
 
 
-def test_damaged_files_are_refused_or_read_with_right_values(tmp_path: Path) -> None:
+def test_damaged_files_are_refused_or_read_with_right_values(tmp_path):
     command = [sys.executable, "-m", "tests.fuzz.models", str(tmp_path), "0", str(CASES)]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
@@ -33,7 +30,7 @@ def test_damaged_files_are_refused_or_read_with_right_values(tmp_path: Path) -> 
     assert done.stdout.startswith(f"{CASES} cases: ")
 
 
-def replaced(data: bytes, at: int, layout: str, *values: float) -> bytes:
+def replaced(data, at, layout, *values):
     return data[:at] + struct.pack(layout, *values) + data[at + struct.calcsize(layout) :]
 
 
@@ -61,13 +58,13 @@ NAN = float("nan")
     ],
 )
 def test_the_program_names_the_damaged_file(
-    file: str,
-    harm: Callable[[bytes], bytes],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    file,
+    harm,
+    words,
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     write_originals(tmp_path)
     (tmp_path / "sparse").mkdir()

@@ -1,9 +1,6 @@
 """Initialisers that need no matching."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -22,7 +19,7 @@ from tests.init.models import add_point
 from tests.init.test_report import CENTERS, NAMES, model_of
 
 
-def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
+def add_points(model_dir, target, count):
     """A copy of the model with points that the first three images see."""
     model = pycolmap.Reconstruction(model_dir)
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3))
@@ -43,7 +40,7 @@ def add_points(model_dir: Path, target: Path, count: int) -> np.ndarray:
     return points
 
 
-def test_dataset_keeps_the_cloud_of_the_model(courtyard: Capture, tmp_path: Path):
+def test_dataset_keeps_the_cloud_of_the_model(courtyard, tmp_path):
     points = add_points(courtyard.model, tmp_path / "model", 20)
     report = Dataset().run(replace(courtyard, model=tmp_path / "model"), tmp_path / "out")
     cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
@@ -56,7 +53,7 @@ def test_dataset_keeps_the_cloud_of_the_model(courtyard: Capture, tmp_path: Path
     assert any("only 20 points" in warning for warning in report.warnings)
 
 
-def test_dataset_needs_points_and_a_model(courtyard: Capture, bare_photos: Capture, tmp_path: Path):
+def test_dataset_needs_points_and_a_model(courtyard, bare_photos, tmp_path):
     with pytest.raises(InputError, match="has no points: use init=sfm"):
         Dataset().run(courtyard, tmp_path)
     with pytest.raises(InputError, match="came without"):
@@ -64,7 +61,7 @@ def test_dataset_needs_points_and_a_model(courtyard: Capture, bare_photos: Captu
 
 
 @pytest.mark.slow
-def test_random_fills_the_cube_around_the_training_cameras(courtyard: Capture, tmp_path: Path):
+def test_random_fills_the_cube_around_the_training_cameras(courtyard, tmp_path):
     report = Random(count=5000, size=2.0, seed=3).run(courtyard, tmp_path / "a")
     cloud = read_cloud(tmp_path / "a" / MODEL_FOLDER)
     images = pycolmap.Reconstruction(courtyard.model).images.values()
@@ -82,7 +79,7 @@ def test_random_fills_the_cube_around_the_training_cameras(courtyard: Capture, t
     assert not np.allclose(read_cloud(tmp_path / "c" / MODEL_FOLDER).points, cloud.points)
 
 
-def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_path: Path) -> None:
+def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_path):
     """By hand: their mean is (0, 1/3, 0), and the farthest are sqrt(10) / 3 away from it."""
     capture = Capture("hand", tmp_path, NAMES, ("d.png",), None, False, "0")
     cloud = Random(count=5000, size=2.0, seed=3).cloud(capture, model_of(CENTERS))
@@ -99,9 +96,7 @@ def test_random_draws_points_and_colours_around_the_training_cameras_alone(tmp_p
 
 
 @pytest.mark.parametrize("seen_by", [1, 3])
-def test_carved_keeps_points_in_view_of_enough_training_cameras(
-    courtyard: Capture, tmp_path: Path, seen_by: int
-) -> None:
+def test_carved_keeps_points_in_view_of_enough_training_cameras(courtyard, tmp_path, seen_by):
     """Checked with COLMAP's projection, one point and one image at a time."""
     options = {"count": 300, "size": 2.0, "seed": 3}
     Random(**options).run(courtyard, tmp_path / "random")
@@ -122,12 +117,12 @@ def test_carved_keeps_points_in_view_of_enough_training_cameras(
     assert 0 < len(expected) == report.num_points < 300
 
 
-def test_carved_refuses_a_cloud_without_points_in_view(courtyard: Capture, tmp_path: Path) -> None:
+def test_carved_refuses_a_cloud_without_points_in_view(courtyard, tmp_path):
     with pytest.raises(InputError, match=r"none is in view of 9999 training cameras"):
         Carved(count=10, seen_by=9999).run(courtyard, tmp_path)
 
 
-def test_shifts_of_copies_are_proportional_to_the_neighbours_distance(tmp_path: Path) -> None:
+def test_shifts_of_copies_are_proportional_to_the_neighbours_distance(tmp_path):
     """Shifts are normal and proportional to the distance of the nearest neighbour."""
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
     points = np.concatenate([grid, 100 + 10 * grid])
@@ -141,21 +136,19 @@ def test_shifts_of_copies_are_proportional_to_the_neighbours_distance(tmp_path: 
     assert not np.allclose(copies, shifted_copies(points, 3, 0.5, seed=2))
 
 
-def test_random_needs_cameras(bare_photos: Capture, courtyard: Capture, tmp_path: Path):
+def test_random_needs_cameras(bare_photos, courtyard, tmp_path):
     assert Random().needs_reference(bare_photos)
     with pytest.raises(InputError, match="init=random needs cameras"):
         Random().run(bare_photos, tmp_path)
     assert Random(count=10).run(bare_photos, tmp_path, reference=courtyard.model).num_points == 10
 
 
-def test_reading_a_cloud_without_a_model_is_refused(tmp_path: Path):
+def test_reading_a_cloud_without_a_model_is_refused(tmp_path):
     with pytest.raises(InputError, match="no COLMAP model here"):
         read_cloud(tmp_path)
 
 
-def test_a_trained_model_becomes_points_and_is_copied_unchanged(
-    courtyard: Capture, tmp_path: Path
-) -> None:
+def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_path):
     gaussians = random_gaussians(20, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "model.ply")
     report = Ply(path=str(tmp_path / "model.ply")).run(courtyard, tmp_path / "out")

@@ -1,10 +1,7 @@
 """Clouds of points from files of all formats, against the written arrays and pycolmap."""
 
-from __future__ import annotations
-
 import codecs
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -17,7 +14,6 @@ from gsbench.init.base import PointCloud
 from gsbench.init.placed import GREY, points_in_view, seen_colors
 from gsbench.init.point_files import read_points
 from gsbench.scene.images import read_image
-from gsbench.scene.types import Capture
 from tests.init.models import camera_at, model_with
 from tests.init.test_report import CENTERS, model_of
 
@@ -27,12 +23,12 @@ RGB = RNG.integers(0, 256, (40, 3))
 
 
 def write(
-    path: Path,
-    properties: list[tuple[str, str]],
-    values: dict[str, np.ndarray],
-    text: bool,
-    order: str,
-) -> Path:
+    path,
+    properties,
+    values,
+    text,
+    order,
+):
     table = np.zeros(len(XYZ), dtype=[(name, kind) for name, kind in properties])
     for name, column in values.items():
         table[name] = column
@@ -50,9 +46,7 @@ def write(
         (("red", "green", "blue"), "u2", 257),
     ],
 )
-def test_ply_properties_may_have_any_order_and_type(
-    tmp_path: Path, text: bool, order: str, names, kind: str, scale: float
-):
+def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names, kind, scale):
     red, green, blue = ((name, kind) for name in names)
     properties = [blue, ("z", "f8"), ("nx", "f4"), ("x", "f4"), red, ("y", "f8"), green]
     values = dict(zip((*"xyz", *names), [*XYZ.T, *RGB.T * scale], strict=True))
@@ -63,9 +57,7 @@ def test_ply_properties_may_have_any_order_and_type(
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
 @pytest.mark.parametrize("colored", [False, True])
-def test_a_table_has_coordinates_with_or_without_colours(
-    tmp_path: Path, suffix: str, colored: bool
-):
+def test_a_table_has_coordinates_with_or_without_colours(tmp_path, suffix, colored):
     table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
@@ -75,7 +67,7 @@ def test_a_table_has_coordinates_with_or_without_colours(
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
-def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path: Path, suffix: str):
+def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path, suffix):
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, XYZ, fmt="%.17g", delimiter="," if suffix == ".csv" else " ", newline="\r\n")
     path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
@@ -85,7 +77,7 @@ def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path: P
         read_points(path)
 
 
-def rows(*columns: np.ndarray, between: str = " ") -> str:
+def rows(*columns, between=" "):
     table = np.column_stack(columns)
     return "".join(between.join(f"{value:.17g}" for value in row) + "\n" for row in table)
 
@@ -112,16 +104,14 @@ NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
         ("a.xyz", rows(XYZ, between="\t"), False),
     ],
 )
-def test_tables_of_scanners_and_other_programs_are_read(
-    tmp_path: Path, name: str, text: str, colored: bool
-):
+def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
     (tmp_path / name).write_text(text)
     points, colors = read_points(tmp_path / name)
     np.testing.assert_array_equal(points, XYZ)
     np.testing.assert_array_equal(colors, RGB if colored else None)
 
 
-def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path: Path):
+def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path):
     """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: 3DGS's colour without view dependence."""
     properties = [(name, "f4") for name in (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2")]
     dc = (RGB / 255 - 0.5) * 2 * np.sqrt(np.pi)
@@ -132,7 +122,7 @@ def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path: Path):
     np.testing.assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
 
 
-def test_colours_come_from_the_nearest_photograph(courtyard: Capture):
+def test_colours_come_from_the_nearest_photograph(courtyard):
     model = pycolmap.Reconstruction(courtyard.model)
     points = RNG.uniform(-6, 6, (60, 3))
     found = seen_colors(points, courtyard, model)
@@ -151,7 +141,7 @@ def test_colours_come_from_the_nearest_photograph(courtyard: Capture):
 
 
 def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
-    courtyard: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    courtyard, tmp_path, monkeypatch
 ):
     save(tmp_path / "scan.xyz", XYZ[:3])
     seen = np.array([[0, 0, 0], [-1, -1, -1], [0, 9, 255]], dtype=np.int16)
@@ -163,7 +153,7 @@ def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
     assert not cloud.colors.any()
 
 
-def test_the_points_of_the_reference_are_all_replaced(courtyard: Capture, tmp_path: Path):
+def test_the_points_of_the_reference_are_all_replaced(courtyard, tmp_path):
     save(tmp_path / "scan.xyz", np.tile([0.0, 0.0, 5.0], (4, 1)) + np.arange(4)[:, None] / 10)
     model = model_of(CENTERS)
     own = {tuple(point.xyz) for point in model.points3D.values()}
@@ -178,9 +168,7 @@ def test_the_points_of_the_reference_are_all_replaced(courtyard: Capture, tmp_pa
     assert not any(len(image.points2D) for image in model.images.values())
 
 
-def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(
-    courtyard: Capture, tmp_path: Path
-):
+def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(courtyard, tmp_path):
     save(tmp_path / "scan.xyz", XYZ)
     options = Points(path=tmp_path / "scan.xyz", max_points=30, seed=1)
     report = options.run(courtyard, tmp_path / "out")
@@ -196,17 +184,17 @@ def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(
     assert options.content() != first
 
 
-def save(path: Path, table: np.ndarray) -> None:
+def save(path, table):
     np.savetxt(path, table, fmt="%.17g")
 
 
-def bad_ply(path: Path) -> None:
+def bad_ply(path):
     path.write_bytes(
         b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n"
     )
 
 
-def empty_ply(path: Path) -> None:
+def empty_ply(path):
     properties = b"".join(b"property float %c\n" % axis for axis in b"xyz")
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\n" + properties + b"end_header\n")
 
@@ -229,9 +217,7 @@ def empty_ply(path: Path) -> None:
         ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],
 )
-def test_bad_files_are_refused_in_one_line(
-    courtyard: Capture, tmp_path: Path, name: str, make, message: str
-):
+def test_bad_files_are_refused_in_one_line(courtyard, tmp_path, name, make, message):
     make(tmp_path / name)
     with pytest.raises(InputError, match=message) as caught:
         Points(path=tmp_path / name).cloud(courtyard, pycolmap.Reconstruction(courtyard.model))
@@ -239,7 +225,7 @@ def test_bad_files_are_refused_in_one_line(
 
 
 def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
-    bare_photos: Capture, tmp_path: Path
+    bare_photos, tmp_path
 ):
     with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is not a file"):
         Points(path="nowhere.ply")
@@ -250,12 +236,12 @@ def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
 @pytest.mark.parametrize(
     ("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
 )
-def test_a_cloud_refuses_points_of_another_shape_or_type(shape: tuple[int, ...], kind: str) -> None:
+def test_a_cloud_refuses_points_of_another_shape_or_type(shape, kind):
     with pytest.raises(ValueError, match="points must be"):
         PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))
 
 
-def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_behind() -> None:
+def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_behind():
     wide = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 100, 80)
     model = model_with({"a": camera_at([0, 0, 0])}, camera=wide)
     points = np.array(

@@ -1,7 +1,5 @@
 """Structure from motion on a scene whose cameras and surfaces are known exactly."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -19,7 +17,6 @@ from gsbench.init.base import (
     PICTURE_FILE,
     REPORT_FILE,
     WORK_FOLDER,
-    InitReport,
 )
 from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.scene.types import Capture
@@ -27,40 +24,40 @@ from tests.init.models import camera_at, digest, model_with
 from tests.scene.courtyard.surfaces import surface_distance
 
 
-def picture(path: Path, pixels: np.ndarray) -> None:
+def picture(path, pixels):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels.astype(np.uint8)).save(path)
 
 
-def capture_of(folder: Path) -> Capture:
+def capture_of(folder):
     names = tuple(sorted(path.name for path in folder.iterdir()))
     return Capture("photos", folder, names, (), None, False, "0")
 
 
 @pytest.fixture(scope="module")
-def own(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[InitReport, Path]:
+def own(courtyard, tmp_path_factory):
     output = tmp_path_factory.mktemp("own")
     return Sfm(poses="own").run(courtyard, output), output
 
 
 @pytest.fixture(scope="module")
-def told() -> list[tuple[str, int, int | None]]:
+def told():
     """The progress that the run of the fixture ``shared`` reported."""
     return []
 
 
 @pytest.fixture(scope="module")
 def shared(
-    courtyard: Capture,
-    told: list[tuple[str, int, int | None]],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[InitReport, Path]:
+    courtyard,
+    told,
+    tmp_path_factory,
+):
     output = tmp_path_factory.mktemp("shared")
     return Sfm().run(courtyard, output, lambda *state: told.append(state[:3])), output
 
 
 @pytest.mark.slow
-def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
+def test_own_poses_agree_with_the_exact_ones(own):
     report, _ = own
     assert report.num_registered == report.num_images == 8
     assert report.pose_errors is not None
@@ -74,9 +71,7 @@ def test_own_poses_agree_with_the_exact_ones(own: tuple[InitReport, Path]):
 
 
 @pytest.mark.slow
-def test_jittered_is_sfm_with_copies_nearby(
-    shared: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
-) -> None:
+def test_jittered_is_sfm_with_copies_nearby(shared, courtyard, tmp_path):
     """First the same points, bit for bit, then two shifted copies in the same colours."""
     plain, folder = shared
     report = Jittered(copies=2, shift=0.1).run(courtyard, tmp_path)
@@ -92,7 +87,7 @@ def test_jittered_is_sfm_with_copies_nearby(
         assert 0 < np.median(np.linalg.norm(copies - before.points, axis=1)) < 1.0
 
 
-def test_own_model_is_written_in_both_gauges(own: tuple[InitReport, Path], courtyard: Capture):
+def test_own_model_is_written_in_both_gauges(own, courtyard):
     report, output = own
     aligned, raw, exact = (
         {
@@ -114,9 +109,7 @@ def test_own_model_is_written_in_both_gauges(own: tuple[InitReport, Path], court
         np.testing.assert_allclose(aligned[name], center, atol=0.02)
 
 
-def test_known_poses_give_points_on_the_true_surfaces(
-    shared: tuple[InitReport, Path], courtyard: Capture
-):
+def test_known_poses_give_points_on_the_true_surfaces(shared, courtyard):
     report, output = shared
     assert report.poses == "shared"
     assert report.pose_errors is None
@@ -131,7 +124,7 @@ def test_known_poses_give_points_on_the_true_surfaces(
         )
 
 
-def test_colours_are_those_of_the_photographs(shared: tuple[InitReport, Path], courtyard: Capture):
+def test_colours_are_those_of_the_photographs(shared, courtyard):
     _, output = shared
     model = pycolmap.Reconstruction(output / MODEL_FOLDER)
     pixels = {
@@ -148,7 +141,7 @@ def test_colours_are_those_of_the_photographs(shared: tuple[InitReport, Path], c
     assert np.median(differences) < 12
 
 
-def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport, Path]):
+def test_output_is_complete_and_the_work_folder_is_gone(shared):
     report, output = shared
     assert json.loads((output / REPORT_FILE).read_text()) == report.to_dict()
     assert report.to_dict()["settings"]["peak_threshold"] == pytest.approx(0.02 / 3)
@@ -157,9 +150,7 @@ def test_output_is_complete_and_the_work_folder_is_gone(shared: tuple[InitReport
     assert not (output / WORK_FOLDER).exists()
 
 
-def test_the_progress_of_each_phase_is_reported_from_start_to_end(
-    shared: tuple[InitReport, Path], told: list
-) -> None:
+def test_the_progress_of_each_phase_is_reported_from_start_to_end(shared, told):
     phases = {phase: [state for state in told if state[0] == phase] for phase, _, _ in told}
     assert list(phases) == ["extract", "match", "triangulate"]
     for (_, first, _), *_, (_, last, total) in phases.values():
@@ -178,10 +169,10 @@ def test_the_progress_of_each_phase_is_reported_from_start_to_end(
     ],
 )
 def test_poses_and_points_from_choose_the_photographs_and_the_need_for_a_reference(
-    poses: str, intrinsics: str, points_from: str, names: str, needed: bool
-) -> None:
+    poses, intrinsics, points_from, names, needed
+):
     """There are four photographs; b is a test view, and a is not in the reference."""
-    options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)  # type: ignore[arg-type]
+    options = Sfm(poses=poses, intrinsics=intrinsics, points_from=points_from)
     capture = Capture("x", Path("x"), ("a", "b", "c", "d"), ("b",), None, False, "0")
     reference = model_with({name: camera_at([0, 0, 0]) for name in "dcb"})
     assert options.select_images(capture, reference) == list(names)
@@ -191,18 +182,14 @@ def test_poses_and_points_from_choose_the_photographs_and_the_need_for_a_referen
 
 
 @pytest.mark.slow
-def test_two_runs_are_equal_bit_for_bit_on_any_number_of_threads(
-    own: tuple[InitReport, Path], courtyard: Capture, tmp_path: Path
-):
+def test_two_runs_are_equal_bit_for_bit_on_any_number_of_threads(own, courtyard, tmp_path):
     _, first = own
     Sfm(poses="own", threads=3).run(courtyard, tmp_path)
     assert digest(tmp_path / MODEL_FOLDER) == digest(first / MODEL_FOLDER)
 
 
 @pytest.mark.slow
-def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(
-    bare_photos: Capture, tmp_path: Path
-):
+def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(bare_photos, tmp_path):
     assert not Sfm().needs_reference(bare_photos)
     report = Sfm().run(bare_photos, tmp_path / "sfm")
     assert report.poses == "own"
@@ -220,7 +207,7 @@ def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(
 
 
 @pytest.mark.slow
-def test_names_with_spaces_and_photos_of_two_sizes_are_accepted(courtyard: Capture, tmp_path: Path):
+def test_names_with_spaces_and_photos_of_two_sizes_are_accepted(courtyard, tmp_path):
     images = tmp_path / "my photos"
     images.mkdir()
     for index, name in enumerate(courtyard.image_names):
@@ -238,7 +225,7 @@ def test_names_with_spaces_and_photos_of_two_sizes_are_accepted(courtyard: Captu
 
 
 @pytest.mark.slow
-def test_webp_photos_give_the_same_points_as_png_photos(courtyard: Capture, tmp_path: Path):
+def test_webp_photos_give_the_same_points_as_png_photos(courtyard, tmp_path):
     """COLMAP cannot read WebP; lossless copies must lead to the same points."""
     images = tmp_path / "images"
     images.mkdir()
@@ -252,15 +239,13 @@ def test_webp_photos_give_the_same_points_as_png_photos(courtyard: Capture, tmp_
     np.testing.assert_array_equal(first.colors, second.colors)
 
 
-def test_keypoints_found_at_a_smaller_size_are_scaled_back_to_the_file(
-    courtyard: Capture, tmp_path: Path
-):
+def test_keypoints_found_at_a_smaller_size_are_scaled_back_to_the_file(courtyard, tmp_path):
     Sfm(max_image_size=200).run(courtyard, tmp_path)
     assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
 
 
 @pytest.mark.slow
-def test_a_wrong_reference_gives_a_warning(courtyard: Capture, tmp_path: Path):
+def test_a_wrong_reference_gives_a_warning(courtyard, tmp_path):
     """All images get a pose, but a warning says that poses are wrong."""
     model = pycolmap.Reconstruction(courtyard.model)
     names = sorted(image.name for image in model.images.values())
@@ -276,14 +261,14 @@ def test_a_wrong_reference_gives_a_warning(courtyard: Capture, tmp_path: Path):
     assert any("degrees against the true ones" in warning for warning in report.warnings)
 
 
-def test_photos_without_texture_are_refused(tmp_path: Path):
+def test_photos_without_texture_are_refused(tmp_path):
     for index in range(4):
         picture(tmp_path / f"{index}.png", np.full((60, 80, 3), 40 * index))
     with pytest.raises(InputError, match="no keypoint in any image"):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-def test_photos_without_overlap_are_refused(tmp_path: Path):
+def test_photos_without_overlap_are_refused(tmp_path):
     rng = np.random.default_rng(0)
     for index in range(4):
         picture(tmp_path / f"{index}.png", rng.integers(0, 255, (120, 160, 3)))
@@ -292,7 +277,7 @@ def test_photos_without_overlap_are_refused(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_photos_from_one_place_are_refused(courtyard: Capture, tmp_path: Path):
+def test_photos_from_one_place_are_refused(courtyard, tmp_path):
     """Copies of one photograph match perfectly, but without depth."""
     for index in range(4):
         shutil.copy(courtyard.images / "0000.png", tmp_path / f"{index}.png")
@@ -300,7 +285,7 @@ def test_photos_from_one_place_are_refused(courtyard: Capture, tmp_path: Path):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 
-def test_two_photos_are_refused(courtyard: Capture, tmp_path: Path):
+def test_two_photos_are_refused(courtyard, tmp_path):
     with pytest.raises(InputError, match="has 2 images: sfm needs at least 3"):
         Sfm().run(replace(courtyard, image_names=courtyard.image_names[:2]), tmp_path)
 
@@ -324,6 +309,6 @@ def test_two_photos_are_refused(courtyard: Capture, tmp_path: Path):
         ),
     ],
 )
-def test_settings_are_checked_by_name(options: dict[str, object], message: str):
+def test_settings_are_checked_by_name(options, message):
     with pytest.raises(InputError, match=message):
         Sfm(**options)

@@ -3,8 +3,6 @@
 import json
 import logging
 import time
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -32,7 +30,7 @@ TINY = [
 ]
 
 
-def declaring(runs: Path, primary: str | None, seed: int = 0, **densify: Any) -> Trial:
+def declaring(runs, primary, seed=0, **densify):
     """A trial of a command with this ``eval.primary``."""
     named = {"densify": {"name": "adc"} | densify, "scene": {"name": "courtyard"}, "name": "exp"}
     return trial(runs, seed, eval={"primary": primary}, **named)

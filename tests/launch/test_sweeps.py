@@ -5,11 +5,8 @@ import fcntl
 import json
 import os
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -30,7 +27,6 @@ from gsbench.logs import set_up_logging
 from gsbench.runs.keys import TRAIN, Step, config_hash
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.locks import BusyError, hold
 from tests.composed import composed
 from tests.finished import record_of
@@ -40,26 +36,26 @@ from tests.runs.test_trial_folder import edit
 pytestmark = pytest.mark.usefixtures("runs")
 
 
-def trial_values(*words: str) -> dict[str, Any]:
+def trial_values(*words):
     """A configuration in this test's runs folder."""
     (trial,) = composed(words)
     return trial.values
 
 
-def planned(runs: Path, seed: int = 0) -> Trial:
+def planned(runs, seed=0):
     """A trial for a plan, which is not composed."""
     return Trial(bare_trial(runs, seed).values, (f"seed={seed}",))
 
 
-def why_not_done(values: dict[str, Any]) -> str:
+def why_not_done(values):
     return TrialFolder.of(values).why_not_done(values)
 
 
 def finish(
-    values: dict[str, Any],
-    seconds: float = 100.0,
-    awaited: Sequence[str] = (),
-) -> TrialRecord:
+    values,
+    seconds=100.0,
+    awaited=(),
+):
     """Make the files of a finished trial, with one stage in the store and one source file."""
     folder = TrialFolder.of(values)
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -89,7 +85,7 @@ def finish(
 
 
 @cache
-def experiment(name: str) -> list[Trial]:
+def experiment(name):
     """The trials of an experiment, composed once: the paper's tables take seconds."""
     return compose_trials([f"+experiment={name}"])
 
@@ -416,8 +412,8 @@ def test_dry_run_tells_states_and_time(runs):
 @pytest.fixture
 def fake_trial(monkeypatch):
     """Replace the trial by one that does what ``behaviour[seed]`` says, and records the order."""
-    behaviour: dict[int, Exception] = {}
-    order: list[int] = []
+    behaviour = {}
+    order = []
 
     def run_one(trial, mirror, wait):
         seed = trial.values["seed"]
@@ -439,7 +435,7 @@ def fake_trial(monkeypatch):
     return behaviour, order
 
 
-def sweep() -> list[Trial]:
+def sweep():
     return composed(["name=x", "densify=adc", "seed=0,1,2"])
 
 

@@ -5,7 +5,6 @@ import json
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,11 +29,11 @@ TRAINED = Step(TRAIN, {}, lambda folder: None)
 FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
 
 
-def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
+def inputs(fps=None, **options):
     """The inputs of an evaluation without LPIPS; a key needs no views."""
     evaluator = Evaluator(PAPER, lpips=[], **options)
     cpu = torch.device("cpu")
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         evaluator=evaluator,
         rasterizer=create_rasterizer("reference", cpu, 1),
         device=cpu,
@@ -87,9 +86,9 @@ def test_speed_is_measured_at_the_given_size(monkeypatch):
 
 
 @pytest.fixture
-def told(monkeypatch) -> list[tuple[Any, ...]]:
+def told(monkeypatch):
     """The progress that an evaluation reports."""
-    told: list[tuple[Any, ...]] = []
+    told = []
     monkeypatch.setattr(
         evaluate_module, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
     )
@@ -109,7 +108,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
     earlier = faint.select(torch.arange(50))
     write_ply(earlier, training / snapshot_file(7))
     np.savez(training / "lineage.npz", causes=np.zeros(80, dtype=np.int64), ids=np.arange(80))
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         evaluator=Evaluator(PAPER, lpips=[], flip=False),
         rasterizer=ReferenceRasterizer(),
         device=torch.device("cpu"),
@@ -119,7 +118,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
         user_code=UserCode(),
         program=None,
     )
-    views: Any = SimpleNamespace(store=store, scene=scene, init=init)
+    views = SimpleNamespace(store=store, scene=scene, init=init)
     folder = tmp_path / "built"
     folder.mkdir()
     evaluate_step(views, TRAINED, parts).build(folder)
@@ -177,13 +176,13 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
     renders.mkdir(parents=True)
     for shift, view in enumerate(tiny_scene.test, 4):
         Image.fromarray((view.image // 2 + shift).astype(np.uint8)).save(renders / view.name)
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         evaluator=Evaluator(PAPER, lpips=[], flip=False),
         eval=SimpleNamespace(fps=[20, 16]),
         user_code=UserCode(),
         program=SimpleNamespace(leaves_model=False),
     )
-    views: Any = SimpleNamespace(store=store, scene=tiny_scene)
+    views = SimpleNamespace(store=store, scene=tiny_scene)
     folder = tmp_path / "built"
     folder.mkdir()
     step = evaluate_step(views, TRAINED, parts)
@@ -206,7 +205,7 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
 
 
 def test_the_mean_colour_of_counted_training_pixels_is_measured_against_the_test_views(tiny_scene):
-    def plain(view: View, color: tuple[int, int, int]) -> View:
+    def plain(view, color):
         return replace(view, image=np.broadcast_to(np.uint8(color), view.image.shape).copy())
 
     black, light, dark = (

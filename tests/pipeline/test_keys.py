@@ -41,7 +41,7 @@ KEYS = [
 
 
 class BareSource(CaptureSource):
-    def read(self, made: Path | None) -> Capture:
+    def read(self, made):
         return BARE
 
 

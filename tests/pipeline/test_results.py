@@ -2,8 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -37,14 +35,14 @@ PROGRAM = {
 EVENTS = [{"step": 1, "cloned": 2, "pruned_size": 1}, {"step": 2, "cloned": 3}]
 
 
-def write(files: dict[str, Any], folder: Path) -> None:
+def write(files, folder):
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
 
 
 @pytest.fixture
-def made(tmp_path, tiny_scene) -> Any:
+def made(tmp_path, tiny_scene):
     """A function that makes the results of a trial with the training ``TRAINING`` and changes."""
     values = compose_one(
         ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]

@@ -3,7 +3,6 @@
 import json
 import sys
 from types import ModuleType
-from typing import Any
 
 import pytest
 
@@ -63,7 +62,7 @@ def test_auto_threads_are_those_that_parallel_trials_leave(monkeypatch):
 
 def test_auto_threads_of_the_initialiser_are_those_of_the_trial():
     for word, threads in (("init.threads=auto", 3), ("init.threads=2", 2)):
-        initializer: Any = Parts(
+        initializer = Parts(
             compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values
         ).initializer
         assert initializer.threads == threads
@@ -134,7 +133,7 @@ function = len
 
 
 @pytest.fixture
-def own_module(tmp_path, monkeypatch) -> None:
+def own_module(tmp_path, monkeypatch):
     (tmp_path / "own_classes.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "own_classes", raising=False)
@@ -227,7 +226,7 @@ def test_code_whose_version_results_cannot_record_is_named(tmp_path, monkeypatch
         assert [message[: len(said[0])] for message in caplog.messages] == said
     caplog.clear()
     made_up = ModuleType("made_up")
-    made_up.Mine = type("Mine", (ADC,), {"__module__": "made_up"})  # type: ignore[attr-defined]
+    made_up.Mine = type("Mine", (ADC,), {"__module__": "made_up"})
     monkeypatch.setitem(sys.modules, "made_up", made_up)
     build("densify", {"_target_": "made_up.Mine"}, ["made_up"])
     assert caplog.messages == [

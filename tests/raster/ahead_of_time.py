@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,16 +33,16 @@ class Launch:
     named: dict[str, Any]
 
     @property
-    def name(self) -> str:
+    def name(self):
         return str(self.kernel.fn.__name__)
 
 
 @contextmanager
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
+def recorded(monkeypatch):
     """Within this context, kernels do not run; their launches are appended to the list."""
-    launches: list[Launch] = []
+    launches = []
 
-    def run(kernel: JITFunction, *arguments: Any, grid: Any, warmup: bool, **named: Any) -> None:
+    def run(kernel, *arguments, grid, warmup, **named):
         launches.append(Launch(kernel, arguments, named))
 
     with monkeypatch.context() as patch:
@@ -51,7 +50,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
         yield launches
 
 
-def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, ...]:
+def specialization(launch, compute_capability=90):
     """The properties for which Triton compiles a kernel separately.
 
     These are types, constants, and which arguments are divisible by 16.
@@ -73,12 +72,12 @@ class Compiled:
     text: str  # SASS
 
     @property
-    def inner_loop(self) -> int:
+    def inner_loop(self):
         """Instructions of the longest innermost loop; 0 without one."""
         return max(self.loops.values(), default=0)
 
 
-def compile_for(launch: Launch, compute_capability: int) -> Compiled:
+def compile_for(launch, compute_capability):
     target = GPUTarget("cuda", compute_capability, 32)
     backend = make_backend(target)
     kernel = launch.kernel
@@ -100,10 +99,10 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
     )
 
 
-def innermost_loops(text: str) -> dict[str, int]:
+def innermost_loops(text):
     """For each innermost loop, the number of instructions from its label to the branch back."""
-    labels: dict[str, int] = {}
-    loops: dict[str, tuple[int, int]] = {}
+    labels = {}
+    loops = {}
     place = 0
     for line in text.splitlines():
         if label := re.match(r"\s*(\.L_\w+):", line):
@@ -122,7 +121,7 @@ def innermost_loops(text: str) -> dict[str, int]:
     return {label: loops[label][1] - loops[label][0] for label in sorted(inner)}
 
 
-def _run(tool: str, *arguments: str) -> str:
+def _run(tool, *arguments):
     path = BINARIES / tool
     command = str(path) if path.exists() else shutil.which(tool)
     if command is None:

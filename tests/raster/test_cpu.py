@@ -3,8 +3,6 @@
 Results have the same bits on every run, their memory is not overwritten, and any CPU will do.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess
@@ -12,7 +10,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numba
 import numpy as np
@@ -41,11 +38,11 @@ SUBJECT = Subject(lambda: CpuRasterizer(threads=1), CASE, MANY, 2e-5)
 
 
 @pytest.mark.parametrize("promise", PROMISES)
-def test_it_keeps_the_promise_that(promise: str) -> None:
+def test_it_keeps_the_promise_that(promise):
     PROMISES[promise](SUBJECT)
 
 
-def test_the_same_bits_on_every_run_and_for_any_number_of_threads() -> None:
+def test_the_same_bits_on_every_run_and_for_any_number_of_threads():
     one = CpuRasterizer(threads=1)
     expected = bits_of(one, MANY)
     assert bits_of(one, MANY) == expected  # memory that was used before
@@ -55,7 +52,7 @@ def test_the_same_bits_on_every_run_and_for_any_number_of_threads() -> None:
             assert bits_of(rasterizer, MANY) == expected
 
 
-def test_depths_are_sorted_as_numpy_sorts_them() -> None:
+def test_depths_are_sorted_as_numpy_sorts_them():
     generator = np.random.default_rng(0)
     depths = np.exp(generator.uniform(-1.6, 20, 500)).astype(np.float32)
     depths[generator.integers(0, 500, 60)] = depths[7]
@@ -78,9 +75,7 @@ def test_depths_are_sorted_as_numpy_sorts_them() -> None:
         ([5, 5, 5, 5, 5, 5], 1, [0, 6]),
     ],
 )
-def test_tiles_are_divided_by_their_work(
-    lengths: list[int], shards: int, bounds: list[int]
-) -> None:
+def test_tiles_are_divided_by_their_work(lengths, shards, bounds):
     starts = np.concatenate([[0], np.cumsum(lengths)])
     found, of_tile = np.full(shards + 1, -1), np.full(len(lengths), 99, np.uint8)
     binning.balance_tiles(starts, shards, found, of_tile)
@@ -88,7 +83,7 @@ def test_tiles_are_divided_by_their_work(
     assert of_tile.tolist() == np.repeat(np.arange(shards), np.diff(bounds)).tolist()
 
 
-def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndarray:
+def highest(records, low_x, low_y, size):
     """The largest log2(alpha) of records [R, 16] in squares of side ``size``, [R, squares].
 
     It is at the mean if the square contains it, or else on an edge.
@@ -97,7 +92,7 @@ def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndar
         records[:, k, None].astype(np.float64) for k in range(6)
     )
 
-    def at(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    def at(dx, dy):
         return top + curve_t * (dx + shear * dy) ** 2 + curve_y * dy**2
 
     left, upper = low_x - mean_x, low_y - mean_y  # [R, S]
@@ -111,13 +106,13 @@ def highest(records: np.ndarray, low_x: Any, low_y: Any, size: float) -> np.ndar
     return best
 
 
-def test_a_record_is_listed_in_the_tiles_and_blocks_that_its_contour_reaches() -> None:
+def test_a_record_is_listed_in_the_tiles_and_blocks_that_its_contour_reaches():
     """These have a pixel with alpha >= 1/255; a margin for rounding is allowed."""
     case = Case(96, 64, 150, sh_degree=0, log_scale=-2.5, logit=-3.0)  # faint: no pixel stops
     output = CpuRasterizer(threads=1).render(
         case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
     )
-    passed = output.footprint.args[0]  # type: ignore[union-attr]
+    passed = output.footprint.args[0]
     frame, edges = passed.frame, executor._edges(case.count)
     assert (frame.last == composite.NEVER_STOPPED).all()
     shards = zip(edges[:-1], passed.visible, strict=True)
@@ -175,12 +170,12 @@ def test_a_record_is_listed_in_the_tiles_and_blocks_that_its_contour_reaches() -
     assert (high - low < past - first).any()
 
 
-def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -> None:
+def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block():
     case = Case(40, 40, 300, sh_degree=0, log_scale=-1.5, logit=3.0)
     output = CpuRasterizer(threads=1).render(
         case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
     )
-    frame = output.footprint.args[0].frame  # type: ignore[union-attr]
+    frame = output.footprint.args[0].frame
     skipped = 0
     for tile in range(9):
         begin, end = frame.starts[tile], frame.processed[tile]
@@ -193,7 +188,7 @@ def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block() -
     assert skipped > 100
 
 
-def test_gradients_accumulate() -> None:
+def test_gradients_accumulate():
     own = leaves(CASE)
     rasterizer = CpuRasterizer(threads=1)
     rasterizer.render(own, CASE.camera(), 3, BLACK).image.sum().backward()
@@ -203,8 +198,8 @@ def test_gradients_accumulate() -> None:
 
 
 def test_an_interrupted_backward_pass_does_not_change_later_gradients(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     for threads in (1, 2):
         rasterizer = CpuRasterizer(threads=threads)
         _, expected = render_with_gradients(rasterizer, CASE, torch.float32)
@@ -216,18 +211,18 @@ def test_an_interrupted_backward_pass_does_not_change_later_gradients(
         assert torch.equal(gradients["means"], expected["means"])
 
 
-def _interrupt(*_: object) -> None:
+def _interrupt(*_):
     raise KeyboardInterrupt
 
 
-def test_zero_threads_are_refused() -> None:
+def test_zero_threads_are_refused():
     with pytest.raises(ValueError, match="threads"):
         CpuRasterizer(threads=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cpu", ["generic"])
-def test_hosts_without_wide_vectors_match_the_reference(cpu: str, tmp_path: Path) -> None:
+def test_hosts_without_wide_vectors_match_the_reference(cpu, tmp_path):
     """A separate process compiles for the simplest CPU of this architecture (SSE2 on x86)."""
     script = """
 import sys, torch
@@ -260,7 +255,7 @@ print(float((output.image.double() - expected.image).abs().max()), worst)
 
 
 @numba.njit
-def _vector_functions(a, b, out):  # type: ignore[no-untyped-def]
+def _vector_functions(a, b, out):
     x, y = simd.load(a, 0), simd.load(b, 0)
     simd.store(out, 0, simd.fma(x, y, 2) - x / y)
     simd.store(out, 16, simd.exp2(x * 8))
@@ -272,7 +267,7 @@ def _vector_functions(a, b, out):  # type: ignore[no-untyped-def]
     return simd.mask_bits(mask), simd.lowest_bit(np.uint64(0b101000))
 
 
-def test_vector_functions_match_numpy() -> None:
+def test_vector_functions_match_numpy():
     generator = np.random.default_rng(0)
     a, b = generator.normal(size=(2, 16)).astype(np.float32)
     out = np.full(96, np.nan, np.float32)
@@ -294,7 +289,7 @@ def test_vector_functions_match_numpy() -> None:
 
 
 @numba.njit
-def _logarithms(x, out):  # type: ignore[no-untyped-def]
+def _logarithms(x, out):
     for i in range(0, len(x), simd.LANES):
         value = simd.load(x, i)
         simd.store(out[0], i, simd.log2(value))
@@ -305,7 +300,7 @@ def _logarithms(x, out):  # type: ignore[no-untyped-def]
     "kind", [types.Array(types.float64, 1, "C"), types.Array(types.float32, 1, "A"), types.intp]
 )
 @pytest.mark.parametrize("name", ["load", "load_numbers", "store", "gather", "scatter"])
-def test_only_contiguous_float32_arrays_are_accepted(name: str, kind: types.Type) -> None:
+def test_only_contiguous_float32_arrays_are_accepted(name, kind):
     define = getattr(simd, name)._defn
     others = [types.intp] * (define.__code__.co_argcount - 2)
     define(None, types.Array(types.float32, 2, "C"), *others)
@@ -313,7 +308,7 @@ def test_only_contiguous_float32_arrays_are_accepted(name: str, kind: types.Type
         define(None, kind, *others)
 
 
-def test_logarithms_and_roots_are_accurate_over_their_range() -> None:
+def test_logarithms_and_roots_are_accurate_over_their_range():
     x = np.exp2(np.linspace(-126, 100, 16 * 4096)).astype(np.float32)
     out = np.empty((2, len(x)), np.float32)
     _logarithms(x, out)
@@ -323,13 +318,13 @@ def test_logarithms_and_roots_are_accurate_over_their_range() -> None:
 
 
 @numba.njit
-def _gather_and_scatter(array, indices, out):  # type: ignore[no-untyped-def]
+def _gather_and_scatter(array, indices, out):
     value = simd.gather(array, indices, 3, 1)
     simd.store(out, 0, value)
     simd.scatter(array, indices, 3, 2, value)
 
 
-def test_gather_and_scatter_match_numpy_indexing() -> None:
+def test_gather_and_scatter_match_numpy_indexing():
     array = np.arange(60, dtype=np.float32).reshape(20, 3)
     before = array.copy()
     indices = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7])
@@ -341,7 +336,7 @@ def test_gather_and_scatter_match_numpy_indexing() -> None:
 
 
 @numba.njit
-def _shuffles(matrix, rest, basis, out, moved):  # type: ignore[no-untyped-def]
+def _shuffles(matrix, rest, basis, out, moved):
     shuffle.transpose(matrix, 0)
     loaded = shuffle.load_rest(rest, 45)
     shuffle.store_rest(moved, 45, loaded)
@@ -355,7 +350,7 @@ def _shuffles(matrix, rest, basis, out, moved):  # type: ignore[no-untyped-def]
     simd.store(out, 128, shuffle.as_integers(simd.load(basis, 0)))
 
 
-def test_shuffles_move_each_number_to_its_place() -> None:
+def test_shuffles_move_each_number_to_its_place():
     matrix = np.arange(256, dtype=np.float32)
     rest, moved = np.arange(135, dtype=np.float32), np.zeros(135, np.float32)
     basis, out = np.arange(16, dtype=np.float32), np.zeros(144, np.float32)
@@ -372,12 +367,12 @@ def test_shuffles_move_each_number_to_its_place() -> None:
     np.testing.assert_array_equal(integers[128:144], np.arange(16))
 
 
-def test_exp2_is_accurate_over_its_range() -> None:
+def test_exp2_is_accurate_over_its_range():
     x = np.linspace(-126, 127, 16 * 4096).astype(np.float32)
     out = np.empty_like(x)
 
     @numba.njit
-    def fill(x, out):  # type: ignore[no-untyped-def]
+    def fill(x, out):
         for i in range(0, len(x), 16):
             simd.store(out, i, simd.exp2(simd.load(x, i)))
 
@@ -385,7 +380,7 @@ def test_exp2_is_accurate_over_its_range() -> None:
     np.testing.assert_allclose(out, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
 
 
-def test_memory_is_reused_when_nothing_refers_to_it() -> None:
+def test_memory_is_reused_when_nothing_refers_to_it():
     pool = TensorPool()
     first = pool.empty((100, 3))
     address = first.data_ptr()
@@ -405,7 +400,7 @@ def test_memory_is_reused_when_nothing_refers_to_it() -> None:
     assert not arena.take("a", (1000,), np.float32, zero=True).any()
 
 
-def test_unused_memory_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unused_memory_is_freed(monkeypatch):
     pool = TensorPool()
     del (large := [pool.empty((100_000,))])[:]
     assert not large
@@ -421,10 +416,10 @@ def test_unused_memory_is_freed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert allocate(10).size == 10
 
 
-def test_a_runner_with_one_thread_uses_the_calling_thread() -> None:
+def test_a_runner_with_one_thread_uses_the_calling_thread():
     threads = {}
 
-    def note(first: int, past: int) -> None:
+    def note(first, past):
         threads[first, past] = threading.get_ident()
 
     ShardRunner(1).run(8, note)
@@ -435,10 +430,10 @@ def test_a_runner_with_one_thread_uses_the_calling_thread() -> None:
     assert threading.get_ident() not in threads.values()
 
 
-def test_no_shard_runs_after_an_error_was_raised() -> None:
+def test_no_shard_runs_after_an_error_was_raised():
     second_began, done = threading.Event(), []
 
-    def work(first: int, past: int) -> None:
+    def work(first, past):
         if first == 0:
             second_began.wait(10)
             raise ZeroDivisionError
@@ -455,8 +450,8 @@ def test_no_shard_runs_after_an_error_was_raised() -> None:
     assert done == finished
 
 
-def test_an_error_in_a_shard_is_raised() -> None:
-    def fail(first: int, past: int) -> None:
+def test_an_error_in_a_shard_is_raised():
+    def fail(first, past):
         if first <= 3 < past:
             raise ZeroDivisionError
 

@@ -1,13 +1,10 @@
 """A rasterizer from a file outside gsbench: the one of docs/rasterizer.md, in the real program."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -41,7 +38,7 @@ OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """A folder with the document's ``untiled.py``, from which modules can be imported."""
     blocks = re.findall(
         r"^```python\n(# untiled\.py\n.*?)^```$",
@@ -54,7 +51,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def gsbench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def gsbench(folder, *words):
     environment = os.environ | {"GSBENCH_RUNS": str(folder / "runs")}
     return subprocess.run(
         [sys.executable, "-m", "gsbench.cli", *words],
@@ -68,7 +65,7 @@ def gsbench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_the_real_program_trains_with_it_and_records_its_source(folder: Path) -> None:
+def test_the_real_program_trains_with_it_and_records_its_source(folder):
     first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     assert first.returncode == 0, first.stderr
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
@@ -93,7 +90,7 @@ def test_the_real_program_trains_with_it_and_records_its_source(folder: Path) ->
     assert "missing" in changed.stdout
 
 
-def test_its_options_are_checked_and_are_part_of_the_key(folder: Path) -> None:
+def test_its_options_are_checked_and_are_part_of_the_key(folder):
     values = composed(*OWN, "+raster.rows=7")
     rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
@@ -112,7 +109,7 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder: Path) -> None:
         compose_one(OWN[:1])
 
 
-def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder: Path) -> None:
+def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder):
     Parts(composed(*OWN)).check(on_this_machine=False)
     parts = Parts(composed(*OWN, "densify=pixelgs"))
     with pytest.raises(
@@ -120,11 +117,11 @@ def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder
         match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference",
     ):
         parts.check(on_this_machine=False)
-    parts.own_rasterizer.has_footprint = True  # type: ignore[union-attr]
+    parts.own_rasterizer.has_footprint = True
     parts.check(on_this_machine=False)
 
 
-def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder: Path) -> None:
+def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder):
     (folder / "untiled.py").write_text(
         "from gsbench.raster.reference import ReferenceRasterizer\n"
         "class Same(ReferenceRasterizer):\n    pass\n"
@@ -146,7 +143,7 @@ def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder: 
             )
 
 
-def test_its_source_is_part_of_the_hash(folder: Path) -> None:
+def test_its_source_is_part_of_the_hash(folder):
     own = config_hash(composed(*OWN))
     assert own != config_hash(composed())
     (folder / "untiled.py").write_text("changed = True\n")

@@ -3,8 +3,6 @@
 Each part runs in a separate process.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -36,7 +34,7 @@ LIMIT = 1700
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_passes_in_the_interpreter(part: str) -> None:
+def test_a_part_passes_in_the_interpreter(part):
     if fault := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(fault)
     environment = os.environ | {
@@ -73,16 +71,14 @@ def test_a_part_passes_in_the_interpreter(part: str) -> None:
         (("3.10.0", "2.5.2"), True),
     ],
 )
-def test_versions_of_triton_and_numpy_that_do_not_fit_are_known(
-    versions: tuple[str, str], works: bool
-) -> None:
+def test_versions_of_triton_and_numpy_that_do_not_fit_are_known(versions, works):
     assert (interpreter_fault(*versions) is None) == works
 
 
-def test_every_test_is_in_exactly_one_part() -> None:
+def test_every_test_is_in_exactly_one_part():
     environment = os.environ | {"TRITON_INTERPRET": "1"}
 
-    def collected(arguments: list[str]) -> list[str]:
+    def collected(arguments):
         words = [
             sys.executable,
             "-m",

@@ -1,12 +1,9 @@
 """Photographs that renders are compared with, and the places at which they are entered."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -50,19 +47,19 @@ FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})
     ],
 )
 def test_places_that_would_mix_or_damage_results_are_refused(
-    word: str, scene: str | None, seed: int, truth: ReferenceImages, said: str, tmp_path: Path
-) -> None:
+    word, scene, seed, truth, said, tmp_path
+):
     with pytest.raises(InputError, match=said):
         find_destination(word, scene, seed, truth, tmp_path)
 
 
 @pytest.fixture(scope="module")
-def defaults() -> dict[str, Any]:
+def defaults():
     return dict(compose_one(QUICK).values)
 
 
 @pytest.fixture
-def trial(runs: Path, defaults: dict[str, Any]) -> Path:
+def trial(runs, defaults):
     """The folder of a trial of ``exp`` that tests the scene garden in two views, one masked."""
     plan = Plan("exp", ["garden"], densifiers=["adc"], seeds=[0], views=2, pictures=True)
     (folder,) = write_runs(runs, plan)
@@ -76,9 +73,7 @@ def trial(runs: Path, defaults: dict[str, Any]) -> Path:
     return folder
 
 
-def test_renders_are_entered_beside_the_trial_of_their_photographs(
-    trial: Path, runs: Path, said: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_renders_are_entered_beside_the_trial_of_their_photographs(trial, runs, said, capsys):
     renders = trial.parents[4] / "mine"
     renders.mkdir()
     for name in ("view000", "view001"):
@@ -97,7 +92,7 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(
     assert found["pictures"] == {"view000": "view000.png", "view001": "view001.png"}
     results = json.loads((entered / "results.json").read_text())
     assert results["metrics"] == pytest.approx(found["metrics"])
-    wanted: dict[str, object] = {
+    wanted = {
         **{"status": "complete", "evaluated_from": "renders", "raster": "unknown"},
         **{"iterations": 0, "test_views": 2, "resolution": [400, 300], "seed": 3},
         "renders": {"folder": str(renders), "names matched": "apart from the extension"},
@@ -124,9 +119,7 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(
     assert yaml.safe_load((other / "config.yaml").read_text())["init"] == {"name": "dnn"}
 
 
-def test_photographs_are_found_by_trial_folder_and_address(
-    trial: Path, runs: Path, tmp_path: Path, refused: Any, said: Any
-) -> None:
+def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path, refused, said):
     other = trial.with_name("deadbeef-seed0")  # the same arm with another setting
     shutil.copytree(trial, other)
     config = json.loads((other / "config.yaml").read_text())
@@ -170,21 +163,21 @@ def test_photographs_are_found_by_trial_folder_and_address(
     [("colmap", "x=1", 2), ("photos", "x=1", 1), ("colmap", "init=sfm", 1)],
 )
 def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
-    kind: str, word: str, times: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+    kind, word, times, monkeypatch, tmp_path
+):
     """With the fastest initialiser if the scene has cameras, unless one is chosen."""
-    composed: list[list[str]] = []
-    built: list[Path] = []
+    composed = []
+    built = []
 
-    def compose(words: list[str]) -> Any:
+    def compose(words):
         composed.append(words)
         return SimpleNamespace(values={"scene": {"kind": kind}, "runs": str(tmp_path)})
 
-    def get(step: Any) -> Any:
+    def get(step):
         built.append(tmp_path / step.stage.name)
         return SimpleNamespace(path=built[-1])
 
-    def view(name: str, width: int, height: int) -> Any:
+    def view(name, width, height):
         return SimpleNamespace(name=name, camera=SimpleNamespace(width=width, height=height))
 
     scene = SimpleNamespace(
@@ -215,7 +208,7 @@ def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
     assert truth.masks == {"a.png": place / "masks" / "a.png"}
 
 
-def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_path: Path) -> None:
+def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_path):
     write_runs(tmp_path, Plan("exp", ["garden"], ["random"], seeds=[0]))
     garden = ReferenceImages(
         {}, "the pictures in a folder", "0" * 64, (96, 72), {}, "garden", "sfm"
@@ -236,7 +229,7 @@ def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_pat
     assert find_destination("exp:mine", None, 0, garden, tmp_path).init == "random"
 
 
-def test_the_scene_of_the_photographs_may_be_repeated(tmp_path: Path) -> None:
+def test_the_scene_of_the_photographs_may_be_repeated(tmp_path):
     wanted = Destination("table1", "courtyard", "sfm", "mine", 3)
     assert find_destination("table1:mine", "courtyard", 3, COURTYARD, tmp_path) == wanted
     assert find_destination("table1:mine", None, 3, COURTYARD, tmp_path) == wanted
@@ -252,8 +245,8 @@ def test_the_scene_of_the_photographs_may_be_repeated(tmp_path: Path) -> None:
     ],
 )
 def test_renders_of_other_photographs_than_the_experiments_are_refused(
-    data: str, resolution: tuple[int, int], refused: bool, tmp_path: Path
-) -> None:
+    data, resolution, refused, tmp_path
+):
     write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
     truth = ReferenceImages({}, "the pictures in a folder", data, resolution, {})
     destination = Destination("exp", "garden", "sfm", "mine", 0)
@@ -264,8 +257,8 @@ def test_renders_of_other_photographs_than_the_experiments_are_refused(
         check_destination(destination, truth, tmp_path)
 
 
-def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metrics() -> None:
-    evaluator: Any = SimpleNamespace(
+def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metrics():
+    evaluator = SimpleNamespace(
         protocol=SimpleNamespace(id="paper-1"),
         unavailable={"lpips_vgg_raw": "no weights", "fps": "renders alone"},
         awaited={"lpips_vgg_raw"},

@@ -6,7 +6,6 @@ import importlib.util
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,7 +58,7 @@ STEPS = {
 }
 # Rooms that a step's module imports but that need not be in its key: another stage's key has them, or
 # they only make objects.
-BESIDE: dict[str, tuple[str, ...]] = {
+BESIDE = {
     "scene": ("gaussians",),
     "init": (),
     "train": ("init", "eval", "weights.py", "pipeline/steps/scene.py"),
@@ -69,7 +68,7 @@ BESIDE: dict[str, tuple[str, ...]] = {
 
 
 @pytest.fixture
-def package(tmp_path, monkeypatch) -> Iterator[Path]:
+def package(tmp_path, monkeypatch):
     """A copy of gsbench, other than the one that runs, without the files of a release.
 
     It is read as by a new process.
@@ -83,7 +82,7 @@ def package(tmp_path, monkeypatch) -> Iterator[Path]:
     again()
 
 
-def again() -> None:
+def again():
     """Forget what this process has read, as in a new process."""
     for cached in (keys._released, keys._state, keys._first_contents):
         cached.cache_clear()
@@ -199,7 +198,7 @@ CLASS = "class Mine: ...\n"
 
 
 @pytest.fixture
-def home(tmp_path, monkeypatch) -> Iterator[Path]:
+def home(tmp_path, monkeypatch):
     """A folder in which a user types commands, whose modules are allowed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -211,13 +210,11 @@ def home(tmp_path, monkeypatch) -> Iterator[Path]:
     allowed_modules().clear()
 
 
-def digest(path: Path) -> str:
+def digest(path):
     return hashlib.sha256(keys.syntax_of(path.read_bytes())).hexdigest()
 
 
-def values_of(
-    *targets: str, allowed: tuple[str, ...] = ("own_code", "helper")
-) -> dict[str, object]:
+def values_of(*targets, allowed=("own_code", "helper")):
     return {
         "densify": {"inner": [{"_target_": name} for name in targets]},
         "allow_targets": list(allowed),

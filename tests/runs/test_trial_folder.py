@@ -4,7 +4,6 @@ import json
 import os
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -21,13 +20,13 @@ from tests.fuzz.records import EXPERIMENT, write_trial
 
 
 @pytest.fixture
-def trial(tmp_path, monkeypatch) -> Path:
+def trial(tmp_path, monkeypatch):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     write_trial(tmp_path, "adc", 1)
     return write_trial(tmp_path, "adc", 0)
 
 
-def edit(path: Path, old: str, new: str) -> None:
+def edit(path, old, new):
     """Change a file and keep its time, as somebody does who wants to hide the change."""
     state = path.stat()
     assert old in path.read_text()
@@ -292,7 +291,7 @@ def test_each_change_since_the_results_were_written_is_named(trial, place, value
 def test_a_missing_metric_that_can_be_computed_now_is_a_reason_to_run(trial):
     folder = TrialFolder(trial)
     values = folder.settings() | {"eval": {"primary": "x"}}
-    asked: list[dict[str, object]] = []
+    asked = []
     unavailable = lambda options: asked.append(options) or {"flip"}  # noqa: E731
     record = replace(folder.record(), hashes={"config": config_hash(values)})
     folder.write_finished(values, record)

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -40,7 +39,7 @@ RESULTS = {
 PATH = Path("results.json")
 
 
-def record(**changes: Any) -> Any:
+def record(**changes):
     return record_from(json.dumps(RESULTS | changes).encode(), PATH)
 
 

@@ -1,9 +1,6 @@
 """COLMAP models fitted to files: sizes, subsets, names, poses."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,7 +24,7 @@ from tests.scene.cameras import cameras_of
 from .conftest import smooth_image
 
 
-def reprojection_errors(model: pycolmap.Reconstruction) -> list[float]:
+def reprojection_errors(model):
     """All distances in px between projected 3D and stored 2D points, by pycolmap's own cameras."""
     errors = []
     for point in model.points3D.values():
@@ -63,7 +60,7 @@ def test_cameras_follow_smaller_files(make_scene, model, params):
     assert fitted.points3D[1].color.tolist() == original.points3D[1].color.tolist()
 
 
-def test_subset_drops_images_and_their_observations(make_scene, tmp_path: Path):
+def test_subset_drops_images_and_their_observations(make_scene, tmp_path):
     fitted = read_reference(read_colmap("toy", make_scene(), max_images=3))
     assert sorted(image.name for image in fitted.images.values()) == ["00.png", "02.png", "04.png"]
     assert {point.track.length() for point in fitted.points3D.values()} == {3}
@@ -118,7 +115,7 @@ def test_distorted_cameras_are_not_pinholes(make_scene):
         cameras_of(read_model(root / "sparse/0"))
 
 
-def test_written_cameras_project_points_to_the_same_pixels(tmp_path: Path):
+def test_written_cameras_project_points_to_the_same_pixels(tmp_path):
     rng = np.random.default_rng(5)
     cameras = {}
     for k in range(4):
@@ -138,7 +135,7 @@ def test_written_cameras_project_points_to_the_same_pixels(tmp_path: Path):
         np.testing.assert_allclose(back.center, image.projection_center(), atol=1e-12)
 
 
-def test_camera_models_are_those_of_colmap() -> None:
+def test_camera_models_are_those_of_colmap():
     """Model numbers and parameter counts are COLMAP's, and focal lengths come first."""
     known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
     known.pop("INVALID")
@@ -158,7 +155,7 @@ POSE = (1.0, 0, 0, 0, 0, 0, 5)
 LARGEST = {"camera": 2**32 - 2, "image": 2**32 - 2, "point": 2**64 - 2}
 
 
-def sound_model() -> list[tuple[str, tuple]]:
+def sound_model():
     """Calls of `ModelChecks` for a sound model with the smallest and largest ids."""
     return [
         ("camera", (0, "SIMPLE_PINHOLE", 1, 1, (0.5, 0, 0))),
@@ -201,9 +198,7 @@ def sound_model() -> list[tuple[str, tuple]]:
         (4, 2, [(0, 0)], "2D point 0 of image 0"),
     ],
 )
-def test_impossible_values_in_a_model_are_refused(
-    call: int | None, argument: int, value: object, said: str
-) -> None:
+def test_impossible_values_in_a_model_are_refused(call, argument, value, said):
     checks = ModelChecks()
     for place, (name, arguments) in enumerate(sound_model()):
         if place != call:
@@ -217,7 +212,7 @@ def test_impossible_values_in_a_model_are_refused(
 
 
 @pytest.fixture(params=["bin", "txt"])
-def rigs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def rigs(request, tmp_path):
     """A model of two rigs with three cameras each, as COLMAP writes it."""
     options = pycolmap.SyntheticDatasetOptions(
         num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=9
@@ -228,7 +223,7 @@ def rigs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs: Path, stem: str) -> None:
+def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs, stem):
     check_model(rigs)
     (file,) = rigs.glob(f"{stem}.*")
     whole = file.read_bytes()
@@ -238,7 +233,7 @@ def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs: Path, stem: 
             check_model(rigs)
 
 
-def test_a_rig_without_sensors_is_accepted(rigs: Path) -> None:
+def test_a_rig_without_sensors_is_accepted(rigs):
     if (rigs / "rigs.bin").is_file():
         (rigs / "rigs.bin").write_bytes(struct.pack("<QIIII", 2, 1, 0, 2, 0))
     else:
@@ -254,9 +249,7 @@ def test_a_rig_without_sensors_is_accepted(rigs: Path) -> None:
         ("frames", 16, 2, "frame 1"),
     ],
 )
-def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(
-    rigs: Path, stem: str, start: int, at: int, said: str
-) -> None:
+def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(rigs, stem, start, at, said):
     """The quaternion at byte ``start``, or at word ``at`` of a text line, becomes zero."""
     (file,) = rigs.glob(f"{stem}.*")
     if file.suffix == ".bin":
@@ -272,7 +265,7 @@ def test_a_zero_quaternion_of_a_rig_or_a_frame_is_refused(
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_a_name_in_a_code_page_is_named(make_scene, text: bool) -> None:
+def test_a_name_in_a_code_page_is_named(make_scene, text):
     root = make_scene(names=[f"{k:04d}.png" for k in range(4)], text=text)
     file = root / "sparse/0" / ("images.txt" if text else "images.bin")
     file.write_bytes(file.read_bytes().replace(b"0003.png", "가나.png".encode("cp949")))
@@ -283,7 +276,7 @@ def test_a_name_in_a_code_page_is_named(make_scene, text: bool) -> None:
 
 
 @pytest.mark.parametrize("names", [("a.png", "b c.png", "d.png"), ("1", "22", "333")])
-def test_an_image_without_its_line_of_points_is_named(make_scene, names) -> None:
+def test_an_image_without_its_line_of_points_is_named(make_scene, names):
     root = make_scene(text=True)
     file = root / "sparse/0/images.txt"
     for stem in ("rigs", "frames"):
@@ -323,9 +316,7 @@ def test_an_image_without_its_line_of_points_is_named(make_scene, names) -> None
         ("points3D", "1 0 0 5 0 255 0 0.1 1", "point 1 lacks numbers"),
     ],
 )
-def test_a_bad_line_of_a_text_model_is_named(
-    tmp_path: Path, stem: str, line: str, said: str
-) -> None:
+def test_a_bad_line_of_a_text_model_is_named(tmp_path, stem, line, said):
     lines = {
         "cameras": "# a comment\n1 PINHOLE 40 30 50 50 20 15",
         "images": "1 1 0 0 0 0 0 5 1 a.png\n1 2 -1",
@@ -339,7 +330,7 @@ def test_a_bad_line_of_a_text_model_is_named(
         check_model(tmp_path)
 
 
-def test_rotations_of_sensors_in_a_rig_get_unit_length() -> None:
+def test_rotations_of_sensors_in_a_rig_get_unit_length():
     """COLMAP normalises those of images only. A rotation of unit length keeps its bits."""
     rig = pycolmap.Rig(rig_id=1)
     rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
@@ -350,7 +341,7 @@ def test_rotations_of_sensors_in_a_rig_get_unit_length() -> None:
         kept = pose.rotation.quat.copy()
         pose.rotation.quat = length * kept
         rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, sensor), pose)
-    _normalize_quaternions(SimpleNamespace(rigs={1: rig}, frames={}))  # type: ignore[arg-type]
+    _normalize_quaternions(SimpleNamespace(rigs={1: rig}, frames={}))
     long, exact = (pose for _, pose in sorted(rig.non_ref_sensors.items(), key=str))
     np.testing.assert_allclose(long.rotation.quat, kept, rtol=1e-15)
     assert exact.rotation.quat.tolist() == kept.tolist()

@@ -1,11 +1,8 @@
 """From capture and model to a scene: undistortion, sizes, cache, missing poses."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -25,7 +22,7 @@ from gsbench.scene.load import (
 )
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
-from gsbench.scene.types import CameraModel, Scene
+from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import check_lenses, folded_shares, undistort
 
 WIDTH, HEIGHT = 200, 150
@@ -57,7 +54,7 @@ def test_every_model_of_this_pycolmap_is_tested():
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_undistorted_spots_land_where_a_pinhole_sees_them(name: str):
+def test_undistorted_spots_land_where_a_pinhole_sees_them(name):
     source = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=MODELS[name])
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = np.zeros((HEIGHT, WIDTH))
@@ -84,7 +81,7 @@ PERSPECTIVE = [name for name in MODELS if "FISHEYE" not in name]
 @pytest.mark.parametrize("amount", [0.0, 1e-7, 1.0])
 @pytest.mark.parametrize("name", MODELS)
 def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
-    make_scene, tmp_path: Path, name: str, amount
+    make_scene, tmp_path, name, amount
 ):
     """With zero or tiny coefficients, perspective models keep their pixels; fisheyes do not."""
     plain = pycolmap.Camera.create_from_model_name(1, name, 150.0, WIDTH, HEIGHT)
@@ -172,7 +169,7 @@ def test_a_small_fold_in_the_corners_is_reported(caplog):
     assert "turns back inside the picture" in caplog.text
 
 
-def test_panoramas_are_refused(tmp_path: Path):
+def test_panoramas_are_refused(tmp_path):
     camera = CameraModel("EQUIRECTANGULAR", WIDTH, HEIGHT, (float(WIDTH), float(HEIGHT)))
     with pytest.raises(InputError, match="EQUIRECTANGULAR"):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
@@ -182,7 +179,7 @@ def test_panoramas_are_refused(tmp_path: Path):
         prepare_all([image], no_progress)
 
 
-def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
+def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path):
     images, told, halved = [], [], Downscaling(2, None, "area")
     for width in range(20, 56):
         source, target = tmp_path / f"{width}.png", tmp_path / "made" / f"{width}.png"
@@ -198,7 +195,7 @@ def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
         assert camera.cx == pytest.approx(camera.width / 2)
 
 
-def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path: Path):
+def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path):
     root = make_scene()
     capture = read_colmap("toy", root)
     scene = load_scene(capture, capture.model, tmp_path / "cache")
@@ -212,14 +209,14 @@ def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_
     assert scene.extent == pytest.approx(1.1 * 0.2)
 
 
-def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp_path: Path):
+def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp_path):
     root = make_scene(size=(81, 60), model="SIMPLE_RADIAL", params=[70, 40, 30, 0.05])
     capture = read_colmap("toy", root)
     done = []
     options = {"downscale": 2, "progress": lambda *step: done.append(step)}
     cache = tmp_path / "cache"
 
-    def load(folder: Path = cache, **others: object) -> Scene:
+    def load(folder=cache, **others):
         return load_scene(capture, capture.model, folder, **(options | others))
 
     first = load()
@@ -252,7 +249,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert len(done) == 4  # pixels depend on the cameras
 
 
-def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path: Path):
+def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(), max_images=3)
     load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
@@ -262,14 +259,14 @@ def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path: Pa
     ]
 
 
-def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path: Path):
+def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene())
     Image.new("RGB", (40, 26)).save(capture.images / "01.png")
     with pytest.raises(InputError, match=r"01\.png: the image is 40x26 px but its camera .* 40x30"):
         load_scene(capture, capture.model, tmp_path / "cache")
 
 
-def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path: Path):
+def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene())
     options = {"downscale": 2, "resample": "area"}
     first = load_scene(capture, capture.model, tmp_path / "cache", **options)
@@ -282,23 +279,23 @@ def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path
     assert [folder.name for folder in (tmp_path / "cache").iterdir()] == [file.parent.name]
 
 
-def _other_focal(file: Path) -> None:
+def _other_focal(file):
     document = json.loads(file.read_text())
     for view in document["views"].values():
         view["fx"] *= 1.3
     file.write_text(json.dumps(document, indent=1))
 
 
-def _other_file(file: Path) -> None:
+def _other_file(file):
     file.write_text(file.read_text().replace('"00000.png"', '"../../../00000.png"'))
 
 
-def _other_pixels(file: Path) -> None:
+def _other_pixels(file):
     picture = file.with_name("00000.png")
     Image.new("RGB", Image.open(picture).size).save(picture)
 
 
-def _other_sums(file: Path) -> None:
+def _other_sums(file):
     file.with_name("files.json").write_text('{"files": {}}')
 
 
@@ -315,9 +312,7 @@ def _other_sums(file: Path) -> None:
         lambda file: file.with_name("files.json").unlink(),
     ],
 )
-def test_a_cached_set_that_was_changed_is_prepared_again(
-    change, make_scene, tmp_path: Path, caplog
-):
+def test_a_cached_set_that_was_changed_is_prepared_again(change, make_scene, tmp_path, caplog):
     capture = read_colmap("toy", make_scene())
     first = load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
@@ -336,7 +331,7 @@ def test_a_cached_set_that_was_changed_is_prepared_again(
     assert not caplog.text
 
 
-def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
+def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
     used = load_scene(capture, capture.model, tmp_path)
     centred = load_scene(capture, capture.model, tmp_path, principal_point="centred")
@@ -345,10 +340,10 @@ def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
     assert centred.train[0].camera.fy == 51
     np.testing.assert_array_equal(used.train[0].image, centred.train[0].image)
     with pytest.raises(InputError, match="principal_point"):
-        load_scene(capture, capture.model, tmp_path, principal_point="center")  # type: ignore[arg-type]
+        load_scene(capture, capture.model, tmp_path, principal_point="center")
 
 
-def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path, caplog):
+def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path, caplog):
     capture = read_colmap("toy", make_scene(), split=SplitRule(test_every=3))
     small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
     with caplog.at_level(logging.WARNING):
@@ -365,7 +360,7 @@ def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path
         load_scene(only_test, small / "sparse/0", tmp_path / "cache2")
 
 
-def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path: Path):
+def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     root = make_scene(size=(80, 60))
     path = root / "images/03.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -376,9 +371,7 @@ def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path: Pa
 
 
 @pytest.mark.shared
-def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(
-    shared: Path, tmp_path: Path
-):
+def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(shared, tmp_path):
     capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
     scene = load_scene(capture, capture.model, tmp_path, max_size=300)
     assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}

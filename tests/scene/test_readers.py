@@ -1,7 +1,5 @@
 """Readers: which files are found, kept and held out, and errors for bad folders."""
 
-from __future__ import annotations
-
 import codecs
 import logging
 import shutil
@@ -21,7 +19,7 @@ from gsbench.scene.readers import missing_model, read_colmap, read_photos
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
-def test_a_colmap_folder_gives_photographs_and_model(make_scene, text: bool, sparse: str):
+def test_a_colmap_folder_gives_photographs_and_model(make_scene, text, sparse):
     root = make_scene(text=text, sparse=sparse)
     capture = read_colmap("toy", root, split=SplitRule(test_every=3))
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
@@ -114,9 +112,7 @@ def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, f
 
 
 @pytest.mark.parametrize("prefix", ["images/", "/home/x/images/", "C:\\data\\images\\", "./"])
-def test_a_model_whose_names_have_another_folder_gives_the_same_capture(
-    make_scene, caplog, prefix: str
-) -> None:
+def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_scene, caplog, prefix):
     plain = read_colmap("toy", make_scene(), max_images=4)
     root = make_scene(root="other")
     (root / "images/thumbs").mkdir()
@@ -145,7 +141,7 @@ def test_a_model_whose_names_have_another_folder_gives_the_same_capture(
         ({"sparse/0": 4, "colmap/sparse/0": 6}, "sparse/0"),
     ],
 )
-def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chosen, text: bool):
+def test_the_model_with_the_most_images_is_read(make_scene, caplog, models, chosen, text):
     for sparse, count in models.items():
         root = make_scene(names=[f"{k}.png" for k in range(count)], sparse=sparse, text=text)
     capture = read_colmap("toy", root)
@@ -174,7 +170,7 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
 @pytest.mark.parametrize("mark", [b"", codecs.BOM_UTF8])
 @pytest.mark.parametrize("line_end", [b"\n", b"\r\n"])
 def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
-    make_scene, text: bool, mark, line_end
+    make_scene, text, mark, line_end
 ):
     names = [f"my  photo {k}.png" for k in range(6)]
     root = make_scene(names=names, text=text)
@@ -202,7 +198,7 @@ def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
 )
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
 def test_wrong_encodings_and_decimal_commas_of_a_text_model_are_named(
-    make_scene, change, said: str, stem: str
+    make_scene, change, said, stem
 ):
     root = make_scene(text=True, params=[50.5, 50.5, 20, 15])
     file = root / f"sparse/0/{stem}.txt"
@@ -270,7 +266,7 @@ def test_a_split_without_views_is_refused():
             split_names(names, **options)
 
 
-def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path: Path):
+def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path):
     root = make_scene()
     copy = Path(shutil.copytree(root, tmp_path / "elsewhere"))
     first = read_colmap("toy", root)
@@ -282,7 +278,7 @@ def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path: Path)
     assert read_colmap("toy", copy).fingerprint != first.fingerprint
 
 
-def test_missing_folders_images_and_models_are_named(make_scene, tmp_path: Path):
+def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read_photos("toy", tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"scene\.path is not set"):
@@ -306,7 +302,7 @@ def test_missing_folders_images_and_models_are_named(make_scene, tmp_path: Path)
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "frames"])
 @pytest.mark.parametrize("keep", [0.0, 0.6])
-def test_a_truncated_model_is_named_in_one_line(make_scene, file: str, keep: float):
+def test_a_truncated_model_is_named_in_one_line(make_scene, file, keep):
     root = make_scene()
     path = root / "sparse/0" / f"{file}.bin"
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
@@ -315,9 +311,7 @@ def test_a_truncated_model_is_named_in_one_line(make_scene, file: str, keep: flo
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(
-    make_scene, tmp_path: Path
-) -> None:
+def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(make_scene, tmp_path):
     assert SceneConfig(name=None, kind="photos", path=str(tmp_path / "my fern")).name == "my fern"
     assert SceneConfig(name=None, kind="photos", path="/").name == "scene"
     said = missing_model("fern", tmp_path, None)

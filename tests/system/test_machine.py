@@ -1,13 +1,10 @@
 """The record of the machine that a result was computed on."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -33,7 +30,7 @@ XEON = (
 )
 
 
-def test_record_is_plain_text_and_full() -> None:
+def test_record_is_plain_text_and_full():
     record = describe_machine(torch.device("cpu"))
     assert json.loads(json.dumps(record)) == record
     assert set(record) == {"cpu", "architecture", "kernels", "torch", "device"}
@@ -50,9 +47,7 @@ def test_record_is_plain_text_and_full() -> None:
         ("Model : Raspberry Pi 5", "Raspberry Pi 5"),
     ],
 )
-def test_names_of_processors_on_linux(
-    content: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_of_processors_on_linux(content, name, tmp_path, monkeypatch):
     (tmp_path / "cpuinfo").write_text(content)
     monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(sys, "platform", "linux")
@@ -60,9 +55,7 @@ def test_names_of_processors_on_linux(
 
 
 @pytest.mark.parametrize("system", ["linux", "darwin", "win32", "sunos"])
-def test_a_processor_without_a_name_is_called_by_its_architecture(
-    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_processor_without_a_name_is_called_by_its_architecture(system, tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "missing")
     monkeypatch.setenv("PATH", str(tmp_path))  # no program of the system
     monkeypatch.delenv("PROCESSOR_IDENTIFIER", raising=False)
@@ -71,7 +64,7 @@ def test_a_processor_without_a_name_is_called_by_its_architecture(
     assert cpu_name.__wrapped__() == platform.machine()
 
 
-def test_levels_follow_the_psabi() -> None:
+def test_levels_follow_the_psabi():
     v2 = {"sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "cx16", "sahf", "sse2"}
     v3 = v2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"}
     v4 = v3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
@@ -82,7 +75,7 @@ def test_levels_follow_the_psabi() -> None:
     assert x86_level(v4 - {"sse4.2"}) == "x86-64-v1"
 
 
-def test_the_target_of_kernels_follows_numba_cpu_name() -> None:
+def test_the_target_of_kernels_follows_numba_cpu_name():
     code = "from gsbench.system.machine import kernel_target; print(kernel_target())"
     changed = dict(os.environ) | {"NUMBA_CPU_NAME": "generic"}
     asked = subprocess.run(
@@ -102,9 +95,7 @@ def test_the_target_of_kernels_follows_numba_cpu_name() -> None:
         ("NUMBA_DISABLE_JIT=0", None),
     ],
 )
-def test_a_variable_that_numba_cannot_read_is_refused(
-    variable: str, least: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variable_that_numba_cannot_read_is_refused(variable, least, monkeypatch):
     monkeypatch.setenv(*variable.split("="))
     if least is None:
         load_numba()
@@ -113,7 +104,7 @@ def test_a_variable_that_numba_cannot_read_is_refused(
             load_numba()
 
 
-def test_kernels_are_for_the_processor_and_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_for_the_processor_and_its_level(monkeypatch):
     features = "+" + ",+".join(machine.X86_LEVELS["x86-64-v2"]) + ",-avx"
     monkeypatch.setattr(machine, "numba_target", lambda: ("haswell", features))
     for system, target in (
@@ -128,7 +119,7 @@ def test_kernels_are_for_the_processor_and_its_level(monkeypatch: pytest.MonkeyP
     assert kind_of_machine(record | {"device": "H100"}) == "H100, A (B, torch C)"
 
 
-def test_numba_reads_no_settings_of_the_current_folder(tmp_path: Path) -> None:
+def test_numba_reads_no_settings_of_the_current_folder(tmp_path):
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\nopt: 0\n")
     code = (
         "import gsbench.raster.cpu\nfrom numba.core import config\nconfig.reload_config()\n"

@@ -1,15 +1,11 @@
 """Signals stop the program at once or at the end of a step; locks are held by one process."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
 import signal
 import sys
 import threading
-from pathlib import Path
-from typing import Any
 
 import pytest
 from filelock import FileLock, Timeout
@@ -29,7 +25,7 @@ from gsbench.system.stopping import (
 )
 
 
-def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back() -> None:
+def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back():
     before = [signal.getsignal(number) for number in SIGNALS]
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2):
         with pytest.raises(Stopped) as stop, stop_on_signals():
@@ -50,7 +46,7 @@ def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back() -> Non
     assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
-def test_a_deferred_signal_stops_at_the_end_of_the_block_and_a_second_one_at_once() -> None:
+def test_a_deferred_signal_stops_at_the_end_of_the_block_and_a_second_one_at_once():
     with stop_on_signals():
         with pytest.raises(Stopped, match="SIGTERM"), deferred():  # noqa: PT012
             with deferred():
@@ -69,7 +65,7 @@ def test_a_deferred_signal_stops_at_the_end_of_the_block_and_a_second_one_at_onc
             signal.raise_signal(signal.SIGUSR2)
 
 
-def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers() -> None:
+def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers():
     before = signal.getsignal(signal.SIGINT)
     with interrupts_ignored():
         signal.raise_signal(signal.SIGINT)
@@ -77,7 +73,7 @@ def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers() -
     assert signal.getsignal(signal.SIGINT) is before
     ran = []
 
-    def work() -> None:
+    def work():
         with stop_on_signals(), interrupts_ignored(), deferred():
             ran.append(signal.getsignal(signal.SIGINT) is before)
 
@@ -90,9 +86,7 @@ def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers() -
 # ---- locks
 
 
-def test_a_lock_names_its_holder_as_long_as_it_is_held(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_names_its_holder_as_long_as_it_is_held(tmp_path, monkeypatch):
     lock = tmp_path / "a.lock"
     monkeypatch.setenv("SLURM_JOB_ID", "5")
     monkeypatch.setattr("time.time", lambda: 12.5)
@@ -114,22 +108,20 @@ def test_a_lock_names_its_holder_as_long_as_it_is_held(
     assert not is_held(lock)
 
 
-def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(tmp_path, monkeypatch, caplog):
     caplog.set_level(logging.INFO, "gsbench")
-    asked: list[Any] = []
+    asked = []
 
     class Held:
-        def __init__(self, path: Path) -> None:
+        def __init__(self, path):
             pass
 
-        def acquire(self, **how: Any) -> None:
+        def acquire(self, **how):
             asked.append(how)
             if how == {"timeout": 0}:
                 raise Timeout("x")
 
-        def release(self) -> None:
+        def release(self):
             asked.append("released")
 
     monkeypatch.setattr(locks, "FileLock", Held)
@@ -142,9 +134,7 @@ def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(
 
 
 @pytest.mark.parametrize("system", ["with flock", "without"])
-def test_whether_a_lock_is_held_is_seen_on_every_system(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
-) -> None:
+def test_whether_a_lock_is_held_is_seen_on_every_system(tmp_path, monkeypatch, system):
     if system == "without":
         monkeypatch.setattr(locks, "fcntl", None)
     lock = tmp_path / "a"
@@ -160,9 +150,7 @@ def test_whether_a_lock_is_held_is_seen_on_every_system(
 # ---- a user's modules
 
 
-def test_only_allowed_modules_are_found_in_their_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_allowed_modules_are_found_in_their_folder(tmp_path, monkeypatch):
     finder = AllowedModules()
     monkeypatch.setattr(own_modules, "_allowed", finder)
     monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))

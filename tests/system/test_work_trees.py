@@ -1,10 +1,7 @@
 """Work trees of a stranger's repository: its programs do not run, its checkout does not change."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +12,7 @@ Git = Callable[..., str]
 
 
 @pytest.fixture
-def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Git:
+def git(tmp_path, monkeypatch):
     """git in the folder ``theirs``, which is a repository with three commits of a file."""
     for name, value in {
         "GIT_CONFIG_GLOBAL": "/dev/null",
@@ -26,7 +23,7 @@ def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Git:
     folder = tmp_path / "theirs"
     (folder / "inner").mkdir(parents=True)
 
-    def run(*words: str) -> str:
+    def run(*words):
         command = ["git", "-C", str(folder), "-c", "user.name=x", "-c", "user.email=x@y", *words]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
@@ -39,12 +36,12 @@ def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Git:
     return run
 
 
-def trees(tmp_path: Path, name: str = "place") -> WorkTrees:
+def trees(tmp_path, name="place"):
     (tmp_path / name).mkdir()
     return WorkTrees(tmp_path / "theirs" / "inner", tmp_path / name)
 
 
-def test_commits_and_their_trees(tmp_path: Path, git: Git) -> None:
+def test_commits_and_their_trees(tmp_path, git):
     found = trees(tmp_path)
     assert found.prefix == "inner/"
     commits = found.commits("HEAD~2", "main")
@@ -57,7 +54,7 @@ def test_commits_and_their_trees(tmp_path: Path, git: Git) -> None:
     assert git("status", "--porcelain") == ""
 
 
-def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path: Path, git: Git) -> None:
+def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path, git):
     ran = tmp_path / "ran"
     program = tmp_path / "program"
     program.write_text(f"#!/bin/sh\ntouch {ran}\ncat\n")
@@ -83,7 +80,7 @@ def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path: Path, git: Gi
     assert not ran.exists()
 
 
-def test_wrong_and_reversed_commits_are_refused(tmp_path: Path, git: Git) -> None:
+def test_wrong_and_reversed_commits_are_refused(tmp_path, git):
     found = trees(tmp_path)
     for first, last, message in (
         ("nosuch", "HEAD", "rev-parse"),
@@ -99,8 +96,6 @@ def test_wrong_and_reversed_commits_are_refused(tmp_path: Path, git: Git) -> Non
         WorkTrees(tmp_path / "empty", tmp_path)
 
 
-def test_git_variables_of_a_hook_are_ignored(
-    tmp_path: Path, git: Git, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_git_variables_of_a_hook_are_ignored(tmp_path, git, monkeypatch):
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "nowhere"))  # as in a hook
     assert len(trees(tmp_path).commits("HEAD~1", "HEAD")) == 2

@@ -1,7 +1,5 @@
 """The photometric loss compared with scikit-image, float64 autograd, and itself on more threads."""
 
-from __future__ import annotations
-
 import sys
 from types import SimpleNamespace
 
@@ -18,7 +16,7 @@ from gsbench.train.loss_cpu import CompiledLoss
 SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 
 
-def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _images(height, width):
     """A smooth image with noise and, as target, the smooth image in 8 bits."""
     generator = torch.Generator().manual_seed(height)
     y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
@@ -27,14 +25,14 @@ def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     return image, (smooth.clamp(0, 1) * 255).to(torch.uint8)
 
 
-def test_the_window_has_eleven_weights_of_a_gaussian() -> None:
+def test_the_window_has_eleven_weights_of_a_gaussian():
     taps = window().numpy()
     assert len(taps) == 11
     assert taps.sum() == pytest.approx(1)
     assert taps[6] / taps[5] == pytest.approx(np.exp(-1 / (2 * 1.5**2)))
 
 
-def test_ssim_matches_scikit_image_in_the_interior() -> None:
+def test_ssim_matches_scikit_image_in_the_interior():
     image, target = _images(40, 50)
     target = target / 255
     _, expected = structural_similarity(
@@ -51,7 +49,7 @@ def test_ssim_matches_scikit_image_in_the_interior() -> None:
     np.testing.assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
 
 
-def test_ssim_pads_images_with_zeros() -> None:
+def test_ssim_pads_images_with_zeros():
     """The value at a corner, for constant pictures of 1 and 0.5, is computed by hand."""
     ones = torch.ones(30, 30, 3, dtype=torch.float64)
     share = window()[:6].sum().item() ** 2  # share of the window inside the image at a corner
@@ -61,7 +59,7 @@ def test_ssim_pads_images_with_zeros() -> None:
     assert ssim_map(ones, ones / 2)[0, 0, 0].item() == pytest.approx(expected, rel=1e-9)
 
 
-def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise() -> None:
+def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise():
     loss, (image, target) = PhotometricLoss(0.3, threads=1), _images(12, 13)
     expected, _, _ = loss(image.double(), target)
     assert not loss._compiled
@@ -71,7 +69,7 @@ def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise() -> None:
     assert loss._compiled["meta"](image.double(), target)[0] == expected
 
 
-def test_tritons_loss_is_taken_where_triton_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tritons_loss_is_taken_where_triton_runs(monkeypatch):
     stand_in = SimpleNamespace(TritonLoss=lambda weight: lambda *images: (weight, *images))
     monkeypatch.setitem(sys.modules, "gsbench.train.loss_triton", stand_in)
     obstacles = {"meta": None, "mps": "runs on device=cuda"}
@@ -87,7 +85,7 @@ def test_tritons_loss_is_taken_where_triton_runs(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("weight", [0.2, 0.0, 1.0])
-def test_the_compiled_loss_matches_float64(size: tuple[int, int], weight: float) -> None:
+def test_the_compiled_loss_matches_float64(size, weight):
     image, target = _images(*size)
     for wanted in (target, target / 255):
         leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
@@ -101,7 +99,7 @@ def test_the_compiled_loss_matches_float64(size: tuple[int, int], weight: float)
         assert error < 1e-4
 
 
-def test_equal_images_have_no_loss_and_no_gradient() -> None:
+def test_equal_images_have_no_loss_and_no_gradient():
     image, _ = _images(20, 33)
     leaf = image.clone().requires_grad_()
     loss, l1, similarity = photometric_loss(leaf, image)
@@ -111,7 +109,7 @@ def test_equal_images_have_no_loss_and_no_gradient() -> None:
     assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
 
 
-def test_any_number_of_threads_gives_the_same_bits() -> None:
+def test_any_number_of_threads_gives_the_same_bits():
     image, target = _images(64, 65)
     results = []
     for threads in (1, 1, 2, 4):
@@ -124,7 +122,7 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     assert len(set(results)) == 1
 
 
-def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images() -> None:
+def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images():
     image, target = _images(16, 18)
     loss = PhotometricLoss(threads=1)
     with torch.no_grad():
@@ -134,7 +132,7 @@ def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images() 
     assert loss(image.transpose(0, 1).contiguous().transpose(0, 1), target)[0] == value
 
 
-def test_inputs_that_do_not_fit_are_refused() -> None:
+def test_inputs_that_do_not_fit_are_refused():
     image, target = _images(16, 18)
     with pytest.raises(ValueError, match="shape"):
         photometric_loss(image, target[:-1])

@@ -3,8 +3,6 @@
 The other pixels have the same weight as without a mask.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -23,7 +21,7 @@ CAMERA = Camera(
 
 
 @pytest.fixture
-def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def picture():
     """A render, a photograph, and a mask [H, W, 1] that ignores a disc and the right margin."""
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
@@ -33,7 +31,7 @@ def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return image, target, mask[..., None]
 
 
-def test_the_loss_with_a_mask_matches_its_definition(picture) -> None:
+def test_the_loss_with_a_mask_matches_its_definition(picture):
     """L1 is a sum over the pixels that count, divided by all pixels.
 
     SSIM is that of scikit-image over all pixels, for pictures that are equal under the mask.
@@ -62,9 +60,7 @@ def test_the_loss_with_a_mask_matches_its_definition(picture) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(
-    picture, dtype: torch.dtype
-) -> None:
+def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(picture, dtype):
     image, target, mask = picture
     results = []
     for noise in (0.0, 5.0):
@@ -78,7 +74,7 @@ def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(
     assert torch.equal(results[0][1], results[1][1])
 
 
-def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture) -> None:
+def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture):
     """Thresholds on gradients keep their meaning, because the loss is divided by all pixels.
 
     Far means at least 11 px: the gradient has two windows of SSIM, each of radius 5.
@@ -95,7 +91,7 @@ def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture) ->
     assert not torch.equal(gradients[0][:, 20:30], gradients[1][:, 20:30])
 
 
-def test_densifiers_get_no_error_at_ignored_pixels(picture) -> None:
+def test_densifiers_get_no_error_at_ignored_pixels(picture):
     from gsbench.gaussians.initial import gaussians_from_cloud
 
     _, target, mask = picture
@@ -122,7 +118,7 @@ def test_densifiers_get_no_error_at_ignored_pixels(picture) -> None:
     assert (scene.dissimilarity(0, image)[inside] < 1e-6).all()
 
 
-def test_masks_are_reduced_with_their_images(picture) -> None:
+def test_masks_are_reduced_with_their_images(picture):
     from gsbench.train.resolution import ScaledViews
 
     _, target, mask = picture

@@ -1,12 +1,8 @@
 """The GitHub action of the gate: its script, run with a stand-in for gsbench."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -16,13 +12,13 @@ from tests.conftest import ROOT
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 
 
-def steps() -> list[dict[str, Any]]:
+def steps():
     action = yaml.safe_load((ROOT / "action.yml").read_text(encoding="utf-8"))
-    found: list[dict[str, Any]] = action["runs"]["steps"]
+    found = action["runs"]["steps"]
     return found
 
 
-def ended(tmp_path: Path, code: int, **inputs: str) -> tuple[int, list[str]]:
+def ended(tmp_path, code, **inputs):
     """Run the script with a gsbench that ends with the exit code ``code``.
 
     Returns the script's exit code, and the words that gsbench was given.

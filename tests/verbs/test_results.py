@@ -1,11 +1,8 @@
 """``gsbench tables``, ``report`` and ``explain`` with made-up results."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -70,7 +67,7 @@ def test_bad_addresses_are_explained(tmp_path, address, words):
 
 
 @pytest.fixture
-def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def made(tmp_path, monkeypatch):
     """The runs folder of an experiment with two arms on one scene, and of one with a single arm."""
     write_runs(tmp_path / "runs", Plan(scenes=("garden",)))
     write_runs(tmp_path / "runs", Plan(experiment="alone", densifiers=("adc",)))
@@ -195,7 +192,7 @@ def test_an_origin_names_program_machine_and_code():
         code=SimpleNamespace(commit="", edited=False, rooms={"init": AS_RELEASED}),
         versions={"torch": "2.13.0"},
     )
-    trial: Any = SimpleNamespace(
+    trial = SimpleNamespace(
         record=record,
         path=Path("runs/x"),
         from_renders=False,

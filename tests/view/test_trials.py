@@ -1,7 +1,5 @@
 """Photographs and the page's camera, against the cameras that they come from."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -15,11 +13,10 @@ from PIL import Image, ImageFont
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from gsbench.analysis.results import Configurations, TrialResult
+from gsbench.analysis.results import Configurations
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians
 from gsbench.init.base import PointCloud
 from gsbench.normalization import Normalization
 from gsbench.raster import create_rasterizer
@@ -42,24 +39,24 @@ from tests.gaussians.helpers import random_gaussians
 from tests.view.conftest import POINTS
 
 
-def smooth_image(height: int, width: int) -> np.ndarray:
+def smooth_image(height, width):
     noise = np.random.default_rng(0).uniform(0, 255, (height, width, 3))
     blurred = gaussian_filter(noise, (4, 4, 0))
     return np.uint8(255 * (blurred - blurred.min()) / np.ptp(blurred))
 
 
-def make_view(x: float = 0.0) -> View:
+def make_view(x=0.0):
     camera = Camera(80, 60, 70.0, 70.0, 38.0, 31.0, np.eye(3), np.array([-x, 0.0, 0.0]))
     return View("a.png", camera, smooth_image(60, 80))
 
 
-def test_photograph_in_its_own_camera_is_itself() -> None:
+def test_photograph_in_its_own_camera_is_itself():
     view = make_view()
     np.testing.assert_array_equal(photograph_at(view.camera, view), view.image)
 
 
 @pytest.mark.parametrize("scale", [2, 0.5])
-def test_photograph_follows_the_focal_length_and_the_principal_point(scale: float) -> None:
+def test_photograph_follows_the_focal_length_and_the_principal_point(scale):
     view = make_view()
     width, height = round(80 * scale), round(60 * scale)
     camera = view.camera.resized(width, height)
@@ -71,7 +68,7 @@ def test_photograph_follows_the_focal_length_and_the_principal_point(scale: floa
 
 
 @pytest.mark.parametrize("stripes", [np.s_[::2], np.s_[:, ::2]], ids=["rows", "columns"])
-def test_fine_stripes_become_grey_in_a_smaller_picture(stripes: object) -> None:
+def test_fine_stripes_become_grey_in_a_smaller_picture(stripes):
     view = make_view()
     view.image[:] = 0
     view.image[stripes] = 255
@@ -79,7 +76,7 @@ def test_fine_stripes_become_grey_in_a_smaller_picture(stripes: object) -> None:
     assert np.abs(small[1:-1, 1:-1].astype(int) - 127).max() < 30
 
 
-def test_panes_stand_side_by_side_with_labels() -> None:
+def test_panes_stand_side_by_side_with_labels():
     left, right = np.full((50, 60, 3), 40, np.uint8), np.full((50, 60, 3), 80, np.uint8)
     row = side_by_side([("a label far too long for such a small pane", left), ("b", right)])
     assert row.shape == (50, 120, 3)
@@ -97,7 +94,7 @@ def test_panes_stand_side_by_side_with_labels() -> None:
     assert 104 <= inked[1][inked[1] > 101].min() <= 106
 
 
-def test_page_camera_projects_as_the_page_does() -> None:
+def test_page_camera_projects_as_the_page_does():
     turn = Rotation.from_euler("xyz", [0.3, -0.5, 1.1])
     x, y, z, w = turn.as_quat()
     position, fov, aspect = np.array([1.0, 2.0, -3.0]), 0.9, 1.6
@@ -112,7 +109,7 @@ def test_page_camera_projects_as_the_page_does() -> None:
 
 
 @pytest.mark.parametrize("aspect", [0.4, 1.0, 3.0])
-def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float) -> None:
+def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect):
     view = make_view()
     fov = fitting_fov(view.camera, aspect)
     pane = page_camera(np.array([1.0, 0, 0, 0]), np.zeros(3), fov, aspect, 1000, 1)
@@ -127,7 +124,7 @@ def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.4, math.pi])
-def test_page_stands_upright_where_the_photograph_was_taken(roll: float) -> None:
+def test_page_stands_upright_where_the_photograph_was_taken(roll):
     """The page builds its camera from forward and upward directions, as look-at cameras do."""
     turn = Rotation.from_euler("YXZ", [0.7, -0.5, roll]).as_matrix()
     camera = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, turn.T, np.zeros(3))
@@ -142,13 +139,13 @@ def test_page_stands_upright_where_the_photograph_was_taken(roll: float) -> None
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (1, 0, 0)])
 def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(
-    up: tuple[float, ...],
-) -> None:
+    up,
+):
     """The camera looks straight up, or the direction is to its right."""
     np.testing.assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
 
 
-def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction() -> None:
+def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction():
     views = [make_view(x) for x in (0.0, 3.0, 9.0)]  # 4, 1 and 5 from their middle
     np.testing.assert_allclose(mean_up(views), [0, -1, 0])
     assert orbit_distance(views) == pytest.approx(10 / 3)
@@ -168,16 +165,16 @@ def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction(
         *(("aspect", value) for value in (1e6, 0.0, math.nan)),
     ],
 )
-def test_impossible_cameras_of_a_page_are_refused(name: str, value: object) -> None:
+def test_impossible_cameras_of_a_page_are_refused(name, value):
     sound = {"wxyz": (1, 0, 0, 0), "position": (1, 2, 3), "fov": 0.9, "aspect": 1.6}
     for aspect, width in ((0.11, 1), (1.6, 4), (9.9, 25)):
-        pane = page_camera(**(sound | {"aspect": aspect}), height=5, panes=2)  # type: ignore[arg-type]
+        pane = page_camera(**(sound | {"aspect": aspect}), height=5, panes=2)
         assert (pane.width, pane.height) == (width, 5)
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
-        page_camera(**(sound | {name: value}), height=540, panes=1)  # type: ignore[arg-type]
+        page_camera(**(sound | {name: value}), height=540, panes=1)
 
 
-def painter() -> TrialPainter:
+def painter():
     """A model of 40 Gaussians in front of `make_view`, nine of them large, and four points."""
     gaussians = random_gaussians(40, seed=1, dtype=torch.float32)
     volumes = np.linspace(-3.0, 0.9, 40)
@@ -188,14 +185,14 @@ def painter() -> TrialPainter:
     return TrialPainter(trial, create_rasterizer("reference", torch.device("cpu")))
 
 
-def rendered(painter: TrialPainter, gaussians: Gaussians, degree: int = 3) -> np.ndarray:
+def rendered(painter, gaussians, degree=3):
     camera = make_view().camera
     with torch.no_grad():
         image = painter.rasterizer.render(gaussians, camera, degree, torch.zeros(3)).image
     return np.round(255 * image.clamp(0, 1).numpy())
 
 
-def test_layers_choose_what_is_drawn() -> None:
+def test_layers_choose_what_is_drawn():
     shown, camera = painter(), make_view().camera
     gaussians = shown.trial.gaussians
     assert rendered(shown, gaussians).max() > 50
@@ -229,7 +226,7 @@ def test_layers_choose_what_is_drawn() -> None:
     assert (colors < hues.max(0) + 8).all()
 
 
-def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word() -> None:
+def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word():
     length = ImageFont.load_default(10.0).getlength
     # half a text size stays free on either side
     assert _fitted("ab cd ef", 10.0, math.ceil(length("ab cd ef")) + 10) == ("ab cd ef", 10.0)
@@ -238,12 +235,12 @@ def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word() -> N
     assert (text, size) == ("i\nwwwwwwww", pytest.approx(10 * 30 / length("wwwwwwww")))
 
 
-def configured(trial: TrialResult, **settings: object) -> TrialResult:
+def configured(trial, **settings):
     values = {key.replace("__", "."): value for key, value in settings.items()}
     return replace(trial, settings=Configurations({trial.key: values}))
 
 
-def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs: Path) -> None:
+def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):
     trial = find_trial("small:courtyard:volumetric", small_runs)
     moved = replace(trial.record, normalization=Normalization((1.0, 2.0, 3.0), 2.0))
     viewed, there = (
@@ -269,7 +266,7 @@ def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs: Path) -> None:
     assert (camera.cx, camera.cy) == (24, 32)
 
 
-def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs: Path, tmp_path: Path) -> None:
+def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs, tmp_path):
     first = find_trial("small:courtyard:adc", small_runs)
     assert (first.seed, first.densify) == (0, "adc")
     assert find_trial("small:courtyard:random-adc:1", small_runs).seed == 1
@@ -294,7 +291,7 @@ def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs: Path, tmp_
         find_trial(str(copy), tmp_path / "runs")
 
 
-def test_what_is_gone_from_a_trial_is_named(small_runs: Path, tmp_path: Path) -> None:
+def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
     shutil.copytree(small_runs, tmp_path / "runs")
     trial = find_trial("small:courtyard:adc", tmp_path / "runs")
     renders = replace(trial.record, evaluated_from="renders")
@@ -312,7 +309,7 @@ def test_what_is_gone_from_a_trial_is_named(small_runs: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
-def test_a_damaged_record_of_causes_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_record_of_causes_is_refused(tmp_path, content):
     (tmp_path / "lineage.npz").write_bytes(content)
     with pytest.raises(InputError, match=r"lineage\.npz cannot be read"):
         read_causes(tmp_path / "lineage.npz", 1)

@@ -1,7 +1,5 @@
 """The similarity between camera sets, against scikit-image, pycolmap and known transformations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 import pytest
@@ -20,7 +18,7 @@ TRUE_ROTATION = Rotation.from_rotvec([0.3, -1.1, 2.0]).as_matrix()
 TRUE_TRANSLATION = np.array([4.0, -1.0, 0.5])
 
 
-def poses(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def poses(count, seed=0):
     """Random cameras, and the same cameras after the true similarity."""
     rng = np.random.default_rng(seed)
     centers = rng.normal(size=(count, 3))
@@ -47,7 +45,7 @@ def test_reflected_points_give_a_rotation():
     assert np.linalg.det(fit_similarity(source, target * [1, 1, -1]).rotation) == pytest.approx(1.0)
 
 
-def test_three_cameras_give_a_similarity_and_two_do_not() -> None:
+def test_three_cameras_give_a_similarity_and_two_do_not():
     similarity = align_poses(*poses(3))
     assert similarity.scale == pytest.approx(TRUE_SCALE, rel=1e-9)
     with pytest.raises(ValueError, match="at least 3 common cameras, got 2"):
@@ -55,7 +53,7 @@ def test_three_cameras_give_a_similarity_and_two_do_not() -> None:
 
 
 @pytest.mark.parametrize("away", [0.0, 1000.0])
-def test_wrong_cameras_do_not_change_the_alignment(away: float):
+def test_wrong_cameras_do_not_change_the_alignment(away):
     """The origin may be far away, as in captures with satellite positions."""
     centers, rotations, moved, moved_rotations = poses(30)
     centers, moved = centers + away, moved + away * TRUE_SCALE * TRUE_ROTATION.sum(axis=1)
@@ -80,21 +78,21 @@ def test_cameras_on_a_line_are_aligned_by_their_orientations():
 
 
 @pytest.mark.parametrize("centers", [np.zeros((2, 3)), np.ones((5, 3))])
-def test_too_few_or_coinciding_cameras_are_refused(centers: np.ndarray):
+def test_too_few_or_coinciding_cameras_are_refused(centers):
     rotations = np.tile(np.eye(3), (len(centers), 1, 1))
     with pytest.raises(ValueError, match="similarity needs"):
         align_poses(centers, rotations, centers, rotations)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-6, 0.05, 30.0, 179.9, 180.0])
-def test_rotation_angles_are_those_of_scipy(degrees: float):
+def test_rotation_angles_are_those_of_scipy(degrees):
     turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
     base = Rotation.random(4, rng=np.random.default_rng(0)).as_matrix()
     np.testing.assert_allclose(rotation_angles(base, turn @ base), degrees, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
-def test_collinearity_does_not_depend_on_the_scale(scale: float):
+def test_collinearity_does_not_depend_on_the_scale(scale):
     """Cameras on a line are aligned by orientations, others by their centres alone."""
     centers, _, moved, _ = poses(9, seed=4)
     others = Rotation.random(9, rng=np.random.default_rng(5)).as_matrix()
@@ -112,7 +110,7 @@ def test_collinearity_does_not_depend_on_the_scale(scale: float):
 
 
 @pytest.mark.parametrize("count", [3, 40])
-def test_without_wrong_cameras_all_are_fitted_by_least_squares(count: int):
+def test_without_wrong_cameras_all_are_fitted_by_least_squares(count):
     centers, rotations, moved, moved_rotations = poses(count, seed=2)
     moved = moved + np.random.default_rng(6).uniform(-0.01, 0.01, moved.shape)
     similarity = align_poses(centers, rotations, moved, moved_rotations)

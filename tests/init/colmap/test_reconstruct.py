@@ -1,9 +1,5 @@
 """Triangulation under given cameras, and the poses of two models, on exact matches."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
@@ -25,11 +21,11 @@ NAMES = [f"{letter}.png" for letter in "abcd"]
 POINTS = np.random.default_rng(0).uniform((-2, -1.5, 4), (2, 1.5, 7), (120, 3))
 
 
-def camera() -> pycolmap.Camera:
+def camera():
     return pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, HEIGHT)
 
 
-def poses() -> dict[str, pycolmap.Rigid3d]:
+def poses():
     """Four cameras on an arc, each turned towards the points."""
     made = {}
     for index, name in enumerate(NAMES):
@@ -38,13 +34,13 @@ def poses() -> dict[str, pycolmap.Rigid3d]:
     return made
 
 
-def model_of(poses: dict[str, pycolmap.Rigid3d]) -> pycolmap.Reconstruction:
+def model_of(poses):
     """A model without points whose image ids differ from the database's."""
     return model_with(dict(reversed(poses.items())), camera=camera())
 
 
 @pytest.fixture(scope="module")
-def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def database(tmp_path_factory):
     """A database of the points in all cameras, with verified matches."""
     folder = tmp_path_factory.mktemp("exact")
     (folder / "images").mkdir()
@@ -65,9 +61,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change(
-    database: Path, tmp_path: Path
-) -> None:
-    said: list[tuple[str, int, int | None]] = []
+    database, tmp_path
+):
+    said = []
     images, reference = database.parent / "images", model_of(poses())
     model = mapping.triangulate(
         database, images, tmp_path, reference, NAMES[:3], Sfm(), lambda *at: said.append(at)
@@ -86,7 +82,7 @@ def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change
         np.testing.assert_allclose(point.xyz, POINTS[index], atol=1e-3)
 
 
-def test_matches_that_contradict_the_cameras_are_refused(database: Path, tmp_path: Path) -> None:
+def test_matches_that_contradict_the_cameras_are_refused(database, tmp_path):
     images = database.parent / "images"
     reference = model_of(dict(zip(NAMES, reversed(poses().values()), strict=True)))
     said = "no point could be triangulated under the reference cameras"
@@ -94,7 +90,7 @@ def test_matches_that_contradict_the_cameras_are_refused(database: Path, tmp_pat
         mapping.triangulate(database, images, tmp_path, reference, NAMES, Sfm(), no_progress)
 
 
-def test_the_poses_of_two_models_are_paired_by_name() -> None:
+def test_the_poses_of_two_models_are_paired_by_name():
     scale, shift = 2.0, np.array([1.0, -2.0, 3.0])
     moved = {}  # in the opposite order, and without the first
     for name, pose in reversed(list(poses().items())[1:]):
@@ -118,8 +114,8 @@ def test_the_poses_of_two_models_are_paired_by_name() -> None:
 
 
 def test_points_of_training_views_keep_place_and_observations_and_get_those_views_colours(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     model = model_with(poses(), 3, camera())
     for shade, name in zip((10, 20, 60, 200), NAMES, strict=True):
         Image.new("RGB", (WIDTH, HEIGHT), (shade, 0, 255 - shade)).save(tmp_path / name)
@@ -142,7 +138,7 @@ def test_points_of_training_views_keep_place_and_observations_and_get_those_view
         reconstruct.keep_training_points(model, NAMES[1:2], tmp_path)
 
 
-def test_settings_reach_colmaps_verification() -> None:
+def test_settings_reach_colmaps_verification():
     made = geometry.verification_options(Sfm(seed=7, min_inliers=11, min_inlier_ratio=0.31))
     assert made.ransac.random_seed == 7
     assert (made.min_num_inliers, made.min_inlier_ratio) == (11, 0.31)

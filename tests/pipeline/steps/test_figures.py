@@ -14,7 +14,7 @@ from gsbench.pipeline.steps.evaluate import _with_legend, draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 
-def two_gaussians(means: list[list[float]], log_scales: torch.Tensor) -> Gaussians:
+def two_gaussians(means, log_scales):
     return Gaussians(
         means=torch.tensor(means),
         log_scales=log_scales,

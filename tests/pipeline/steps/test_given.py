@@ -5,9 +5,7 @@ import shlex
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +52,7 @@ if model != "none":
 
 
 @pytest.fixture
-def views(tmp_path) -> Any:
+def views(tmp_path):
     """Four training views and two test views of noise, and a cloud of seven points."""
     rng = np.random.default_rng(0)
     made = [
@@ -75,7 +73,7 @@ def views(tmp_path) -> Any:
     )
 
 
-def parts_of(seed: int = 5) -> Any:
+def parts_of(seed=5):
     return SimpleNamespace(
         values={"densify": {"name": "other"}},
         train=SimpleNamespace(iterations=900),
@@ -86,7 +84,7 @@ def parts_of(seed: int = 5) -> Any:
     )
 
 
-def trainer(tmp_path: Path, model: str, cameras: bool = True, **settings: Any) -> External:
+def trainer(tmp_path, model, cameras=True, **settings):
     (tmp_path / "program.py").write_text(PROGRAM)
     words = ["{data}", "{output}", "{test_cameras}" if cameras else "none", model]
     rest = ["{iterations}", "{seed}", "{device}", "{threads}", "{kind}"]
@@ -176,7 +174,7 @@ def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(vi
 
 @pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
 def test_a_program_runs_with_the_given_time_limit(views, tmp_path, monkeypatch, minutes, limit):
-    given: list[Any] = []
+    given = []
     ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
     monkeypatch.setattr(train_steps, "run_program", lambda *rest: given.append(rest) or ended)
     step = external_step(views, trainer(tmp_path, "none", time_limit_minutes=minutes), parts_of())
@@ -204,16 +202,16 @@ def test_a_program_gets_the_environment_without_variables_of_gsbench(tmp_path, m
 
 
 def test_a_training_writes_its_model_lineage_and_summary(views, tmp_path, monkeypatch):
-    told: list[tuple[Any, ...]] = []
-    reset: list[torch.device] = []
+    told = []
+    reset = []
     monkeypatch.setattr(
         train_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
     )
     monkeypatch.setattr(train_steps, "reset_peak_memory", reset.append)
-    logged: list[Any] = []
+    logged = []
     monkeypatch.setattr(train_steps, "_log_normalization", lambda *given: logged.append(given))
     cpu = torch.device("cpu")
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         trainer=ADC(),
         rasterizer=ReferenceRasterizer(),
         train=TrainConfig(iterations=2),
@@ -270,11 +268,11 @@ def test_training_starts_from_the_gaussians_of_the_initialiser_if_there_are_any(
 
 
 def test_initial_gaussians_are_checked_with_their_colours_as_bytes(monkeypatch):
-    seen: list[Any] = []
+    seen = []
     monkeypatch.setattr(train_steps, "check_points", lambda *given: seen.append(given))
     gaussians = random_gaussians(2)
     gaussians.sh_dc = torch.tensor([[0.0, 10.0, -10.0], [1.0, -1.0, 0.5]])
-    context: Any = ("scene", "parts", "normalization")
+    context = ("scene", "parts", "normalization")
     check_gaussians(gaussians, *context)
     ((points, colors, *rest),) = seen
     np.testing.assert_allclose(points, gaussians.means)
@@ -321,10 +319,10 @@ class Noting:
     count: int = 3
     name = "noting"
 
-    def content(self) -> str:
+    def content(self):
         return "c"
 
-    def run(self, capture: Capture, folder: Path, report: Any, reference: Path | None) -> None:
+    def run(self, capture, folder, report, reference):
         (folder / "given").write_text(str(reference))
 
 
@@ -332,7 +330,7 @@ class Noting:
 def test_an_initialiser_gets_the_reference_cameras_and_they_are_in_its_key(
     tmp_path, has_reference, monkeypatch
 ):
-    told: list[tuple[Any, ...]] = []
+    told = []
     monkeypatch.setattr(
         scene_steps, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
     )

@@ -2,9 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +29,7 @@ from gsbench.scene.types import Capture
 
 
 @pytest.fixture
-def photographs(tmp_path) -> Path:
+def photographs(tmp_path):
     """Four photographs with masks that ignore the upper half; b is transparent on its left half."""
     for index, name in enumerate(("a", "b", "c", "d")):
         pixels = np.full((20, 30, 4), [10, 20, 30, 255], np.uint8)
@@ -68,7 +66,7 @@ def test_the_courtyard_has_a_step_and_photographs_are_read_directly(photographs)
 
 
 def test_a_capture_is_moved_to_the_coordinates_of_the_training_by_a_step(photographs, monkeypatch):
-    moved: list[tuple[Capture, Path]] = []
+    moved = []
     monkeypatch.setattr(scene_steps, "normalize_capture", lambda *given: moved.append(given))
     capture = read_photos("own", photographs)
     assert normalizing_step(capture) is None
@@ -81,7 +79,7 @@ def test_a_capture_is_moved_to_the_coordinates_of_the_training_by_a_step(photogr
 
 
 def test_masked_and_transparent_pixels_are_replaced(photographs, tmp_path, monkeypatch):
-    told: list[tuple[int, int]] = []
+    told = []
     monkeypatch.setattr(
         scene_steps, "progress", lambda title: nullcontext(lambda _, *counts: told.append(counts))
     )
@@ -119,7 +117,7 @@ def test_ground_truth_has_the_test_views_and_their_masks(tmp_path, tiny_scene):
     counts[:, 7:] = True
     scene = replace(tiny_scene, test=(tiny_scene.test[0], replace(tiny_scene.test[1], mask=counts)))
     init = Step(INIT, {}, lambda folder: None)
-    views: Any = SimpleNamespace(scene=scene, inputs={}, init=init)
+    views = SimpleNamespace(scene=scene, inputs={}, init=init)
     ground_truth_step(views).build(tmp_path)
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png")) == [
         "00.png",
@@ -135,7 +133,7 @@ def test_each_setting_that_changes_views_changes_the_key(tmp_path):
     capture = Capture("own", tmp_path, ("a", "b", "c"), ("a",), None, False, "0")
     init, store = Step(INIT, {}, lambda folder: None), Store(tmp_path / "store")
     base = SceneConfig(name="own", kind="photos", path=str(tmp_path))
-    changes: list[dict[str, Any]] = [
+    changes = [
         {},
         {"downscale": 2},
         {"max_size": 100},

@@ -1,9 +1,6 @@
 """The procedural courtyard: repeatable, consistent between views, and not blank."""
 
-from __future__ import annotations
-
 import filecmp
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ from tests.scene.courtyard.surfaces import fingerprint, surface_distance
 
 
 @pytest.fixture(scope="module")
-def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture_dir(tmp_path_factory):
     folder = tmp_path_factory.mktemp("courtyard")
     render_courtyard(folder, views=4, width=160, height=120)
     return folder
@@ -32,7 +29,7 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("threads", [1, 5])
 def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
-    capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
+    capture_dir, tmp_path, monkeypatch, threads
 ):
     monkeypatch.setattr("gsbench.scene.courtyard.render.available_threads", lambda: threads)
     told = []
@@ -46,7 +43,7 @@ def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
     assert len(same) == len(names) >= 7
 
 
-def test_the_colmap_model_has_the_exact_cameras(capture_dir: Path, tmp_path: Path):
+def test_the_colmap_model_has_the_exact_cameras(capture_dir, tmp_path):
     written = cameras_of(read_model(capture_dir / "sparse/0"))
     for name, camera in courtyard_cameras(4, 160, 120).items():
         np.testing.assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
@@ -57,7 +54,7 @@ def test_the_colmap_model_has_the_exact_cameras(capture_dir: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("views", [12, 48, 60])
-def test_neighbouring_views_are_close(views: int):
+def test_neighbouring_views_are_close(views):
     centers = np.array([camera.center for camera in courtyard_cameras(views, 40, 30).values()])
     azimuth = np.degrees(np.unwrap(np.arctan2(centers[:, 1], centers[:, 0])))
     assert np.abs(np.diff(azimuth)).max() <= 7.5 + 1e-9
@@ -130,7 +127,7 @@ PICTURES = [  # for each view: `fingerprint` of red, green and blue, about four 
 
 
 @pytest.mark.parametrize("seed", SOLIDS)
-def test_the_solids_change_only_with_the_version(seed: int):
+def test_the_solids_change_only_with_the_version(seed):
     """If this test fails, raise the courtyard's VERSION."""
     made = {name: fingerprint(values) for name, values in build_layout(seed)._asdict().items()}
     assert made == pytest.approx(SOLIDS[seed], rel=1e-9), made
