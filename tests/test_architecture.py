@@ -279,6 +279,24 @@ def test_verbs_do_not_import_each_other():
             assert not others, f"{module} imports {others}"
 
 
+def annotated(text):
+    """The functions of a file that have annotations. Triton's constants of a kernel need theirs."""
+    return [
+        node.name
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (node.returns or any(getattr(each, "annotation", None) for each in ast.walk(node.args)))
+        and "constexpr" not in ast.unparse(node.args)
+    ]
+
+
+def test_functions_of_tests_have_no_annotations():
+    assert annotated("def f(a, *b: int): ...\ndef g() -> None: ...") == ["f", "g"]
+    for path in Path(__file__).parent.rglob("*.py"):
+        found = annotated(path.read_text(encoding="utf-8"))
+        assert not found, f"{path}: {found}"
+
+
 def test_the_checks_can_fail():
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
     assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
