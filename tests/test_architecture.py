@@ -222,7 +222,7 @@ def test_the_ground_floor_is_small():
     assert loose == GROUND_FLOOR | {"cli", "__main__"}
 
 
-@pytest.mark.parametrize(("above", "below"), sorted(ONLY))
+@pytest.mark.parametrize("above, below", sorted(ONLY))
 def test_some_rooms_import_only_parts_of_others(above, below):
     for module, targets in arrows().items():
         if room(module) == above:

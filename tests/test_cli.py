@@ -47,7 +47,7 @@ def test_help_and_reading_verbs_load_no_torch(runs):
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "text"),
+    "error, code, text",
     [
         (InputError("bad photo"), 2, "gsbench: bad photo\n"),
         (GsbenchError("went wrong"), 1, "gsbench: went wrong\n"),
@@ -59,13 +59,7 @@ def test_help_and_reading_verbs_load_no_torch(runs):
         (KeyboardInterrupt(), 130, "gsbench: stopped; to continue, give the same command again\n"),
     ],
 )
-def test_errors_become_a_line_and_an_exit_code(
-    error,
-    code,
-    text,
-    monkeypatch,
-    capsys,
-):
+def test_errors_become_a_line_and_an_exit_code(error, code, text, monkeypatch, capsys):
     def fail(argv):
         raise error
 
@@ -75,7 +69,7 @@ def test_errors_become_a_line_and_an_exit_code(
 
 
 @pytest.mark.parametrize(
-    ("words", "asked"),
+    "words, asked",
     [
         ("status x", ("verb", ["x"], "runs")),
         ("status --help", ("verb", ["--help"], "runs")),

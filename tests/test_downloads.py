@@ -57,7 +57,7 @@ def test_the_last_try_ends_with_an_error_without_a_pause(pauses):
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (failures.SSLError("old"), r"the certificate is not trusted here \(old\)"),
         (failures.InvalidURL("no host"), r"no address that can be fetched \(no host\)"),
@@ -78,7 +78,7 @@ def test_a_busy_server_is_asked_again(status, pauses):
 
 
 @pytest.mark.parametrize(
-    ("error", "reason"),
+    "error, reason",
     [
         (failures.ReadTimeout("x"), "no answer in time"),
         (urllib3.exceptions.ReadTimeoutError(None, "", "x"), "no answer in time"),
@@ -96,13 +96,9 @@ def test_a_failure_is_named_by_its_cause(error, reason):
     assert f"1 failures in a row ({reason})" in str(raised.value)
 
 
-@pytest.mark.parametrize(("length", "total"), [("5", 5), (None, None), ("many", None)])
+@pytest.mark.parametrize("length, total", [("5", 5), (None, None), ("many", None)])
 def test_every_try_starts_from_the_beginning_and_reports_its_bytes(
-    tmp_path,
-    monkeypatch,
-    pauses,
-    length,
-    total,
+    tmp_path, monkeypatch, pauses, length, total
 ):
     bodies = [[b"xy", failures.ChunkedEncodingError()], [b"abc", b"de"]]
     asked = []

@@ -79,9 +79,7 @@ def _refuse(number):
     return refuse
 
 
-def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_written(
-    tmp_path,
-):
+def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_written(tmp_path):
     out = tmp_path / "new" / "below" / "page.html"
     with writable_output(out):
         out.write_text("a")
@@ -226,7 +224,7 @@ def test_a_runs_folder_is_made_and_tried(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("error", "kind", "words"),
+    "error, kind, words",
     [
         (OSError(errno.ENOSPC, "x"), DiskFullError, "is full"),
         (OSError(errno.EDQUOT, "x"), DiskFullError, "is full"),

@@ -25,9 +25,7 @@ def test_indexes_of_pips_settings_are_passed_to_uv(install, monkeypatch):
     }
 
 
-@pytest.mark.parametrize(
-    ("uv", "code", "last"), [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")]
-)
+@pytest.mark.parametrize("uv, code, last", [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")])
 def test_pip_installs_if_uv_is_missing_or_fails(install, monkeypatch, uv, code, last):
     ran = []
 

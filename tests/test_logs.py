@@ -133,7 +133,7 @@ def said(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("verbose", "shown"),
+    "verbose, shown",
     [
         (False, "INFO"),
         (True, "gsbench gsbench.eval gsbench.evaluate INFO"),
@@ -208,7 +208,7 @@ def test_a_log_on_a_full_disk_stops_nothing(said):
 
 
 @pytest.mark.parametrize(
-    ("encoding", "shown"), [("latin-1", b"\\u2191 \xe9"), ("ascii", b"\\u2191 \\xe9")]
+    "encoding, shown", [("latin-1", b"\\u2191 \xe9"), ("ascii", b"\\u2191 \\xe9")]
 )
 def test_what_an_encoding_lacks_is_escaped(encoding, shown):
     raw = io.BytesIO()

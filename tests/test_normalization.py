@@ -96,7 +96,7 @@ def test_cameras_at_one_place_are_not_normalized(centers):
 
 
 @pytest.mark.parametrize(
-    ("center", "scale"), [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)]
+    "center, scale", [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)]
 )
 def test_a_normalization_needs_finite_numbers_and_a_positive_scale(center, scale):
     with pytest.raises(ValueError, match="positive scale"):
@@ -109,7 +109,7 @@ def box(size, center=0.0):
 
 
 @pytest.mark.parametrize(
-    ("size", "center", "scale", "moved"),
+    "size, center, scale, moved",
     [
         (30.0, 0.0, 1.0, False),  # three times COLMAP's size
         (30.01, 0.0, 10 / 30.01, True),

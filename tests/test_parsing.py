@@ -105,7 +105,7 @@ def nested(levels, innermost=1):
 
 
 @pytest.mark.parametrize(
-    ("value", "fault"),
+    "value, fault",
     [
         ({"a": [1, 2.5, "b", True, None]}, ""),
         (3, ""),
@@ -143,7 +143,7 @@ def test_values_are_counted_and_may_be_infinite_where_allowed():
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    "text, fault",
     [
         ("a: !!python/object:os.system x", "is damaged: it has the tag tag:yaml.org,2002:python"),
         ("a: {b: 1, b: 2}", "is not YAML ('b' is in it twice (line 1))"),
@@ -222,7 +222,7 @@ class Row(Record):
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
+    "content, reason",
     [
         ("{", "is not JSON (EOF while parsing an object at line 1 column 1)"),
         ("{}", "is damaged: it lacks 'amount'"),
@@ -260,7 +260,7 @@ def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_
 
 
 @pytest.mark.parametrize(
-    ("content", "amounts", "warned"),
+    "content, amounts, warned",
     [
         ('{"amount": 1}\n{"amount": 2}\n', [1, 2], ""),
         ('{"amount": 1}\r\n{"amount": 2}', [1, 2], ""),

@@ -7,9 +7,7 @@ import sys
 from gsbench.logs import SECONDS_BETWEEN_LINES, no_progress, progress
 
 
-def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
-    caplog,
-):
+def test_a_log_gets_the_first_line_of_a_phase_and_the_last(caplog):
     caplog.set_level(logging.INFO, "gsbench")
     with progress("train") as report:
         for done in range(1, 5):
@@ -43,9 +41,7 @@ def test_a_log_gets_a_line_from_time_to_time(caplog, monkeypatch):
     no_progress("a", 1, 2)
 
 
-def test_a_terminal_gets_a_bar_without_control_characters_of_others(
-    monkeypatch,
-):
+def test_a_terminal_gets_a_bar_without_control_characters_of_others(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
             return True

@@ -172,7 +172,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
 
 
 @pytest.mark.parametrize(
-    ("link", "folder", "repository", "wanted"),
+    "link, folder, repository, wanted",
     [
         ("[a](search.md#here)", "docs", None, "[a](search.md#here)"),
         ("[a](#here)", "docs", None, "[a](#here)"),
@@ -211,7 +211,7 @@ def test_links_are_rewritten_for_the_site(link, folder, repository, wanted):
 
 
 @pytest.mark.parametrize(
-    ("link", "wanted"),
+    "link, wanted",
     [
         ("[a](docs/gpu.md#x)", f"[a]({REPOSITORY}blob/main/docs/gpu.md#x)"),
         ("![a](docs/demo.jpg)", f"![a]({REPOSITORY}raw/main/docs/demo.jpg)"),

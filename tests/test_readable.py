@@ -17,7 +17,7 @@ from gsbench.words import (
 
 
 @pytest.mark.parametrize(
-    ("seconds", "text"),
+    "seconds, text",
     [
         (0.4, "0 s"),
         (89, "89 s"),
@@ -33,7 +33,7 @@ def test_times_are_shown_in_a_readable_unit(seconds, text):
 
 
 @pytest.mark.parametrize(
-    ("count", "text"),
+    "count, text",
     [
         (None, "unknown size"),
         (0, "0 bytes"),

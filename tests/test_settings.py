@@ -54,7 +54,7 @@ class Options:
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "words"),
+    "name, given, words",
     [
         ("count", 0, "options.count must be a whole number above 0, got 0"),
         ("count", 1.5, "options.count must be a whole number above 0, got 1.5"),
@@ -133,7 +133,7 @@ def test_unknown_keys_name_the_nearest():
 
 
 @pytest.mark.parametrize(
-    ("make", "key"),
+    "make, key",
     [
         (lambda: ADC(start=-1), "densify.start"),
         (lambda: ADC(stop=500), "densify.stop"),
@@ -198,7 +198,7 @@ def test_any_value_is_accepted_or_refused_in_one_line(name, value):
 
 
 @pytest.mark.parametrize(
-    ("value", "good"),
+    "value, good",
     [
         ("a b", True),
         ("größe", True),
@@ -214,7 +214,7 @@ def test_a_name_must_fit_into_a_path_on_every_system(value, good):
 
 
 @pytest.mark.parametrize(
-    ("value", "good"),
+    "value, good",
     [
         ("http://a:1", True),
         ("sqlite:///x", True),

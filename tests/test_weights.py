@@ -201,7 +201,7 @@ def test_download_shows_a_bar_on_a_terminal(server):
 
 
 @pytest.mark.parametrize(
-    ("content", "manners", "said"),
+    "content, manners, said",
     [
         (
             b"x" * 100_000,

@@ -222,13 +222,7 @@ def test_a_permission_may_stand_anywhere_in_a_command(command, capsys):
 
 @pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])
 @pytest.mark.parametrize("runs", ["file", "file/below", "~nosuchuser/x", ""])
-def test_a_name_that_cannot_be_a_runs_folder_is_refused(
-    runs,
-    command,
-    place,
-    monkeypatch,
-    capsys,
-):
+def test_a_name_that_cannot_be_a_runs_folder_is_refused(runs, command, place, monkeypatch, capsys):
     (place / "file").touch()
     monkeypatch.setenv("GSBENCH_RUNS", runs)
     assert cli.run(shlex.split(command)) == 2

@@ -41,9 +41,7 @@ def points_of(capture):
     return np.unique([point.xyz for point in model.points3D.values()], axis=0)
 
 
-def test_a_prepared_capture_has_fewer_points_and_the_same_cameras_and_photographs(
-    tmp_path,
-):
+def test_a_prepared_capture_has_fewer_points_and_the_same_cameras_and_photographs(tmp_path):
     given = write_capture(tmp_path / "data" / "fox")
     few = write_capture(tmp_path / "data" / "bonsai", points=10)
     for name in ("out", "again"):

@@ -123,13 +123,7 @@ def trial_folder(runs, data, config_hash="c0ffee00"):
     return runs / data["experiment"] / data["scene"] / arm / f"{config_hash}-seed{data['seed']}"
 
 
-def write_trial(
-    runs,
-    data,
-    views,
-    config_hash="c0ffee00",
-    **settings,
-):
+def write_trial(runs, data, views, config_hash="c0ffee00", **settings):
     """Write a trial's folder: results, per-view metrics, events, curves, and a configuration.
 
     ``settings`` (``group__key=value``) are added to the configuration.
@@ -160,14 +154,7 @@ def write_trial(
     return path
 
 
-def write_arms(
-    runs,
-    arms,
-    seeds=(0, 1, 2),
-    scenes=("courtyard",),
-    experiment="exp",
-    **settings,
-):
+def write_arms(runs, arms, seeds=(0, 1, 2), scenes=("courtyard",), experiment="exp", **settings):
     """Write trials of arms whose results are noise.
 
     ``arms`` has the densifier's settings of each arm; ``settings`` (``group__key=value``) are

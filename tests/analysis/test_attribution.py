@@ -88,7 +88,7 @@ def test_settings_of_the_first_configuration_come_first():
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "expected"),
+    "first, second, expected",
     [
         ("adc", "longaxis", ("split", "gradient", "threshold")),
         ("absgrad", "longaxis", ("split",)),

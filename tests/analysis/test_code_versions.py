@@ -53,7 +53,7 @@ def test_older_trials_with_other_settings_still_count(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "part"),
+    "old, new, part",
     [
         ({"_code": code()}, {"_code": code(train=2)}, "stage train"),
         (
@@ -149,9 +149,7 @@ def superseded(runs, present=None):
     return {path.name.partition("-")[2]: reason for path, reason in found.items()}
 
 
-def test_without_the_module_the_version_that_finished_last_is_the_present_one(
-    tmp_path,
-):
+def test_without_the_module_the_version_that_finished_last_is_the_present_one(tmp_path):
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
     assert superseded(tmp_path) == {

@@ -119,7 +119,7 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arms", "pairs", "named"),
+    "arms, pairs, named",
     [
         # the settings that both have decide
         (
@@ -167,7 +167,7 @@ def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("records", "trials", "doubt"),
+    "records, trials, doubt",
     [
         # an idea, the day after the baseline, each by its own command with eval.primary
         ([(1, "adc"), (5, "mine")], {"adc": 2, "mine": 6}, ""),
@@ -208,11 +208,7 @@ def test_a_question_is_declared_if_it_was_fixed_before_the_first_trial_of_its_ar
 
 
 def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
-    adc, old, new = (
-        grid("adc"),
-        grid("mine", code=OLD, lr=1),
-        grid("mine", day=6, code=NEW, lr=1),
-    )
+    adc, old, new = (grid("adc"), grid("mine", code=OLD, lr=1), grid("mine", day=6, code=NEW, lr=1))
     write(tmp_path, [*adc, *old[:1], *new])
     declare(tmp_path, (1, [*adc, *old]), (5, new))
     found = answer(tmp_path)

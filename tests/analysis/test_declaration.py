@@ -87,9 +87,7 @@ def test_a_verdict_in_words_has_its_numbers(tmp_path):
 # --- families
 
 
-def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(
-    tmp_path,
-):
+def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(tmp_path):
     (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
     assert [verdict.quantity.key for verdict in one.verdicts] == [
         "flip",
@@ -160,9 +158,7 @@ def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path):
     assert "no metric was declared" not in page
 
 
-def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(
-    tmp_path,
-):
+def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(tmp_path):
     write_runs(tmp_path, Plan(effect=CLEAR, views=3))
     experiment = load_experiment(tmp_path, "exp")
     page = build_report(experiment)
@@ -180,9 +176,7 @@ def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so
     assert verdict.removeprefix("Verdict, ") in page
 
 
-def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(
-    tmp_path,
-):
+def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR)
     whole = [note for note in build_table(experiment).notes if note.startswith("Verdict")]
     assert len(whole) == 1
@@ -195,9 +189,7 @@ def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_sh
     assert [note for note in part.notes if note.startswith("Verdict")] == whole
 
 
-def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_it(
-    tmp_path,
-):
+def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_it(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_alex", EARLY), effect=CLEAR)
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
@@ -216,9 +208,7 @@ def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_
 # --- when it was declared
 
 
-def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
-    tmp_path,
-):
+def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", LATE), effect=CLEAR, views=3)
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
@@ -253,9 +243,7 @@ def test_a_replaced_declaration_is_reported(tmp_path):
 OLDER = (0, 1, 3)  # two trials of the baseline, which do no harm, and one of the arm
 
 
-def test_the_time_of_measuring_counts_not_that_of_writing_results(
-    tmp_path,
-):
+def test_the_time_of_measuring_counts_not_that_of_writing_results(tmp_path):
     """The store gives another experiment the same numbers at once, with their ``measured``."""
     paths = write_runs(tmp_path, Plan(scenes=("garden",)))
     declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
@@ -318,20 +306,14 @@ WHOLE = planned([0, 1, 2])
 
 
 @pytest.mark.parametrize(
-    ("trials", "added"),  # the baseline's first trials were there before the arm's first result
+    "trials, added",  # the baseline's first trials were there before the arm's first result
     [
         (planned([0, 1]), 3),
         (planned([0]), 6),
         (planned([0, 1, 2], ("adc",)), 6),
-        (
-            {key: seeds for key, seeds in WHOLE.items() if "garden" not in key},
-            6,
-        ),
+        ({key: seeds for key, seeds in WHOLE.items() if "garden" not in key}, 6),
         (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, 1),
-        (
-            {key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()},
-            9,
-        ),
+        ({key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()}, 9),
         ({}, 9),
     ],
 )
@@ -364,9 +346,7 @@ def test_declared_trials_that_are_missing_are_counted(tmp_path):
     assert "4 of the 16 declared trials are still missing" in lines(experiment)
 
 
-def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(
-    tmp_path,
-):
+def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(tmp_path):
     """Results repeat the declared metric and its time, but not the declared trials."""
     for path in write_runs(tmp_path, Plan(effect=CLEAR)):
         data = json.loads((path / "results.json").read_text())

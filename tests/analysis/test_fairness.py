@@ -205,7 +205,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("searched", "said"),
+    "searched, said",
     [
         (("2026-01", "2026-02"), "before any of these trials"),
         # a trial of the same moment may not have guided the search

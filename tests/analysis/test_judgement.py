@@ -36,9 +36,7 @@ def test_pairs_share_scene_and_seed(make_experiment):
     assert pair(trials, named(trials)).differences.tolist() == found.differences.tolist()
 
 
-def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(
-    make_experiment,
-):
+def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(make_experiment):
     trials = [
         t for t in make_experiment().trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)
     ]
@@ -51,17 +49,13 @@ def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(
     assert len(found.trials) == 8
 
 
-def test_planned_seeds_after_the_first_missing_one_do_not_count(
-    make_experiment,
-):
+def test_planned_seeds_after_the_first_missing_one_do_not_count(make_experiment):
     trials = make_experiment().trials
     kept = [t for t in trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
     assert pair(kept, named(trials)).seeds == 1
 
 
-def test_arms_under_different_conditions_are_not_compared(
-    make_experiment,
-):
+def test_arms_under_different_conditions_are_not_compared(make_experiment):
     trials = make_experiment().trials
     for trial in trials:
         if trial.densify == "adc":
@@ -72,18 +66,14 @@ def test_arms_under_different_conditions_are_not_compared(
     assert found.left_out == (f"courtyard: {reason}", f"garden: {reason}")
 
 
-def test_a_seed_that_an_arm_has_twice_is_not_compared(
-    make_experiment,
-):
+def test_a_seed_that_an_arm_has_twice_is_not_compared(make_experiment):
     trials = make_experiment(scenes=("garden",)).trials
     found = pair([*trials, trials[0]], PSNR)
     assert not found.rows
     assert "scene=garden sfm-adc has seed 0 twice" in found.left_out[0]
 
 
-def test_budgets_may_differ_if_the_question_names_its_trials(
-    make_experiment,
-):
+def test_budgets_may_differ_if_the_question_names_its_trials(make_experiment):
     trials = make_experiment().trials
     for trial in trials:
         if trial.densify == "adc":
@@ -92,9 +82,7 @@ def test_budgets_may_differ_if_the_question_names_its_trials(
     assert not pair(trials, PSNR).rows
 
 
-def test_relative_differences_are_means_of_logarithms(
-    make_experiment,
-):
+def test_relative_differences_are_means_of_logarithms(make_experiment):
     trials = make_experiment().trials
     question = replace(named(trials), metric="gaussians", relative=True, least=0.1)
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(question,)))
@@ -121,9 +109,7 @@ def test_no_ratio_is_taken_of_a_value_of_zero(make_experiment, densify):
     assert "garden seed 1: PSNR (dB) is 0, and a ratio needs numbers above 0" in found.left_out
 
 
-def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(
-    make_experiment,
-):
+def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(make_experiment):
     trials = make_experiment(effect={"psnr": 3.0}).trials
     declared = Declaration(time=EARLY, questions=(named(trials),), looks=(2, 3))
     (whole,) = judge(trials, declared)
@@ -137,9 +123,7 @@ def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(
     assert judge(later, declared)[0].interval == whole.interval
 
 
-def test_trials_measured_before_the_question_divide_its_error_rate(
-    make_experiment,
-):
+def test_trials_measured_before_the_question_divide_its_error_rate(make_experiment):
     trials = make_experiment(effect={"psnr": 3.0}).trials
     one, late = (
         judge(trials, Declaration(time=t, questions=(named(trials),), looks=(3,)))[0]
@@ -173,9 +157,7 @@ def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(make_experime
         assert found.mean == pytest.approx(statistics.mean(own))
 
 
-def test_arms_that_never_differ_cannot_be_tested(
-    make_experiment,
-):
+def test_arms_that_never_differ_cannot_be_tested(make_experiment):
     trials = make_experiment().trials
     for trial in trials:
         object.__setattr__(trial.record, "metrics", {"psnr": 20.0})
@@ -212,9 +194,7 @@ def test_an_outlying_training_is_found():
     assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []
 
 
-def test_a_verdict_that_depends_on_one_training_is_undecided(
-    make_experiment,
-):
+def test_a_verdict_that_depends_on_one_training_is_undecided(make_experiment):
     """Without the training that failed the mean has the other sign."""
     trials = make_experiment(scenes=("a", "b", "c"), seeds=range(6)).trials
     values = {
@@ -233,7 +213,7 @@ def test_a_verdict_that_depends_on_one_training_is_undecided(
 
 
 @pytest.mark.parametrize(
-    ("rest", "outcome", "least", "expected"),
+    "rest, outcome, least, expected",
     [
         (0.1, "supported", None, False),
         (0.0, "supported", None, True),
@@ -283,9 +263,7 @@ def test_variants_are_compared_with_the_baseline_of_the_same_settings():
     assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[0], arms[2])]
 
 
-def test_what_was_left_out_of_a_compared_pair_is_noted_for_each_metric(
-    make_experiment,
-):
+def test_what_was_left_out_of_a_compared_pair_is_noted_for_each_metric(make_experiment):
     trials = make_experiment(scenes=("garden",)).trials
     kept = [trial for trial in trials if (trial.densify, trial.seed) != ("adc", 1)]
     (judged,) = judge_pairs(kept, [(ADC, VOLUMETRIC)])

@@ -30,7 +30,7 @@ def seven(make_experiment):
 
 
 @pytest.mark.parametrize(
-    ("arms", "q"), [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)]
+    "arms, q", [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)]
 )
 def test_the_critical_values_are_those_of_demsar(arms, q):
     """Demšar 2006, table 5a."""

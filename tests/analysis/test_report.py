@@ -434,7 +434,7 @@ def test_an_axis_has_round_ticks_within_its_range(values, log):
 
 
 @pytest.mark.parametrize(
-    ("values", "log", "ticks", "labels"),
+    "values, log, ticks, labels",
     [
         ((2, 5), False, [2, 3, 4, 5], ["2", "3", "4", "5"]),
         ((0, 10), False, [0, 2.5, 5, 7.5, 10], ["0.0", "2.5", "5.0", "7.5", "10.0"]),
@@ -456,7 +456,7 @@ def test_ticks_are_at_round_values_with_matching_labels(values, log, ticks, labe
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
+    "value, text",
     [
         (0, "0"),
         (1e-4, "0.0001"),
@@ -483,7 +483,7 @@ def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict():
 
 
 @pytest.mark.parametrize(
-    ("key", "better"), [("psnr", "right of zero is better"), ("flip", "left of zero is better")]
+    "key, better", [("psnr", "right of zero is better"), ("flip", "left of zero is better")]
 )
 def test_a_forest_plot_of_a_verdict_has_its_scenes_and_from_two_on_their_mean(key, better):
     scenes = [
@@ -507,7 +507,7 @@ def test_an_axis_from_zero_begins_at_zero():
 
 
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    "settings, expected",
     [
         ({"volume_threshold": 0.03}, 0.03),
         ({"volume_threshold": 0.03, "threshold_mode": "absolute"}, 0.03),
@@ -644,7 +644,7 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("plan", "decided"),
+    "plan, decided",
     [
         ({"trial_noise": 0, "residual_noise": 0}, False),
         ({"scenes": ("garden",), "effect": {"psnr": 5.0}, "trial_noise": 0.01}, True),

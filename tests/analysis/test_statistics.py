@@ -74,7 +74,7 @@ def test_two_pairs_suffice_and_single_ones_have_the_spread_of_scenes_for_that_of
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "known"), [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)]
+    "low, high, known", [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)]
 )
 def test_an_interval_that_ends_at_zero_does_not_exclude_it(low, high, known):
     assert Interval(low, high).excludes_zero() == Interval(-high, -low).excludes_zero() == known
@@ -119,7 +119,7 @@ def test_an_interval_excludes_zero_exactly_if_p_is_below_5_percent(seed):
 
 
 @pytest.mark.parametrize(
-    ("interval", "sign", "expected"),
+    "interval, sign, expected",
     [
         ((0.1, 2.0), 1, "supported"),
         ((0.1, 2.0), -1, "refuted"),
@@ -208,7 +208,7 @@ def test_the_statement_agrees_with_the_sign_test_at_every_level():
 # --- looks
 
 
-@pytest.mark.parametrize(("scenes", "noise"), [(1, 1.0), (3, 1.0), (3, 10.0), (8, 10.0)])
+@pytest.mark.parametrize("scenes, noise", [(1, 1.0), (3, 1.0), (3, 10.0), (8, 10.0)])
 def test_all_looks_together_err_in_at_most_5_percent_also_with_a_noisy_scene(scenes, noise):
     looks = (2, 3, 4, 5, 6)
     levels = look_levels(scenes, looks, 0.05)

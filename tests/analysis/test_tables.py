@@ -21,13 +21,7 @@ from gsbench.analysis.quantities import (
     relative_change,
 )
 from gsbench.analysis.results import Experiment, load_experiment
-from gsbench.analysis.table_formats import (
-    escape_latex,
-    to_csv,
-    to_html_page,
-    to_latex,
-    to_markdown,
-)
+from gsbench.analysis.table_formats import escape_latex, to_csv, to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
@@ -35,13 +29,7 @@ from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 Make = Callable[..., Experiment]
 
 
-def one_trial(
-    runs,
-    seed,
-    config_hash="c0ffee00",
-    settings=None,
-    **values,
-):
+def one_trial(runs, seed, config_hash="c0ffee00", settings=None, **values):
     """A trial of one scene; ``psnr=…`` gives a metric, ``_iterations=…`` a key of results.json."""
     metrics = {key: value for key, value in values.items() if not key.startswith("_")}
     plan = Plan()
@@ -141,7 +129,7 @@ def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("key", "values"),
+    "key, values",
     [
         ("iterations", (7000, 30000)),
         ("raster", ("cpu", "cuda")),
@@ -198,7 +186,7 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("second_budget", "blocked", "compared"),
+    "second_budget, blocked, compared",
     [
         # neither cap acted, so none limited the growth
         ({"max_gaussians": None, "cap": None}, (0, 0), True),
@@ -408,7 +396,7 @@ def test_results_files_are_plain_json(make_experiment):
 
 
 @pytest.mark.parametrize(
-    ("gaussians", "seconds", "headings"),
+    "gaussians, seconds, headings",
     [
         (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
         (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
@@ -452,7 +440,7 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
 
 
 @pytest.mark.parametrize(
-    ("metrics", "said"),
+    "metrics, said",
     [
         (("psnr", "lpips_vgg_raw"), "was 0.52 for PSNR in one study"),
         (("ssim", "psnr"), "was 0.52 for PSNR, 0.37 for SSIM in one study"),

@@ -21,7 +21,7 @@ def false_signs(noise, seeds, level, effect=0.0):
     return float((scipy.stats.norm.sf(half - effect) + scipy.stats.norm.cdf(-half - effect)).mean())
 
 
-@pytest.mark.parametrize(("scenes", "seeds"), CASES)
+@pytest.mark.parametrize("scenes, seeds", CASES)
 @pytest.mark.parametrize("ratio", [1.0, 10.0, 20.0, 100.0])
 def test_false_signs_keep_their_level(scenes, seeds, ratio):
     noise = np.where(np.arange(scenes) < 1, ratio, 1.0)

@@ -19,14 +19,7 @@ STAGES = {"scene": 1, "init": 1, "train": 1, "evaluate": 1}
 NO_MEAN = "No mean over the scenes is shown, since they differ in conditions or code."
 
 
-def write(
-    runs,
-    scene,
-    config_hash="c0ffee00",
-    densify="adc",
-    settings=None,
-    **results,
-):
+def write(runs, scene, config_hash="c0ffee00", densify="adc", settings=None, **results):
     """Two trials of a scene; ``settings`` are settings, ``results`` keys of results.json."""
     for seed in (0, 1):
         views = {"psnr": 20.0 + (densify == "mcmc") + np.zeros(2) + seed}
@@ -80,7 +73,7 @@ def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("key", "values"),
+    "key, values",
     [
         ("protocol", ("paper-1", "standard-1")),
         ("iterations", (2000, 7000)),

@@ -26,7 +26,7 @@ OWN_FILES = {
 
 
 @pytest.mark.parametrize(
-    ("changes", "typed", "multirun", "launch", "added"),
+    "changes, typed, multirun, launch, added",
     [
         ({}, [], True, "serial", []),
         (
@@ -75,7 +75,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("changes", "multirun", "said"),
+    "changes, multirun, said",
     [
         ({}, False, None),
         ({"hydra.sweeper.params": {"seed": "0,1"}}, True, None),
@@ -119,7 +119,7 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 
 
 @pytest.mark.parametrize(
-    ("ends", "code", "advice"),
+    "ends, code, advice",
     [
         ("dd", 0, "2 of 2 trials done; the table: gsbench tables x"),
         ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
@@ -168,10 +168,7 @@ def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatc
     monkeypatch.setattr(command, "compose_trials", compose_trials)
     assert one_trial_per_scene("gate", ["scene=a,b"], "train_time") == {"a": made[0], "b": made[1]}
     one_trial_per_scene("gate", ["+name=y"], "train_time")
-    assert asked == [
-        (["scene=a,b", "seed=0", "name=gate"], True),
-        (["+name=y", "seed=0"], True),
-    ]
+    assert asked == [(["scene=a,b", "seed=0", "name=gate"], True), (["+name=y", "seed=0"], True)]
     for words, said in (
         (["seed=1"], "seed follows from the other words"),
         (["+eval.primary=psnr"], r"eval\.primary follows from"),
@@ -194,10 +191,7 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
         command.compose_trials(["hydra.run.dir=${nope}"])
 
 
-@pytest.mark.parametrize(
-    ("words", "trials", "code"),
-    [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)],
-)
+@pytest.mark.parametrize("words, trials, code", [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)])
 def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
     made = [trial(tmp_path, seed) for seed in range(trials)]
 

@@ -125,7 +125,7 @@ def test_grids_in_a_users_own_experiment(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "text"),
+    "words, text",
     [
         (
             ["+experiment=threshold", "hydra/sweeper=basic"],

@@ -32,12 +32,7 @@ class Fake:
     Trials with the seed ``fails`` fail; at the seed ``stops_at`` comes a Ctrl-C.
     """
 
-    def __init__(
-        self,
-        psnr,
-        fails=None,
-        stops_at=None,
-    ):
+    def __init__(self, psnr, fails=None, stops_at=None):
         self.psnr, self.fails, self.stops_at = psnr, fails, stops_at
         self.batches = []
 
@@ -225,7 +220,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["eval.primary=null"], "needs the metric that decides"),
         (["seed=3"], "at least 2 seeds"),

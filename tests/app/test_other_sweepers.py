@@ -19,7 +19,7 @@ def config_of(**hydra):
 
 
 @pytest.mark.parametrize(
-    ("sweeper", "sign"),
+    "sweeper, sign",
     [
         ({"direction": "maximize"}, 1),
         ({"direction": "MAXIMIZE"}, 1),
@@ -87,7 +87,7 @@ def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(caps
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (
             RuntimeError("study is\ngone"),

@@ -21,7 +21,7 @@ from tests.finished import write_results
 
 
 @pytest.mark.parametrize(
-    ("primary", "found"),
+    "primary, found",
     [
         (None, ("psnr", 1)),
         ("ssim", ("ssim", 1)),
@@ -187,7 +187,7 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (GsbenchError("ours"), "^ours$"),
         (ValueError("a\n b"), "^hydra/launcher=joblib: a b .gsbench status tells"),

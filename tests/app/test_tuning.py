@@ -419,7 +419,7 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("file", "word", "part"), MISTAKES)
+@pytest.mark.parametrize("file, word, part", MISTAKES)
 def test_mistakes_are_one_line_before_any_work(file, word, part, sweep, runs, capsys):
     fake = Fake()
     assert sweep(fake, *([word] if word else []), file=file) == 2

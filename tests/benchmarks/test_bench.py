@@ -86,9 +86,7 @@ def reports(monkeypatch):
     return said
 
 
-def test_rows_have_the_medians_of_each_size_count_and_rasterizer(
-    reports,
-):
+def test_rows_have_the_medians_of_each_size_count_and_rasterizer(reports):
     both = ["cpu", "reference"]
     rows = run_bench(both, [(40, 30), (33, 17)], [50, 1000], repeats=3, kernels=True)
     assert [(row["size"], row["count"], row["raster"]) for row in rows] == [
@@ -114,9 +112,7 @@ def test_rows_have_the_medians_of_each_size_count_and_rasterizer(
     assert reports[12][1] == "40x30, 1,000 Gaussians"
 
 
-def test_a_model_is_timed_once_per_size_in_place_of_the_counts(
-    reports,
-):
+def test_a_model_is_timed_once_per_size_in_place_of_the_counts(reports):
     (row,) = run_bench(["cpu"], [(40, 30)], [50, 100], ply=Path("my/m.ply"), repeats=3, threads=2)
     assert (row["scene"], row["count"], row["threads"]) == ("my/m.ply", 70, 2)
     assert "kernels_ms" not in row
@@ -187,7 +183,7 @@ def test_kernels_are_recorded_on_the_device_and_divided_by_the_steps(paced, monk
     assert len(waits) == on_gpu
 
 
-@pytest.mark.parametrize(("device", "resets"), [("cpu", 0), ("cuda", 1)])
+@pytest.mark.parametrize("device, resets", [("cpu", 0), ("cuda", 1)])
 def test_peak_memory_is_that_of_three_steps(device, resets, monkeypatch):
     done = []
     stepper = SimpleNamespace(device=torch.device(device), step=lambda: done.append("step"))
@@ -199,9 +195,7 @@ def test_peak_memory_is_that_of_three_steps(device, resets, monkeypatch):
     assert done == ["reset"] * resets + ["step"] * 3
 
 
-def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(
-    monkeypatch,
-):
+def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(monkeypatch):
     for is_there, own in ((True, "cuda"), (False, "cpu")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: is_there)  # noqa: B023
         assert device_of("mine.Rasterizer").type == own
@@ -333,7 +327,7 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "cause"),
+    "arguments, cause",
     [
         (["--size", "500"], "500x375"),
         (["--count", "0"], "at least 1"),

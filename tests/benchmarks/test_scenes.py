@@ -34,9 +34,7 @@ def test_the_camera_before_a_scene_is_at_twice_the_median_distance_from_its_midd
 
 
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
-def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(
-    make,
-):
+def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(make):
     scene = make(500)
     assert len(scene) == 500
     assert torch.equal(scene.means, make(500).means)

@@ -99,10 +99,7 @@ def test_the_volumetric_class_declares_three_switches_and_only_those_that_are_on
 
 
 def test_switches_in_a_yaml_file_do_not_change_the_configuration_hash():
-    values = {
-        "grow": 1,
-        "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}},
-    }
+    values = {"grow": 1, "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}}}
     assert declared_switches({}, values) == {"growth": Switch({"grow": 0}, "it grows")}
     plain = compose_one(["densify=adc"]).values
     named = compose_one(
@@ -175,7 +172,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["densify=none"], "declares no switch"),
         (["densify=adc,volumetric"], "one densifier"),

@@ -160,7 +160,7 @@ def flip_a_bit(file):
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    "damage, message",
     [
         (cut, "not a complete zip"),
         (flip_a_bit, "exp.zip: "),

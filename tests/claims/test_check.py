@@ -11,14 +11,7 @@ from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import Answer, StudentT
-from gsbench.claims.check import (
-    ClaimVerdict,
-    _late_words,
-    _number,
-    make_page,
-    prepare,
-    to_html,
-)
+from gsbench.claims.check import ClaimVerdict, _late_words, _number, make_page, prepare, to_html
 from gsbench.claims.file import parse_claims
 from gsbench.claims.stopping import run_looks
 from gsbench.cli import run
@@ -192,7 +185,7 @@ def judged(outcome, mean=0.0, error=0.0, direction="higher", **more):
 
 
 @pytest.mark.parametrize(
-    ("one", "reason"),
+    "one, reason",
     [
         (judged("supported", 1.0), "it is higher"),
         (judged("supported", 0.3), "it is higher"),

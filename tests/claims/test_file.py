@@ -226,7 +226,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD]
+    "content, message", [case[1:] for case in BAD], ids=[case[0] for case in BAD]
 )
 def test_bad_input_is_refused_in_one_line(content, message):
     with pytest.raises(InputError, match=message) as caught:

@@ -76,7 +76,7 @@ def gate(tmp_path, effect, noise, declared=None):
 
 
 @pytest.mark.parametrize(
-    ("effect", "noise", "result", "words", "seeds"),
+    "effect, noise, result, words, seeds",
     [
         (-1.0, 0.01, WORSE, "worse in PSNR (dB): −0.99", 2),
         (1.0, 0.01, PASSED, "passed, better in PSNR", 2),
@@ -102,7 +102,7 @@ def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("sign", "mean", "result"),
+    "sign, mean, result",
     [
         (1, -0.1, NOT_DECIDED),
         (1, -0.09, PASSED),
@@ -128,9 +128,7 @@ def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
     assert "trials are missing" in describe(verdict)
 
 
-def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(
-    tmp_path,
-):
+def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
     def made_by(own, state, measured):
         code = Code(rooms={"densify": state})
         return [
@@ -182,7 +180,7 @@ def test_questions_that_cannot_be_judged_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         ([], "the following arguments are required: archive"),
         (["nowhere.zip"], "no such file"),
@@ -197,13 +195,7 @@ def test_questions_that_cannot_be_judged_are_refused():
         (["exp.zip", "launch.wait=false"], "launch.wait"),
     ],
 )
-def test_bad_input_of_gate_is_refused(
-    tmp_path,
-    monkeypatch,
-    capsys,
-    words,
-    message,
-):
+def test_bad_input_of_gate_is_refused(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GSBENCH_RUNS", raising=False)
     write_runs(tmp_path / "made", Plan(densifiers=("adc", "volumetric")))
@@ -214,16 +206,9 @@ def test_bad_input_of_gate_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("effect", "code", "words"), [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")]
+    "effect, code, words", [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")]
 )
-def test_the_exit_code_of_gate_is_its_result(
-    tmp_path,
-    monkeypatch,
-    capsys,
-    effect,
-    code,
-    words,
-):
+def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effect, code, words):
     trained = []
 
     def train(planned):
@@ -301,7 +286,7 @@ def step(tmp_path, loss, place, noise=0.01):
 
 
 @pytest.mark.parametrize("loss", [0.06, 0.3])
-@pytest.mark.parametrize(("place", "result"), [("first", PASSED), ("last", WORSE)])
+@pytest.mark.parametrize("place, result", [("first", PASSED), ("last", WORSE)])
 def test_a_loss_below_the_least_that_matters_is_placed_too(tmp_path, loss, place, result):
     found, words = step(tmp_path, loss, place)
     assert found == result

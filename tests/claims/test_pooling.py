@@ -98,14 +98,7 @@ def test_studies_are_rows_of_a_table():
     assert second == "| b | -0.5 | unknown |  |"
 
 
-def archive(
-    tmp_path,
-    name,
-    seed=0,
-    protocol="paper-1",
-    budget=None,
-    **plan,
-):
+def archive(tmp_path, name, seed=0, protocol="paper-1", budget=None, **plan):
     """Write the archive of a laboratory in which "volumetric" gains 1 dB."""
     runs = tmp_path / f"runs_{name}_{seed}"
     paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))

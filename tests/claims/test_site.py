@@ -99,7 +99,7 @@ def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "taken", "key"),
+    "name, taken, key",
     [
         ("A b!", set(), "a-b"),
         ("exp", {"exp"}, "exp-2"),

@@ -237,7 +237,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["make", "exp"], "needs --out"),
         (["make", "exp", "--out", "."], "is there already"),
@@ -370,7 +370,7 @@ def _without_votes(path):
 
 
 @pytest.mark.parametrize(
-    ("change", "people", "said"),
+    "change, people, said",
     [
         (_copied, 2, "copy of another file"),
         (_edited, 1, "was edited"),

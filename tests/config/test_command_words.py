@@ -45,7 +45,7 @@ def test_options_and_words_may_come_in_any_order(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["--config-name", "mine"], "--config-name: gsbench's main configuration is its own: write "
             "yours to FOLDER/experiment/mine.yaml"),
@@ -68,7 +68,7 @@ def test_options_that_do_not_exist_are_explained(words, said):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["scene=courtyard", "+densify.x=1", "~densify.x", "~raster.x", "init={a:1}"], None),
         (["densify=adc,mcmc", "+experiment=demo", "hydra.job.name=a", "seed=range(3)"], None),
@@ -118,7 +118,7 @@ def test_only_a_list_of_plain_names_gives_permission():
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    "word, said",
     [
         ("hydra.searchpath=[file:///a,/b,pkg://gsbench.x,pkg://mine/sub]", None),
         ("hydra.searchpath=[pkg://other]", r"imports a package; if you trust it, add "
@@ -160,7 +160,7 @@ def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("key", "other"),
+    "key, other",
     [
         *((key, True) for key in ("seed", "name", "densify", "densify.start", "scene.path")),
         *((key, False) for key in ("threads", "init.threads", "eval.primary", "launch.parallel")),
@@ -193,7 +193,7 @@ def test_words_tell_their_key_value_and_kind():
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    "word, said",
     [
         ("a b=1", r"is not a setting like key=value \([^;]*\)$"),
         ("a=b(c", r"'a=\"b\(c\"'$"),
@@ -209,7 +209,7 @@ def test_special_characters_are_shown_quoted(word, said):
         parse_word(word)
 
 
-@pytest.mark.parametrize(("group", "word"), [("experiment", "experiment=a"), ("init", "init=[a]")])
+@pytest.mark.parametrize("group, word", [("experiment", "experiment=a"), ("init", "init=[a]")])
 def test_choices_of_the_users_folder_are_listed_too(tmp_path, group, word):
     (tmp_path / group).mkdir()
     (tmp_path / group / "of_mine.yaml").touch()

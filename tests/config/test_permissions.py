@@ -170,7 +170,7 @@ PROGRAM = [
 
 
 @pytest.mark.parametrize(
-    ("words", "missing"),
+    "words, missing",
     [
         ([], "python"),
         (["densify.version_command=[curl,strange]"], "python,curl"),

@@ -81,7 +81,7 @@ def needs(option):
 
 
 @pytest.mark.parametrize(
-    ("group", "option"), [(group, option) for group in GROUPS for option in options(group)]
+    "group, option", [(group, option) for group in GROUPS for option in options(group)]
 )
 def test_every_option_composes(group, option):
     extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
@@ -165,7 +165,7 @@ def test_experiments_have_the_size_of_the_paper():
 
 
 @pytest.mark.parametrize(
-    ("overrides", "key"),
+    "overrides, key",
     [
         (["scene.test_every=1"], "scene.test_every"),
         (["train.iterations=0"], "train.iterations"),
@@ -181,7 +181,7 @@ def test_errors_name_the_key(base, overrides, key):
 
 
 @pytest.mark.parametrize(
-    ("words", "error"),
+    "words, error",
     [
         (
             ["eval.primary=lpips_vg"],
@@ -247,7 +247,7 @@ def test_asking_for_more_metrics_changes_the_hash(base):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["eval.more=[psnr]"], "eval.more"),
         (["eval.more=[gmsd,gmsd]"], "at most once"),
@@ -292,7 +292,7 @@ def test_a_users_metric_needs_a_plain_name_that_is_not_taken(base, name):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    "changes, said",
     [
         ({"scene.transparent": "white", "train.background": [1, 1, 1]}, None),
         ({"scene.transparent": "white", "train.background": [0, 0, 0]}, "background=[1,1,1]"),
@@ -396,7 +396,7 @@ def test_an_impossible_number_of_threads_is_refused(base, threads):
 
 
 @pytest.mark.parametrize(
-    ("word", "is_kept"),
+    "word, is_kept",
     [
         ("name=1_1", False),
         ("name=1e3", False),
@@ -422,7 +422,7 @@ def test_a_text_is_kept_as_typed_or_refused(word, is_kept):
 
 
 @pytest.mark.parametrize(
-    ("words", "scaled"),
+    "words, scaled",
     [
         (["train=paper", "train.steps_scaler=0.1"], (3000, 50, 1500, 10, 300)),
         (

@@ -71,7 +71,7 @@ def test_a_bad_value_is_refused_in_a_shared_composition(words):
 
 
 @pytest.mark.parametrize(
-    ("words", "values"),
+    "words, values",
     [
         (["a.b=1", "seed=2", "c=3", "d.e='4'"], {"a.b": 1, "seed": 2, "d.e": "4"}),
         (["a.b={c:1}", "d.e=2"], {}),  # a mapping, whose order matters

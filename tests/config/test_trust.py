@@ -232,7 +232,7 @@ SOME = ("a callback", "made of a text", "a module of a package", "logging", "a l
 
 
 @pytest.mark.parametrize(
-    ("case", "mode"),
+    "case, mode",
     [*((case, "run") for case in STRANGE), *product(SOME, ["dry run", "question", "info"])],
 )
 def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
@@ -336,7 +336,7 @@ def test_only_variables_that_choose_threads_and_devices_need_no_permission(monke
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    "word, said",
     [
         ("hydra.searchpath=[pkg://bombs]", "allow_targets=[bombs]"),
         ("hydra.searchpath=[file://conf,pkg://bombs/sub]", "allow_targets=[bombs]"),
@@ -402,7 +402,7 @@ def test_a_typed_permission_also_covers_classes_in_files(capsys):
 
 
 @pytest.mark.parametrize(
-    ("target", "said"),
+    "target, said",
     [
         ("mine.os.mkdir", "cannot be imported"),
         ("mine.os", "is not a class for densify"),
@@ -423,7 +423,7 @@ def test_permission_for_a_module_covers_gsbenchs_classes_in_it():
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    "settings, said",
     [
         ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
         ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),

@@ -109,7 +109,7 @@ def test_a_member_without_a_name_is_skipped():
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    "names, said",
     [
         (("s/images/a", "s/images/a/b.jpg"), "images/a is a file and a folder in one"),
         (("s/images/a/b/c.jpg", "s/images/a"), "images/a is a file and a folder in one"),
@@ -198,7 +198,7 @@ def test_a_member_is_fetched_whole_and_alone(served, tmp_path, manners):
 
 
 @pytest.mark.parametrize(
-    ("manners", "kind", "said"),
+    "manners, kind, said",
     [
         (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*same command again"),
         (Manners(stall_every=1), FetchError, "no answer in time"),

@@ -173,7 +173,7 @@ def test_the_list_tells_which_scenes_are_here(fetch, data, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["mipnerf"], "no data set 'mipnerf'; did you mean mipnerf360?"),
         (["garden"], "garden is a scene: gsbench fetch mipnerf360 garden"),
@@ -194,13 +194,7 @@ def test_unknown_names_and_addresses_are_refused(archives, data, capsys, words, 
 
 
 @pytest.mark.parametrize("place", ["a-file", "a-file/below", "/proc/nosuch"])
-def test_a_data_folder_that_cannot_be_made_is_refused(
-    archives,
-    data,
-    capsys,
-    monkeypatch,
-    place,
-):
+def test_a_data_folder_that_cannot_be_made_is_refused(archives, data, capsys, monkeypatch, place):
     (data.parent / "a-file").touch()
     monkeypatch.setenv("GSBENCH_DATA", str(data.parent / place))
     assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == BAD_INPUT

@@ -54,13 +54,7 @@ def split_all(rows, chosen, scales, noise):
     return [row for i, row in enumerate(rows) if i not in chosen] + children
 
 
-def adc_growth(
-    rows,
-    mean_gradient,
-    extent,
-    noise,
-    events,
-):
+def adc_growth(rows, mean_gradient, extent, noise, events):
     clones = []
     chosen = []
     for i, row in enumerate(rows):

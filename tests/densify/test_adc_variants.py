@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import (
-    ADC,
-    AbsGS,
-    DensifyContext,
-    PixelGS,
-    QuantileADC,
-    ResGS,
-    SteepGS,
-)
+from gsbench.densify import ADC, AbsGS, DensifyContext, PixelGS, QuantileADC, ResGS, SteepGS
 from gsbench.errors import InputError
 from gsbench.raster.base import Footprint
 from tests.densify import restatement
@@ -270,15 +262,7 @@ def least(matrix):
     return float(values[0]), vector * np.sign(vector[np.abs(vector).argmax()])
 
 
-def steep_gs_growth(
-    rows,
-    gradient,
-    matrices,
-    noise,
-    rate,
-    threshold=-1e-6,
-    share=0.5,
-):
+def steep_gs_growth(rows, gradient, matrices, noise, rate, threshold=-1e-6, share=0.5):
     """Split Gaussians with a gradient of at least 0.0002 and an eigenvalue below ``threshold``.
 
     Their halves lie on either side of the parent along the least eigenvector. The halves of a large
@@ -438,7 +422,7 @@ def residual_split(rows, gradient, stage, noise):
     return parents + children
 
 
-@pytest.mark.parametrize(("step", "stage"), [(800, 1), (2400, 3), (4100, 5)])
+@pytest.mark.parametrize("step, stage", [(800, 1), (2400, 3), (4100, 5)])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_round_of_res_gs_matches_the_restatement(seed, step, stage):
     densifier = ResGS(**WINDOW)

@@ -85,7 +85,7 @@ COMBINATIONS = [
 
 
 @pytest.mark.parametrize(
-    ("kind", "options"), COMBINATIONS, ids=lambda value: getattr(value, "__name__", str(value))
+    "kind, options", COMBINATIONS, ids=lambda value: getattr(value, "__name__", str(value))
 )
 def test_the_forecast_is_the_count_after_the_round(kind, options):
     for seed, (step, strictness, cull) in enumerate(
@@ -184,7 +184,7 @@ def test_far_above_its_target_a_round_prunes_more_faint_gaussians():
     assert event.after == 60 - event.pruned_opacity == 30
 
 
-@pytest.mark.parametrize(("target", "culls"), [(199, False), (198, True)])
+@pytest.mark.parametrize("target, culls", [(199, False), (198, True)])
 def test_a_count_up_to_one_percent_above_its_target_is_not_culled(target, culls):
     densifier = ADC(max_gaussians=200, cap="governor", gradient_threshold=1.0, prune_size=100.0)
     trainable, _ = prepared(densifier, 5, count=200)
@@ -225,7 +225,7 @@ def test_a_cap_that_needs_a_forecast_or_a_limit_is_refused_without_it(cap):
 
 
 @pytest.mark.parametrize(
-    ("cap", "count", "most", "allowed"),
+    "cap, count, most, allowed",
     [
         ("soft", 5, 9, 4),
         ("soft", 5, 3, 0),

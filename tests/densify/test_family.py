@@ -268,7 +268,7 @@ def test_mcmc_shares_an_opacity_among_at_most_fifty_copies():
 
 
 @pytest.mark.parametrize(
-    ("kind", "setting", "value"),
+    "kind, setting, value",
     [
         (ADC, "split_children", 65),
         (Volumetric, "volume_children", 10**9),

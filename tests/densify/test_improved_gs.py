@@ -71,7 +71,7 @@ def expected_scores(gaussians, views):
     return total
 
 
-@pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
+@pytest.mark.parametrize("step, views", [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
 def test_edge_aware_scores_match_the_restatement(step, views):
     """A score is the mean over the drawn views, each normalised by its own mean.
 
@@ -228,7 +228,7 @@ def restated(densifier, logits, weight, soft):
 
 
 @pytest.mark.parametrize(
-    ("step", "soft"), [(15_001, True), (15_951, True), (16_001, False), (22_951, False)]
+    "step, soft", [(15_001, True), (15_951, True), (16_001, False), (22_951, False)]
 )
 def test_the_pressure_and_its_gradient_match_the_formula(step, soft):
     """Central differences show that the gradient also flows through the divisor."""
@@ -278,7 +278,7 @@ def test_the_weight_follows_an_aim_that_falls_to_zero(sinks):
     assert acted == list(range(15_001, 23_001, 50))
 
 
-@pytest.mark.parametrize(("budget", "place"), [(20, 19), (17, 16), (50, 49), (70, 49)])
+@pytest.mark.parametrize("budget, place", [(20, 19), (17, 16), (50, 49), (70, 49)])
 def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget, place):
     densifier, gaussians = begun(max_gaussians=budget)
     densifier.step = 15_000
@@ -319,9 +319,7 @@ def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget():
     assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
 
 
-def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours_the_opaque(
-    caplog,
-):
+def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours_the_opaque(caplog):
     densifier = GNS(max_gaussians=20)
     trainable, _ = started(densifier, 0)
     trainable.values.opacity_logits.data[20:] = -30.0
@@ -336,9 +334,7 @@ def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours
     )
 
 
-def test_a_selection_close_to_its_budget_logs_no_warning(
-    caplog,
-):
+def test_a_selection_close_to_its_budget_logs_no_warning(caplog):
     densifier = GNS(max_gaussians=COUNT - 1)
     trainable, _ = started(densifier, 0)
     assert densifier.refine(16_050, trainable, generator(0)).after == COUNT - 1

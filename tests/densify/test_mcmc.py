@@ -142,7 +142,7 @@ def begun(densifier, seed):
     return trainable, seen
 
 
-@pytest.mark.parametrize(("step", "room"), [(600, 1000), (600, 5), (600, 0), (16_000, 1000)])
+@pytest.mark.parametrize("step, room", [(600, 1000), (600, 5), (600, 0), (16_000, 1000)])
 def test_a_round_of_mrnf_matches_the_restatement(step, room):
     densifier = MRNF(max_gaussians=COUNT + room, growth_share=0.4, growth_threshold=0.5)
     trainable, seen = begun(densifier, 1)

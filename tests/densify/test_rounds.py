@@ -234,7 +234,7 @@ def test_default_windows_agree_with_the_options_of_training():
     assert ADC.opacity_reset_interval == TrainConfig.opacity_reset_interval == 3000
 
 
-@pytest.mark.parametrize(("white", "resets"), [(False, [3000, 6000]), (True, [500, 3000, 6000])])
+@pytest.mark.parametrize("white, resets", [(False, [3000, 6000]), (True, [500, 3000, 6000])])
 def test_with_a_white_background_opacities_are_also_reset_at_the_start(white, resets):
     densifier = ADC(stop=9000)
     trainable, _ = prepared(densifier, 0, count=3)

@@ -104,7 +104,7 @@ def test_a_subclass_adds_to_the_statistics_of_its_base():
 
 
 @pytest.mark.parametrize(
-    ("order", "place"),
+    "order, place",
     [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)],
     ids=lambda value: str(value),
 )
@@ -150,9 +150,7 @@ def test_normal_draws_on_the_cpu_are_those_of_the_generator():
     assert torch.equal(drawn, torch.randn(4, 3, generator=generator(3), dtype=torch.float64))
 
 
-def test_normal_draws_on_another_device_are_seeded_by_the_generator(
-    monkeypatch,
-):
+def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch):
     rng, again = (generator(3) for _ in range(2))
     seeds = []
 

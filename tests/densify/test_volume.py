@@ -147,7 +147,7 @@ def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene():
 
 
 @pytest.mark.parametrize(
-    ("options", "key"),
+    "options, key",
     [
         ({"volume_threshold": -1.0}, "densify.volume_threshold"),
         ({"max_condition": 0.5}, "densify.max_condition"),
@@ -176,7 +176,7 @@ def test_admit_chooses_the_best_scores_and_counts_the_refused():
 
 
 @pytest.mark.parametrize(
-    ("count", "most", "cap", "allowed"),
+    "count, most, cap, allowed",
     [
         (5, 10, "hard", 5),
         (12, 10, "hard", 0),

@@ -162,7 +162,7 @@ def test_files_in_the_architecture_document_exist():
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    "text, fault",
     [
         ("    gsbench tabels x", "no verb tabels"),
         ("say `gsbench tables x --formt csv`", "tables has no option --formt"),

@@ -89,7 +89,7 @@ def test_docstrings_and_titles_begin_with_a_verb_or_a_noun():
 
 
 @pytest.mark.parametrize(
-    ("source", "lines"),
+    "source, lines",
     [
         ('"""What it is."""', [1]),
         ('def run():\n    """Whether it runs."""', [2]),
@@ -120,7 +120,7 @@ def test_examples_in_docstrings_are_true(name, capsys):
 
 
 @pytest.mark.parametrize(
-    ("extended", "word"),
+    "extended, word",
     [
         *((extended, "class ") for extended in (Densifier, Initializer, Metric, Rasterizer, Sink)),
         (External, "command="),

@@ -195,7 +195,7 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
 
 
-@pytest.mark.parametrize(("module", "name"), [("careful", "Careful"), ("peak", "Peak")])
+@pytest.mark.parametrize("module, name", [("careful", "Careful"), ("peak", "Peak")])
 def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name):
     from gsbench.densify import ADC, DensifyContext
     from gsbench.gaussians.paper_values import LearningRates

@@ -194,7 +194,7 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["SMALLER", "--truth", "small:courtyard:adc"], "sizes are never changed"),
         (

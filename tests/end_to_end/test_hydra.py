@@ -95,7 +95,7 @@ def test_an_experiment_file_can_set_callbacks_and_a_sweep(gsbench, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("package", "launcher"),
+    "package, launcher",
     [("hydra_joblib_launcher", "joblib"), ("hydra_submitit_launcher", "submitit_local")],
 )
 def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, launcher):

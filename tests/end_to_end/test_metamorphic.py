@@ -197,7 +197,7 @@ def other_place(folder, model):
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    "change, text",
     [
         pytest.param(other_place, True, id="a text model"),
         pytest.param(rename, False, id="other names"),

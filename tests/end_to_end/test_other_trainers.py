@@ -270,7 +270,7 @@ BAD_RENDERS = {
 }
 
 
-@pytest.mark.parametrize(("arm", "expected"), [("cloud", BAD), ("painter", BAD_RENDERS)])
+@pytest.mark.parametrize("arm, expected", [("cloud", BAD), ("painter", BAD_RENDERS)])
 def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
     trainers, tmp_path, monkeypatch, capsys, arm, expected
 ):
@@ -348,8 +348,7 @@ def hanging(environment, trainers, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "signum",
-    [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
+    "signum", [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))]
 )
 def test_another_program_ends_with_gsbench(hanging, signum):
     process, pids = hanging
@@ -364,7 +363,7 @@ def test_another_program_ends_with_gsbench(hanging, signum):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["allow_targets=[]"], "if you trust it, add allow_targets=["),
         (

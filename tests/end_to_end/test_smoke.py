@@ -238,7 +238,7 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("word", "hint"),
+    "word, hint",
     [
         ("densify=volumetrik", "volumetric"),
         ("densify.grad_threshold=1", "gradient_threshold"),

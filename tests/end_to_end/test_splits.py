@@ -61,8 +61,7 @@ def bits(folder):
 
 
 @pytest.mark.parametrize(
-    ("init", "choice"),
-    [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")],
+    "init, choice", [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")]
 )
 def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path, init, choice):
     """Poses are given here. Renders are equal, too, and only their photographs differ."""

@@ -107,7 +107,7 @@ def test_metrics_with_missing_weights_are_awaited_and_unrequested_ones_are_not(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "name, value",
     [
         ("direction", 2),
         ("direction", "up"),
@@ -128,7 +128,7 @@ def test_wrong_attributes_of_a_users_metric_are_refused(name, value):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "name, value",
     [("direction", 0), ("decimals", 0), ("decimals", 12), ("unit", ""), ("worthwhile", 1e-9)],
 )
 def test_allowed_attributes_of_a_users_metric_are_accepted(name, value):

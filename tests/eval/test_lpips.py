@@ -96,7 +96,7 @@ def test_the_published_heads_fit_the_taps(shared, net):
     assert float(network(torch.rand(1, 3, 40, 40), torch.rand(1, 3, 40, 40))) > 0
 
 
-@pytest.mark.parametrize(("net", "taps"), [("vgg", vgg_taps), ("alex", alex_taps)])
+@pytest.mark.parametrize("net, taps", [("vgg", vgg_taps), ("alex", alex_taps)])
 def test_networks_match_an_independent_version(net, taps):
     features, heads = random_weights(net)
     generator = torch.Generator().manual_seed(1)
@@ -108,7 +108,7 @@ def test_networks_match_an_independent_version(net, taps):
 
 
 @pytest.mark.parametrize(
-    ("net", "channels"),
+    "net, channels",
     [
         ("vgg", [64, 128, 256, 512, 512]),
         ("alex", [64, 192, 384, 256, 256]),

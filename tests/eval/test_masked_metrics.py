@@ -36,7 +36,7 @@ def test_masked_psnr_is_over_the_pixels_that_count(pair):
     assert found == pytest.approx(-10 * np.log10(squared.mean()), abs=1e-6)
 
 
-@pytest.mark.parametrize(("protocol", "inside"), [(STANDARD, True), (PAPER, False)])
+@pytest.mark.parametrize("protocol, inside", [(STANDARD, True), (PAPER, False)])
 def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(pair, protocol, inside):
     render, truth, mask = pair
     shown = np.where(mask[..., None], render, truth) / 255

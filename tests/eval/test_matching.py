@@ -13,7 +13,7 @@ PHOTOGRAPHS = ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"]
 
 
 @pytest.mark.parametrize(
-    ("photographs", "pictures", "rule"),
+    "photographs, pictures, rule",
     [
         (PHOTOGRAPHS, ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"], ""),
         (PHOTOGRAPHS, ["DSC08000.png", "DSC08008.png", "DSC08016.png"], "apart from the extension"),
@@ -60,7 +60,7 @@ def test_renders_of_training_views_are_left_out():
 
 
 @pytest.mark.parametrize(
-    ("photographs", "pictures", "words"),
+    "photographs, pictures, words",
     [
         (
             ["a.JPG", "b.JPG"],

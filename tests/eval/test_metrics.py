@@ -122,8 +122,7 @@ def test_flip_depends_on_the_viewing_distance():
 
 
 @pytest.mark.parametrize(
-    ("shape", "other"),
-    [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))],
+    "shape, other", [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))]
 )
 def test_wrong_shapes_are_refused(shape, other):
     for metric in (

@@ -79,7 +79,7 @@ def failing():
 
 
 @pytest.mark.parametrize(
-    ("fall", "said"),
+    "fall, said",
     [
         (
             failing,

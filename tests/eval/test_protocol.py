@@ -112,9 +112,7 @@ def test_lpips_of_too_small_a_view_is_unavailable(shared):
     assert evaluator.unavailable["lpips_squeeze"] == "a view is 40x16 px, below 17 px a side"
 
 
-def test_without_the_flip_package_the_metric_is_unavailable(
-    monkeypatch,
-):
+def test_without_the_flip_package_the_metric_is_unavailable(monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     evaluator = Evaluator(PAPER, lpips=[])
     image = np.zeros((16, 16, 3), dtype=np.uint8)

@@ -198,7 +198,7 @@ def test_a_batch_gives_the_values_of_its_images(key):
 
 
 @pytest.mark.parametrize(
-    ("key", "smallest"), [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)]
+    "key, smallest", [("ms_ssim", 161), ("iw_ssim", 161), ("fsim", 16), ("gmsd", 2)]
 )
 def test_too_small_images_are_refused_and_reported_as_unavailable(key, smallest):
     assert MULTISCALE_MIN_SIZE == 161
@@ -251,7 +251,7 @@ def test_images_of_different_sizes_are_refused(key):
 
 
 @pytest.mark.parametrize(
-    ("size", "expected"),
+    "size, expected",
     [
         (4, [0, 0.25, -0.5, -0.25]),
         # Kovesi's filters have both ends at half a cycle per pixel

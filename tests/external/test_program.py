@@ -105,9 +105,7 @@ def test_the_folder_of_test_cameras_has_no_images_and_the_same_projections(views
         assert (frame["w"], frame["h"]) == (view.camera.width, view.camera.height)
 
 
-def test_the_one_model_of_a_program_is_taken_in_the_coordinates_of_the_training(
-    tmp_path,
-):
+def test_the_one_model_of_a_program_is_taken_in_the_coordinates_of_the_training(tmp_path):
     gaussians = random_gaussians(9)
     (tmp_path / "out" / "7").mkdir(parents=True)
     for words in (r"it left no \*/p.ply \(densify.result\); it wrote no file", "it wrote 7/x.txt"):
@@ -133,7 +131,7 @@ def test_the_one_model_of_a_program_is_taken_in_the_coordinates_of_the_training(
 
 
 @pytest.mark.parametrize(
-    ("names", "by_order", "said"),
+    "names, by_order, said",
     [
         (("a.png", "left__b.png", "c.png"), False, ""),
         (("1.png", "2.png", "10.png"), True, ""),  # sorted by value, as a, c and left__b are
@@ -204,20 +202,13 @@ def test_a_command_must_contain_data_and_its_result_tells_model_from_renders():
 
 
 @pytest.mark.parametrize(
-    ("ends", "limit", "code", "pauses"),
+    "ends, limit, code, pauses",
     [
         (0.1, None, 5, [0.02, 0.04, 0.08]),
         (1e9, 1.5, None, [0.02, 0.04, 0.08, 0.16, 0.32, 0.5, 0.5]),
     ],
 )
-def test_a_program_is_watched_to_its_end_or_limit(
-    ends,
-    limit,
-    code,
-    pauses,
-    tmp_path,
-    monkeypatch,
-):
+def test_a_program_is_watched_to_its_end_or_limit(ends, limit, code, pauses, tmp_path, monkeypatch):
     clock, done, looks = [100.0], [], iter([10.0, 30.0, 20.0] + 9 * [1.0])
 
     def wait(pause=None):
@@ -241,9 +232,7 @@ def test_a_program_is_watched_to_its_end_or_limit(
     assert done == [*map(pytest.approx, pauses), *(["kill", None] if code is None else [])]
 
 
-def test_the_memory_of_a_program_is_the_sum_over_its_processes(
-    monkeypatch,
-):
+def test_the_memory_of_a_program_is_the_sum_over_its_processes(monkeypatch):
     def process(size, *children):
         def memory():
             if size is None:
@@ -260,7 +249,7 @@ def test_the_memory_of_a_program_is_the_sum_over_its_processes(
 
 
 @pytest.mark.parametrize(
-    ("ended", "said"),
+    "ended, said",
     [
         (ProgramResult(0, 1.0, 2.0), ""),
         (ProgramResult(3, 1.0, 2.0), r"train ended early \(exit code 3\); its last lines: oh; log"),

@@ -13,7 +13,7 @@ def external(result, **options):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options, said",
     [
         ({"lr": "???"}, "densify.options.lr is not set: give it a value"),
         ({"seed": 1}, "densify.options.seed: an option is one value with a name of its own"),
@@ -82,7 +82,7 @@ def test_patterns_below_the_output_folder_are_accepted(result):
 
 
 @pytest.mark.parametrize(
-    ("result", "words"),
+    "result, words",
     [
         ("**.ply", "not a pattern of files"),
         ("a**/b.ply", "not a pattern of files"),

@@ -38,7 +38,7 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("file", "harm", "words"),
+    "file, harm, words",
     [
         (
             "images.bin",
@@ -57,14 +57,7 @@ NAN = float("nan")
         ("points3D.bin", lambda data: data + b"\0", "1 bytes too many"),
     ],
 )
-def test_the_program_names_the_damaged_file(
-    file,
-    harm,
-    words,
-    tmp_path,
-    monkeypatch,
-    capsys,
-):
+def test_the_program_names_the_damaged_file(file, harm, words, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     write_originals(tmp_path)
     (tmp_path / "sparse").mkdir()

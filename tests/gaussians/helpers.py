@@ -7,13 +7,7 @@ from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.scene.types import Camera
 
 
-def random_gaussians(
-    count,
-    seed=0,
-    dtype=torch.float64,
-    depth=(2.0, 6.0),
-    log_scale=(-3.0, -1.0),
-):
+def random_gaussians(count, seed=0, dtype=torch.float64, depth=(2.0, 6.0), log_scale=(-3.0, -1.0)):
     """Gaussians in front of ``front_camera``, of mixed sizes, shapes, opacities and colours."""
     rng = torch.Generator().manual_seed(seed)
 

@@ -110,7 +110,7 @@ def rewritten(path, old, new):
     return path
 
 
-@pytest.mark.parametrize(("text", "bytes_each"), [(False, 61 * 4 + 8), (True, 62 * 2)])
+@pytest.mark.parametrize("text, bytes_each", [(False, 61 * 4 + 8), (True, 62 * 2)])
 def test_a_header_that_promises_more_than_the_file_has_is_refused(tmp_path, text, bytes_each):
     """The header promises 62 numbers each, one of them a double; in text, at least two bytes."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
@@ -128,7 +128,7 @@ def test_a_header_that_promises_more_than_the_file_has_is_refused(tmp_path, text
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    "old, new, said",
     [
         (b" f_rest_0\n", b" f_rest_50\n", r"it has 45, with f_rest_50"),
         (b" f_rest_0\n", b" f_rest_00\n", r"it has 45, with f_rest_00"),
@@ -149,7 +149,7 @@ def test_rgb_to_dc_and_dc_to_rgb_are_inverse():
     assert dc_to_rgb(rgb_to_dc(rgb)).tolist() == pytest.approx(rgb.tolist())
 
 
-@pytest.mark.parametrize(("degree", "stored"), [(0, 0), (1, 3), (2, 8), (3, 15)])
+@pytest.mark.parametrize("degree, stored", [(0, 0), (1, 3), (2, 8), (3, 15)])
 def test_a_ply_of_a_lower_degree_is_read(tmp_path, degree, stored):
     """Some programs store fewer coefficients, channel by channel; the missing ones become zero."""
     table = table_of(tmp_path / "a.ply")
@@ -199,7 +199,7 @@ def test_the_end_of_a_header_is_searched_in_the_first_64_kib(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    "name, value, said",
     [
         ("x", np.nan, "x is not a finite number everywhere"),
         ("f_rest_44", np.inf, "f_rest_44 is not a finite number everywhere"),
@@ -255,7 +255,7 @@ def zipped(*names):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    "name, content, said",
     [
         ("a.pth", b"PK\3\4" + bytes(9), "a checkpoint of PyTorch: give the PLY"),
         ("last.ckpt", bytes(9), "a checkpoint of PyTorch: give the PLY"),
@@ -291,7 +291,7 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("column", "refused", "said"),
+    "column, refused, said",
     [
         ("beta", True, "the column beta: Beta Splatting's kernels are no Gaussians"),
         ("sb_params_3", True, "Beta Splatting's"),
@@ -330,7 +330,7 @@ def test_files_of_gsbench_are_not_suspected(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    "name, content, said",
     [
         ("a.compressed.ply", COMPRESSED, "a compressed PLY, as SuperSplat writes it"),
         ("a.ply", gzip.compress(b"NGSP", mtime=0), "the format SPZ"),
@@ -373,7 +373,7 @@ def test_a_value_beyond_float32_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("prefix", "values", "said"),
+    "prefix, values, said",
     [
         ("scale_", (0.001, 0.5), "all scales are positive"),
         ("scale_", (-0.001, 0.5), ""),
@@ -410,7 +410,7 @@ def test_lengths_and_logarithms_are_told_apart_in_any_unit(tmp_path, unit, activ
 
 
 @pytest.mark.parametrize(
-    ("center", "scale", "kind"),
+    "center, scale, kind",
     [
         ((0.0, 0.0, 0.0), 1.0, "f4"),
         ((0.1, -0.2, 0.3), 100.0, "f4"),

@@ -12,11 +12,7 @@ def camera_at(center, rotation=None):
     return pycolmap.Rigid3d(np.column_stack([turn, -turn @ np.asarray(center)]))
 
 
-def model_with(
-    poses,
-    keypoints=0,
-    camera=None,
-):
+def model_with(poses, keypoints=0, camera=None):
     """A model of images with ids from 1 and one camera, by default of 100 x 80 px, f = 100 px.
 
     ``keypoints`` are the keypoints [K, 2] of each image, or their number.
@@ -31,12 +27,7 @@ def model_with(
     return model
 
 
-def add_point(
-    model,
-    position,
-    color=(10, 20, 30),
-    seen_by=None,
-):
+def add_point(model, position, color=(10, 20, 30), seen_by=None):
     """Add a point; ``seen_by`` maps the ids of images to the indices of their keypoints."""
     elements = [pycolmap.TrackElement(*item) for item in (seen_by or {}).items()]
     place = np.asarray(position, dtype=float)

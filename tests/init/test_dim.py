@@ -163,7 +163,7 @@ class TestStore:
 class TestContracts:
     """Undocumented behaviour of transformers and kornia on which the code relies."""
 
-    @pytest.mark.parametrize(("width", "height"), [(128, 96), (1237, 40), (131, 101)])
+    @pytest.mark.parametrize("width, height", [(128, 96), (1237, 40), (131, 101)])
     def test_superpoint_keypoints_are_the_maxima_of_its_score_map(
         self, untrained_weights, width, height
     ):
@@ -260,7 +260,7 @@ class TestContracts:
 
 
 @pytest.mark.parametrize(
-    ("extractor", "threshold", "radius"),
+    "extractor, threshold, radius",
     [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0.0, 2)],
 )
 def test_detection_settings_are_the_extractors_own_unless_given(
@@ -366,7 +366,7 @@ class TestErrors:
         assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
 
     @pytest.mark.parametrize(
-        ("options", "message"),
+        "options, message",
         [
             (
                 {"extractor": "sift"},

@@ -22,13 +22,7 @@ XYZ = RNG.uniform(-2, 2, (40, 3)).astype(np.float32).astype(np.float64)
 RGB = RNG.integers(0, 256, (40, 3))
 
 
-def write(
-    path,
-    properties,
-    values,
-    text,
-    order,
-):
+def write(path, properties, values, text, order):
     table = np.zeros(len(XYZ), dtype=[(name, kind) for name, kind in properties])
     for name, column in values.items():
         table[name] = column
@@ -39,7 +33,7 @@ def write(
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
-    ("names", "kind", "scale"),
+    "names, kind, scale",
     [
         (("red", "green", "blue"), "u1", 1),
         (("r", "g", "b"), "f4", 1 / 255),
@@ -87,7 +81,7 @@ NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "colored"),
+    "name, text, colored",
     [
         ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY, RGB)}", True),
         ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY)}", False),
@@ -200,7 +194,7 @@ def empty_ply(path):
 
 
 @pytest.mark.parametrize(
-    ("name", "make", "message"),
+    "name, make, message",
     [
         ("a.ply", bad_ply, "no property y, z"),
         ("a.ply", lambda path: path.write_bytes(b"no cloud"), "not a readable file of points"),
@@ -234,7 +228,7 @@ def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
 
 
 @pytest.mark.parametrize(
-    ("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
+    "shape, kind", [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
 )
 def test_a_cloud_refuses_points_of_another_shape_or_type(shape, kind):
     with pytest.raises(ValueError, match="points must be"):

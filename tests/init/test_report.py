@@ -87,7 +87,7 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("sound", "doubtful", "said"),
+    "sound, doubtful, said",
     [
         (
             {"num_registered": 9},
@@ -130,7 +130,7 @@ def test_each_limit_has_its_own_warning(capture, sound, doubtful, said):
 
 
 @pytest.mark.parametrize(
-    ("focal", "view"), [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
+    "focal, view", [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
 )
 def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(capture, focal, view):
     """Along the longest side, 100 px, it is 2 atan(50 / focal)."""
@@ -280,9 +280,7 @@ def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path):
     assert not red[480 + 40, 478:483].any()
 
 
-@pytest.mark.parametrize(
-    ("count", "inked"), [(2, 9), (5_000, 9), (5_001, 4), (50_000, 4), (50_001, 1)]
-)
+@pytest.mark.parametrize("count, inked", [(2, 9), (5_000, 9), (5_001, 4), (50_000, 4), (50_001, 1)])
 def test_more_points_are_drawn_smaller(count, inked, tmp_path, monkeypatch):
     """All points but one are at one place; the other one is measured."""
     points, colors = np.tile([1.0, 1, 5], (count, 1)), np.zeros((count, 3), np.uint8)

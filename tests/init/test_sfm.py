@@ -12,12 +12,7 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Jittered, Sfm, SfmDense, read_cloud
-from gsbench.init.base import (
-    OWN_GAUGE_FOLDER,
-    PICTURE_FILE,
-    REPORT_FILE,
-    WORK_FOLDER,
-)
+from gsbench.init.base import OWN_GAUGE_FOLDER, PICTURE_FILE, REPORT_FILE, WORK_FOLDER
 from gsbench.init.colmap.reconstruct import poses_by_name
 from gsbench.scene.types import Capture
 from tests.init.models import camera_at, digest, model_with
@@ -47,11 +42,7 @@ def told():
 
 
 @pytest.fixture(scope="module")
-def shared(
-    courtyard,
-    told,
-    tmp_path_factory,
-):
+def shared(courtyard, told, tmp_path_factory):
     output = tmp_path_factory.mktemp("shared")
     return Sfm().run(courtyard, output, lambda *state: told.append(state[:3])), output
 
@@ -159,7 +150,7 @@ def test_the_progress_of_each_phase_is_reported_from_start_to_end(shared, told):
 
 
 @pytest.mark.parametrize(
-    ("poses", "intrinsics", "points_from", "names", "needed"),
+    "poses, intrinsics, points_from, names, needed",
     [
         ("shared", "estimate", "all", "bcd", False),
         ("shared", "reference", "all", "bcd", True),
@@ -291,7 +282,7 @@ def test_two_photos_are_refused(courtyard, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    "options, message",
     [
         ({"poses": "both"}, "init.poses must be 'shared' or 'own', got 'both'"),
         (

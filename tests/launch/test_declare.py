@@ -152,11 +152,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
         found.metric,
         len(found.standing([], experiment.trials).seen),
         [one.primary for one in found.earlier],
-    ) == (
-        "ssim",
-        1,
-        ["psnr"],
-    )
+    ) == ("ssim", 1, ["psnr"])
 
     # Another experiment gets the same numbers from the store: they were measured before its
     # declaration.

@@ -287,7 +287,7 @@ class Jobs:
         return SimpleNamespace(done=done, paths=paths, _process=process)
 
 
-@pytest.mark.parametrize(("minutes", "limit"), [(None, 365 * 24 * 60), (30, 30)])
+@pytest.mark.parametrize("minutes, limit", [(None, 365 * 24 * 60), (30, 30)])
 def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, minutes, limit):
     caplog.set_level(logging.INFO, "gsbench")
     pauses = []

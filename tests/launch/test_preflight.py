@@ -26,7 +26,7 @@ from tests.launch.test_jobs import trial as bare_trial
 
 
 @pytest.mark.parametrize(
-    ("group", "name", "target", "said"),
+    "group, name, target, said",
     [
         ("densify", "adc", "mine.Patient", ["densify.name=patient"]),
         # the name of another class of gsbench
@@ -78,7 +78,7 @@ def called(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("launch", "launcher", "mirrors"),
+    "launch, launcher, mirrors",
     [
         (LOCAL | {"name": "serial"}, "run_serial", 1),
         (LOCAL, "run_local", 1),
@@ -169,7 +169,7 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("word", "free"),
+    "word, free",
     [
         ("seed=3", True),
         ("densify=adc", True),

@@ -9,13 +9,7 @@ import pytest
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.launch.progress import (
-    Progress,
-    _in_words,
-    _seconds_left,
-    progress_frame,
-    progress_of,
-)
+from gsbench.launch.progress import Progress, _in_words, _seconds_left, progress_frame, progress_of
 from gsbench.launch.states import TrialState
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
@@ -129,7 +123,7 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
 
 
 @pytest.mark.parametrize(
-    ("names", "states", "seconds"),
+    "names, states, seconds",
     [
         ([("adc", "a")], ["missing"], 11),  # its arm and scene
         ([("adc", "b")], ["partial"], 21),

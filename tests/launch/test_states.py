@@ -76,7 +76,7 @@ def begun(runs, seed=0, step=0, **settings):
 
 
 @pytest.mark.parametrize(
-    ("queue", "state", "note"),
+    "queue, state, note",
     [
         ({"7_1": QueuedJob("REQUEUED", "None")}, "queued", "in train at iteration 70 Slurm job 7_1, requeued"),
         ({"7_1": QueuedJob("RUNNING", "None")}, "running", "in train at iteration 70 Slurm job 7_1, running"),

@@ -51,11 +51,7 @@ def why_not_done(values):
     return TrialFolder.of(values).why_not_done(values)
 
 
-def finish(
-    values,
-    seconds=100.0,
-    awaited=(),
-):
+def finish(values, seconds=100.0, awaited=()):
     """Make the files of a finished trial, with one stage in the store and one source file."""
     folder = TrialFolder.of(values)
     folder.path.mkdir(parents=True, exist_ok=True)
@@ -201,13 +197,7 @@ def test_mistake_in_a_users_yaml_names_the_file(tmp_path):
 
 def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
-    words = [
-        "-m",
-        "scene=courtyard,truck",
-        "init=dataset",
-        "tracking=none",
-        "train.iterations=1",
-    ]
+    words = ["-m", "scene=courtyard,truck", "init=dataset", "tracking=none", "train.iterations=1"]
     with pytest.raises(InputError, match=r"scene truck: .*truck does not exist.*; .*gsbench fetch"):
         launch(words)
     assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # no trial has begun
@@ -260,7 +250,7 @@ def test_finished_trial_is_recognised_until_something_changes(runs):
 
 
 @pytest.mark.parametrize(
-    ("change", "names"),
+    "change, names",
     [
         ("photo", "photos/a.jpg has changed"),
         ("photo gone", "photos/a.jpg cannot be read (No such file"),
@@ -327,7 +317,7 @@ def test_a_dry_run_tells_arms_and_their_changes_apart(runs):
 
 
 @pytest.mark.parametrize(
-    ("missing", "download", "note"),
+    "missing, download, note",
     [
         (["lpips_squeeze"], False, ""),
         (["lpips_squeeze"], True, "  will be checked: it lacks lpips_squeeze, which can be "),

@@ -127,7 +127,7 @@ def test_results_combine_the_results_of_the_steps(made):
 
 
 @pytest.mark.parametrize(
-    ("changes", "evaluated_from", "raster", "unknown", "timed"),
+    "changes, evaluated_from, raster, unknown, timed",
     [
         ({"iterations": 0}, "model", "reference", {"train_time", "total_time"}, False),
         (PROGRAM, "model", "reference", set(), True),

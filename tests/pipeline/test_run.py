@@ -54,7 +54,7 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("error", "kind", "message", "bad_input"),
+    "error, kind, message, bad_input",
     [
         (InputError("no photos"), InputError, "no photos", True),
         (TrainingError("nan"), TrainingError, "nan", False),

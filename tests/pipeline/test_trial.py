@@ -28,7 +28,7 @@ def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "here", "refusal"),
+    "words, here, refusal",
     [
         (["raster=auto"], True, None),
         (["raster=cpu"], True, None),
@@ -140,7 +140,7 @@ def own_module(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("group", "values", "said"),
+    "group, values, said",
     [
         ("densify", {"_target_": "own_classes.Picky", "least": 2.0}, None),
         ("densify", {"_target_": "own_classes.Picky", "lest": 2.0}, r"densify\.lest"),
@@ -183,9 +183,7 @@ def test_a_part_that_cannot_be_made_is_refused_with_the_name_of_its_setting(
             build(group, values, ["own_classes"])
 
 
-@pytest.mark.parametrize(
-    ("name", "sound"), [("Named", True), ("Nameless", False), ("Taken", False)]
-)
+@pytest.mark.parametrize("name, sound", [("Named", True), ("Nameless", False), ("Taken", False)])
 def test_a_users_rasterizer_needs_a_name_of_its_own(own_module, name, sound):
     values = {"name": "own", "_target_": f"own_classes.{name}"}
     if sound:

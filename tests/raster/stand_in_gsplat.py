@@ -47,14 +47,7 @@ def fully_fused_projection(
     return radii.detach(), means2d.contiguous(), depths, conics, None
 
 
-def isect_tiles(
-    means2d,
-    radii,
-    depths,
-    tile_size,
-    tile_width,
-    tile_height,
-):
+def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
     calls.append("isect_tiles")
     return definitions._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
 
@@ -73,13 +66,7 @@ def spherical_harmonics(degrees_to_use, dirs, coeffs, masks=None):
 def head():
     """The stand-in for gsplat 1.6, whose harmonics take poses and check every shape."""
 
-    def spherical_harmonics(
-        degrees_to_use,
-        means,
-        viewmats,
-        coeffs,
-        masks=None,
-    ):
+    def spherical_harmonics(degrees_to_use, means, viewmats, coeffs, masks=None):
         calls.append("spherical_harmonics of 1.6")
         cameras, count = len(viewmats), len(means)
         assert means.shape == (count, 3)
@@ -154,14 +141,7 @@ class _Rasterize(torch.autograd.Function):
         return *found[:4], None, None
 
 
-def _composite(
-    means2d,
-    conics,
-    colors,
-    opacities,
-    backgrounds,
-    settings,
-):
+def _composite(means2d, conics, colors, opacities, backgrounds, settings):
     """Return image [1, H, W, 3], alpha [1, H, W, 1] and a list with two tensors for each tile.
 
     These are the tile's Gaussians [K] and copies of their means for each pixel [P, K, 2].

@@ -67,7 +67,7 @@ def test_depths_are_sorted_as_numpy_sorts_them():
 
 
 @pytest.mark.parametrize(
-    ("lengths", "shards", "bounds"),
+    "lengths, shards, bounds",
     [
         ([0, 0, 32, 0, 0, 0], 2, [0, 2, 6]),  # with 16 for each tile, shares of 64: 32 + 96
         ([0, 0, 0, 0], 2, [0, 2, 4]),  # a share is met exactly
@@ -197,9 +197,7 @@ def test_gradients_accumulate():
     assert torch.equal(own.sh_rest.grad, 2 * once)
 
 
-def test_an_interrupted_backward_pass_does_not_change_later_gradients(
-    monkeypatch,
-):
+def test_an_interrupted_backward_pass_does_not_change_later_gradients(monkeypatch):
     for threads in (1, 2):
         rasterizer = CpuRasterizer(threads=threads)
         _, expected = render_with_gradients(rasterizer, CASE, torch.float32)

@@ -69,9 +69,7 @@ def test_auto_takes_the_best_installed_executor(monkeypatch, caplog):
     assert resolve("auto", "mps").name == "reference"
 
 
-def test_an_executor_that_cannot_run_is_refused_with_a_remedy(
-    monkeypatch,
-):
+def test_an_executor_that_cannot_run_is_refused_with_a_remedy(monkeypatch):
     assert resolve("reference", "cpu").name == "reference"
     assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
     for name, device, said in (
@@ -177,7 +175,7 @@ def footprint_of(out, **changes):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    "change, told",
     [
         (
             lambda out: {"image": out.image[None]},

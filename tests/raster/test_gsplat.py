@@ -78,9 +78,7 @@ def test_backward_may_run_late_and_twice_without_the_absolute_gradient(library):
     assert torch.equal(outputs[0].screen_points.grad[:, 0] != 0, once.abs().sum(-1) != 0)
 
 
-def test_screen_points_have_a_gradient_even_if_no_parameter_requires_one(
-    library,
-):
+def test_screen_points_have_a_gradient_even_if_no_parameter_requires_one(library):
     _, expected = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
     gaussians = FAINT.gaussians().map(torch.Tensor.float)
     output = GsplatRasterizer(library=library).render(

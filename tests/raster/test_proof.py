@@ -126,7 +126,7 @@ def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors():
     assert not {"image", "alpha"} & proof.errors.keys()
 
 
-@pytest.mark.parametrize(("name", "held"), [("gsplat", False), ("cpu", True)])
+@pytest.mark.parametrize("name, held", [("gsplat", False), ("cpu", True)])
 def test_an_executor_apart_from_the_contract_is_not_held_to_radii_bits_and_clamped_alphas(
     name, held
 ):
@@ -284,9 +284,7 @@ def test_only_one_process_makes_a_proof_at_a_time(cache, monkeypatch):
     assert lock.parent == cache
 
 
-def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(
-    monkeypatch,
-):
+def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(monkeypatch):
     gpu = torch.device("cuda:1")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, device.index))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "GPU")
@@ -299,7 +297,7 @@ def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(
 
 
 @pytest.mark.parametrize(
-    ("known", "has_gpu", "answers", "said"),
+    "known, has_gpu, answers, said",
     [
         ("550.54\n", True, ["1"], "550.54"),
         (None, True, ["551.2", "551.2"], "551.2"),
@@ -364,7 +362,7 @@ def gpu(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("failing", "taken"),
+    "failing, taken",
     [
         ([], "triton"),
         (["triton"], "gsplat"),

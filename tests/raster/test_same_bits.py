@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    ("width", "height", "count"),
+    "width, height, count",
     [
         pytest.param(32, 16, 12, id="tiny"),
         pytest.param(

@@ -118,7 +118,7 @@ def test_errors_of_the_checks_are_raised():
 
 
 @pytest.mark.parametrize(
-    ("of", "said"),
+    "of, said",
     [
         (camera(16385), "camera: width is 16385 px, more than 16384"),
         (camera(4, 16385), "camera: height is 16385 px, more than 16384"),

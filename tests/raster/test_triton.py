@@ -61,7 +61,7 @@ def test_a_part_passes_in_the_interpreter(part):
 
 
 @pytest.mark.parametrize(
-    ("versions", "works"),
+    "versions, works",
     [
         (("3.6.0", "2.4.0"), False),
         (("3.6.0", "2.10.1"), False),

@@ -64,9 +64,7 @@ def shorten_segments(monkeypatch):
         monkeypatch.setattr(module, "SEGMENT", tl.constexpr(8))
 
 
-def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(
-    monkeypatch,
-):
+def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch):
     """No kernel reads memory before it is written, and the order of programs does not matter.
 
     The second run starts with memory full of NaN and of places far outside, and shuffles the
@@ -357,7 +355,7 @@ def test_training_matches_that_of_the_reference(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("size", "weight"), [((3, 4), 0.2), ((11, 16), 0.0), ((11, 16), 1.0), ((37, 53), 0.2)], ids=str
+    "size, weight", [((3, 4), 0.2), ((11, 16), 0.0), ((11, 16), 1.0), ((37, 53), 0.2)], ids=str
 )
 def test_the_loss_matches_float64(size, weight):
     """The last size is wider than one strip and higher than one program."""
@@ -483,9 +481,7 @@ def test_memory_of_direct_steps_is_kept_for_few_sizes():
     assert set(steps.direct._plan) == set(steps.direct._memory)
 
 
-def test_direct_steps_pass_their_proof_and_a_fault_of_them_is_found(
-    monkeypatch,
-):
+def test_direct_steps_pass_their_proof_and_a_fault_of_them_is_found(monkeypatch):
     cpu = torch.device("cpu")
     assert direct_fault(TritonRasterizer(), cpu, TINY) == ""
     real = TritonAdam.launch

@@ -36,7 +36,7 @@ FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})
 
 
 @pytest.mark.parametrize(
-    ("word", "scene", "seed", "truth", "said"),
+    "word, scene, seed, truth, said",
     [
         ("table1:mine", "garden", 0, COURTYARD, "--scene garden: .* of the scene courtyard"),
         ("table1:mine", None, -1, COURTYARD, "--seed -1: must be 0 or more"),
@@ -159,8 +159,7 @@ def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("kind", "word", "times"),
-    [("colmap", "x=1", 2), ("photos", "x=1", 1), ("colmap", "init=sfm", 1)],
+    "kind, word, times", [("colmap", "x=1", 2), ("photos", "x=1", 1), ("colmap", "init=sfm", 1)]
 )
 def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
     kind, word, times, monkeypatch, tmp_path
@@ -237,7 +236,7 @@ def test_the_scene_of_the_photographs_may_be_repeated(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("data", "resolution", "refused"),
+    "data, resolution, refused",
     [
         ("data-garden", (400, 300), False),
         ("data-garden", (400, 301), True),
@@ -268,10 +267,7 @@ def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metr
     views = {"a": {"psnr": 20.0, "ssim": 0.5}, "bcdef": {"psnr": 21.0, "ssim": 0.25}}
     lines = _lines(FOLDER, evaluator, matching, views, Path("runs/x"))
     assert lines[0] == "2 views: the pictures in a folder; protocol paper-1"
-    assert lines[1:3] == [
-        "names matched by their order",
-        "left out, without a photograph: x, y",
-    ]
+    assert lines[1:3] == ["names matched by their order", "left out, without a photograph: x, y"]
     assert lines[3:7] == [
         "       PSNR (dB)  SSIM",
         "a         20.000  0.5000",

@@ -106,19 +106,13 @@ def test_only_renders_and_photographs_are_unpacked_and_only_for_a_while(form, me
 
 @pytest.mark.parametrize("pack", [as_tar, as_zip])
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         ({"color/../../evil.png": b"x"}, "leads out of the archive"),
         ({"other/color/a.png": b"x", "other/gt-color/a.png": b"x"}, "and has 2"),
     ],
 )
-def test_strange_archives_are_refused(
-    pack,
-    change,
-    message,
-    members,
-    tmp_path,
-):
+def test_strange_archives_are_refused(pack, change, message, members, tmp_path):
     archive = pack(members | change, tmp_path / "predictions")
     with pytest.raises(InputError, match=message), opened_renders(archive):
         pass
@@ -126,10 +120,7 @@ def test_strange_archives_are_refused(
 
 
 def test_files_that_are_no_archive_of_predictions_are_refused(
-    members,
-    tmp_path,
-    monkeypatch,
-    capsys,
+    members, tmp_path, monkeypatch, capsys
 ):
     (tmp_path / "text.zip").write_text("no archive")
     whole = as_tar(members, tmp_path / "whole").read_bytes()

@@ -77,7 +77,7 @@ def test_the_best_point_is_the_one_with_the_best_value(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("points", "fault"),
+    "points, fault",
     [
         ([*POINTS, {"settings": {"y": 1.0}, "value": 1.0}], "different settings"),
         ([{"settings": {"x": 0.0}, "value": 1.0}], "not above 0"),

@@ -314,9 +314,7 @@ def test_a_new_file_is_found_even_if_its_folder_keeps_its_time(home):
 # ---- what enters a key
 
 
-@pytest.mark.parametrize(
-    ("one", "other"), [("f()", "g()"), ("1", "2"), ("if a:\n 'x'", "if a:\n 'y'")]
-)
+@pytest.mark.parametrize("one, other", [("f()", "g()"), ("1", "2"), ("if a:\n 'x'", "if a:\n 'y'")])
 def test_only_docstrings_are_left_out(one, other):
     assert syntax_of(one.encode()) != syntax_of(other.encode())
 

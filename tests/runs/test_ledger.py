@@ -52,12 +52,7 @@ def started(idea, against="baseline"):
 def ended(idea, result):
     difference = Difference(mean=1.0, low=0.5, high=1.5)
     return Ended(
-        time=TIME,
-        idea=idea,
-        result=result,
-        reason="better",
-        seeds=3,
-        difference=difference,
+        time=TIME, idea=idea, result=result, reason="better", seeds=3, difference=difference
     )
 
 
@@ -67,9 +62,7 @@ ENTRIES = [
     started("b", "a"),
     ended("b", FAILED),
     Confirming(
-        time=TIME,
-        seeds=(0, 1),
-        keys={"baseline": {"park": "park/x/1"}, "a": {"park": "park/y/2"}},
+        time=TIME, seeds=(0, 1), keys={"baseline": {"park": "park/x/1"}, "a": {"park": "park/y/2"}}
     ),
     Confirmed(time=TIME, number=0, results={"a": KEPT}, differences={}),
 ]
@@ -115,7 +108,7 @@ CHANGES = ("edit", "drop", "swap", "repeat", "space")
 
 
 @pytest.mark.parametrize(
-    ("number", "change"),
+    "number, change",
     [(number, change) for number in range(LAST) for change in CHANGES]
     + [(LAST, change) for change in ("edit", "repeat", "space")],
 )

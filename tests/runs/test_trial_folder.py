@@ -253,7 +253,7 @@ def test_pictures_are_sorted_by_name(trial):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "reason"),
+    "place, value, reason",
     [
         (("hashes", "config"), "0", "of another configuration"),
         (("made_of", "config"), "0", "of another configuration"),

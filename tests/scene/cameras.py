@@ -6,13 +6,7 @@ from gsbench.scene.colmap import pinhole_camera
 from gsbench.scene.types import Camera
 
 
-def looking(
-    eye,
-    target,
-    up=(0.0, 0.0, 1.0),
-    size=(64, 48),
-    focal=60.0,
-):
+def looking(eye, target, up=(0.0, 0.0, 1.0), size=(64, 48), focal=60.0):
     """A camera at ``eye`` that looks at ``target``; x right, y down, z ahead."""
     ahead = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(ahead, up)

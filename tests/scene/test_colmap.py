@@ -37,7 +37,7 @@ def reprojection_errors(model):
 
 
 @pytest.mark.parametrize(
-    ("model", "params"),
+    "model, params",
     [
         ("SIMPLE_PINHOLE", [160, 80, 60]),
         ("PINHOLE", [160, 150, 79, 61]),
@@ -168,7 +168,7 @@ def sound_model():
 
 
 @pytest.mark.parametrize(
-    ("call", "argument", "value", "said"),
+    "call, argument, value, said",
     [
         (None, 0, None, ""),
         *(
@@ -242,7 +242,7 @@ def test_a_rig_without_sensors_is_accepted(rigs):
 
 
 @pytest.mark.parametrize(
-    ("stem", "start", "at", "said"),
+    "stem, start, at, said",
     [
         ("rigs", 33, 7, "a sensor of rig 1"),
         ("rigs", 98, 17, "a sensor of rig 1"),
@@ -292,7 +292,7 @@ def test_an_image_without_its_line_of_points_is_named(make_scene, names):
 
 
 @pytest.mark.parametrize(
-    ("stem", "line", "said"),
+    "stem, line, said",
     [
         ("cameras", "1 PINHOLE 40 30 50 50 20", "lacks parameters"),
         ("cameras", "1 OTHER 40 30 50 50 20 15", "unknown model"),

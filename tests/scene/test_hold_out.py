@@ -91,9 +91,7 @@ def test_validation_of_lists_takes_every_nth_of_the_training_list():
     assert "the 4 test views (by lists) put away unseen" in found.description
 
 
-def test_a_view_dropped_by_validation_is_not_in_the_capture(
-    make_scene,
-):
+def test_a_view_dropped_by_validation_is_not_in_the_capture(make_scene):
     root = make_scene(names=NAMES[:9])
     rules = [SplitRule(test_every=3, validation=judged) for judged in (False, True)]
     plain, judged = (read_colmap("toy", root, split=rule) for rule in rules)
@@ -106,9 +104,7 @@ def test_a_view_dropped_by_validation_is_not_in_the_capture(
     assert other.fingerprint != plain.fingerprint
 
 
-def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(
-    make_scene,
-):
+def test_sectors_of_a_folder_use_its_cameras_under_other_file_names(make_scene):
     root = make_scene(names=NAMES[:8])
     for name in NAMES[:8]:
         (root / "images" / name).rename(root / "images" / f"{name[:2]}.jpg")
@@ -133,7 +129,7 @@ def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene):
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    "settings, message",
     [
         (
             {"split": "matched"},
@@ -162,7 +158,7 @@ def test_too_many_sectors_and_photographs_without_cameras_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("name", "least", "most"),
+    "name, least, most",
     [
         ("max_images", 3, 10**6),
         ("test_every", 2, 999),
@@ -189,7 +185,7 @@ def test_a_setting_has_limits(name, least, most):
 
 
 @pytest.mark.parametrize(
-    ("kind", "changes"),
+    "kind, changes",
     [
         ("transforms", {"sparse": "sparse/0"}),
         ("photos", {"sparse": "sparse/0"}),

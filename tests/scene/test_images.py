@@ -57,7 +57,7 @@ def test_damaged_files_are_named(tmp_path, suffix):
 
 # the sizes of Mip-NeRF 360's own images_4 and images_2
 @pytest.mark.parametrize(
-    ("native", "factor", "expected"),
+    "native, factor, expected",
     [
         ((4946, 3286), 4, (1237, 822)),
         ((5187, 3361), 4, (1297, 840)),
@@ -83,7 +83,7 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
 
 
 @pytest.mark.parametrize(
-    ("size", "same"),
+    "size, same",
     [((40, 26), False), ((42, 30), True), ((43, 30), False), ((40, 31), True), ((40, 32), False)],
 )
 def test_sides_may_be_rounded_by_one_pixel(size, same):

@@ -75,7 +75,7 @@ READERS = [
 ]
 
 
-@pytest.mark.parametrize(("suffix", "read"), READERS)
+@pytest.mark.parametrize("suffix, read", READERS)
 def test_pipes_and_devices_are_refused(suffix, read, tmp_path, photos):
     for path in odd_files(tmp_path, suffix):
         with pytest.raises(InputError, match="is not a regular file"):

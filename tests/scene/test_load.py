@@ -13,13 +13,7 @@ from gsbench.errors import InputError
 from gsbench.logs import no_progress
 from gsbench.scene.colmap import plain_camera, read_model
 from gsbench.scene.distortion import folded_share, largest_distortion
-from gsbench.scene.load import (
-    INTRINSICS,
-    Downscaling,
-    ImageToPrepare,
-    load_scene,
-    prepare_all,
-)
+from gsbench.scene.load import INTRINSICS, Downscaling, ImageToPrepare, load_scene, prepare_all
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import CameraModel
@@ -124,7 +118,7 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
 
 
 @pytest.mark.parametrize(
-    ("name", "params", "share"),
+    "name, params, share",
     [
         ("SIMPLE_RADIAL", (90, 80, 60, -0.35), 0.68),
         ("SIMPLE_RADIAL", (150, 80, 60, -0.1), 0.0),

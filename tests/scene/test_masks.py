@@ -78,9 +78,7 @@ def test_a_mask_file_with_another_name_is_not_used(tmp_path):
         find_masks(tmp_path, tmp_path / "images", ["a.jpg", "b.jpg"])
 
 
-def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(
-    make_scene,
-):
+def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(make_scene):
     root = with_masks(make_scene()) / "images"
     (root.parent / "masks").rename(root / "masks")
     capture = read_photos("toy", root, masks="masks")
@@ -137,7 +135,7 @@ def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("pixels", "said"),
+    "pixels, said",
     [
         (np.zeros((5, 7), np.uint8), "black all over"),
         (noise(20, 30, 3), "in colours, and no mask"),
@@ -199,7 +197,7 @@ def test_filling_between_two_pixels_is_linear():
 
 
 @pytest.mark.parametrize(
-    ("mask", "alpha", "backdrop", "copied"),
+    "mask, alpha, backdrop, copied",
     [
         (None, 255, "black", True),
         (None, 9, "black", True),  # since reading blends it over black anyway
@@ -226,7 +224,7 @@ def test_a_photograph_without_changes_is_copied(tmp_path, mask, alpha, backdrop,
             np.testing.assert_allclose(picture, np.broadcast_to(expected, (6, 8, 3)), atol=1)
 
 
-@pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
+@pytest.mark.parametrize("width, height", [(25, 18), (10, 9), (20, 12), (17, 13)])
 def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width, height):
     """A pixel belongs to the area that its centre is in; on an edge, to either side."""
     counts = np.random.default_rng(1).random((36, 50)) > 0.05

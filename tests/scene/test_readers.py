@@ -61,7 +61,7 @@ def test_files_with_another_extension_are_used_and_missing_ones_left_out(make_sc
 
 
 @pytest.mark.parametrize(
-    ("wanted", "files", "matches"),
+    "wanted, files, matches",
     [
         (["b.JPG"], ["b.png"], {"b.JPG": "b.png"}),
         (["img_1.jpg"], ["IMG_1.JPG"], {"img_1.jpg": "IMG_1.JPG"}),
@@ -91,7 +91,7 @@ def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, m
 
 
 @pytest.mark.parametrize(
-    ("wanted", "files", "matches"),
+    "wanted, files, matches",
     [
         (["images/a.png"], ["a.png"], {"images/a.png": "a.png"}),
         (["/home/x/a.png"], ["a.JPG"], {"/home/x/a.png": "a.JPG"}),
@@ -130,7 +130,7 @@ def test_a_model_whose_names_have_another_folder_gives_the_same_capture(make_sce
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(
-    ("models", "chosen"),
+    "models, chosen",
     [
         ({"sparse/0": 2, "sparse/1": 6}, "sparse/1"),
         ({"sparse/0": 4, "sparse/1": 4}, "sparse/0"),
@@ -186,7 +186,7 @@ def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [
         (lambda text: text.encode("utf-16"), "UTF-16 or UTF-32: save it as UTF-8"),
         (lambda text: text.encode("utf-32"), "UTF-16 or UTF-32: save it as UTF-8"),
@@ -230,7 +230,7 @@ LISTS = {  # name of a file: what it lists
 
 
 @pytest.mark.parametrize(
-    ("train", "test", "trained_on", "tested_on"),
+    "train, test, trained_on, tested_on",
     [
         (None, "test", (0, 2, 4, 5), (1, 3)),
         ("train", "test", (0, 2), (1, 3)),

@@ -19,7 +19,7 @@ def photographs(folder, pattern="{}.jpg", scale=1, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("pattern", "scale", "named"),
+    "pattern, scale, named",
     [
         ("masks/{}.jpg.png", 1, "masks/ (5)"),
         ("Mask/{}.png", 1, "Mask/ (5)"),
@@ -51,7 +51,7 @@ def test_other_files_beside_photographs_change_no_capture(tmp_path, caplog, patt
 
 
 @pytest.mark.parametrize(
-    ("patterns", "kept"),
+    "patterns, kept",
     [
         ({"images_2/{}.jpg": 2, "images_4/{}.jpg": 4}, "images_2/{}.jpg"),
         ({"images_8/{}.png": 4, "images_4/{}.jpg": 2}, "images_4/{}.jpg"),

@@ -164,7 +164,7 @@ def in_blenders_files(folder):
 
 
 @pytest.mark.parametrize(
-    ("said", "model", "params"),
+    "said, model, params",
     [
         ({}, "PINHOLE", [50, 51, 19.5, 15.5]),
         (
@@ -305,7 +305,7 @@ WRONG_FRAMES = [
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [
         (lambda d: d.pop("frames"), "lacks 'frames'"),
         *((lambda d, keys=keys: d.update(keys), said) for keys, said in WRONG_KEYS),
@@ -407,7 +407,7 @@ def focal(side, degrees):
 
 
 @pytest.mark.parametrize(
-    ("said", "focal_x", "focal_y"),
+    "said, focal_x, focal_y",
     [
         ({"x_fov": 70.0}, focal(40, 70), focal(40, 70)),
         ({"y_fov": 50.0}, focal(30, 50), focal(30, 50)),
@@ -478,7 +478,7 @@ def test_unknown_keys_are_named_in_one_line(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("lists", "train", "test"),
+    "lists, train, test",
     [
         ({"train": [0, 1, 2], "val": [3], "test": [4, 5]}, (0, 1, 2), (4, 5)),
         ({"train": [0, 1, 2], "val": [3]}, (0, 1, 2), (3,)),

@@ -21,7 +21,7 @@ from tests.train.conftest import orbit_camera
 
 
 @pytest.mark.parametrize(
-    ("names", "wanted", "left_out"),
+    "names, wanted, left_out",
     [
         (["a.jpg", "a.png", "b.jpg"], (), {"a.png": "a.jpg"}),
         # the format that more photographs have
@@ -53,9 +53,7 @@ def test_a_folder_with_every_photograph_in_two_formats_is_read_once(tmp_path, ca
     assert (capture.fingerprint, alone.left_out) == (alone.fingerprint, {})
 
 
-def test_a_training_file_with_the_content_of_a_test_view_is_left_out(
-    make_scene,
-):
+def test_a_training_file_with_the_content_of_a_test_view_is_left_out(make_scene):
     root = make_scene()
     shutil.copy(root / "images/00.png", root / "images/03.png")  # 00.png is the test view
     # copies within training are the user's choice
@@ -97,7 +95,7 @@ def scene_of(test, other, mask=None):
 
 
 @pytest.mark.parametrize(
-    ("change", "left_out", "is_near"),
+    "change, left_out, is_near",
     [
         (lambda image: image.copy(), True, False),
         (encoded_again, False, True),
@@ -107,12 +105,7 @@ def scene_of(test, other, mask=None):
         (lambda image: picture(77), False, False),
     ],
 )
-def test_equal_pixels_are_left_out_and_near_twins_are_reported(
-    caplog,
-    change,
-    left_out,
-    is_near,
-):
+def test_equal_pixels_are_left_out_and_near_twins_are_reported(caplog, change, left_out, is_near):
     scene = without_copies(scene_of(picture(0), change(picture(0))))
     assert len(scene.train) == (3 if left_out else 4)
     assert scene.twins.left_out == ({"twin.png": "0.png"} if left_out else {})
@@ -155,7 +148,7 @@ def test_flat_pictures_are_twins_only_if_they_are_equal(caplog):
 
 @pytest.mark.shared
 @pytest.mark.parametrize(
-    ("capture", "most"), [("fox", 0.2), ("garfield", 0.0), ("monstree", 0.0), ("studio_room", 0.2)]
+    "capture, most", [("fox", 0.2), ("garfield", 0.0), ("monstree", 0.0), ("studio_room", 0.2)]
 )
 def test_few_neighbours_of_real_captures_are_near_twins(shared, capture, most):
     """Neighbouring views of a walk around an object differ enough to be trained on."""

@@ -13,7 +13,7 @@ SOUND = {
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "name, value",
     [
         *(("width", 0), ("height", 0), ("cx", np.inf), ("cy", np.nan)),
         *((focal, value) for focal in ("fx", "fy") for value in (0.0, -1.0, np.inf, np.nan)),

@@ -20,7 +20,7 @@ def rounding():
 
 
 @pytest.mark.parametrize(
-    ("name", "gpus", "answer"),
+    "name, gpus, answer",
     [
         ("auto", 0, "cpu"),
         ("auto", 2, "cuda"),
@@ -41,9 +41,7 @@ def test_a_device_is_chosen_or_refused(rounding, name, gpus, answer, monkeypatch
         assert select_device(name) == torch.device(answer)
 
 
-def test_memory_that_torch_has_reserved_and_does_not_use_is_free(
-    monkeypatch,
-):
+def test_memory_that_torch_has_reserved_and_does_not_use_is_free(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1000, 9999))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 50)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 20)

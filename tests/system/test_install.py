@@ -36,7 +36,7 @@ def test_elsewhere_the_hint_names_the_distribution(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("record", "found"),
+    "record, found",
     [
         ('{"dir_info": {}, "url": "file://FOLDER"}', True),
         ('{"dir_info": {}, "url": "file://FOLDER/gone"}', False),

@@ -150,7 +150,7 @@ def test_child_ends_with_its_parent(functions, tmp_path, sign):
 
 
 @pytest.mark.parametrize(
-    ("output", "said"),
+    "output, said",
     [
         (b"", "(no output)"),
         (b"\n  \n", "(no output)"),
@@ -173,7 +173,7 @@ def test_only_the_end_of_a_long_output_is_read(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("code", "said"),
+    "code, said",
     [
         (-9, "crashed (SIGKILL, perhaps out of memory)"),
         (-11, "crashed (SIGSEGV)"),

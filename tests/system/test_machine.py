@@ -40,7 +40,7 @@ def test_record_is_plain_text_and_full():
 
 
 @pytest.mark.parametrize(
-    ("content", "name"),
+    "content, name",
     [
         (XEON, "Intel(R) Xeon(R)"),
         (ARM_64, "ARM implementer 0x41 part 0xd40"),
@@ -87,7 +87,7 @@ def test_the_target_of_kernels_follows_numba_cpu_name():
 
 
 @pytest.mark.parametrize(
-    ("variable", "least"),
+    "variable, least",
     [
         *((f"NUMBA_NUM_THREADS={value}", 1) for value in ("0", "-1", "", "²", "1.5")),
         *((f"NUMBA_DISABLE_JIT={value}", 0) for value in ("x", "-1")),

@@ -77,7 +77,7 @@ def test_nobody_imports_a_starter_by_its_own_name():
 
 
 @pytest.mark.parametrize(
-    ("name", "start"),
+    "name, start",
     [
         ("git", lambda folder: install._git(folder, "rev-parse", "HEAD")),
         ("nvidia-smi", lambda folder: resources.nvidia_smi("index")),

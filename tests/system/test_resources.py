@@ -102,7 +102,7 @@ def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cores", "gigabytes", "most", "gpus", "expected"),
+    "cores, gigabytes, most, gpus, expected",
     [
         (2, 16, None, 0, 2),
         (1, 16, None, 0, 1),
@@ -118,12 +118,7 @@ def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch):
     ],
 )
 def test_trials_at_once_suit_cores_memory_and_gpus(
-    cores,
-    gigabytes,
-    most,
-    gpus,
-    expected,
-    monkeypatch,
+    cores, gigabytes, most, gpus, expected, monkeypatch
 ):
     monkeypatch.setattr("gsbench.system.resources.available_cores", lambda: cores)
     monkeypatch.setattr("gsbench.system.resources.installed_gpus", lambda: ["0"] * gpus)

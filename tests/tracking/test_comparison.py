@@ -17,13 +17,7 @@ from PIL import Image
 from gsbench.analysis.results import read_experiment
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, publish
-from gsbench.tracking.comparison import (
-    MAX_TAG,
-    OWN_NOTE,
-    _set,
-    addresses,
-    description,
-)
+from gsbench.tracking.comparison import MAX_TAG, OWN_NOTE, _set, addresses, description
 from gsbench.tracking.mirror import sync
 from gsbench.verbs import servers
 from tests.tracking.helpers import (

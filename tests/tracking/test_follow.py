@@ -81,7 +81,7 @@ def test_one_process_gets_the_folders_of_all_trials(processes, tmp_path, caplog)
 
 
 @pytest.mark.parametrize(
-    ("error", "seconds"), [(None, 7.0), (ValueError(), 7.0), (KeyboardInterrupt(), 3.0)]
+    "error, seconds", [(None, 7.0), (ValueError(), 7.0), (KeyboardInterrupt(), 3.0)]
 )
 def test_a_stopped_sweep_waits_less_for_a_slow_tracker(
     processes, tmp_path, caplog, monkeypatch, error, seconds
@@ -110,7 +110,7 @@ REST = "; the files are complete, `gsbench sync` mirrors them later"
 
 
 @pytest.mark.parametrize(
-    ("code", "errors", "said"),
+    "code, errors, said",
     [
         (3, b"Traceback\n  File\nMLflow does not take x\n", "MLflow does not take x"),
         (

@@ -46,8 +46,7 @@ def experiment(stage="active", **tags):
 
 
 @pytest.mark.parametrize(
-    ("uri", "served"),
-    [("sqlite:///x.db", False), ("http://there", True), ("https://there", True)],
+    "uri, served", [("sqlite:///x.db", False), ("http://there", True), ("https://there", True)]
 )
 def test_a_new_experiment_keeps_its_artifacts_in_the_runs_folder_unless_served(
     tmp_path, uri, served
@@ -145,7 +144,7 @@ def test_a_run_that_failed_before_and_is_complete_now_has_no_error(sink):
 
 
 @pytest.mark.parametrize(
-    ("refusals", "lengths"), [(0, [600]), (1, [600, 500]), (2, [600, 500, 250]), (3, None)]
+    "refusals, lengths", [(0, [600]), (1, [600, 500]), (2, [600, 500, 250]), (3, None)]
 )
 def test_long_settings_are_shortened_for_servers_that_refuse_them(sink, refusals, lengths):
     full = MlflowException("too long")

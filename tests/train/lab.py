@@ -85,13 +85,7 @@ class Lab:
         parts = (self.scene, cloud(self.truth), densifier, self.rasterizer)
         return Trainer(*parts, options(**changes), seed, snapshot_at)
 
-    def train(
-        self,
-        densifier,
-        name="",
-        on_status=lambda status: None,
-        **changes,
-    ):
+    def train(self, densifier, name="", on_status=lambda status: None, **changes):
         (self.folder / name).mkdir(exist_ok=True)
         return self.new(densifier, **changes).run(self.folder / name, on_status)
 

@@ -23,17 +23,7 @@ from gsbench.train.resolution import (
 from gsbench.train.views import Targets
 from tests.config.test_schema import composed
 from tests.train.conftest import orbit_camera
-from tests.train.lab import (
-    CPU,
-    EVENTS,
-    METRICS,
-    STATEFUL,
-    StopError,
-    options,
-    same,
-    small,
-    stop_at,
-)
+from tests.train.lab import CPU, EVENTS, METRICS, STATEFUL, StopError, options, same, small, stop_at
 
 SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
 BOTH = "pictures_and_count"
@@ -94,9 +84,7 @@ def stated_again(pictures, until):
     return [*answers, 1]
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)]
-)
+@pytest.mark.parametrize("height, width, until", [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)])
 def test_the_schedule_of_sizes_matches_a_restatement(height, width, until):
     pictures = soft_pictures(3, height, width, height)
     found = scale_schedule(pictures, until)
@@ -128,7 +116,7 @@ def weights(size, smaller):
     return triangle / triangle.sum(1, keepdims=True)
 
 
-@pytest.mark.parametrize(("scale", "height", "width"), [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
+@pytest.mark.parametrize("scale, height, width", [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
 def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, width):
     camera = orbit_camera(0.3)
     (image,) = soft_pictures(1, camera.height, camera.width, 5)
@@ -146,7 +134,7 @@ def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, wi
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 
 
-@pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
+@pytest.mark.parametrize("height, width", [(7, 5), (8, 5), (6, 4)])
 def test_the_energy_of_a_window_is_the_sum_over_its_frequencies(height, width):
     """A window has the same number of pixels on both sides of frequency zero.
 
@@ -296,7 +284,7 @@ def test_an_unknown_schedule_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("scales", "full"),
+    "scales, full",
     [
         ((8.0, 4.0, 2.0, 1.0), 200),
         ((8.0, 2.5, 1.9, 1.0), 100),

@@ -70,7 +70,7 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(scene, cloud, c
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [  # the views are 40x32 px; 20 px / tan(75 deg) = 5.36 px
         ({"fx": 5.3, "fy": 5.3}, "a focal length of 5.3 px for a width of 40 px"),
         ({"fx": 5.4, "fy": 5.4}, ""),
@@ -87,13 +87,7 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(scene, cloud, c
         ({"cx": 4.1, "cy": 3.3}, ""),
     ],
 )
-def test_intrinsics_that_no_lens_has_cause_one_warning(
-    scene,
-    cloud,
-    change,
-    said,
-    caplog,
-):
+def test_intrinsics_that_no_lens_has_cause_one_warning(scene, cloud, change, said, caplog):
     train = tuple(replace(view, camera=replace(view.camera, **change)) for view in scene.train)
     changed = replace(scene, train=train)
     lines = odd_lenses(changed)
@@ -143,7 +137,7 @@ def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene):
 
 
 @pytest.mark.parametrize(
-    ("change", "doubt"),
+    "change, doubt",
     [
         (lambda points: points - [1.4, 0.3, 0], "hardly agree"),
         (lambda points: (points - [0, 0, 4]) * [-1, -1, 1] + [0, 0, 4], "hardly agree"),
@@ -161,11 +155,7 @@ def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene):
     ],
 )
 def test_a_wrong_cloud_causes_a_warning_and_a_random_one_none_about_colours_or_views(
-    scene,
-    cloud,
-    caplog,
-    change,
-    doubt,
+    scene, cloud, caplog, change, doubt
 ):
     points, colors = cloud
     facts = check_start(change(points), colors, scene)
@@ -188,7 +178,7 @@ def test_colour_agreement_is_relative_to_all_pairs_of_points(scene, cloud):
 
 
 @pytest.mark.parametrize(
-    ("points", "error"),
+    "points, error",
     [
         (np.array([[0, 0, 4.0]] * 9), r"all at one place, \(0, 0, 4\)"),
         (

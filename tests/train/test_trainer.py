@@ -219,9 +219,7 @@ def test_visible_adam_updates_only_visible_gaussians(visible_adam, lab):
     assert (visible is not None) is visible_adam
 
 
-@pytest.mark.parametrize(
-    ("background", "white"), [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)]
-)
+@pytest.mark.parametrize("background, white", [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)])
 def test_the_context_of_a_densifier_knows_a_white_background(background, white, lab):
     context = lab.new(NoDensifier(), background=background).context
     assert context.white_background is white
@@ -229,7 +227,7 @@ def test_the_context_of_a_densifier_knows_a_white_background(background, white, 
     assert context.limit is None
 
 
-@pytest.mark.parametrize(("spare", "resident"), [(0, True), (-2, False)])
+@pytest.mark.parametrize("spare, resident", [(0, True), (-2, False)])
 def test_images_may_use_half_of_the_free_memory(spare, resident, lab, monkeypatch):
     size = sum(view.image.size for view in lab.scene.train)
     monkeypatch.setattr(trainer, "free_bytes", lambda _: 2 * size + spare)

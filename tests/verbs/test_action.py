@@ -51,7 +51,7 @@ def ended(tmp_path, code, **inputs):
 ENDS = [(0, "fail", 0), (1, "pass", 1), (2, "pass", 2), (3, "fail", 3), (3, "pass", 0)]
 
 
-@pytest.mark.parametrize(("code", "undecided", "expected"), ENDS)
+@pytest.mark.parametrize("code, undecided, expected", ENDS)
 def test_the_step_has_the_exit_code_of_the_gate(tmp_path, code, undecided, expected):
     found, words = ended(tmp_path, code, UNDECIDED=undecided)
     assert found == expected

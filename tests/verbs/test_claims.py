@@ -46,7 +46,7 @@ def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, ca
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["exp", "--metric", "psn"], "unknown metric"),
         (["exp", "--metric", "gaussians"], "not counts"),
@@ -114,11 +114,8 @@ def test_failed_trials_of_ablate_are_not_judged(runs, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (["densify=adc", "densify=taming/mine"], "ablate_taming_mine"),
-        (["seed=1"], "ablate"),
-    ],
+    "words, name",
+    [(["densify=adc", "densify=taming/mine"], "ablate_taming_mine"), (["seed=1"], "ablate")],
 )
 def test_the_experiment_is_named_after_the_chosen_densifier(words, name):
     assert claims._default_name(words) == name

@@ -66,7 +66,7 @@ def test_the_archive_of_results_gets_the_name_of_the_experiment_or_of_out(runs, 
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--results", "exp", "a:b:c"], "takes an experiment, --out and --pictures alone"),
         (["--results", "a/b"], "'a/b' is not the name of an experiment"),
@@ -82,7 +82,7 @@ def test_words_that_do_not_go_together_are_refused(refused, words, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "good"),
+    "name, good",
     [("m.ply", True), ("M.PLY", True), ("m.compressed.ply", False), ("m.splat", False)],
 )
 def test_only_the_3dgs_form_is_written(name, good):
@@ -100,7 +100,7 @@ def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, ref
 
 
 @pytest.mark.parametrize(
-    ("words", "file"),
+    "words, file",
     [
         (["export", "--results", "exp"], "exp.zip"),
         (["export", "--results", "exp", "--out", "."], "exp.zip"),

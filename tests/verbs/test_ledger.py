@@ -160,7 +160,7 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    "words, reason",
     [
         (["scene.views=12"], "scene.views: an idea may change densify, init, train and raster"),
         (["seed=7"], "seed: an idea may change"),
@@ -183,7 +183,7 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, re
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    "words, reason",
     [
         (["seed=0"], "needs at least 2 seeds"),
         (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
@@ -299,7 +299,7 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, traini
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    "words, reason",
     [
         (["seed=5,6"], "needs captures that no idea has seen"),
         (["scene=courtyard", "seed=5,6"], "courtyard was seen by the ideas"),
@@ -399,7 +399,7 @@ def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused
     assert "used has trials already" in refused("ledger", "new", "used", *NEW[2:])
 
 
-@pytest.mark.parametrize(("code", "kind"), [(1, 1), (2, 2)])
+@pytest.mark.parametrize("code, kind", [(1, 1), (2, 2)])
 def test_nothing_is_confirmed_if_trials_fail(home, monkeypatch, code, kind, capsys):
     attempt(f"{SPLIT}=0.02")
     monkeypatch.setattr(verb, "run_trials", lambda trials: code)

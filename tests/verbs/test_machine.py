@@ -173,7 +173,7 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--json"], "belong to --prove"),
         (["--raster", "cpu"], "belong to --prove"),
@@ -186,7 +186,7 @@ def test_options_of_a_proof_need_prove(tmp_path, words, message):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--size", "15x20"], "a size is WIDTHxHEIGHT"),
         (["--size", "500"], "a size is WIDTHxHEIGHT"),

@@ -44,7 +44,7 @@ def test_missing_trials_and_metrics_are_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("address", "words"),
+    "address, words",
     [
         ("exp:garden:psnr", "is not EXPERIMENT:SCENE:METRIC:ARM"),
         ("nope:garden:psnr:adc", "no experiment 'nope'"),
@@ -82,7 +82,7 @@ def test_tables_alone_lists_the_experiments(made, capsys):
     assert "no experiment in" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("values", "seeds"), [("0,2", 2), ("1", 1), ("2,7", 1), ("0,1,2", 3)])
+@pytest.mark.parametrize("values, seeds", [("0,2", 2), ("1", 1), ("2,7", 1), ("0,1,2", 3)])
 def test_where_takes_several_values(made, capsys, values, seeds):
     assert tables(["exp", "--where", f"seed={values}", "--format", "trials"], made) == 0
     assert len(capsys.readouterr().out.splitlines()) == 1 + 2 * seeds
@@ -94,7 +94,7 @@ FAIR = ["--layout", "fairness"]
 
 
 @pytest.mark.parametrize(
-    ("words", "files", "begins"),
+    "words, files, begins",
     [
         (["--out", "new/t.csv"], ["new/t.csv"], "scene,"),
         (["--out", "T.TeX"], ["T.TeX"], "% "),
@@ -156,7 +156,7 @@ def test_trials_that_are_left_out_are_named_on_the_error_stream(made, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "file"),
+    "words, file",
     [
         ([], "{runs}/exp/report.html"),
         (["--out", "r.HTML"], "r.HTML"),

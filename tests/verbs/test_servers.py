@@ -141,7 +141,7 @@ def test_no_second_server_is_started(runs, served, said, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--uri", "file"], "--uri file is not an address"),
         (["none"], "no experiment 'none'"),
@@ -199,7 +199,7 @@ def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, c
 
 
 @pytest.mark.parametrize(
-    ("platform", "variables", "found"),
+    "platform, variables, found",
     [
         ("linux", {}, False),
         ("linux", {"DISPLAY": ":0"}, True),

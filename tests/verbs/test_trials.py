@@ -87,8 +87,7 @@ def test_finished_trials_are_listed_with_all_or_with_a_note():
 
 
 @pytest.mark.parametrize(
-    ("state", "words"),
-    [("running", "for 2 min"), ("queued", "for 2 min"), ("failed", "2 min ago")],
+    "state, words", [("running", "for 2 min"), ("queued", "for 2 min"), ("failed", "2 min ago")]
 )
 def test_a_lasting_state_has_a_duration_and_a_final_one_an_age(state, words):
     assert trials._age(TrialState(Path("x"), state, time.time() - 120, "")) == words

@@ -31,14 +31,7 @@ class Trainings:
         self.done = []
         self.environments = []
 
-    def __call__(
-        self,
-        command,
-        log,
-        folder,
-        environment,
-        _,
-    ):
+    def __call__(self, command, log, folder, environment, _):
         commit = folder.parent.name[0]
         if commit == self.fails:
             raise TrainingError("it broke")

@@ -76,7 +76,7 @@ def test_the_page_is_in_the_models_own_coordinates(small_runs):
 
 
 @pytest.mark.parametrize(
-    ("fails", "cause"),
+    "fails, cause",
     [
         ("echo first; echo 'no device' >&2; exit 1", "failed (no device)"),
         ("echo first; echo last; exit 1", "failed (last)"),
@@ -86,12 +86,7 @@ def test_the_page_is_in_the_models_own_coordinates(small_runs):
     ],
 )
 def test_without_npx_the_error_names_the_command_to_type(
-    fails,
-    cause,
-    small_runs,
-    tmp_path,
-    monkeypatch,
-    capsys,
+    fails, cause, small_runs, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     place = f"{stand_in(tmp_path / 'bin', 'never', fails)}:/bin" if fails else str(tmp_path)
@@ -147,11 +142,7 @@ def test_npx_starts_where_no_package_of_the_current_folder_is_found(
 
 @pytest.mark.parametrize("name", ["node_modules", ".npmrc", "package.json"])
 def test_a_temporary_folder_below_packages_is_refused(
-    name,
-    small_runs,
-    tmp_path,
-    monkeypatch,
-    capsys,
+    name, small_runs, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1")

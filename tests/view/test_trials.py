@@ -138,9 +138,7 @@ def test_page_stands_upright_where_the_photograph_was_taken(roll):
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (1, 0, 0)])
-def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(
-    up,
-):
+def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(up):
     """The camera looks straight up, or the direction is to its right."""
     np.testing.assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
 
@@ -156,7 +154,7 @@ def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "name, value",
     [
         ("wxyz", (1e-7, 0, 0, 0)),
         ("wxyz", (math.nan, 0, 0, 1)),

@@ -35,7 +35,7 @@ UNWELCOME = [
 ]
 
 
-@pytest.mark.parametrize(("hosts", "origins"), WELCOME + UNWELCOME)
+@pytest.mark.parametrize("hosts, origins", WELCOME + UNWELCOME)
 def test_only_the_own_page_and_programs_are_accepted(hosts, origins):
     assert is_own_page(hosts, origins) == ((hosts, origins) in WELCOME)
 

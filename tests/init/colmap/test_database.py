@@ -53,7 +53,7 @@ def database(images, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("sharing", "expected"),
+    "sharing, expected",
     [
         ("exif", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
         ("single", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
@@ -93,7 +93,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
 @pytest.mark.parametrize(
-    ("change", "cameras"),
+    "change, cameras",
     [
         ({}, 1),
         ({"mm": 6.8004}, 1),  # as written by another program
@@ -207,7 +207,7 @@ def test_assumed_focal_lengths_count_as_known(database):
             assert opened.num_verified_image_pairs() == 0
 
 
-@pytest.mark.parametrize(("count", "each"), [(30, 50), (120, 50), (2100, 105)])
+@pytest.mark.parametrize("count, each", [(30, 50), (120, 50), (2100, 105)])
 def test_verification_reports_progress_in_parts(database, monkeypatch, count, each):
     """A part has 50 pairs, or a twentieth of all; each pair is listed once, by image ids."""
     pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
@@ -223,7 +223,7 @@ def test_verification_reports_progress_in_parts(database, monkeypatch, count, ea
     assert not list(database.parent.glob("*.txt"))
 
 
-@pytest.mark.parametrize(("threads", "each"), [(1, 8), (4, 8), (9, 18)])
+@pytest.mark.parametrize("threads, each", [(1, 8), (4, 8), (9, 18)])
 def test_features_are_extracted_from_eight_images_at_a_time_or_two_per_thread(
     images, monkeypatch, threads, each
 ):
@@ -287,7 +287,7 @@ def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
 
 
 @pytest.mark.parametrize(
-    ("count", "processes", "size"), [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
+    "count, processes, size", [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
 )
 def test_parts_are_small_enough_for_six_per_process(count, processes, size):
     """sqrt(12 processes) blocks, rounded up, with ``size`` images each, at least 2 and at most 16."""

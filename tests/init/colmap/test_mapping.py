@@ -73,9 +73,7 @@ def mapped(database, mapper):
 
 
 @pytest.mark.slow
-def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(
-    tmp_path,
-):
+def test_a_small_baseline_without_a_focal_length_is_placed_by_another_strategy(tmp_path):
     database, truth = small_baseline(tmp_path)
     with pytest.raises(InputError, match="found no pair of images to start from"):
         mapped(database, "incremental")
@@ -130,7 +128,7 @@ class Model:
 
 
 @pytest.mark.parametrize(
-    ("found", "best", "tried"),
+    "found, best, tried",
     [
         ([[(9, 1)], [(10, 1)]], (9, 1), 1),  # enough of ten images
         ([[(8, 1)], [(10, 1)]], (10, 1), 2),
@@ -141,11 +139,7 @@ class Model:
     ],
 )
 def test_strategies_are_tried_until_one_places_nine_of_ten_images(
-    tmp_path,
-    monkeypatch,
-    found,
-    best,
-    tried,
+    tmp_path, monkeypatch, found, best, tried
 ):
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 30.0, 40, 30)
     create_database(tmp_path / "database.db", [(camera, [f"{k}.png" for k in range(10)])])
@@ -217,7 +211,7 @@ def test_mapping_reports_progress_from_no_image_to_all(tmp_path, monkeypatch):
     assert told == [("map", 0, 3), ("map", 3, 3)]
 
 
-@pytest.mark.parametrize(("share", "plausible"), [(0.9, False), (1.1, True)])
+@pytest.mark.parametrize("share, plausible", [(0.9, False), (1.1, True)])
 def test_a_model_needs_an_angle_at_half_of_its_points(share, plausible):
     """Two cameras see points at distance one under an angle; a third is at the first one's place."""
     half = np.tan(np.radians(share * mapping.MIN_ANGLE_DEG) / 2)

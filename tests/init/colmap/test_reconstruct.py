@@ -113,9 +113,7 @@ def test_the_poses_of_two_models_are_paired_by_name():
     assert [part.shape for part in nothing] == [(0, 3), (0, 3, 3)] * 2
 
 
-def test_points_of_training_views_keep_place_and_observations_and_get_those_views_colours(
-    tmp_path,
-):
+def test_points_of_training_views_keep_place_and_observations_and_get_those_views_colours(tmp_path):
     model = model_with(poses(), 3, camera())
     for shade, name in zip((10, 20, 60, 200), NAMES, strict=True):
         Image.new("RGB", (WIDTH, HEIGHT), (shade, 0, 255 - shade)).save(tmp_path / name)

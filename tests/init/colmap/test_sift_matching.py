@@ -127,10 +127,7 @@ def test_colmaps_matcher_never_gets_a_second_thread(features, tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_auto_matches_only_the_pairs_that_a_preview_proposes(
-    features,
-    bare_photos,
-    tmp_path,
-    monkeypatch,
+    features, bare_photos, tmp_path, monkeypatch
 ):
     """Few images get all pairs and the same bits; with more (here five), each gets best partners."""
     exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")

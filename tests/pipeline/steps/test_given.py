@@ -172,7 +172,7 @@ def test_a_program_works_in_the_given_coordinates_and_its_model_is_normalized(vi
     torch.testing.assert_close(kept.log_scales, wanted.log_scales, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize(("minutes", "limit"), [(2.5, 150.0), (None, None)])
+@pytest.mark.parametrize("minutes, limit", [(2.5, 150.0), (None, None)])
 def test_a_program_runs_with_the_given_time_limit(views, tmp_path, monkeypatch, minutes, limit):
     given = []
     ended = SimpleNamespace(seconds=1.0, peak_memory_mb=1.0)
