@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 import tests.raster.conftest  # noqa: F401 - makes the interpreter faster
+from benchmarks.counters import counting_waits
 from gsbench.bench.measure import NEVER, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
@@ -19,7 +20,6 @@ from gsbench.raster import create_rasterizer, staged
 from gsbench.raster.staged import Readback
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.trainer import Trainer
-from tests.benchmarks.counters import counting_waits
 
 DENSIFIERS = {
     "adc": ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER),

@@ -1,6 +1,6 @@
 """A simulation of a training step of ``raster=cpu`` on more threads than this machine has.
 
-    python -m tests.benchmarks.threads [TRIAL WIDTH] ...
+    python -m benchmarks.threads [TRIAL WIDTH] ...
 
 A trial is a folder with a trained model; one of its training views is drawn, ``WIDTH`` px wide.
 Without a trial, the scene of `gsbench bench` is drawn. Every shard is timed on one thread, by
@@ -10,9 +10,12 @@ serial. Effects of threads on each other (memory, caches, scheduling) are left o
 upper bounds.
 """
 
+from __future__ import annotations
+
 import heapq
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from unittest import mock
 
@@ -22,6 +25,7 @@ import torch
 from gsbench.bench.measure import NEVER, SH_DEGREE, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC
+from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.trial import TrialSteps
@@ -39,7 +43,7 @@ TILE_SHARDS = (8, 16, 32)
 STEPS = 9
 
 
-def trained(folder, width):
+def trained(folder: Path, width: int) -> tuple[Gaussians, Scene]:
     """A trial's model, and its first training view, ``width`` px wide, with noise as photograph."""
     values = TrialFolder(folder).configuration()
     steps = TrialSteps(Parts(values), Store(Path(values["runs"]) / STORE))
@@ -58,7 +62,7 @@ class Timed:
     ``stages`` are the stages of the last step in order: the name, and the ms of each shard.
     """
 
-    def __init__(self, gaussians, scene):
+    def __init__(self, gaussians: Gaussians, scene: Scene) -> None:
         densifier = ADC(
             start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None
         )
@@ -66,13 +70,13 @@ class Timed:
             scene, gaussians, densifier, CpuRasterizer(threads=1), constant_scene_options(), 0
         )
         self.trainer.step = SH_DEGREE
-        self.stages = []
+        self.stages: list[tuple[str, list[float]]] = []
 
-    def step(self):
+    def step(self) -> tuple[list[tuple[str, list[float]]], float, float]:
         """The stages of a step, ms of torch's Adam, and ms of all else."""
         self.stages = []
 
-        def timed(runner, shards, work):
+        def timed(runner: ShardRunner, shards: int, work: Callable[[int, int], None]) -> None:
             times = []
             for shard in range(shards):
                 begin = time.process_time()
@@ -92,7 +96,7 @@ class Timed:
         return self.stages, adam, 1e3 * (end - begin) - in_shards - adam
 
 
-def makespan(times, threads):
+def makespan(times: Sequence[float], threads: int) -> float:
     """The time until the last shard ends, if each goes to the first thread that is free."""
     free = [0.0] * threads
     for ms in times:
@@ -100,7 +104,7 @@ def makespan(times, threads):
     return max(free)
 
 
-def simulate(title, gaussians, scene):
+def simulate(title: str, gaussians: Gaussians, scene: Scene) -> None:
     """Print the simulated times of a step, by number of threads and of shards of tiles."""
     for shards in TILE_SHARDS:
         with mock.patch.object(executor, "TILE_SHARDS", shards):

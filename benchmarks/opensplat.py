@@ -1,12 +1,14 @@
 """Time a training iteration in OpenSplat and in ``raster=cpu``, in turns, with the same inputs.
 
-    python -m tests.benchmarks.opensplat [WIDTHxHEIGHT COUNT]
+    python -m benchmarks.opensplat [WIDTHxHEIGHT COUNT]
 
 The model is the trained-like scene of `gsbench bench`, seen by two cameras side by side;
 photographs are noise. Nothing grows, and both optimisers step in every iteration. Both programs are
 kept on one core, so that OpenSplat starts one thread. Times are processor times of whole
 iterations. OpenSplat's time is that between two lines of its log, after its warm-up.
 """
+
+from __future__ import annotations
 
 import os
 import statistics
@@ -32,6 +34,7 @@ from gsbench.bench.measure import (
 from gsbench.bench.scenes import frontal_camera, trained_like_gaussians
 from gsbench.densify import ADC
 from gsbench.external.exchange import write_training_views
+from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.init.base import PointCloud
 from gsbench.scene.types import Scene, View
@@ -50,7 +53,7 @@ FIRST_LINE, COMMENT = (
 )
 
 
-def two_views(width, height):
+def two_views(width: int, height: int) -> tuple[View, ...]:
     """Two views of noise, whose cameras are on either side of the origin."""
     middle, noise = frontal_camera(width, height), np.random.default_rng(0)
     found = []
@@ -60,7 +63,7 @@ def two_views(width, height):
     return tuple(found)
 
 
-def write_inputs(folder, gaussians, views):
+def write_inputs(folder: Path, gaussians: Gaussians, views: tuple[View, ...]) -> Path:
     """Write OpenSplat's inputs to ``folder``; returns the model from which it continues."""
     points = gaussians.means.double().numpy()
     write_training_views(
@@ -73,7 +76,7 @@ def write_inputs(folder, gaussians, views):
     return model
 
 
-def milliseconds_of_opensplat(folder, model):
+def milliseconds_of_opensplat(folder: Path, model: Path) -> float:
     """Processor time of an iteration of OpenSplat, which continues from ``model``."""
     first, last = LONG_AGO + WARM_UP_STEPS, LONG_AGO + WARM_UP_STEPS + ITERATIONS
     never = [word for name in ("--densify-from", "--densify-until") for word in (name, str(NEVER))]
@@ -87,7 +90,7 @@ def milliseconds_of_opensplat(folder, model):
         str(folder / "out.ply"),
     ]
     words += ["--num-iters", str(last + 1), *never]
-    marks = {}
+    marks: dict[int, float] = {}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -100,7 +103,7 @@ def milliseconds_of_opensplat(folder, model):
 class Ours:
     """A training of ``raster=cpu`` on one thread that does not change its model."""
 
-    def __init__(self, gaussians, views):
+    def __init__(self, gaussians: Gaussians, views: tuple[View, ...]) -> None:
         densifier = ADC(
             start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER, max_gaussians=None
         )
@@ -111,7 +114,7 @@ class Ours:
         self.trainer.step = SH_DEGREE
         self.milliseconds(WARM_UP_STEPS)
 
-    def milliseconds(self, iterations):
+    def milliseconds(self, iterations: int) -> float:
         """Processor time of an iteration."""
         begin = time.process_time()
         for _ in range(iterations):
@@ -119,7 +122,7 @@ class Ours:
         return 1e3 * (time.process_time() - begin) / iterations
 
 
-def main(size, count):
+def main(size: str, count: int) -> None:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     torch.set_num_threads(1)
     width, height = map(int, size.split("x"))

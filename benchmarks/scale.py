@@ -1,10 +1,12 @@
 """Time how long verbs take to read an experiment of thousands of finished, made-up trials.
 
-    python -m tests.benchmarks.scale FOLDER [SCENES ARMS SEEDS]
+    python -m benchmarks.scale FOLDER [SCENES ARMS SEEDS]
 
 prints a line for each verb, and one for the dry run of a sweep of as many further trials: its name,
 CPU seconds and wall seconds of the whole command.
 """
+
+from __future__ import annotations
 
 import hashlib
 import json
@@ -14,6 +16,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from gsbench.runs.keys import config_hash, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
@@ -24,7 +27,7 @@ VERBS = (["tables", NAME], ["status", NAME], ["report", NAME])
 DENSIFIERS = "adc absgrad absgs edgeaware longaxis mcmc pixelgs revised taming volumetric".split()  # noqa: SIM905
 
 
-def values_of(runs, scene, arm, seed):
+def values_of(runs: Path, scene: int, arm: int, seed: int) -> dict[str, Any]:
     """As many settings as a real trial has; every second arm is a variant of the one before."""
     groups = {
         group: {f"setting_{k}": k / 7 for k in range(20)}
@@ -34,7 +37,7 @@ def values_of(runs, scene, arm, seed):
         "name": "adc" if arm < 2 else f"arm{arm // 2}",
         "volume_threshold": 0.03 if arm % 2 else 0.3,
     }
-    names = {
+    names: dict[str, Any] = {
         "name": NAME,
         "seed": seed,
         "runs": str(runs),
@@ -52,7 +55,7 @@ def values_of(runs, scene, arm, seed):
     )
 
 
-def write_trial(values, psnr):
+def write_trial(values: dict[str, Any], psnr: float) -> None:
     """Write the files of a finished trial, as `gsbench.runs.trial_folder` leaves them."""
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
@@ -97,7 +100,7 @@ def write_trial(values, psnr):
         (folder / name).write_text(content)
 
 
-def write_all(runs, scenes, arms, seeds):
+def write_all(runs: Path, scenes: int, arms: int, seeds: int) -> int:
     """Write the trials of every scene, arm and seed; returns their number."""
     for scene in range(scenes):
         for arm in range(arms):
@@ -109,7 +112,7 @@ def write_all(runs, scenes, arms, seeds):
     return scenes * arms * seeds
 
 
-def dry_run(runs, scenes, arms, seeds):
+def dry_run(runs: Path, scenes: int, arms: int, seeds: int) -> list[str]:
     """The words of a sweep that is only listed; its captures are empty folders."""
     captures = [runs / ".captures" / f"scene{k:02d}" for k in range(scenes)]
     for capture in captures:
@@ -125,7 +128,7 @@ def dry_run(runs, scenes, arms, seeds):
     return ["-m", "name=further", "scene=colmap", *words, "--dry-run"]
 
 
-def timed(runs, argv):
+def timed(runs: Path, argv: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of a command of gsbench."""
     started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = os.environ | {"GSBENCH_RUNS": str(runs)}

@@ -8,8 +8,8 @@ import sys
 import pytest
 import torch
 
+from benchmarks.counters import counting_waits
 from gsbench.raster.staged import Readback
-from tests.benchmarks.counters import counting_waits
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow

@@ -1,9 +1,13 @@
 """For work on speed: the time of a step by kernel, and its number of waits for a GPU."""
 
+from __future__ import annotations
+
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -33,13 +37,13 @@ MAKING = "lift_fresh"  # a tensor of Python numbers: an upload if it is for a de
 
 
 @contextmanager
-def timed_kernels():
+def timed_kernels() -> Iterator[Counter[str]]:
     """Measure the processor time, ms, of each compiled kernel within the block, over all threads.
 
     Until the block ends, every kernel in a module of gsbench is replaced by one that is timed.
     """
-    times = Counter()
-    replaced = []
+    times: Counter[str] = Counter()
+    replaced: list[tuple[dict[str, Any], str, Any]] = []
     for module, contents in [
         (name, vars(found)) for name, found in sys.modules.items() if found is not None
     ]:
@@ -56,19 +60,19 @@ def timed_kernels():
             contents[name] = value
 
 
-def _timed_call(kernel, times):
-    def call(*arguments, **options):
+def _timed_call(kernel: Any, times: Counter[str]) -> Callable[..., Any]:
+    def call(*arguments: Any, **options: Any) -> Any:
         begin = time.thread_time()
         try:
             return kernel(*arguments, **options)
         finally:
-            times[kernel.py_func.__name__] += 1e3 * (time.thread_time() - begin)
+            times[kernel.py_func.__name__] += 1e3 * (time.thread_time() - begin)  # type: ignore[assignment]
 
     return call
 
 
 @contextmanager
-def counting_waits(pretend=False):
+def counting_waits(pretend: bool = False) -> Iterator[Counter[str]]:
     """Count the operations within the block that would make the host wait for a CUDA device.
 
     These read a value, need a size that depends on values (``nonzero``, an index that is a mask),
@@ -76,7 +80,7 @@ def counting_waits(pretend=False):
     ``pretend``, every tensor on the CPU counts as one on a device, so that a tensor of Python
     numbers is an upload.
     """
-    counts = Counter()
+    counts: Counter[str] = Counter()
     before = Readback.waits
     with _CountingMode(counts, pretend):
         yield counts
@@ -85,12 +89,14 @@ def counting_waits(pretend=False):
 
 
 class _CountingMode(TorchDispatchMode):
-    def __init__(self, counts, pretend):
+    def __init__(self, counts: Counter[str], pretend: bool) -> None:
         super().__init__()
         self._counts = counts
         self._pretend = pretend
 
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         kwargs = kwargs or {}
         name = function.overloadpacket.__name__
         result = function(*args, **kwargs)
@@ -111,17 +117,17 @@ class _CountingMode(TorchDispatchMode):
         return result
 
 
-def _is_mask(index):
+def _is_mask(index: Any) -> bool:
     return isinstance(index, torch.Tensor) and index.dtype in (torch.bool, torch.uint8)
 
 
-def _crosses(args, result):
+def _crosses(args: Any, result: Any) -> bool:
     """Return whether a copy goes from one type of device to another."""
     types = {tensor.device.type for tensor in (*args, result) if isinstance(tensor, torch.Tensor)}
     return len(types) > 1
 
 
-def _is_asynchronous(name, args, kwargs):
+def _is_asynchronous(name: str, args: Any, kwargs: Any) -> bool:
     if kwargs.get("non_blocking"):
         return True
     return name == "copy_" and len(args) > 2 and bool(args[2])
