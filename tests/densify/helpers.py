@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
 
 from gsbench.densify import RefineEvent, Refinement
 from gsbench.gaussians.paper_values import LearningRates
@@ -76,7 +77,7 @@ def assert_same(trainable, rows):
     for real, expected in zip(found, rows, strict=True):
         assert real.keys() == expected.keys()
         for name, value in real.items():
-            np.testing.assert_allclose(value, expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
+            assert_allclose(value, expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
             apart = np.abs(value - expected[name]) / np.maximum(1, np.abs(expected[name]))
             restatement.DIFFERENCES.append(float(apart.max(initial=0)))
 

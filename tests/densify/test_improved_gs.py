@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis
 from gsbench.densify.scores import draw
@@ -82,9 +83,7 @@ def test_edge_aware_scores_match_the_restatement(step, views):
     with torch.no_grad():
         scores = densifier.scores(trainable.values, step, generator(step))
     drawn = torch.randperm(3, generator=generator(step))[:views].tolist()
-    np.testing.assert_allclose(
-        scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9
-    )
+    assert_allclose(scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9)
 
 
 def test_in_the_last_500_iterations_the_score_is_the_gradient_and_the_threshold_is_lower():
@@ -92,12 +91,12 @@ def test_in_the_last_500_iterations_the_score_is_the_gradient_and_the_threshold_
     trainable, gradient = started(densifier, 0)
     for step, threshold in ((14_500, 3e-4), (14_600, 2e-4)):
         over, _ = densifier.candidates(at(step, trainable))
-        np.testing.assert_array_equal(over, gradient >= threshold)
-    np.testing.assert_allclose(densifier.scores(trainable.values, 14_600, generator()), gradient)
+        assert_array_equal(over, gradient >= threshold)
+    assert_allclose(densifier.scores(trainable.values, 14_600, generator()), gradient)
     full = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT)
     trainable, _ = started(full, 0)
     over, _ = full.candidates(at(14_600, trainable))
-    np.testing.assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold is not lowered
+    assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold is not lowered
 
 
 @pytest.mark.parametrize("step", [600, 3100, 14_900])
@@ -236,7 +235,6 @@ def test_the_pressure_and_its_gradient_match_the_formula(step, soft):
     densifier.step = step - 1
     gaussians = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
     term = densifier.regularizer(gaussians)
-    assert term is not None
     logits = gaussians.opacity_logits.detach().numpy()
     assert term.item() == pytest.approx(restated(densifier, logits, 2e-4, soft), rel=1e-12)
     (gradient,) = torch.autograd.grad(term, gaussians.opacity_logits)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext
 from gsbench.densify.mcmc import bounds
@@ -190,7 +191,7 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite():
         with torch.no_grad():
             densifier.decay(at(step, trainable))
         shrunk = (trainable.values.log_scales - before).exp()
-        torch.testing.assert_close(shrunk, torch.full_like(shrunk, 1 - 0.002 * remaining))
+        assert_close(shrunk, torch.full_like(shrunk, 1 - 0.002 * remaining))
     single = trained(random_gaussians(3, dtype=torch.float32))
     single.values.opacity_logits.data[:] = torch.tensor([50.0, -50.0, 0.0])
     with torch.no_grad():

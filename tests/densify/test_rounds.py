@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, Volumetric
 from gsbench.gaussians.model import Gaussians
@@ -172,7 +173,6 @@ def test_any_combination_of_options_runs_through_several_rounds(seed):
     for step in (2900, 3000, 3100, 3200):
         observe(densifier, trainable, rng, step)
         event = densifier.refine(step, trainable, rng_of_rules)
-        assert event is not None
         assert event.balances()
         assert event.after == len(trainable) == len(densifier.lineage.ids)
         assert event.after == len(densifier.statistics["gradient_sum"])
@@ -202,7 +202,7 @@ def test_opacity_reset_zeroes_the_opacity_moments_only():
     before = trainable.values.detach().map(torch.clone)
     event = densifier.refine(3000, trainable, generator())
     assert event.opacity_reset
-    torch.testing.assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
+    assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
     assert torch.equal(trainable.values.means, before.means)
     assert not trainable.adam["opacity_logits"].first.any()
     assert trainable.adam["means"].first.all()

@@ -6,13 +6,13 @@ import torch
 
 from gsbench.densify import FastGS
 from gsbench.densify.scores import draw
-from gsbench.errors import InputError
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.train.loss import torch_photometric_loss
 from tests.densify.helpers import EXTENT, assert_same, at, gathered, generator, to_rows
 from tests.densify.restatement import opacity
 from tests.densify.test_adc_variants import absgs_growth
 from tests.densify.test_scores import BLACK, COUNT, Room, alphas, started
+from tests.helpers import refusal
 
 
 def counted(values, threshold):
@@ -123,5 +123,5 @@ def test_without_bad_pixels_nothing_grows():
 
 @pytest.mark.parametrize("cap", ["freeze", "governor"])
 def test_caps_that_need_a_forecast_are_refused(cap):
-    with pytest.raises(InputError, match=r"densify\.cap must be"):
+    with refusal(r"densify\.cap must be"):
         FastGS(cap=cap)

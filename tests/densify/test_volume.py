@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.densify import DensifyContext, Volumetric
 from gsbench.densify.budget import admit, allowance
@@ -20,7 +21,7 @@ def test_children_of_an_isotropic_gaussian_have_its_size():
     sphere = scales((0.2, 0.2, 0.2))
     assert math.exp(log_volume(sphere)) == pytest.approx(4 / 3 * math.pi * 0.008)
     assert math.exp(log_condition(sphere)) == pytest.approx(1)
-    torch.testing.assert_close(Volumetric().child_log_scales(sphere), sphere)
+    assert_close(Volumetric().child_log_scales(sphere), sphere)
 
 
 def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand():
@@ -32,26 +33,22 @@ def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand():
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = Volumetric().child_log_scales(parent)
-    torch.testing.assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
+    assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
     assert math.exp(log_volume(parent) - log_volume(child)) == pytest.approx(8)
     as_adc = Volumetric(condition_of="nothing").child_log_scales(parent)  # no eq. 7
-    torch.testing.assert_close(as_adc.exp(), parent.exp() / 1.6)
+    assert_close(as_adc.exp(), parent.exp() / 1.6)
     in_scales = Volumetric(condition_of="scales").child_log_scales(parent)  # s / kappa
-    torch.testing.assert_close(
-        in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64)
-    )
+    assert_close(in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64))
 
 
 def test_children_of_a_needle_vanish_unless_kappa_is_limited():
     needle = scales((1.0, 1e-3, 1e-3))  # kappa = 1e6
-    torch.testing.assert_close(
+    assert_close(
         Volumetric().child_log_scales(needle).exp(),
         torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64),
     )
     limited = Volumetric(max_condition=4.0).child_log_scales(needle)
-    torch.testing.assert_close(
-        limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64)
-    )
+    assert_close(limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64))
 
 
 def test_volume_does_not_underflow():
