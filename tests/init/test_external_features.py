@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.init import Sfm
@@ -75,9 +76,9 @@ def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_phot
     )
     assert first.num_points3D() == second.num_points3D() > 100
     for point_id, point in first.points3D.items():
-        np.testing.assert_array_equal(point.xyz, second.points3D[point_id].xyz)
+        assert_array_equal(point.xyz, second.points3D[point_id].xyz)
     for image_id, image in first.images.items():
-        np.testing.assert_array_equal(
+        assert_array_equal(
             image.cam_from_world().matrix(), second.images[image_id].cam_from_world().matrix()
         )
 
@@ -112,7 +113,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path, center):
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
     features = extract(tmp_path / "blob.png", 1600)
-    np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
+    assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
 
 
 def test_keypoints_are_scaled_separately_in_x_and_y():
@@ -123,7 +124,7 @@ def test_keypoints_are_scaled_separately_in_x_and_y():
         network_size=(100, 50),
         file_size=(400, 201),
     )
-    np.testing.assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
+    assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
 
 
 def test_a_pair_must_keep_a_share_of_its_matches(own_path, bare_photos, tmp_path):
@@ -151,6 +152,6 @@ def test_a_pair_must_keep_a_share_of_its_matches(own_path, bare_photos, tmp_path
         free, asked = geometries[0.0][pair], geometries[0.8][pair]
         assert len(asked.inlier_matches) >= 0.8 * len(matches[pair])
         if asked.config == free.config:
-            np.testing.assert_array_equal(asked.inlier_matches, free.inlier_matches)
+            assert_array_equal(asked.inlier_matches, free.inlier_matches)
     for pair in verified - kept:
         assert len(geometries[0.0][pair].inlier_matches) < 0.8 * len(matches[pair])

@@ -6,14 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData, PlyElement
 
-from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
 from gsbench.init.base import PointCloud
 from gsbench.init.placed import GREY, points_in_view, seen_colors
 from gsbench.init.point_files import read_points
 from gsbench.scene.images import read_image
+from tests.helpers import refusal
 from tests.init.models import camera_at, model_with
 from tests.init.test_report import CENTERS, model_of
 
@@ -45,8 +46,8 @@ def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names
     properties = [blue, ("z", "f8"), ("nx", "f4"), ("x", "f4"), red, ("y", "f8"), green]
     values = dict(zip((*"xyz", *names), [*XYZ.T, *RGB.T * scale], strict=True))
     points, colors = read_points(write(tmp_path / "cloud.ply", properties, values, text, order))
-    np.testing.assert_allclose(points, XYZ, rtol=1e-6)
-    np.testing.assert_array_equal(colors, RGB)
+    assert_allclose(points, XYZ, rtol=1e-6)
+    assert_array_equal(colors, RGB)
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
@@ -56,8 +57,8 @@ def test_a_table_has_coordinates_with_or_without_colours(tmp_path, suffix, color
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
     points, colors = read_points(path)
-    np.testing.assert_array_equal(points, XYZ)
-    np.testing.assert_array_equal(colors, RGB if colored else None)
+    assert_array_equal(points, XYZ)
+    assert_array_equal(colors, RGB if colored else None)
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
@@ -65,9 +66,9 @@ def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path, s
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, XYZ, fmt="%.17g", delimiter="," if suffix == ".csv" else " ", newline="\r\n")
     path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
-    np.testing.assert_array_equal(read_points(path)[0], XYZ)
+    assert_array_equal(read_points(path)[0], XYZ)
     path.write_text("1 2 3\n", encoding="utf-16")
-    with pytest.raises(InputError, match="UTF-16 or UTF-32: save it as UTF-8"):
+    with refusal("UTF-16 or UTF-32: save it as UTF-8"):
         read_points(path)
 
 
@@ -101,8 +102,8 @@ NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
 def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
     (tmp_path / name).write_text(text)
     points, colors = read_points(tmp_path / name)
-    np.testing.assert_array_equal(points, XYZ)
-    np.testing.assert_array_equal(colors, RGB if colored else None)
+    assert_array_equal(points, XYZ)
+    assert_array_equal(colors, RGB if colored else None)
 
 
 def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path):
@@ -112,8 +113,8 @@ def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path):
     dc[0], dc[1] = 9.0, -9.0
     values = dict(zip("xyz", XYZ.T, strict=True)) | {f"f_dc_{k}": dc[:, k] for k in range(3)}
     points, colors = read_points(write(tmp_path / "model.ply", properties, values, False, "<"))
-    np.testing.assert_array_equal(points, XYZ)
-    np.testing.assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
+    assert_array_equal(points, XYZ)
+    assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
 
 
 def test_colours_come_from_the_nearest_photograph(courtyard):
@@ -130,7 +131,7 @@ def test_colours_come_from_the_nearest_photograph(courtyard):
             if pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height:
                 expected = read_image(courtyard.images / image.name)[int(pixel[1]), int(pixel[0])]
                 break
-        np.testing.assert_array_equal(color, expected)
+        assert_array_equal(color, expected)
     assert 5 < (found[:, 0] >= 0).sum() < 60
 
 
@@ -141,7 +142,7 @@ def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
     seen = np.array([[0, 0, 0], [-1, -1, -1], [0, 9, 255]], dtype=np.int16)
     monkeypatch.setattr("gsbench.init.placed.seen_colors", lambda *_: seen)
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
-    np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
+    assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
     seen[:] = 0
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
     assert not cloud.colors.any()
@@ -172,7 +173,7 @@ def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(courtyard, tm
     assert distances.max() < 1e-9
     assert len(np.unique(cloud.points, axis=0)) == 30
     seen = seen_colors(cloud.points, courtyard, pycolmap.Reconstruction(courtyard.model))
-    np.testing.assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))
+    assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))
     first = options.content()
     save(tmp_path / "scan.xyz", 2 * XYZ)
     assert options.content() != first
@@ -213,7 +214,7 @@ def empty_ply(path):
 )
 def test_bad_files_are_refused_in_one_line(courtyard, tmp_path, name, make, message):
     make(tmp_path / name)
-    with pytest.raises(InputError, match=message) as caught:
+    with refusal(message) as caught:
         Points(path=tmp_path / name).cloud(courtyard, pycolmap.Reconstruction(courtyard.model))
     assert "\n" not in str(caught.value)
 
@@ -221,7 +222,7 @@ def test_bad_files_are_refused_in_one_line(courtyard, tmp_path, name, make, mess
 def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
     bare_photos, tmp_path
 ):
-    with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is not a file"):
+    with refusal(r"init\.path=nowhere\.ply is not a file"):
         Points(path="nowhere.ply")
     save(tmp_path / "a.xyz", XYZ)
     assert Points(path=tmp_path / "a.xyz").needs_reference(replace(bare_photos))
@@ -251,7 +252,7 @@ def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_beh
     )
     seen, pixels, distances = points_in_view(points, "a", model)
     assert seen.tolist() == [0, 2, 6]
-    np.testing.assert_allclose(pixels, [[0, 40], [50, 0], [80, 60]])
-    np.testing.assert_allclose(distances, [2**0.5, 1.64**0.5, 0.38**0.5])
+    assert_allclose(pixels, [[0, 40], [50, 0], [80, 60]])
+    assert_allclose(distances, [2**0.5, 1.64**0.5, 0.38**0.5])
     unknown = points_in_view(points, "b", model)
     assert [values.shape for values in unknown] == [(0,), (0, 2), (0,)]

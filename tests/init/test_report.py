@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -200,8 +201,8 @@ def test_up_is_the_normal_of_a_ring_of_cameras():
         right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
         rotations.append([right, np.cross(forward, right), forward])
     axes = view_from_above(ring, np.array(rotations), np.zeros((1, 3)))
-    np.testing.assert_allclose(axes[2], up, atol=1e-9)
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_allclose(axes[2], up, atol=1e-9)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
@@ -216,7 +217,7 @@ def test_up_is_that_of_the_images_unless_the_cameras_lie_in_a_plane(size, flatne
     )
     tilted = [0, math.sin(math.radians(20)), math.cos(math.radians(20))]
     expected = tilted if flatness > 0.5 else [0, 0, 1]
-    np.testing.assert_allclose(axes[2] * np.sign(axes[2, 2]), expected, atol=1e-9)
+    assert_allclose(axes[2] * np.sign(axes[2, 2]), expected, atol=1e-9)
 
 
 def test_cameras_in_a_plane_across_their_right_have_a_right_hand_view():
@@ -224,8 +225,8 @@ def test_cameras_in_a_plane_across_their_right_have_a_right_hand_view():
     centers = np.array([[0.0, y, z] for y in range(3) for z in range(4)])
     looking_along_y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     axes = view_from_above(centers, np.tile(looking_along_y, (12, 1, 1)), np.zeros((0, 3)))
-    np.testing.assert_allclose(np.abs(axes[2]), [1, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_allclose(np.abs(axes[2]), [1, 0, 0], atol=1e-9)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
@@ -237,7 +238,7 @@ def test_up_points_from_the_points_to_cameras_that_look_down(points, side):
     # world to camera: looks along -z or z, the image's top is +y
     down = np.diag([side, -1.0, -side])
     axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((points, 3)))
-    np.testing.assert_allclose(axes[2], [0, 0, side], atol=1e-9)
+    assert_allclose(axes[2], [0, 0, side], atol=1e-9)
 
 
 def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path):
@@ -254,7 +255,7 @@ def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path):
         column, row = 480 + x * scale, 480 + (y - 2.5) * scale
         red = np.argwhere(np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8)
         near = red[np.abs(red - [row, column]).max(axis=1) < 8]
-        np.testing.assert_allclose(near.mean(axis=0), [row, column], atol=1.1)
+        assert_allclose(near.mean(axis=0), [row, column], atol=1.1)
         assert len(near) == pytest.approx(math.pi * 3.5**2, rel=0.3)
     for x, y in ((0, 0), (0.5, 0.5)):
         column, row = math.floor(480 + x * scale), math.floor(480 + (y - 2.5) * scale)
@@ -262,7 +263,7 @@ def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path):
     assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
     bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
     # the bar is one unit long
-    np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
+    assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
 
 
 def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path):
@@ -301,5 +302,5 @@ def test_a_camera_whose_right_is_up_gives_axes_at_right_angles():
     axes = view_from_above(
         np.array([[0, 0, 0], [1.0, 0, 0]]), np.stack([first, second]), np.empty((0, 3))
     )
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(axes[2], up, atol=1e-12)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_allclose(axes[2], up, atol=1e-12)

@@ -1,19 +1,19 @@
 """Points that do not depend on test photographs (init.points_from=train)."""
 
-import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia, read_cloud
 from gsbench.init.base import REPORT_FILE
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
+from tests.helpers import read_json, refusal
 from tests.init.models import add_point
 
 
@@ -76,11 +76,10 @@ def test_dataset_keeps_the_points_that_two_training_views_see(with_points, tmp_p
     assert all(len(names) >= 2 for names in seen_by(after))
     assert len(after.images) == len(before.images), "test views keep their cameras"
     points = report.training_points
-    assert points is not None
     kept, total = len(wanted), before.num_points3D()
     assert (points.choice, points.kept, points.total) == ("train", kept, total)
     assert points.removed == pytest.approx(1 - kept / total)
-    said = json.loads((tmp_path / REPORT_FILE).read_text())["training_points"]
+    said = read_json(tmp_path / REPORT_FILE)["training_points"]
     assert said["removed"] == points.removed
     assert not (tmp_path / "work").exists()
 
@@ -104,7 +103,7 @@ def test_colours_come_from_training_photographs(with_points, tmp_path):
                 (1 - dy) * ((1 - dx) * picture[row, column] + dx * picture[row, column + 1])
                 + dy * ((1 - dx) * picture[row + 1, column] + dx * picture[row + 1, column + 1])
             )
-        np.testing.assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
+        assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
 
 
 def with_noise(capture, folder):
@@ -147,14 +146,13 @@ def test_estimated_cameras_keep_all_views_and_points_of_training_views(bare_phot
     assert report.num_registered == len(capture.image_names)
     assert not any(names & test for names in seen_by(model))
     points = report.training_points
-    assert points is not None
     assert points.total is not None
     assert points.kept == model.num_points3D() < points.total
 
 
 def test_points_from_train_is_refused_with_one_training_view(with_points, tmp_path):
     lonely = replace(with_points, test_names=with_points.image_names[1:])
-    with pytest.raises(InputError, match=r"init\.points_from=train: no point is left"):
+    with refusal(r"init\.points_from=train: no point is left"):
         Dataset(points_from="train").run(lonely, tmp_path)
 
 

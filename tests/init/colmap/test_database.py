@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.init import Sfm
@@ -162,7 +163,7 @@ def test_the_strongest_features_are_those_of_the_largest_area(database):
     order = sorted(range(12), key=lambda row: -areas[row])
     for name, rows in (("b.png", order[:5]), ("a.png", [0]), ("c.png", [])):
         strongest = made.strongest_descriptors(database, name, 5)
-        np.testing.assert_array_equal(strongest, descriptors[rows].reshape(-1, 128))
+        assert_array_equal(strongest, descriptors[rows].reshape(-1, 128))
 
 
 def write_geometries(database, inliers):
@@ -261,7 +262,6 @@ def test_masks_have_the_names_that_colmap_expects(images, tmp_path):
     given = {"a.png": images / "b.png", "left/b.png": images / "c.png"}
     for _ in range(2):
         folder = made.colmap_masks(given, tmp_path)
-        assert folder is not None
         for name, mask in given.items():
             assert (folder / f"{name}.png").resolve() == mask
         assert len([path for path in folder.rglob("*.png") if path.is_symlink()]) == 2
