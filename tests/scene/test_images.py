@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
 from gsbench.scene.options import check_final_size, downscaled_size
+from tests.helpers import refusal
 
 from .conftest import smooth_image
 
@@ -16,7 +18,7 @@ def test_lossless_formats_come_back_exactly(tmp_path, suffix):
     image = smooth_image(20, 14)
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(image).save(path)
-    np.testing.assert_array_equal(read_image(path), image)
+    assert_array_equal(read_image(path), image)
     assert image_size(path) == (20, 14)
 
 
@@ -30,7 +32,7 @@ def test_all_pixel_modes_become_rgb(tmp_path):
     Image.fromarray(np.array([[0x1234, 0xFFFF]], dtype=np.uint16)).save(path)
     assert read_image(path).tolist() == [[[0x12] * 3, [0xFF] * 3]]
     Image.fromarray(np.zeros((2, 2), dtype=np.float32)).save(tmp_path / "f.tif")
-    with pytest.raises(InputError, match="convert it to 8-bit"):
+    with refusal("convert it to 8-bit"):
         read_image(tmp_path / "f.tif")
 
 
@@ -46,12 +48,12 @@ def test_damaged_files_are_named(tmp_path, suffix):
     path = tmp_path / f"broken.{suffix}"
     Image.fromarray(smooth_image(200, 150)).save(path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match=rf"broken\.{suffix}: the image is damaged"):
+    with refusal(rf"broken\.{suffix}: the image is damaged"):
         read_image(path)
     path.write_text("no image at all")
-    with pytest.raises(InputError, match=rf"broken\.{suffix}: not a readable image"):
+    with refusal(rf"broken\.{suffix}: not a readable image"):
         read_image(path)
-    with pytest.raises(InputError, match="no such image"):
+    with refusal("no such image"):
         read_image(tmp_path / "absent.png")
 
 
@@ -94,7 +96,7 @@ def test_a_final_side_below_sixteen_pixels_is_refused():
     check_final_size((16, 40), 1, None, "a.png")
     check_final_size((40, 32), 2, None, "a.png")
     for size, downscale, max_size in (((15, 40), 1, None), ((40, 31), 3, None), ((40, 20), 1, 30)):
-        with pytest.raises(InputError, match="at least 16 px are needed"):
+        with refusal("at least 16 px are needed"):
             check_final_size(size, downscale, max_size, "a.png")
 
 
@@ -105,6 +107,6 @@ def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():
     assert np.abs(resize_image(image, 20, 15, "area") - blocks).max() <= 1.0
     ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 30, 0).repeat(3, 2)
     small = resize_image(ramp, 50, 15, "lanczos")
-    np.testing.assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)
-    with pytest.raises(InputError, match="resample"):
+    assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)
+    with refusal("resample"):
         resize_image(image, 20, 15, "cubic")

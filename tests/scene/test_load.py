@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.logs import no_progress
 from gsbench.scene.colmap import plain_camera, read_model
 from gsbench.scene.distortion import folded_share, largest_distortion
@@ -18,6 +18,7 @@ from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import check_lenses, folded_shares, undistort
+from tests.helpers import read_json, refusal
 
 WIDTH, HEIGHT = 200, 150
 UNCHANGED = Downscaling(1, None, "lanczos")
@@ -66,7 +67,7 @@ def test_undistorted_spots_land_where_a_pinhole_sees_them(name):
         window = flat[top : top + 11, left : left + 11, 0].astype(float)
         ys, xs = np.mgrid[:11, :11] + 0.5
         center = np.array([(window * xs).sum(), (window * ys).sum()]) / window.sum()
-        np.testing.assert_allclose(center, [x - left, y - top], atol=0.12)
+        assert_allclose(center, [x - left, y - top], atol=0.12)
 
 
 PERSPECTIVE = [name for name in MODELS if "FISHEYE" not in name]
@@ -91,7 +92,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
         image = model.find_image_with_name(view.name)
         stored = np.asarray(Image.open(capture.images / view.name))
         if amount < 1.0 and name in PERSPECTIVE:
-            np.testing.assert_array_equal(view.image, stored)
+            assert_array_equal(view.image, stored)
             wanted = source
         else:
             wanted = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
@@ -101,7 +102,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
             x, y, z = camera.rotation @ point + camera.translation
             seen = [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
             expected = wanted.img_from_cam(image.cam_from_world() * point)
-            np.testing.assert_allclose(seen, expected, atol=1e-3)
+            assert_allclose(seen, expected, atol=1e-3)
 
 
 def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not():
@@ -136,7 +137,7 @@ def test_lenses_that_turn_back_inside_the_picture_are_refused(name, params, shar
     assert found == pytest.approx(share, abs=0.01)
     if share:
         said = rf"the camera of a.png \({name}: .*\) turns back .*: {found:.1%}"
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             check_lenses({"a.png": camera})
     else:
         check_lenses({"a.png": camera})
@@ -165,11 +166,11 @@ def test_a_small_fold_in_the_corners_is_reported(caplog):
 
 def test_panoramas_are_refused(tmp_path):
     camera = CameraModel("EQUIRECTANGULAR", WIDTH, HEIGHT, (float(WIDTH), float(HEIGHT)))
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):
+    with refusal("EQUIRECTANGULAR"):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
     image = ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # raised in the isolated process, too
+    with refusal("EQUIRECTANGULAR"):  # raised in the isolated process, too
         prepare_all([image], no_progress)
 
 
@@ -196,7 +197,7 @@ def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_
     assert [view.name for view in scene.test] == ["00.png"]
     assert len(scene.train) == 5
     for view in (*scene.train, *scene.test):
-        np.testing.assert_array_equal(view.image, Image.open(root / "images" / view.name))
+        assert_array_equal(view.image, Image.open(root / "images" / view.name))
         assert (view.camera.fx, view.camera.cx, view.camera.cy) == (50.0, 20.0, 15.0)
     assert not list((tmp_path / "cache").rglob("*.png"))
     # camera k is at x = -0.1 k; training views 1..5: mean -0.3, farthest 0.2 away
@@ -220,8 +221,8 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     third = load(tmp_path / "other")
     for scene in (second, third):
         for a, b in zip(first.train, scene.train, strict=True):
-            np.testing.assert_array_equal(a.image, b.image)
-            np.testing.assert_array_equal(a.camera.rotation, b.camera.rotation)
+            assert_array_equal(a.image, b.image)
+            assert_array_equal(a.camera.rotation, b.camera.rotation)
             assert all(getattr(a.camera, key) == getattr(b.camera, key) for key in INTRINSICS)
     camera = first.train[0].camera
     assert first.train[0].image.shape == (camera.height, camera.width, 3)
@@ -247,7 +248,7 @@ def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(), max_images=3)
     load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
-    assert list(json.loads(file.read_text())["views"]) == ["00.png", "02.png", "04.png"]
+    assert list(read_json(file)["views"]) == ["00.png", "02.png", "04.png"]
     assert sorted(path.name for path in file.parent.glob("*.png")) == [
         f"0000{k}.png" for k in range(3)
     ]
@@ -256,7 +257,7 @@ def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
 def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene())
     Image.new("RGB", (40, 26)).save(capture.images / "01.png")
-    with pytest.raises(InputError, match=r"01\.png: the image is 40x26 px but its camera .* 40x30"):
+    with refusal(r"01\.png: the image is 40x26 px but its camera .* 40x30"):
         load_scene(capture, capture.model, tmp_path / "cache")
 
 
@@ -269,12 +270,12 @@ def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path
     file.unlink()
     again = load_scene(capture, capture.model, tmp_path / "cache", **options)
     assert file.read_bytes() == before
-    np.testing.assert_array_equal(first.train[0].image, again.train[0].image)
+    assert_array_equal(first.train[0].image, again.train[0].image)
     assert [folder.name for folder in (tmp_path / "cache").iterdir()] == [file.parent.name]
 
 
 def _other_focal(file):
-    document = json.loads(file.read_text())
+    document = read_json(file)
     for view in document["views"].values():
         view["fx"] *= 1.3
     file.write_text(json.dumps(document, indent=1))
@@ -319,7 +320,7 @@ def test_a_cached_set_that_was_changed_is_prepared_again(change, make_scene, tmp
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} | before == {
         path.name: path.read_bytes() for path in file.parent.iterdir()
     }
-    np.testing.assert_array_equal(first.train[0].image, again.train[0].image)
+    assert_array_equal(first.train[0].image, again.train[0].image)
     caplog.clear()
     load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     assert not caplog.text
@@ -332,8 +333,8 @@ def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
     assert (used.train[0].camera.cx, used.train[0].camera.cy) == (18, 16)
     assert (centred.train[0].camera.cx, centred.train[0].camera.cy) == (20, 15)
     assert centred.train[0].camera.fy == 51
-    np.testing.assert_array_equal(used.train[0].image, centred.train[0].image)
-    with pytest.raises(InputError, match="principal_point"):
+    assert_array_equal(used.train[0].image, centred.train[0].image)
+    with refusal("principal_point"):
         load_scene(capture, capture.model, tmp_path, principal_point="center")
 
 
@@ -347,10 +348,10 @@ def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path, capl
     assert "1 of 4 training views" in caplog.text
     assert "1 of 2 test views have no pose and are left out: 03.png" in caplog.text
     two = make_scene(names=("00.png", "01.png"), root="two")
-    with pytest.raises(InputError, match="2 of 6 images have a pose"):
+    with refusal("2 of 6 images have a pose"):
         load_scene(capture, two / "sparse/0", tmp_path / "cache")
     only_test = replace(capture, test_names=("00.png", "01.png", "02.png", "04.png"))
-    with pytest.raises(InputError, match="no training view"):
+    with refusal("no training view"):
         load_scene(only_test, small / "sparse/0", tmp_path / "cache2")
 
 
@@ -359,7 +360,7 @@ def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     path = root / "images/03.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     capture = read_colmap("toy", root)
-    with pytest.raises(InputError, match=r"03\.png: the image is damaged"):
+    with refusal(r"03\.png: the image is damaged"):
         load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     assert not list((tmp_path / "cache").iterdir())
 
@@ -371,6 +372,6 @@ def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(
     assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}
     model = pycolmap.Reconstruction(capture.model)
     view = scene.train[0]
-    np.testing.assert_allclose(
+    assert_allclose(
         view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9
     )

@@ -9,12 +9,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.hold_out import select_images, split_names
 from gsbench.scene.images import list_images, match_names
 from gsbench.scene.options import SceneConfig, SplitRule
 from gsbench.scene.readers import missing_model, read_colmap, read_photos
+from tests.helpers import refusal
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -86,7 +86,7 @@ def test_names_match_their_files_and_ambiguous_ones_are_refused(wanted, files, m
     if isinstance(matches, dict):
         assert match_names(wanted, files) == matches
         return
-    with pytest.raises(InputError, match=matches):
+    with refusal(matches):
         match_names(wanted, files)
 
 
@@ -106,7 +106,7 @@ def test_names_in_other_folders_match_by_the_last_parts_of_their_paths(wanted, f
     if isinstance(matches, dict):
         assert match_names(wanted, files, other_folders=True) == matches
     else:
-        with pytest.raises(InputError, match=matches):
+        with refusal(matches):
             match_names(wanted, files, other_folders=True)
     assert set(match_names(wanted, files)) <= {"b.png"}
 
@@ -161,7 +161,7 @@ def test_a_model_beside_others_whose_images_cannot_be_counted_is_named(make_scen
     make_scene(sparse="sparse/1")
     (root / "sparse/0/images.bin").write_bytes(b"\1")
     said = r"sparse/0/images\.bin: its images cannot be counted.*scene\.sparse"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_colmap("toy", root)
     assert read_colmap("toy", root, sparse="sparse/1").model == root / "sparse/1"
 
@@ -203,7 +203,7 @@ def test_wrong_encodings_and_decimal_commas_of_a_text_model_are_named(
     root = make_scene(text=True, params=[50.5, 50.5, 20, 15])
     file = root / f"sparse/0/{stem}.txt"
     file.write_bytes(change(file.read_text().replace(" 5 ", " 5.5 ")))
-    with pytest.raises(InputError, match=rf"{stem}\.txt: .*{said}"):
+    with refusal(rf"{stem}\.txt: .*{said}"):
         read_colmap("toy", root)
 
 
@@ -247,7 +247,7 @@ def test_lists_choose_the_training_and_test_views(make_scene, train, test, train
     train, test = (None if name is None else f"{name}.txt" for name in (train, test))
     rule = SplitRule(train_list=train, test_list=test)
     if tested_on is None:
-        with pytest.raises(InputError, match=trained_on):
+        with refusal(trained_on):
             read_colmap("toy", root, split=rule)
         return
     capture = read_colmap("toy", root, split=rule)
@@ -262,7 +262,7 @@ def test_a_split_without_views_is_refused():
         ({"test": []}, "no test view"),
         *(({"test_every": every}, "test_every must be positive") for every in (0, -1)),
     ):
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             split_names(names, **options)
 
 
@@ -279,24 +279,24 @@ def test_fingerprint_depends_on_content_not_on_place(make_scene, tmp_path):
 
 
 def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
+    with refusal("does not exist"):
         read_photos("toy", tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"scene\.path is not set"):
+    with refusal(r"scene\.path is not set"):
         read_photos("toy", "")
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(InputError, match="0 images"):
+    with refusal("0 images"):
         read_photos("toy", empty)
     root = make_scene()
     said = r"images_8: no such folder; set scene\.images to one of: images, sparse"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_colmap("toy", root, images="images_8")
     for name in list_images(root / "images")[2:]:
         (root / "images" / name).unlink()
-    with pytest.raises(InputError, match="2 images that the model"):
+    with refusal("2 images that the model"):
         read_colmap("toy", root)
     shutil.rmtree(root / "sparse")
-    with pytest.raises(InputError, match="no COLMAP model in sparse/0 or sparse"):
+    with refusal("no COLMAP model in sparse/0 or sparse"):
         read_colmap("toy", root)
 
 
@@ -306,7 +306,7 @@ def test_a_truncated_model_is_named_in_one_line(make_scene, file, keep):
     root = make_scene()
     path = root / "sparse/0" / f"{file}.bin"
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
-    with pytest.raises(InputError, match=rf"{file}\.bin: .*(truncated|too few)") as caught:
+    with refusal(rf"{file}\.bin: .*(truncated|too few)") as caught:
         read_colmap("toy", root)
     assert "\n" not in str(caught.value)
 
@@ -324,5 +324,5 @@ def test_a_scene_is_named_after_its_folder_and_a_missing_model_is_reported(make_
 
 def test_a_missing_list_is_named(make_scene):
     said = r"scene\.test_list: .*cannot be read \(No such file or directory\): name a"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_colmap("toy", make_scene(), split=SplitRule(test_list="\\n"))

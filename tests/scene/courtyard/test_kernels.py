@@ -9,6 +9,7 @@ from types import FunctionType, SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from gsbench.scene.courtyard import kernels, layout, textures
 from gsbench.scene.courtyard.layout import BOX, SPHERE, TUBE, build_layout
@@ -95,7 +96,7 @@ def test_normals_are_the_gradient_of_the_distance(name):
             for step in 1e-6 * np.eye(3)
         ]
         *normal, u, v = PLAIN.local_normal(kind, size, *point)
-        np.testing.assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
+        assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
         assert np.dot(normal, direction) < 0
         x, y, z = point
         if kind == BOX:  # along the longer side of the face, then along the other
