@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.eval.color_correction import color_corrected
 from gsbench.eval.evaluator import Evaluator
@@ -37,7 +38,7 @@ def by_numpy(image, truth):
 
 def test_an_affine_change_of_colours_is_undone():
     changed = TRUTH @ MATRIX.T + OFFSET
-    np.testing.assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
+    assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
 
 
 def test_the_correction_equals_least_squares_of_numpy_with_clipped_pixels():
@@ -45,7 +46,7 @@ def test_the_correction_equals_least_squares_of_numpy_with_clipped_pixels():
     truth[:3] = 1.0
     noisy = np.clip(1.6 * truth @ MATRIX.T + RANDOM.normal(0, 0.05, truth.shape), 0, 1)
     result = corrected(noisy, truth)
-    np.testing.assert_allclose(result, by_numpy(noisy, truth), atol=1e-9)
+    assert_allclose(result, by_numpy(noisy, truth), atol=1e-9)
     assert np.abs(result - truth)[3:].mean() < 0.5 * np.abs(noisy - truth)[3:].mean()
 
 
@@ -54,7 +55,7 @@ def test_pixels_that_a_mask_ignores_do_not_count():
     mask = np.ones(TRUTH.shape[:2], dtype=bool)
     mask[:8] = False
     changed[:8] = 0.5
-    np.testing.assert_allclose(corrected(changed, TRUTH, mask)[8:], TRUTH[8:], atol=1e-9)
+    assert_allclose(corrected(changed, TRUTH, mask)[8:], TRUTH[8:], atol=1e-9)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
@@ -62,11 +63,9 @@ def test_the_correction_of_a_render_of_one_colour_is_finite(value):
     result = corrected(np.full_like(TRUTH, value), TRUTH)
     assert np.isfinite(result).all()
     if value == 0.5:  # the best single colour is the mean
-        np.testing.assert_allclose(
-            result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9
-        )
+        assert_allclose(result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9)
     else:  # all pixels are clipped, so the map is unknown
-        np.testing.assert_array_equal(result, value)
+        assert_array_equal(result, value)
 
 
 @pytest.mark.parametrize("protocol", [PAPER, STANDARD])

@@ -5,9 +5,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.errors import InputError
 from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
 from gsbench.weights import MissingWeightsError, load_state
+from tests.helpers import refusal
 
 State = dict[str, Tensor]
 
@@ -146,9 +146,9 @@ def test_keys_may_lack_the_features_prefix_or_include_a_classifier():
 def test_weights_of_another_network_are_refused():
     alex, alex_heads = random_weights("alex")
     vgg, vgg_heads = random_weights("vgg")
-    with pytest.raises(InputError, match="not that network"):
+    with refusal("not that network"):
         Lpips("vgg", alex, vgg_heads)
-    with pytest.raises(InputError, match="heads"):
+    with refusal("heads"):
         Lpips("vgg", vgg, alex_heads)
 
 

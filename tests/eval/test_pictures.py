@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.eval import pictures
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import PicturePair, measure
 from gsbench.eval.protocol import PAPER
+from tests.helpers import refusal
 
 
 @pytest.fixture
@@ -47,15 +47,13 @@ def test_metrics_are_computed_from_the_pixels_of_the_files(pairs):
 
 def test_a_picture_of_another_size_is_refused(pairs):
     Image.open(pairs[1].picture).resize((25, 20)).save(pairs[1].picture)
-    with pytest.raises(
-        InputError, match=r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"
-    ):
+    with refusal(r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 
 def test_a_truncated_picture_is_named(pairs):
     pairs[0].picture.write_bytes(pairs[0].picture.read_bytes()[:500])
-    with pytest.raises(InputError, match=r"b_render\.png: the image is damaged"):
+    with refusal(r"b_render\.png: the image is damaged"):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 
@@ -64,5 +62,5 @@ def test_pictures_too_large_to_be_measured_are_refused_by_their_header(tmp_path,
     pair = pictures.PicturePair("a", tmp_path / "a.png", tmp_path / "a.png")
     pictures.check_picture_sizes([pair])
     monkeypatch.setattr(pictures, "MAX_PIXELS", 9_999)
-    with pytest.raises(InputError, match="100x100 px: pictures of more than"):
+    with refusal("100x100 px: pictures of more than"):
         pictures.check_picture_sizes([pair])
