@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
@@ -43,9 +44,7 @@ def test_a_step_with_all_gaussians_visible_equals_a_plain_step():
     for seed in range(4):
         step_with(whole, seed)
         step_with(sparse, seed, visible=torch.ones(6, dtype=torch.bool))
-    torch.testing.assert_close(
-        whole.values.tensors(), sparse.values.tensors(), rtol=1e-9, atol=1e-12
-    )
+    assert_close(whole.values.tensors(), sparse.values.tensors(), rtol=1e-9, atol=1e-12)
 
 
 def test_a_step_of_visible_gaussians_does_not_change_the_others():
@@ -68,9 +67,7 @@ def test_steps_at_degree_0_count_for_the_unused_harmonics():
         plain.optimizer_step()
     step_with(quick, 9)
     step_with(plain, 9)
-    torch.testing.assert_close(
-        quick.values.tensors(), plain.values.tensors(), rtol=1e-9, atol=1e-12
-    )
+    assert_close(quick.values.tensors(), plain.values.tensors(), rtol=1e-9, atol=1e-12)
 
 
 def test_load_restores_parameters_and_moments():
