@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from skimage.metrics import structural_similarity
 
 from gsbench.eval.ssim import ssim_map, window
@@ -46,7 +47,7 @@ def test_ssim_matches_scikit_image_in_the_interior():
         full=True,
     )
     ours = ssim_map(image.double(), target.double()).permute(1, 2, 0).numpy()
-    np.testing.assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
+    assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
 
 
 def test_ssim_pads_images_with_zeros():

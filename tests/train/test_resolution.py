@@ -163,7 +163,6 @@ def test_a_picture_keeps_at_least_one_pixel():
 
 def test_each_round_is_reported_to_the_resolution(lab):
     training, told = lab.new(small(), resolution_schedule=BOTH, iterations=50, **SHORT), []
-    assert training.resolution is not None
     training.resolution.observe = told.append
     training.run(lab.folder)
     assert [event.step for event in told] == [40]
@@ -244,10 +243,8 @@ def test_masks_are_as_small_as_their_pictures(lab):
         training = own.new(
             small(), resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT
         )
-        assert training.resolution is not None
         training.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))
         mask = training.scaled_views.at(2)[1].mask(0)
-        assert mask is not None
         assert mask.shape == (16, 20, 1)
         (lab.folder / str(value)).mkdir()
         trained.append(training.run(lab.folder / str(value)))
