@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from numba import types
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.raster.cpu import (
     CpuRasterizer,
@@ -63,7 +64,7 @@ def test_depths_are_sorted_as_numpy_sorts_them():
     order, spare = np.empty((2, 330), np.uint64)
     digits = np.empty((binning.PASSES, binning.BUCKETS), np.int64)
     binning.sort_by_depth(begins, visible, keys, order, spare, digits)
-    np.testing.assert_array_equal(order, np.sort(np.concatenate([keys[:150], keys[320:]])))
+    assert_array_equal(order, np.sort(np.concatenate([keys[:150], keys[320:]])))
 
 
 @pytest.mark.parametrize(
@@ -274,16 +275,14 @@ def test_vector_functions_match_numpy():
     assert bits == sum(1 << k for k in range(16) if mask[k])
     assert 0 < mask.sum() < 16
     assert lowest == 3
-    np.testing.assert_allclose(out[:16], a * b + 2 - a / b, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(out[16:32], np.exp2(8 * a.astype(np.float64)), rtol=1e-6)
-    np.testing.assert_array_equal(out[32:48], np.where(mask, a, np.float32(7)))
-    np.testing.assert_allclose(
-        out[48:64], np.minimum(a, b) + np.maximum(a, 0) * np.abs(b), rtol=1e-6
-    )
+    assert_allclose(out[:16], a * b + 2 - a / b, rtol=1e-5, atol=1e-6)
+    assert_allclose(out[16:32], np.exp2(8 * a.astype(np.float64)), rtol=1e-6)
+    assert_array_equal(out[32:48], np.where(mask, a, np.float32(7)))
+    assert_allclose(out[48:64], np.minimum(a, b) + np.maximum(a, 0) * np.abs(b), rtol=1e-6)
     for k, values in enumerate((a, b, a * b, a - b, -a)):
         assert out[64 + simd.SUM_LANES[k]] == pytest.approx(values.sum(), abs=1e-5)
     assert np.count_nonzero(out[64:80]) == 5
-    np.testing.assert_array_equal(out[80:96], np.where(0b1010 >> np.arange(16) & 1, a, b))
+    assert_array_equal(out[80:96], np.where(0b1010 >> np.arange(16) & 1, a, b))
 
 
 @numba.njit
@@ -312,7 +311,7 @@ def test_logarithms_and_roots_are_accurate_over_their_range():
     _logarithms(x, out)
     exact = np.log2(x.astype(np.float64))
     assert (np.abs(out[0] - exact) / np.maximum(np.abs(exact), 1)).max() < 2e-7
-    np.testing.assert_allclose(out[1], np.sqrt(x) + np.floor(x) - np.ceil(x), rtol=1e-6)
+    assert_allclose(out[1], np.sqrt(x) + np.floor(x) - np.ceil(x), rtol=1e-6)
 
 
 @numba.njit
@@ -328,9 +327,9 @@ def test_gather_and_scatter_match_numpy_indexing():
     indices = np.array([5, 0, 19, 7, 2, 1, 3, 4, 6, 8, 9, 10, 11, 12, 7, 7])
     out = np.empty(16, np.float32)
     _gather_and_scatter(array, indices, out)
-    np.testing.assert_array_equal(out, before[indices, 1])
+    assert_array_equal(out, before[indices, 1])
     before[indices, 2] = before[indices, 1]
-    np.testing.assert_array_equal(array, before)
+    assert_array_equal(array, before)
 
 
 @numba.njit
@@ -353,16 +352,16 @@ def test_shuffles_move_each_number_to_its_place():
     rest, moved = np.arange(135, dtype=np.float32), np.zeros(135, np.float32)
     basis, out = np.arange(16, dtype=np.float32), np.zeros(144, np.float32)
     _shuffles(matrix, rest, basis, out, moved)
-    np.testing.assert_array_equal(matrix.reshape(16, 16), np.arange(256).reshape(16, 16).T)
+    assert_array_equal(matrix.reshape(16, 16), np.arange(256).reshape(16, 16).T)
     own = rest[45:90]
-    np.testing.assert_array_equal(moved, np.concatenate([np.zeros(45), own, np.zeros(45)]))
+    assert_array_equal(moved, np.concatenate([np.zeros(45), own, np.zeros(45)]))
     for channel in range(3):
-        np.testing.assert_array_equal(out[16 * channel :][:15], own.reshape(15, 3)[:, channel])
-    np.testing.assert_array_equal(out[48:93].reshape(15, 3), np.outer(basis[:15], [2, 3, 5]))
+        assert_array_equal(out[16 * channel :][:15], own.reshape(15, 3)[:, channel])
+    assert_array_equal(out[48:93].reshape(15, 3), np.outer(basis[:15], [2, 3, 5]))
     integers = out.view(np.int32)
     assert (integers[96:112] == 7 + (1024 << 16)).all()
-    np.testing.assert_array_equal(integers[112:128], np.arange(40, 56))
-    np.testing.assert_array_equal(integers[128:144], np.arange(16))
+    assert_array_equal(integers[112:128], np.arange(40, 56))
+    assert_array_equal(integers[128:144], np.arange(16))
 
 
 def test_exp2_is_accurate_over_its_range():
@@ -375,7 +374,7 @@ def test_exp2_is_accurate_over_its_range():
             simd.store(out, i, simd.exp2(simd.load(x, i)))
 
     fill(x, out)
-    np.testing.assert_allclose(out, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
+    assert_allclose(out, np.exp2(x.astype(np.float64)), rtol=2.5e-7)
 
 
 def test_memory_is_reused_when_nothing_refers_to_it():

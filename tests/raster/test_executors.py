@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.errors import InputError
 from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, RasterConfig, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.install import conf_dir, install_command
+from tests.helpers import refusal
 
 CPU = torch.device("cpu")
 
@@ -77,12 +77,10 @@ def test_an_executor_that_cannot_run_is_refused_with_a_remedy(monkeypatch):
         ("gsplat", "cpu", "gsplat runs on device=cuda, not on cpu; choose from reference, cpu"),
         ("cpu", "cuda", "cpu runs on device=cpu, not on cuda; choose from reference, "),
     ):
-        with pytest.raises(InputError, match=f"^raster={said}"):
+        with refusal(f"^raster={said}"):
             resolve(name, device)
     installed(monkeypatch)
-    with pytest.raises(
-        InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"
-    ):
+    with refusal(f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
         resolve("gsplat", "cuda")
     assert find_executor("gsplat").obstacle("cuda") is not None
 
@@ -133,18 +131,16 @@ def test_python_headers_are_searched_in_the_usual_scheme(tmp_path, monkeypatch):
 def test_an_error_says_why_the_gpu_cannot_be_used(monkeypatch):
     pytest.importorskip("triton")
     monkeypatch.setattr(executors, "missing_tools", list)
-    with pytest.raises(InputError, match=r"^Triton cannot start: "):
+    with refusal(r"^Triton cannot start: "):
         executors.load_driver()
     monkeypatch.setattr(executors, "missing_tools", lambda: ["a C compiler", "Python.h"])
-    with pytest.raises(InputError, match=r"^Triton needs a C compiler and Python.h$"):
+    with refusal(r"^Triton needs a C compiler and Python.h$"):
         executors.load_driver()
 
 
 def test_an_unknown_rasterizer_is_refused():
     assert RasterConfig(name="cpu").name == "cpu"
-    with pytest.raises(
-        InputError, match=r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"
-    ):
+    with refusal(r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"):
         RasterConfig(name="cpuu")
     assert RasterConfig(name="mine", _target_="mine.Mine")._target_ == "mine.Mine"
 

@@ -1,6 +1,5 @@
 """A rasterizer from a file outside gsbench: the one of docs/rasterizer.md, in the real program."""
 
-import json
 import os
 import re
 import subprocess
@@ -10,12 +9,12 @@ import pytest
 import torch
 
 from gsbench.config.compose import compose_one
-from gsbench.errors import InputError
 from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.raster import create_rasterizer
 from gsbench.runs.keys import config_hash, rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
+from tests.helpers import read_json, refusal
 
 CPU = torch.device("cpu")
 TINY = [
@@ -69,9 +68,9 @@ def test_the_real_program_trains_with_it_and_records_its_source(folder):
     first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     assert first.returncode == 0, first.stderr
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
-    assert json.loads(path.read_text())["raster"] == "untiled"
+    assert read_json(path)["raster"] == "untiled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
-    recorded = json.loads(manifest.read_text())["inputs"]["raster"]
+    recorded = read_json(manifest)["inputs"]["raster"]
     assert (recorded["class"], recorded["name"], recorded["rows"]) == (
         "untiled.Untiled",
         "untiled",
@@ -103,18 +102,17 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder):
         (["+raster.row=3"], r"raster\.row is not a setting; did you mean rows"),
     ):
         values = composed(*OWN, *words)
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             build_own_rasterizer(values["raster"], values["allow_targets"])
-    with pytest.raises(InputError, match=r"allow_targets=\[untiled\]"):
+    with refusal(r"allow_targets=\[untiled\]"):
         compose_one(OWN[:1])
 
 
 def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder):
     Parts(composed(*OWN)).check(on_this_machine=False)
     parts = Parts(composed(*OWN, "densify=pixelgs"))
-    with pytest.raises(
-        InputError,
-        match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference",
+    with refusal(
+        r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
     ):
         parts.check(on_this_machine=False)
     parts.own_rasterizer.has_footprint = True
@@ -137,7 +135,7 @@ def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder):
         ("Options", {"size": 2}, "not a dataclass"),
         ("Absent", {}, "cannot be imported"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             build_own_rasterizer(
                 {"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"]
             )

@@ -21,7 +21,6 @@ import torch
 
 import gsbench
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.raster.contract import Case
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.executors import EXECUTORS
@@ -34,6 +33,7 @@ from gsbench.train import proof as module
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.proof import create_proven, known_proof, proof_of, prove, stamp_of
 from tests.conftest import ROOT
+from tests.helpers import read_json, refusal, write
 from tests.raster.conftest import interpreter_fault
 
 CPU = torch.device("cpu")
@@ -231,8 +231,7 @@ def test_a_failed_proof_is_repeated(monkeypatch):
 def test_without_a_writable_cache_each_call_proves_again_and_logs_it(cache, monkeypatch, caplog):
     made = []
     count_proofs(made, monkeypatch)
-    cache.parent.mkdir(parents=True)
-    cache.write_text("a file where the folder should be")
+    write(cache, "a file where the folder should be")
     for _ in range(2):
         assert proof_of("cpu", CPU).passed
     assert len(made) == 2
@@ -258,7 +257,7 @@ def test_a_device_without_memory_for_a_proof_is_named(monkeypatch):
         raise torch.OutOfMemoryError("full")
 
     monkeypatch.setattr(module, "run_isolated", full)
-    with pytest.raises(InputError, match="device=cuda:1 has no memory left to prove raster=triton"):
+    with refusal("device=cuda:1 has no memory left to prove raster=triton"):
         module.prove_apart("triton", "cuda:1")
     assert asked == [(module._prove_by_name, "triton", "cuda:1", "the proof of raster=triton")]
 
@@ -385,19 +384,16 @@ def test_auto_takes_the_first_executor_that_passes(gpu, failing, taken, caplog):
             "image is off by up to 3.00e-01 at pixel (4, 2) (and 1 more); torch 2; please report "
             "it with " in line
         )
-        assert json.loads(Path(line.split()[-1]).read_text())["failures"] == gpu["triton"]
+        assert read_json(Path(line.split()[-1]))["failures"] == gpu["triton"]
         assert line in caplog.text
 
 
 def test_a_named_executor_that_fails_is_an_error(gpu):
     gpu["triton"] = ["alpha is off"]
-    with pytest.raises(
-        InputError,
-        match=r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains",
-    ):
+    with refusal(r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains"):
         create_proven("triton", torch.device("cuda"))
     gpu |= {name: ["alpha is off"] for name in ("gsplat", "reference")}
-    with pytest.raises(InputError, match=r"raster=triton .*raster=gsplat .*raster=reference "):
+    with refusal(r"raster=triton .*raster=gsplat .*raster=reference "):
         create_proven("auto", torch.device("cuda"))
 
 

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
+from torch.testing import assert_close
 
 from gsbench.raster.reference import ReferenceRasterizer, project
 from gsbench.scene.types import Camera
@@ -109,15 +111,15 @@ def test_images_and_footprints_match_brute_force(shift):
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     out = ReferenceRasterizer().render(gaussians, camera, 0, background)
     image, alpha, covered = brute_force(gaussians, camera, background.numpy())
-    np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
-    np.testing.assert_allclose(out.alpha.detach().numpy(), alpha, atol=1e-10)
+    assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
+    assert_allclose(out.alpha.detach().numpy(), alpha, atol=1e-10)
     assert alpha.max() > 0.999
     footprint = out.footprint(torch.arange(37) + 100 * torch.arange(21).unsqueeze(1))
     assert footprint.pixels.tolist() == covered[:, 0].tolist()
     assert footprint.values.tolist() == covered[:, 1].tolist()
-    np.testing.assert_allclose(footprint.distances, covered[:, 2], rtol=1e-12)
+    assert_allclose(footprint.distances, covered[:, 2], rtol=1e-12)
     depths = gaussians.means.numpy() @ camera.rotation[2] + camera.translation[2]
-    np.testing.assert_allclose(footprint.depths, depths)
+    assert_allclose(footprint.depths, depths)
     assert (covered[:, 0] > 0).sum() > 30
 
 
@@ -154,9 +156,7 @@ def test_gradients_match_finite_differences(degree):
             assert not numeric.any()
             continue
         assert numeric.abs().max() > 0
-        torch.testing.assert_close(
-            tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}"
-        )
+        assert_close(tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc():
@@ -210,9 +210,9 @@ def test_projection_matches_gsplat():
     )
     projected = project(gaussians, camera)
     # gsplat's first pixel centre is at 0.5
-    torch.testing.assert_close(projected.means + 0.5, means[0, projected.index])
-    torch.testing.assert_close(projected.conics, conics[0, projected.index])
-    torch.testing.assert_close(projected.depths, depths[0, projected.index])
+    assert_close(projected.means + 0.5, means[0, projected.index])
+    assert_close(projected.conics, conics[0, projected.index])
+    assert_close(projected.depths, depths[0, projected.index])
     assert len(projected.index) > 150
 
 
@@ -228,7 +228,7 @@ def test_spherical_harmonics_match_gsplat():
     for degree in range(4):
         theirs = gsplat._spherical_harmonics(degree, directions, coefficients)
         ours = colors(gaussians.sh_dc, gaussians.sh_rest, directions, degree)
-        torch.testing.assert_close(ours, (theirs + 0.5).clamp_min(0))
+        assert_close(ours, (theirs + 0.5).clamp_min(0))
 
 
 def test_the_alpha_of_the_pixel_at_a_mean_is_the_opacity():

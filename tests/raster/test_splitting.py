@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch.autograd.functional import hessian, jacobian
+from torch.testing import assert_close
 
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import CONSTANTS
@@ -130,7 +131,7 @@ def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case):
         expected[index] = hessian(weighted, torch.zeros(3).double())
     assert (expected.abs().amax((1, 2)) > 0).sum() > case.count / 4
     exact = slow.matrices("reference")
-    torch.testing.assert_close(exact, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    assert_close(exact, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
     compiled = slow.matrices("cpu")
     sizes = expected.abs().amax((1, 2), keepdim=True)
     # errors are relative to each Gaussian's own matrix
