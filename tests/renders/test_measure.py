@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
-from gsbench.errors import InputError
 from gsbench.eval.pictures import Matching
 from gsbench.renders import measure
 from gsbench.renders.measure import (
@@ -26,6 +26,7 @@ from gsbench.renders.measure import (
 )
 from gsbench.runs.keys import STAGES
 from tests.analysis.synthetic import Plan, write_runs
+from tests.helpers import read_json, refusal, write
 
 QUICK = ["eval.lpips=[]", "eval.flip=false"]
 COURTYARD = ReferenceImages(
@@ -49,7 +50,7 @@ FOLDER = ReferenceImages({}, "the pictures in a folder", "0" * 64, (96, 72), {})
 def test_places_that_would_mix_or_damage_results_are_refused(
     word, scene, seed, truth, said, tmp_path
 ):
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         find_destination(word, scene, seed, truth, tmp_path)
 
 
@@ -63,9 +64,9 @@ def trial(runs, defaults):
     """The folder of a trial of ``exp`` that tests the scene garden in two views, one masked."""
     plan = Plan("exp", ["garden"], densifiers=["adc"], seeds=[0], views=2, pictures=True)
     (folder,) = write_runs(runs, plan)
-    config = json.loads((folder / "config.yaml").read_text())
+    config = read_json(folder / "config.yaml")
     config = defaults | config | {"scene": {"name": "garden", "path": "there"}}
-    (folder / "config.yaml").write_text(json.dumps(config))
+    write(folder / "config.yaml", config)
     (folder / "masks").mkdir()
     mask = np.zeros((120, 160), np.uint8)
     mask[40:, :] = 255
@@ -90,7 +91,7 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(trial, runs, 
     assert found["views"]["view000"]["psnr"] == pytest.approx(psnr + 10 * np.log10(1.5))
     assert (found["names_matched"], found["left_out"]) == ("apart from the extension", [])
     assert found["pictures"] == {"view000": "view000.png", "view001": "view001.png"}
-    results = json.loads((entered / "results.json").read_text())
+    results = read_json(entered / "results.json")
     assert results["metrics"] == pytest.approx(found["metrics"])
     wanted = {
         **{"status": "complete", "evaluated_from": "renders", "raster": "unknown"},
@@ -106,7 +107,7 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(trial, runs, 
     assert config["densify"] == {"name": "theirs", "evaluated_from": "renders"}
     for folder, source in (("renders", renders), ("ground_truth", trial / "ground_truth")):
         pictures = [Image.open(place / "view001.png") for place in (entered / folder, source)]
-        np.testing.assert_array_equal(*pictures)
+        assert_array_equal(*pictures)
     assert [mask.name for mask in (entered / "masks").iterdir()] == ["view001.png"]
     assert {one.densify for one in load_experiment(runs, "exp").trials} == {"adc", "theirs"}
 
@@ -122,9 +123,9 @@ def test_renders_are_entered_beside_the_trial_of_their_photographs(trial, runs, 
 def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path, refused, said):
     other = trial.with_name("deadbeef-seed0")  # the same arm with another setting
     shutil.copytree(trial, other)
-    config = json.loads((other / "config.yaml").read_text())
+    config = read_json(other / "config.yaml")
     config["densify"] |= {"split_size": 0.02}
-    (other / "config.yaml").write_text(json.dumps(config))
+    write(other / "config.yaml", config)
     for arm, folder in (("adc[split_size=0.02]", other), ("sfm-adc[split_size=0.02]", other)):
         truth = find_reference_images(f"exp:garden:{arm}", [], runs)
         assert truth.photographs["view001"] == folder / "ground_truth" / "view001.png"
@@ -152,9 +153,9 @@ def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path
         ("gardn", "is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene; did you mean"),
     ):
         assert words in refused("evaluate", renders, "--truth", place)
-    results = json.loads((trial / "results.json").read_text())
+    results = read_json(trial / "results.json")
     del results["resolution"]
-    (trial / "results.json").write_text(json.dumps(results))
+    write(trial / "results.json", results)
     assert "no record of the size or hash of its test views" in refused(*address)
 
 
@@ -195,8 +196,7 @@ def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
     }.items():
         monkeypatch.setattr(measure, name, stand_in)
     place = tmp_path / "ground_truth"
-    (place / "masks").mkdir(parents=True)
-    (place / "masks" / "a.png").touch()
+    write(place / "masks" / "a.png", b"")
     truth = find_reference_images("garden", [word], tmp_path)
     asked = ["scene=garden", word]
     assert composed == [asked, [asked[0], "init=random", "init.count=100", word]][:times]
@@ -218,13 +218,11 @@ def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_pat
     )
     assert find_destination("new:mine", "garden", 0, FOLDER, tmp_path).init == "renders"
     write_runs(tmp_path, Plan("exp", ["garden"], ["sfm"], seeds=[0]))
-    with pytest.raises(
-        InputError, match=r"has random, sfm on garden: say which, .* exp:random-mine"
-    ):
+    with refusal(r"has random, sfm on garden: say which, .* exp:random-mine"):
         find_destination("exp:mine", None, 0, garden, tmp_path)
     for folder in (tmp_path / "exp" / "garden").glob("sfm-*/*"):
-        results = json.loads((folder / "results.json").read_text())
-        (folder / "results.json").write_text(json.dumps(results | {"evaluated_from": "renders"}))
+        results = read_json(folder / "results.json")
+        write(folder / "results.json", results | {"evaluated_from": "renders"})
     assert find_destination("exp:mine", None, 0, garden, tmp_path).init == "random"
 
 
@@ -250,7 +248,7 @@ def test_renders_of_other_photographs_than_the_experiments_are_refused(
     truth = ReferenceImages({}, "the pictures in a folder", data, resolution, {})
     destination = Destination("exp", "garden", "sfm", "mine", 0)
     if refused:
-        with pytest.raises(InputError, match="tests garden on other photographs"):
+        with refusal("tests garden on other photographs"):
             check_destination(destination, truth, tmp_path)
     else:
         check_destination(destination, truth, tmp_path)

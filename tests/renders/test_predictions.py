@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.renders.predictions import _write, opened_renders
+from tests.helpers import refusal, write
 
 VIEWS = ("DSC001", "sub/DSC002")
 SIZE, PLACES = (24, 32), ("color", "gt-color")
@@ -38,8 +38,7 @@ def members():
 
 def as_folder(files, place):
     for name, content in files.items():
-        (place / name).parent.mkdir(parents=True, exist_ok=True)
-        (place / name).write_bytes(content)
+        write(place / name, content)
     return place
 
 
@@ -78,8 +77,7 @@ def test_predictions_are_measured_with_their_photographs_or_others(members, tmp_
     photographs = tmp_path / "photos"
     for view in VIEWS:
         file = photographs / f"{view}.JPG"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(members[f"gt-color/{view}.png"])
+        write(file, members[f"gt-color/{view}.png"])
     assert run(["evaluate", str(place), "--truth", str(photographs), *quick]) == 0
     assert "names matched" in capsys.readouterr().out
 
@@ -114,7 +112,7 @@ def test_only_renders_and_photographs_are_unpacked_and_only_for_a_while(form, me
 )
 def test_strange_archives_are_refused(pack, change, message, members, tmp_path):
     archive = pack(members | change, tmp_path / "predictions")
-    with pytest.raises(InputError, match=message), opened_renders(archive):
+    with refusal(message), opened_renders(archive):
         pass
     assert not list(tmp_path.rglob("evil.png"))
 
@@ -143,7 +141,7 @@ def test_files_that_are_no_archive_of_predictions_are_refused(
     with opened_renders(big):
         pass
     monkeypatch.setattr("gsbench.renders.predictions.MAX_TOTAL_BYTES", total - 1)
-    with pytest.raises(InputError, match=r"unpacks to .* kB, more than"), opened_renders(big):
+    with refusal(r"unpacks to .* kB, more than"), opened_renders(big):
         pass
 
 
