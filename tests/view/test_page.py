@@ -12,6 +12,7 @@ from gsbench.cli import run
 from gsbench.normalization import Normalization
 from gsbench.view.page import page_settings
 from gsbench.view.trials import find_trial
+from tests.helpers import read_json, write
 from tests.view.conftest import VIEWS
 
 ADDRESS = "small:courtyard:adc"
@@ -26,9 +27,9 @@ case "$*" in *"{works}"*) (echo "<head></head>"; cat "$settings") > "$previous";
 
 def stand_in(folder, works, fails, works_too=":"):
     """Write an npx that copies its settings to the page if its words contain ``works``."""
-    folder.mkdir()
-    (folder / "npx").write_text(
-        NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too)
+    write(
+        folder / "npx",
+        NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too),
     )
     (folder / "npx").chmod(0o755)
     return folder
@@ -104,15 +105,14 @@ def test_without_npx_the_error_names_the_command_to_type(
     assert said.endswith(f" {model} -E {settings} {page}\n")
     assert said.count("\n") == 1
     assert model.read_bytes()[:3] == b"ply"
-    assert json.loads(settings.read_text())["version"] == 2
+    assert read_json(settings)["version"] == 2
     assert not page.exists()
 
 
 def hostile_capture(folder, monkeypatch):
     """Go to a folder whose own npx, packages and settings would run if npm read them."""
     for name in ("node_modules/.bin/npx", ".npmrc", "package.json", "npx"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(f"#!/bin/sh\ntouch {folder}/exploded\n")
+        write(folder / name, f"#!/bin/sh\ntouch {folder}/exploded\n")
         (folder / name).chmod(0o755)
     monkeypatch.chdir(folder)
 

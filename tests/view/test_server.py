@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
-from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.raster import create_rasterizer
 from gsbench.system.install import install_command
@@ -22,6 +22,7 @@ from gsbench.verbs import servers
 from gsbench.view import server
 from gsbench.view.server import Session, Viewer, check_port
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
+from tests.helpers import refusal
 from tests.view.browser import Browser
 
 
@@ -79,7 +80,7 @@ def test_two_trials_and_their_photograph_share_one_camera(viewer, painters, monk
     for place, pane in enumerate(panes):
         # below the label, right of the dividing line
         shown = picture[20:, place * width + 2 : (place + 1) * width]
-        np.testing.assert_array_equal(shown, pane[20:, 2:])
+        assert_array_equal(shown, pane[20:, 2:])
     monkeypatch.setattr(server, "side_by_side", dict)
     labels = [f"courtyard random-{name} seed 0: 40 Gaussians" for name in ("adc", "volumetric")]
     assert list(viewer.draw(view.camera, Layers(), None)) == labels
@@ -178,9 +179,9 @@ def test_a_page_moves_to_the_view_that_it_chooses(viewer):
     session = viewer._sessions[5] = Session(viewer, page)
     session.go_to(viewer.views["view000.png"])
     camera = page.camera
-    np.testing.assert_allclose(camera.position, [1, 2, 0])
-    np.testing.assert_allclose(camera.look_at, [1, 2, 0.5])  # the cameras' distance from their mean
-    np.testing.assert_allclose(camera.up_direction, [0, -1, 0])
+    assert_allclose(camera.position, [1, 2, 0])
+    assert_allclose(camera.look_at, [1, 2, 0.5])  # the cameras' distance from their mean
+    assert_allclose(camera.up_direction, [0, -1, 0])
     # the picture reaches 33.5 px beside its principal point, and its focal length is 50 px
     assert math.tan(camera.fov / 2) == pytest.approx(33.5 / 50 / (1.5 / 3))
     camera.aspect = None  # not known yet
@@ -226,9 +227,9 @@ def test_page_shows_the_trials_in_a_browser(viewer, tmp_path):
 
 def test_without_viser_the_error_names_the_install_command(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=re.escape(install_command("view"))):
+    with refusal(re.escape(install_command("view"))):
         servers.view(["a:b:c"], Path())
-    with pytest.raises(InputError, match="one or two"):
+    with refusal("one or two"):
         servers.view(["a:b:c"] * 3, Path())
 
 
@@ -238,7 +239,7 @@ def test_a_port_in_use_is_refused_and_one_that_was_just_left_is_not():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port} cannot be used .*--port"):
+        with refusal(f"port {port} cannot be used .*--port"):
             check_port(port)
         with socket.create_connection(("127.0.0.1", port)):
             taken.accept()[0].close()  # the server ends first, so the port stays in TIME_WAIT

@@ -1,6 +1,5 @@
 """Photographs and the page's camera, against the cameras that they come from."""
 
-import json
 import math
 import shutil
 from dataclasses import replace
@@ -9,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageFont
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from gsbench.analysis.results import Configurations
-from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.init.base import PointCloud
@@ -36,6 +36,7 @@ from gsbench.view.trials import (
     side_by_side,
 )
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import read_json, refusal, write
 from tests.view.conftest import POINTS
 
 
@@ -52,7 +53,7 @@ def make_view(x=0.0):
 
 def test_photograph_in_its_own_camera_is_itself():
     view = make_view()
-    np.testing.assert_array_equal(photograph_at(view.camera, view), view.image)
+    assert_array_equal(photograph_at(view.camera, view), view.image)
 
 
 @pytest.mark.parametrize("scale", [2, 0.5])
@@ -102,7 +103,7 @@ def test_page_camera_projects_as_the_page_does():
     assert (camera.height, camera.width) == (200, 160)
     ahead = position + turn.apply([0, 0, 2.0])
     seen = camera.rotation @ ahead + camera.translation
-    np.testing.assert_allclose(seen, [0, 0, 2], atol=1e-12)
+    assert_allclose(seen, [0, 0, 2], atol=1e-12)
     top = position + turn.apply([0, -math.tan(fov / 2) * 2, 2.0])  # y is down
     seen = camera.rotation @ top + camera.translation
     assert camera.fy * seen[1] / seen[2] + camera.cy == pytest.approx(0, abs=1e-9)
@@ -131,26 +132,26 @@ def test_page_stands_upright_where_the_photograph_was_taken(roll):
     up = level_up(camera, np.array([0.0, -1.0, 0.0]))
     forward = camera.rotation[2]
     right = np.cross(forward, up)
-    np.testing.assert_allclose(right / np.linalg.norm(right), camera.rotation[0], atol=1e-12)
+    assert_allclose(right / np.linalg.norm(right), camera.rotation[0], atol=1e-12)
     assert np.linalg.norm(up) == pytest.approx(1)
     if roll == 0:
-        np.testing.assert_allclose(up, [0, -1, 0], atol=1e-12)
+        assert_allclose(up, [0, -1, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (1, 0, 0)])
 def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(up):
     """The camera looks straight up, or the direction is to its right."""
-    np.testing.assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
+    assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
 
 
 def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction():
     views = [make_view(x) for x in (0.0, 3.0, 9.0)]  # 4, 1 and 5 from their middle
-    np.testing.assert_allclose(mean_up(views), [0, -1, 0])
+    assert_allclose(mean_up(views), [0, -1, 0])
     assert orbit_distance(views) == pytest.approx(10 / 3)
     assert orbit_distance(views[:1]) == 1e-3
     camera = views[0].camera
     opposite = replace(views[0], camera=replace(camera, rotation=np.diag([-1.0, -1, 1])))
-    np.testing.assert_array_equal(mean_up([views[0], opposite]), [0, 0, 1])
+    assert_array_equal(mean_up([views[0], opposite]), [0, 0, 1])
 
 
 @pytest.mark.parametrize(
@@ -203,20 +204,20 @@ def test_layers_choose_what_is_drawn():
         (Layers(share=1), rendered(shown, opaque.map(lambda tensor: tensor[:1]))),
         (Layers(cloud=True, share=1), rendered(shown, cloud)),
     ):
-        np.testing.assert_allclose(shown.draw(camera, layers), wanted, atol=1)
+        assert_allclose(shown.draw(camera, layers), wanted, atol=1)
     assert list(shown.above(0.05)) == list(range(31, 40))
     counts = shown.counts_above(0.05)
     assert (counts[Cause.CLONE], counts[Cause.SPLIT_VOLUME], sum(counts.values())) == (4, 5, 9)
     plain = shown.draw(camera, Layers()).astype(float)
     none_large = shown.draw(camera, Layers(causes=True, log10_volume=99.0))
-    np.testing.assert_array_equal(none_large, plain)
+    assert_array_equal(none_large, plain)
     marked = shown.draw(camera, Layers(causes=True, log10_volume=0.05)).astype(float)
     with torch.no_grad():
         large = gaussians.select(torch.arange(31, 40))
         alpha = shown.rasterizer.render(large, camera, 0, torch.zeros(3)).alpha.numpy()
     outside = (alpha == 0) & (plain.max(-1) < 255)  # brighter pixels were cut off
     assert outside.any()
-    np.testing.assert_allclose(marked[outside], 0.35 * plain[outside], atol=1)
+    assert_allclose(marked[outside], 0.35 * plain[outside], atol=1)
     inside, share = alpha > 0.2, alpha[..., None].clip(1e-6)
     colors = ((marked - 0.35 * (1 - share) * plain) / share)[inside]
     hues = np.array([Cause.CLONE.color, Cause.SPLIT_VOLUME.color])  # they mix where they overlap
@@ -249,15 +250,15 @@ def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):
     assert load_viewed(trial, torch.device("cpu")).background == (0, 0, 0)
     assert viewed.causes.tolist() == [k % 6 for k in range(10, 50)]
     volumes = 4 / 3 * np.pi * viewed.gaussians.scales.double().prod(-1).numpy()
-    np.testing.assert_allclose(10**viewed.log10_volumes, volumes, rtol=1e-5)
-    np.testing.assert_array_equal(viewed.cloud.points, POINTS)
+    assert_allclose(10**viewed.log10_volumes, volumes, rtol=1e-5)
+    assert_array_equal(viewed.cloud.points, POINTS)
     own = 2 * (viewed.gaussians.means - torch.tensor([1.0, 2, 3]))
-    torch.testing.assert_close(there.gaussians.means, own)
+    assert_close(there.gaussians.means, own)
     first, second = viewed.views
     camera = first.camera  # of a photograph of half the model's size
     assert (first.name, camera.width, camera.height) == ("view000.png", 64, 48)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 55, 33.5, 23)
-    np.testing.assert_allclose(second.camera.center, [2, 2, 0])
+    assert_allclose(second.camera.center, [2, 2, 0])
     folder = small_runs / "store" / "init" / "init-courtyard-random" / "sparse" / "0"
     centred = configured(trial, scene__principal_point="centred")
     camera = read_test_views(centred, folder)[1].camera
@@ -280,12 +281,12 @@ def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs, tmp_path):
         "nothing:courtyard:adc": "nothing",
         str(first.path.parent): "is not a trial's folder",
     }.items():
-        with pytest.raises(InputError, match=words):
+        with refusal(words):
             find_trial(address, small_runs)
     copy = Path(shutil.copytree(small_runs, tmp_path / "runs")) / first.path.relative_to(small_runs)
-    results = json.loads((copy / "results.json").read_text())
-    (copy / "results.json").write_text(json.dumps(results | {"status": "running"}))
-    with pytest.raises(InputError, match="is not a complete trial"):
+    results = read_json(copy / "results.json")
+    write(copy / "results.json", results | {"status": "running"})
+    with refusal("is not a complete trial"):
         find_trial(str(copy), tmp_path / "runs")
 
 
@@ -293,21 +294,21 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
     shutil.copytree(small_runs, tmp_path / "runs")
     trial = find_trial("small:courtyard:adc", tmp_path / "runs")
     renders = replace(trial.record, evaluated_from="renders")
-    with pytest.raises(InputError, match="was evaluated from renders: it has no model"):
+    with refusal("was evaluated from renders: it has no model"):
         model_file(replace(trial, record=renders))
-    with pytest.raises(InputError, match="is of 40 Gaussians, the model has 1: run"):
+    with refusal("is of 40 Gaussians, the model has 1: run"):
         read_causes(trial.path / "lineage.npz", 1)
     for folder, words in (
         (trial.path / "ground_truth", "holds no picture of a test view"),
         (tmp_path / "runs" / "store", "is gone, and it had the cameras of small/courtyard"),
     ):
         shutil.rmtree(folder)
-        with pytest.raises(InputError, match=words):
+        with refusal(words):
             load_viewed(trial, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
 def test_a_damaged_record_of_causes_is_refused(tmp_path, content):
     (tmp_path / "lineage.npz").write_bytes(content)
-    with pytest.raises(InputError, match=r"lineage\.npz cannot be read"):
+    with refusal(r"lineage\.npz cannot be read"):
         read_causes(tmp_path / "lineage.npz", 1)
