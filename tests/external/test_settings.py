@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from gsbench.errors import InputError
 from gsbench.external.settings import External
+from tests.helpers import refusal
 
 
 def external(result, **options):
@@ -23,7 +23,7 @@ def external(result, **options):
     ],
 )
 def test_an_option_is_one_value_with_a_name_of_its_own(options, said):
-    with pytest.raises(InputError, match=re.escape(said)):
+    with refusal(re.escape(said)):
         external("a.ply", options=options)
 
 
@@ -32,14 +32,14 @@ def test_an_option_is_one_value_with_a_name_of_its_own(options, said):
 )
 def test_a_setting_of_the_wrong_kind_is_refused_by_its_name(settings):
     sound = {"command": "train {data}", "result": "a.ply", "version": "1"}
-    with pytest.raises(InputError, match=rf"densify\.{next(iter(settings))}"):
+    with refusal(rf"densify\.{next(iter(settings))}"):
         External(**(sound | settings))
 
 
 def test_placeholders_are_known_and_tell_whether_test_cameras_are_needed():
     for command, result in (("train {data} {lr}", "a.ply"), ("train {data}", "{lr}.ply")):
         key = "command" if "lr" in command else "result"
-        with pytest.raises(InputError, match=rf"densify\.{key}: unknown placeholder \{{lr\}}"):
+        with refusal(rf"densify\.{key}: unknown placeholder \{{lr\}}"):
             External(command=command, result=result, version="1")
     assert not external("a.ply").needs_test_cameras
     assert external("a.ply", environment={"CAMERAS": "{test_cameras}/x"}).needs_test_cameras
@@ -61,7 +61,7 @@ def test_the_program_is_found_on_its_own_path(tmp_path, monkeypatch):
     )
     assert home.executable() == str(tmp_path / "two" / "train")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(InputError, match="this machine has no program 'train': install it"):
+    with refusal("this machine has no program 'train': install it"):
         external("a.ply").executable()
 
 
@@ -98,6 +98,6 @@ def test_patterns_below_the_output_folder_are_accepted(result):
     ],
 )
 def test_patterns_that_fit_no_file_below_the_folder_are_refused(result, words):
-    with pytest.raises(InputError, match=words) as refused:
+    with refusal(words) as refused:
         external(result, options={"kind": "/abs"})
     assert "densify.result" in str(refused.value)
