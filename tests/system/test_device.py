@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from gsbench.errors import InputError
 from gsbench.system.device import free_bytes, select_device
+from tests.helpers import refusal
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def rounding():
 def test_a_device_is_chosen_or_refused(rounding, name, gpus, answer, monkeypatch):
     pretend(monkeypatch, gpus)
     if " " in answer:
-        with pytest.raises(InputError, match=f"device={name}.*{answer}"):
+        with refusal(f"device={name}.*{answer}"):
             select_device(name)
     else:
         assert select_device(name) == torch.device(answer)
@@ -68,9 +68,7 @@ def test_a_gpu_that_another_program_holds_is_named(rounding, monkeypatch):
 
     pretend(monkeypatch, 1)
     monkeypatch.setattr(torch.cuda, "mem_get_info", held)
-    with pytest.raises(
-        InputError, match=r"device=auto: CUDA error: .* unavailable; does another program hold"
-    ):
+    with refusal(r"device=auto: CUDA error: .* unavailable; does another program hold"):
         select_device("auto")
 
 

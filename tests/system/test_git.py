@@ -6,6 +6,7 @@ import subprocess
 import pytest
 
 from gsbench.system.install import checkout_of
+from tests.helpers import write
 
 MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 
@@ -45,8 +46,7 @@ def test_commit_and_changes_are_reported(repository):
 
 def test_an_untracked_folder_is_no_checkout(repository):
     inner = repository / ".venv" / "site-packages"
-    inner.mkdir(parents=True)
-    (inner / "b.py").touch()
+    write(inner / "b.py", b"")
     assert checkout_of(inner, "b.py") == {}
 
 

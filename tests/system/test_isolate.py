@@ -12,11 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
+from numpy.testing import assert_array_equal
 
 import gsbench
 from gsbench.errors import InputError
 from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
+from tests.helpers import refusal
 from tests.processes import heed_interrupts
 
 PATIENCE = 120.0  # seconds; a slow machine needs fewer
@@ -78,7 +80,7 @@ def test_result_comes_back_from_another_process(functions):
     array = np.arange(1_000_000.0).reshape(1000, 1000)
     doubled, pid = run_isolated(functions.double, array)
     assert pid != os.getpid()
-    np.testing.assert_array_equal(doubled, array * 2)
+    assert_array_equal(doubled, array * 2)
 
 
 def test_child_imports_neither_torch_nor_the_main_module(functions):
@@ -89,7 +91,7 @@ def test_child_imports_neither_torch_nor_the_main_module(functions):
 
 
 def test_exception_keeps_type_text_and_traceback(functions):
-    with pytest.raises(InputError, match="the folder is empty: add photos") as caught:
+    with refusal("the folder is empty: add photos") as caught:
         run_isolated(functions.refuse, what="reading")
     assert "in refuse" in "".join(caught.value.__notes__)
     with pytest.raises(RuntimeError, match="Unpicklable: x-1"):

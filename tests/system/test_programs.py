@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsbench.system import install, programs, resources
+from tests.helpers import write
 
 SRC = Path(programs.__file__).parents[1]
 
@@ -86,8 +87,7 @@ def test_nobody_imports_a_starter_by_its_own_name():
 @pytest.mark.parametrize("entry", [".", "", "bin"])
 def test_no_program_of_the_current_folder_starts(name, start, entry, tmp_path, monkeypatch):
     for folder in (tmp_path, tmp_path / "bin"):
-        folder.mkdir(exist_ok=True)
-        (folder / name).write_text(f"#!/bin/sh\ntouch {tmp_path}/exploded\n")
+        write(folder / name, f"#!/bin/sh\ntouch {tmp_path}/exploded\n")
         (folder / name).chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", entry)

@@ -1,6 +1,5 @@
 """Signals stop the program at once or at the end of a step; locks are held by one process."""
 
-import json
 import logging
 import os
 import signal
@@ -23,6 +22,7 @@ from gsbench.system.stopping import (
     requested,
     stop_on_signals,
 )
+from tests.helpers import read_json
 
 
 def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back():
@@ -93,7 +93,6 @@ def test_a_lock_names_its_holder_as_long_as_it_is_held(tmp_path, monkeypatch):
     assert describe_holder(lock) == "another process"
     with hold(lock, "the work"):
         holder = read_holder(lock)
-        assert holder is not None
         assert (holder.pid, holder.since, holder.what) == (os.getpid(), 12.5, "the work")
         assert describe_holder(lock) == f"process {os.getpid()} on {holder.host}, Slurm job 5"
     assert read_holder(lock) is None
@@ -101,7 +100,7 @@ def test_a_lock_names_its_holder_as_long_as_it_is_held(tmp_path, monkeypatch):
     (tmp_path / "target").write_text("kept")
     (tmp_path / "a.lock.holder").symlink_to(tmp_path / "target")
     with hold(lock, "the work"):
-        assert json.loads((tmp_path / "a.lock.holder").read_text())["what"] == "the work"
+        assert read_json(tmp_path / "a.lock.holder")["what"] == "the work"
     assert (tmp_path / "target").read_text() == "kept"
     with pytest.raises(KeyError), hold(lock, "the work"):
         raise KeyError
@@ -164,7 +163,6 @@ def test_only_allowed_modules_are_found_in_their_folder(tmp_path, monkeypatch):
     assert sys.meta_path.count(finder) == 1
     assert sys.meta_path[-1] is finder  # installed modules come first
     found = finder.find_spec("mine")
-    assert found is not None
     assert found.origin == str(tmp_path / "mine.py")
     assert finder.find_spec("other") is None
     assert finder.find_spec("mine", ["/package"]) is None
