@@ -1,7 +1,6 @@
 """What an evaluation depends on, and what it measures."""
 
 import csv
-import json
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.eval.evaluator import Evaluator
@@ -24,6 +24,7 @@ from gsbench.runs.keys import INIT, TRAIN, Step, UserCode
 from gsbench.runs.store import Store
 from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
 from gsbench.train.trainer import snapshot_file
+from tests.helpers import read_json
 
 TRAINED = Step(TRAIN, {}, lambda folder: None)
 FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
@@ -134,7 +135,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
     means = {"last": 0.0, "earlier": 0.0}
     for view in scene.test:
         picture = np.asarray(Image.open(folder / "renders" / view.name)).astype(float)
-        np.testing.assert_array_equal(picture, rendered(truth, view))
+        assert_array_equal(picture, rendered(truth, view))
         counted = np.ones((32, 40), dtype=bool) if view.mask is None else view.mask
         for name, image in (("last", picture), ("earlier", rendered(earlier, view))):
             means[name] += 0.5 * 10 * np.log10(255**2 / ((image - view.image)[counted] ** 2).mean())
@@ -152,7 +153,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
         places = [np.linalg.norm(view.camera.center - other.camera.center) for other in scene.train]
         assert float(row[DISTANCE]) == pytest.approx(min(places) / scene.extent)
         assert float(row["fps"]) > 0
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     assert metrics["metrics"]["psnr"] == pytest.approx(means["last"], abs=1e-5)
     assert metrics["at"].keys() == {"7"}
     assert metrics["at"]["7"]["num_gaussians"] == 50
@@ -195,7 +196,7 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
         for shift, view in enumerate(tiny_scene.test, 4)
     ]
     assert found == pytest.approx(expected, abs=1e-5)
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     assert (
         metrics["unavailable"]["fps"]
         == "only the renders of the other program are known, not its model"

@@ -1,12 +1,12 @@
 """A trial's steps in order, its files, and its failures, with stand-ins for the steps."""
 
-import json
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.files import DiskFullError
@@ -21,6 +21,7 @@ from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.locks import BusyError, hold
 from tests.finished import record_of
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import read_json, write
 from tests.launch.test_jobs import trial
 
 # ---- the frame
@@ -38,8 +39,7 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
         return record
 
     monkeypatch.setattr(trials, "_run", run)
-    one.folder.mkdir(parents=True)
-    (one.folder / ".a.tmp-1").touch()
+    write(one.folder / ".a.tmp-1", b"")
     with hold(one.files.lock, "other"), pytest.raises(BusyError, match="seed 0"):
         run_trial(one, wait=False)
     assert run_trial(one) == record
@@ -210,8 +210,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     for stage, names in content.items():
         place = tmp_path / stage.name
         for name in names:
-            (place / name).parent.mkdir(parents=True, exist_ok=True)
-            (place / name).write_text(f"{stage.name} {name}")
+            write(place / name, f"{stage.name} {name}")
         entries[stage.name] = SimpleNamespace(path=place)
     gaussians = random_gaussians(5, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "train" / "point_cloud.ply")
@@ -232,7 +231,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     assert {name: (folder / name).read_text() for name in texts} == texts
     model = read_ply(folder / "point_cloud.ply")
     given = gaussians.means / normalization.scale + torch.tensor(normalization.center)
-    torch.testing.assert_close(model.means, given.float())
+    assert_close(model.means, given.float())
     assert (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply") == (
         normalization is IDENTITY
     )
@@ -301,8 +300,7 @@ def running(tmp_path, monkeypatch):
 def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     caplog.set_level(logging.INFO, "gsbench")
     one, folder = running.trial, running.trial.folder
-    folder.mkdir(parents=True)
-    (folder / "failed.json").write_text("{}")
+    write(folder / "failed.json", "{}")
     assert run_trial(one) == running.record
     seen = running.seen
     assert (seen["checked"], seen["rasterizer"], seen["threads"]) == (True, True, 3)
@@ -327,7 +325,6 @@ def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     assert not (folder / "failed.json").exists()
     assert not (folder / "building.json").exists()
     made_of = one.files.made_of()
-    assert made_of is not None
     # the photographs of a scene that gsbench made are not looked at again
     assert set(made_of.entries) == {"init", "train", "ground_truth", "evaluate"}
     assert set(made_of.published) == {"config.yaml", "init_report.json"}
@@ -353,9 +350,8 @@ def test_equal_results_are_called_done_and_useless_ones_are_named(running, caplo
 
 def test_a_refused_part_leaves_the_earlier_configuration(running):
     one, running.error = running.trial, InputError("no such device")
-    one.folder.mkdir(parents=True)
-    (one.folder / "config.yaml").write_text("earlier")
+    write(one.folder / "config.yaml", "earlier")
     with pytest.raises(GsbenchError, match="no such device"):
         run_trial(one)
     assert (one.folder / "config.yaml").read_text() == "earlier"
-    assert json.loads((one.folder / "failed.json").read_text())["status"] == "failed"
+    assert read_json(one.folder / "failed.json")["status"] == "failed"

@@ -1,6 +1,5 @@
 """A trial's parts, their checks before any work, and failures of its code."""
 
-import json
 import sys
 from types import ModuleType
 
@@ -13,6 +12,7 @@ from gsbench.pipeline.parts import Parts, build, build_own_rasterizer
 from gsbench.pipeline.trial import _recorded_failures, run_trial
 from gsbench.runs import layout
 from gsbench.runs.trial_folder import TrialFolder
+from tests.helpers import read_json
 
 
 @pytest.mark.parametrize("code", [0, None, 3, "text"])
@@ -24,7 +24,7 @@ def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
         _recorded_failures({"seed": 0}, folder),
     ):
         sys.exit(code)
-    assert "ended the process" in json.loads((folder.path / "failed.json").read_text())["message"]
+    assert "ended the process" in read_json(folder.path / "failed.json")["message"]
 
 
 @pytest.mark.parametrize(
