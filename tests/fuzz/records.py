@@ -44,6 +44,7 @@ from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
 from tests.finished import record_of
 from tests.fuzz.corrupt import corrupt
+from tests.helpers import read_json, write
 
 SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
@@ -130,8 +131,7 @@ def write_trial(runs, densify, seed, threshold=0.03):
     """Write a trial with every file that its readers look for."""
     values = values_of(runs, densify, seed, threshold)
     folder = TrialFolder.of(values).path
-    folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(json.dumps(values))
+    write(folder / "config.yaml", values)
     steps = range(10, 101, 10)
     rows = [
         {"step": k, "psnr": 20 + k / 50, "num_gaussians": 10 * k, "seconds": k / 10, "loss": 1 / k}
@@ -169,33 +169,22 @@ def write_original(runs):
     home = runs / EXPERIMENT
     done, *_ = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)]
     variant = write_trial(runs, "volumetric", 0, 0.5)
-    content = json.loads((variant / "results.json").read_text())
+    content = read_json(variant / "results.json")
     del content["made_of"]  # so that its settings are read from the YAML
-    (variant / "results.json").write_text(json.dumps(content))
+    write(variant / "results.json", content)
     failed = write_trial(runs, "volumetric", 1, 0.5)
     (failed / "results.json").unlink()
-    (failed / "failed.json").write_text(
-        json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1})
+    write(failed / "failed.json", {"error": "E", "message": "m", "time": 1.0, "seed": 1})
+    write(failed / "building.json", {"stage": "train", "folder": str(done)})
+    write(failed / ".submitted.json", {"job": "5", "log": "l", "user": "u"})
+    write(
+        variant / "mlflow.json",
+        {"uri": "u", "token": "t", "started": 1, "logged": {"metrics.jsonl": 5}, "complete": "c"},
     )
-    (failed / "building.json").write_text(json.dumps({"stage": "train", "folder": str(done)}))
-    (failed / ".submitted.json").write_text(json.dumps({"job": "5", "log": "l", "user": "u"}))
-    (variant / "mlflow.json").write_text(
-        json.dumps(
-            {
-                "uri": "u",
-                "token": "t",
-                "started": 1,
-                "logged": {"metrics.jsonl": 5},
-                "complete": "c",
-            }
-        )
-    )
-    (done / ".lock.holder").write_text(
-        json.dumps({"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
-    )
+    write(done / ".lock.holder", {"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
     entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0}
     places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
-    (home / "plan.json").write_text(json.dumps({"version": 1, "trials": places}))
+    write(home / "plan.json", {"version": 1, "trials": places})
     declared = [
         {"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-11-21T20:05:00Z"},
         {
@@ -217,7 +206,7 @@ def write_original(runs):
         "log": [],
         "points": [{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}],
     }
-    (home / "tuning.json").write_text(json.dumps(tuning))
+    write(home / "tuning.json", tuning)
     places_of = {name: done / name for name in NAMES}
     places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "tuning.json")}
     places_of |= {
