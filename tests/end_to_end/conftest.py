@@ -1,7 +1,6 @@
 """Run the real program as a user does: in a subprocess, in an empty folder."""
 
 import hashlib
-import json
 import os
 import shutil
 import subprocess
@@ -12,6 +11,7 @@ import pytest
 from filelock import FileLock
 
 from gsbench.cli import run
+from tests.helpers import read_json
 from tests.processes import heed_interrupts
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -154,9 +154,7 @@ def results_of(runs, name):
     """The results of a sweep without times, with checksums of models, pictures and tables."""
     found = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
-        results = {
-            key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED
-        }
+        results = {key: value for key, value in read_json(path).items() if key not in CLOCKED}
         results["init_report"].pop("seconds", None)
         results.pop("experiment")
         files = [

@@ -1,6 +1,5 @@
 """After an edit of gsbench itself, no command returns the numbers of the earlier code."""
 
-import json
 import shutil
 
 import pytest
@@ -8,6 +7,7 @@ import pytest
 from gsbench.runs.keys import PACKAGE
 from gsbench.system.install import conf_dir
 from tests.end_to_end.conftest import SMALL
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +36,7 @@ def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
 
     def results():
         (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
-        found = json.loads(path.read_text())
+        found = read_json(path)
         return found
 
     train()

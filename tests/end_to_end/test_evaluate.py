@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.cli import run
 from gsbench.scene.types import ANGLE, DISTANCE
 from tests.end_to_end.conftest import SMALL
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 EVAL = ["eval.lpips=[squeeze]", "eval.download=false"]
@@ -54,7 +56,7 @@ def trial(runs, arm="random-adc", seed=0):
 
 
 def results(folder):
-    return json.loads((folder / "results.json").read_text())
+    return read_json(folder / "results.json")
 
 
 def views(folder):
@@ -133,9 +135,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert found["num_gaussians"] is None
     assert list(views(entered)) == list(views(trial(runs)))
     picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
-    np.testing.assert_array_equal(
-        picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png"))
-    )
+    assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
 
     table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
     assert table.returncode == 0, table.stderr

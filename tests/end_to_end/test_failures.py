@@ -1,6 +1,5 @@
 """The program with a full disk, with a read-only folder, and with a trial that raises."""
 
-import json
 import os
 import subprocess
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.end_to_end.conftest import SMALL, SWEEP, results_of
+from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 
@@ -66,9 +66,9 @@ def test_a_failed_trial_does_not_stop_the_others_and_retry_completes_it(gsbench,
         "if not Path('mended').exists():\n            raise RuntimeError('not yet')\n        "
         "super().begin(gaussians, context)\n"
     )
-    (tmp_path / "conf" / "densify").mkdir(parents=True)
-    (tmp_path / "conf" / "densify" / "mine.yaml").write_text(
-        "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n"
+    write(
+        tmp_path / "conf" / "densify" / "mine.yaml",
+        "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n",
     )
     sweep = [
         "--config-dir",
@@ -88,7 +88,7 @@ def test_a_failed_trial_does_not_stop_the_others_and_retry_completes_it(gsbench,
     assert "not yet" in done.stderr
     assert "1 of 2 trials done" in done.stderr
     (failed,) = Path(runs).glob("own/*/random-mine/*/failed.json")
-    assert "not yet" in json.loads(failed.read_text())["traceback"]
+    assert "not yet" in read_json(failed)["traceback"]
     status = gsbench("status", "own", GSBENCH_RUNS=runs)
     assert status.returncode == 1
     assert "failed" in status.stdout

@@ -6,6 +6,7 @@ import subprocess
 import pytest
 
 from tests.end_to_end.conftest import SMALL
+from tests.helpers import write
 
 pytestmark = pytest.mark.slow
 
@@ -111,8 +112,7 @@ def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchang
     ran = tmp_path / "ran"
     for hook in ("post-checkout", "reference-transaction"):
         file = home.parent / ".git" / "hooks" / hook
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(f"#!/bin/sh\ntouch {ran}\n")
+        write(file, f"#!/bin/sh\ntouch {ran}\n")
         file.chmod(0o755)
     write_class(home, 99, worse=False)  # an edit that was not committed
     before = (

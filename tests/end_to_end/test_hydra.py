@@ -1,9 +1,10 @@
 """gsbench as a Hydra app, through the real program: other launchers, and callbacks."""
 
-import json
 from importlib.util import find_spec
 
 import pytest
+
+from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 SECONDS = 900  # a limit for a trial of three iterations on a busy machine
@@ -65,12 +66,11 @@ hydra:
 
 
 def results_below(folder):
-    return [json.loads(path.read_text()) for path in sorted(folder.rglob("results.json"))]
+    return [read_json(path) for path in sorted(folder.rglob("results.json"))]
 
 
 def test_an_experiment_file_can_set_callbacks_and_a_sweep(gsbench, tmp_path):
-    (tmp_path / "conf" / "experiment").mkdir(parents=True)
-    (tmp_path / "conf" / "experiment" / "own.yaml").write_text(EXPERIMENT)
+    write(tmp_path / "conf" / "experiment" / "own.yaml", EXPERIMENT)
     (tmp_path / "notes.py").write_text(CALLBACK)
     words = [
         "--config-dir",

@@ -1,6 +1,5 @@
 """The program, killed by signals or run twice at once, continues and ends as if undisturbed."""
 
-import json
 import os
 import random
 import re
@@ -15,6 +14,7 @@ import yaml
 
 from tests.claims.test_check import content
 from tests.end_to_end.conftest import SMALL, SWEEP, results_of, start
+from tests.helpers import read_json, write
 from tests.launch.test_declare import TINY
 from tests.processes import bytes_written
 
@@ -87,7 +87,7 @@ def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
     content = bytearray(model.read_bytes())
     content[len(content) // 2] ^= 1
     model.write_bytes(content)
-    psnr = json.loads(other.read_text())["metrics"]["psnr"]
+    psnr = read_json(other)["metrics"]["psnr"]
     other.write_text(other.read_text().replace(f'"psnr": {psnr}', '"psnr": 99.0'))
     assert results_of(runs, "attacked") != undisturbed
     process = start(environment, tmp_path, runs, *SWEEP)
@@ -124,7 +124,7 @@ def holders(runs):
     found = {}
     for path in runs.glob("local/*/*/*/.lock.holder"):
         try:
-            found[path.parent.name] = json.loads(path.read_text())["pid"]
+            found[path.parent.name] = read_json(path)["pid"]
         except (OSError, ValueError):
             continue
     return found
@@ -192,7 +192,6 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
     with subprocess.Popen(
         program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
     ) as first:
-        assert first.stderr is not None
         for line in first.stderr:
             if "point 1 of 2" in line:
                 first.send_signal(signal.SIGKILL)
@@ -209,9 +208,7 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
     )
     assert len(arms) == 2
     for arm in arms:
-        points = json.loads((home.parent / f"small-tune-{arm}" / "tuning.json").read_text())[
-            "points"
-        ]
+        points = read_json(home.parent / f"small-tune-{arm}" / "tuning.json")["points"]
         assert len(points) == 2
         best = max(points, key=lambda point: point["value"])
         (results,) = home.glob(f"courtyard/{arm}/*/results.json")
@@ -246,9 +243,7 @@ def test_a_killed_check_continues_and_ends_with_the_same_page(tmp_path):
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
     claims = tmp_path / "claims.yaml"
-    claims.write_text(
-        json.dumps(content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2})
-    )
+    write(claims, content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2})
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     check = [sys.executable, "-m", "gsbench.cli", "check", str(claims)]
     subprocess.run(

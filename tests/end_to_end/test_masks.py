@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import json
 import shutil
 from functools import partial
 
@@ -19,6 +18,7 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import read_mask
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -100,7 +100,7 @@ def bits(folder):
 def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, words):
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
-    clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
+    clean, noisy = (read_json(folder / "results.json") for folder in folders)
     assert clean["hashes"]["data"] != noisy["hashes"]["data"], (
         "the photographs differ, and results say so"
     )
@@ -115,7 +115,7 @@ def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, wor
 
 def _points(folder):
     """The digests of the trial's initial cloud and cameras."""
-    key = json.loads((folder / "results.json").read_text())["hashes"]["init"]
+    key = read_json(folder / "results.json")["hashes"]["init"]
     model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
 
@@ -139,7 +139,7 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     shutil.copytree(captures[0], capture)
     words = ["init=random", "init.count=500", "densify=none", "train.iterations=5"]
     folder = trial(tmp_path / "runs", capture, *words)
-    first = json.loads((folder / "results.json").read_text())
+    first = read_json(folder / "results.json")
     mask = sorted((capture / "masks").iterdir())[3]  # of a training view
     before = mask.read_bytes()
     pixels = np.array(Image.open(mask))
@@ -148,12 +148,12 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     capsys.readouterr()
     trial(tmp_path / "runs", capture, *words)
     assert "already done" not in capsys.readouterr().err
-    second = json.loads((folder / "results.json").read_text())
+    second = read_json(folder / "results.json")
     assert first["hashes"]["train"] != second["hashes"]["train"]
     assert first["hashes"]["config"] == second["hashes"]["config"]
     mask.write_bytes(before)
     trial(tmp_path / "runs", capture, *words)
-    assert json.loads((folder / "results.json").read_text())["hashes"] == first["hashes"]
+    assert read_json(folder / "results.json")["hashes"] == first["hashes"]
 
 
 def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, capfd):

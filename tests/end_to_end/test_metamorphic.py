@@ -4,7 +4,6 @@ A similarity (place, scale, rotation) may change a result as another seed does. 
 another format of the same values, may not change one bit.
 """
 
-import json
 import math
 import shutil
 import statistics
@@ -18,6 +17,7 @@ import pycolmap
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from PIL import Image
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
@@ -27,6 +27,7 @@ from gsbench.files import file_sha256
 from gsbench.scene.colmap import write_model
 from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard
 from tests.end_to_end.conftest import trial_of
+from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 
@@ -92,7 +93,7 @@ def original(good, tmp_path_factory):
 
 
 def psnr_of(trial):
-    return float(json.loads((trial / "results.json").read_text())["metrics"]["psnr"])
+    return float(read_json(trial / "results.json")["metrics"]["psnr"])
 
 
 def require_same_up_to_a_seed(trial, original):
@@ -138,7 +139,7 @@ def require_given_coordinates(trial, untouched, similarity, exported, capture):
     # Trainings differ as two seeds do, so their clouds have the same middle and spread, within a
     # tenth of a unit.
     for share in (0.1, 0.5, 0.9):
-        np.testing.assert_allclose(
+        assert_allclose(
             np.quantile(restored, share, axis=0),
             np.quantile(positions_before, share, axis=0),
             atol=0.5,
@@ -152,7 +153,7 @@ def require_given_coordinates(trial, untouched, similarity, exported, capture):
     resolution = 1e-8 * similarity.scale + 1e-15 * np.abs(similarity.translation).max()
     for image in given_model.images.values():
         center = exported_model.find_image_with_name(image.name).projection_center()
-        np.testing.assert_allclose(center, image.projection_center(), atol=100 * resolution)
+        assert_allclose(center, image.projection_center(), atol=100 * resolution)
 
 
 def rename(folder, model):
@@ -238,5 +239,5 @@ def test_transforms_json_gives_the_result_of_the_colmap_model(good, original, tm
         "cy": cy,
         "ply_file_path": "points.ply",
     }
-    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
+    write(folder / "transforms.json", shared | {"frames": frames})
     require_same_up_to_a_seed(train(tmp_path / "runs", folder, "scene=transforms"), original)

@@ -1,6 +1,5 @@
 """OpenSplat as an arm, where it is installed: its model lies at the right place, and it grows."""
 
-import json
 import shutil
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 from PIL import Image
 
 from gsbench.cli import run
+from tests.helpers import read_json
 
 PROGRAM = "opensplat"
 VERSION = "1.2.0"
@@ -73,7 +73,7 @@ def test_renders_of_opensplat_are_neither_mirrored_nor_shifted(trial):
 
 
 def test_opensplat_grows_on_the_given_schedule(trial):
-    results = json.loads((trial / "results.json").read_text())
+    results = read_json(trial / "results.json")
     assert results["num_gaussians"] > results["num_init_points"]
     assert VERSION in results["trained_by"]["said"]
     rounds = [

@@ -1,7 +1,6 @@
 """Another program as an arm: its inputs, the trials made of its results, and its failures."""
 
 import hashlib
-import json
 import os
 import re
 import signal
@@ -21,6 +20,7 @@ from gsbench.datasets.catalog import read_catalog
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
+from tests.helpers import read_json, write
 from tests.processes import heed_interrupts, is_running
 
 pytestmark = pytest.mark.slow
@@ -61,8 +61,7 @@ COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 def trainers(tmp_path_factory):
     """A folder of configurations with the two trainers: a user's own YAML files."""
     folder = tmp_path_factory.mktemp("conf")
-    (folder / "densify").mkdir()
-    (folder / "densify" / "cloud.yaml").write_text(CLOUD)
+    write(folder / "densify" / "cloud.yaml", CLOUD)
     (folder / "densify" / "painter.yaml").write_text(PAINTER)
     return folder
 
@@ -112,7 +111,7 @@ def trial(home, arm, seed=0):
 
 
 def results(folder):
-    return json.loads((folder / "results.json").read_text())
+    return read_json(folder / "results.json")
 
 
 def pixels(path):
@@ -284,8 +283,7 @@ def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
         assert expected[mode] in line, (mode, line)
     assert len(list(tmp_path.glob("bad/*/*/*/results.json"))) == 1
     for failed in tmp_path.glob("bad/*/*/*/failed.json"):
-        log = re.search(r"log: (\S+)$", json.loads(failed.read_text())["message"])
-        assert log is not None
+        log = re.search(r"log: (\S+)$", read_json(failed)["message"])
         assert "observations 0" in Path(log[1]).read_text()
 
 

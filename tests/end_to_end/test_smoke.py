@@ -2,7 +2,6 @@
 
 import csv
 import html
-import json
 import os
 import re
 import shlex
@@ -14,12 +13,14 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.raster import create_rasterizer
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import FINISHED, SMALL
+from tests.helpers import read_json, write
 
 TINY = [*SMALL, "train.iterations=20", "tracking=none", "eval.lpips=[]", "eval.flip=false"]
 MORTAL = """
@@ -41,7 +42,7 @@ def trials_of(runs, name=FINISHED):
     """The folders of finished trials by densifier and seed, such as ``adc-0``."""
     found = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
-        results = json.loads(path.read_text())
+        results = read_json(path)
         found[f"{results['densify']}-{results['seed']}"] = path.parent
     return found
 
@@ -49,7 +50,7 @@ def trials_of(runs, name=FINISHED):
 def test_a_sweep_leaves_complete_trials(finished_runs):
     trials = trials_of(finished_runs)
     assert list(trials) == ["adc-0", "adc-1", "volumetric-0", "volumetric-1"]
-    records = [json.loads((trial / "results.json").read_text()) for trial in trials.values()]
+    records = [read_json(trial / "results.json") for trial in trials.values()]
     for record in records:
         assert record["status"] == "complete"
         assert record["protocol"] == "paper-1"
@@ -87,7 +88,7 @@ def test_the_viewer_draws_a_test_view_as_the_evaluation_did(finished_runs):
         for view in viewed.views:
             drawn = TrialPainter(viewed, create_rasterizer("cpu", cpu)).draw(view.camera, Layers())
             for folder, picture in (("renders", drawn), ("ground_truth", view.image)):
-                np.testing.assert_array_equal(Image.open(trial / folder / view.name), picture)
+                assert_array_equal(Image.open(trial / folder / view.name), picture)
 
 
 def test_the_same_command_again_computes_nothing(gsbench, runs):
@@ -158,7 +159,7 @@ def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     counts = [
-        json.loads((trial / "results.json").read_text())["num_gaussians"]
+        read_json(trial / "results.json")["num_gaussians"]
         for trial in (trials_of(runs, "own")["solid-0"], trials_of(runs)["adc-0"])
     ]
     assert counts[0] < counts[1]
@@ -170,8 +171,7 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
     (code,) = re.findall(r"```python\n(# mine\.py\n.*?)```", text, re.DOTALL)
     (experiment,) = re.findall(r"```yaml\n(# @package.*?)```", text, re.DOTALL)
     (tmp_path / "mine.py").write_text(code)
-    (tmp_path / "my" / "experiment").mkdir(parents=True)
-    (tmp_path / "my" / "experiment" / "opacity.yaml").write_text(experiment)
+    write(tmp_path / "my" / "experiment" / "opacity.yaml", experiment)
     commands = re.findall(
         r"^    gsbench (--config-dir my .*?) +#.*$|^    gsbench (report opacity)$", text, re.M
     )
@@ -259,8 +259,7 @@ def test_a_mirror_in_mlflow(gsbench, runs):
     done = gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
     assert done.returncode == 0, done.stderr
     wanted = [
-        json.loads((trial / "results.json").read_text())["metrics"]["psnr"]
-        for trial in trials_of(runs).values()
+        read_json(trial / "results.json")["metrics"]["psnr"] for trial in trials_of(runs).values()
     ]
     with sqlite3.connect(runs / "mlflow.db") as database:  # without MLflow's own code
         sent = [

@@ -2,12 +2,12 @@
 
 import csv
 import hashlib
-import json
 import shutil
 from functools import partial
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.init import Sfm
@@ -15,6 +15,7 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -73,13 +74,11 @@ def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path
     )
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
-    clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
+    clean, noisy = (read_json(folder / "results.json") for folder in folders)
     assert clean["hashes"]["data"] != noisy["hashes"]["data"]
     assert clean["metrics"]["psnr"] > noisy["metrics"]["psnr"] + 3
     for render in (folders[0] / "renders").iterdir():
-        np.testing.assert_array_equal(
-            Image.open(render), Image.open(folders[1] / "renders" / render.name)
-        )
+        assert_array_equal(Image.open(render), Image.open(folders[1] / "renders" / render.name))
 
 
 def test_with_points_from_all_photographs_the_noise_changes_the_trial(captures, tmp_path):
@@ -103,7 +102,7 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_p
         "scene.sector=3",
     ]
     folder = trial(tmp_path, captures[0], *words)
-    results = json.loads((folder / "results.json").read_text())
+    results = read_json(folder / "results.json")
     assert results["split"] == "sector 3 of 4"
     assert "principal axis" in results["held_out"]
     assert (results["train_views"], results["test_views"]) == (9, 3)
@@ -121,7 +120,7 @@ def test_a_search_with_validation_views_never_sees_a_test_view(captures, tmp_pat
     """Noise in place of test photographs changes nothing, not even the fingerprint."""
     words = ["init=dataset", "densify=none", "scene.validation=true"]
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
-    one, other = (json.loads((folder / "results.json").read_text()) for folder in (clean, noisy))
+    one, other = (read_json(folder / "results.json") for folder in (clean, noisy))
     assert one["split"] == "every_nth, validation"
     assert one["hashes"]["data"] == other["hashes"]["data"]
     assert one["metrics"] == other["metrics"]
