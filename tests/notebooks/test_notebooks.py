@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
+from tests.helpers import write
 
 pytestmark = pytest.mark.slow
 
@@ -54,8 +55,7 @@ def test_notebook_runs(path, tmp_path, monkeypatch):
         if key.startswith(("GSBENCH_", "MLFLOW_")):
             monkeypatch.delenv(key)
     command = tmp_path / "bin" / "gsbench"  # the console script of the sources under test
-    command.parent.mkdir()
-    command.write_text(f"#!{sys.executable}\nfrom gsbench.cli import main\nmain()\n")
+    write(command, f"#!{sys.executable}\nfrom gsbench.cli import main\nmain()\n")
     command.chmod(0o755)
     monkeypatch.setenv("PATH", str(command.parent), prepend=os.pathsep)
     monkeypatch.setenv("GSBENCH_SMALL", "1")
