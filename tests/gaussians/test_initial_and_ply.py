@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.lib.recfunctions import append_fields
+from numpy.lib.recfunctions import append_fields, drop_fields
 from plyfile import PlyData, PlyElement
 
 from gsbench.errors import InputError
@@ -306,6 +306,11 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path: Path, caplog) -> None:
         ("sb_params_3", True, "Beta Splatting's"),
         ("nu_degree", True, "Student"),
         ("scale_t", True, "its Gaussians move with time"),
+        ("velocity_x", True, "its Gaussians move with time"),
+        ("Beta", True, "Beta Splatting's"),
+        ("f_offset_0", True, "Scaffold-GS computes its Gaussians by networks"),
+        ("f_asg_12", True, "Spec-Gaussian computes its colours by networks"),
+        ("FILTER_3d", False, "Mip-Splatting's filter_3D is applied"),
         ("segment", False, "the column segment is not known and not used"),
         ("scale_3", False, "the column scale_3 is not known and not used"),
         ("red", False, ""),
@@ -325,6 +330,16 @@ def test_unknown_columns_are_named_or_refused(
     read_ply(tmp_path / "b.ply")
     assert said in caplog.text
     assert bool(caplog.text) is bool(said)
+
+
+def test_models_with_two_scales_or_whole_numbers_are_refused_by_name(tmp_path):
+    table = table_of(tmp_path / "a.ply")
+    flat = drop_fields(table, "scale_2", usemask=False)
+    with pytest.raises(InputError, match=r"scale_2: it has flat Gaussians \(2DGS\)"):
+        read_ply(save(flat, tmp_path / "flat.ply"))
+    kinds = [(name, "u1" if name == "opacity" else "f4") for name in table.dtype.names]
+    with pytest.raises(InputError, match="opacity has whole numbers, as in a compressed model"):
+        read_ply(save(table.astype(kinds), tmp_path / "bytes.ply"))
 
 
 def test_files_of_gsbench_are_not_suspected(tmp_path: Path, caplog) -> None:
