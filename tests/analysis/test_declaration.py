@@ -428,4 +428,4 @@ def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
         "no verdict yet, not all of the first 2 seeds are there in both arms"
         in (answers.sentences[0])
     )
-    assert "(garden: seed 1 has no partner)" in answers.unused[0]
+    assert "since garden has no more" in answers.unused[0]
