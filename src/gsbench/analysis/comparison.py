@@ -82,7 +82,7 @@ class Comparison:
             answers = [one for one in self.answers if arm in (one.first, one.second)]
             # Where an arm has no verdict at all, its sentence says why.
             if left_out and any(one.verdicts for one in answers):
-                notes = [note.partition(": ")[2] for one in answers for note in one.notes]
+                notes = [note for one in answers for own in one.verdicts for note in own.notes]
                 reasons = some_of(list(dict.fromkeys(notes))) or NOT_PLANNED
                 yield f"In no verdict: {some_of(left_out)} ({reasons})."
 
