@@ -1,8 +1,5 @@
 """Masks: to which image they belong, which files are refused, and how ignored pixels are filled."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
@@ -25,8 +22,6 @@ from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
-
-MakeScene = Callable[..., Path]
 
 
 def save(path, pixels, **options):
