@@ -14,7 +14,7 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.settings import check_values, option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it

@@ -24,8 +24,8 @@ from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
-from gsbench.runs.keys import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
 

@@ -22,7 +22,7 @@ from gsbench.files import DiskFullError
 from gsbench.launch import jobs
 from gsbench.launch.jobs import Outcome, TrialJob, collect, job_folder, run_one
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
 from tests.finished import record_of, write_results

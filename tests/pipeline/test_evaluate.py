@@ -20,8 +20,9 @@ from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs import keys
-from gsbench.runs.keys import INIT, TRAIN, Step, UserCode
+from gsbench.runs.keys import INIT, TRAIN, Step
 from gsbench.runs.store import Store
+from gsbench.runs.user_code import UserCode
 from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
 from gsbench.train.trainer import snapshot_file
 from tests.helpers import read_json

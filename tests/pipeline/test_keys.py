@@ -10,7 +10,7 @@ from gsbench.pipeline.steps import scene as scene_module
 from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs import keys
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 

@@ -11,7 +11,8 @@ from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.pipeline.trial import cloud_hash, results_of, source_files, versions
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.experiments import Declaration, Question, open_question, record_text
-from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step, sha256_of
+from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Capture

@@ -11,7 +11,8 @@ import torch
 from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.raster import create_rasterizer
-from gsbench.runs.keys import config_hash, rasterizer_inputs
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.keys import rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
 from tests.helpers import read_json, refusal

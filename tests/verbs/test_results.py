@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.runs.keys import AS_RELEASED
+from gsbench.runs.freshness import Change
+from gsbench.runs.package_code import AS_RELEASED
 from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -199,7 +200,8 @@ def test_an_origin_names_program_machine_and_code():
         program=None,
         conditions={"data": 1},
         machine="",
-        code={},
+        code_texts=[],
+        edits=[],
     )
     own = {"folder": "runs/x", "Gaussians": "12,345 from 0 points", "views": "7 for testing"}
     assert _origin(trial) == own | {"train": "t", "versions": "torch 2.13.0"}
@@ -209,17 +211,19 @@ def test_an_origin_names_program_machine_and_code():
     trial.program = "nerfstudio"
     assert _origin(trial)["Gaussians"] == "its own renders"
     record.trained_by = SimpleNamespace(version="brush 1", command=["brush", "a"])
-    trial.machine, trial.code = "a CPU", {"code:mine": "f" * 64}
+    trial.machine, trial.code_texts = "a CPU", ["code of mine ffff", "stage train 2"]
+    trial.edits = [Change("code", "mine", "f" * 64, "e" * 64)]
     record.code.commit, record.code.edited = "abc", True
     found = _origin(trial)
     assert found["program"] == "brush 1: brush a"
     assert found["machine"] == "a CPU"
-    assert found["code"].startswith("code:mine ffff")
+    assert found["code"] == "code of mine ffff, stage train 2"
+    assert found["since"] == "mine was ffffffff, it is now eeeeeeee"
     assert found["commit"] == "abc, edited"
     assert "edited" not in found
     record.code.rooms["eval"] = "1" * 64
     assert _origin(trial)["edited"] == "since the last release: eval"
-    del record.code.rooms["init"]  # all rooms count as edited before the first release
+    del record.code.rooms["init"]  # all packages count as edited before the first release
     assert "edited" not in _origin(trial)
 
 

@@ -31,8 +31,9 @@ from gsbench.pipeline.steps.train import (
     train_step,
 )
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.runs.keys import INIT, Step, UserCode
+from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
+from gsbench.runs.user_code import UserCode
 from gsbench.scene.colmap import model_points, read_model, write_model
 from gsbench.scene.types import Capture, Scene, View
 from gsbench.system.own_modules import SAFE_PATH
