@@ -13,14 +13,16 @@ from gsbench.config.compose import Trial
 
 
 @cache
-def _composed(words: tuple[str, ...], multirun: bool) -> list[Trial]:
-    return compose_trials(words, multirun)
+def _composed(words: tuple[str, ...], multirun: bool, typed: tuple[str, ...] | None) -> list[Trial]:
+    return compose_trials(words, multirun, typed)
 
 
-def composed(words: Sequence[str], multirun: bool = True) -> list[Trial]:
+def composed(
+    words: Sequence[str], multirun: bool = True, typed: Sequence[str] | None = None
+) -> list[Trial]:
     """The trials of a command, in this test's runs folder. Equal words are composed once."""
     runs = {"runs": os.environ["GSBENCH_RUNS"]}
     return [
         replace(trial, values=deepcopy(trial.values) | runs)
-        for trial in _composed((*words,), multirun)
+        for trial in _composed((*words,), multirun, None if typed is None else (*typed,))
     ]
