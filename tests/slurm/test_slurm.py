@@ -110,7 +110,7 @@ def models(runs: Path) -> dict[str, bytes]:
 
 
 def job_logs(runs: Path) -> str:
-    return "\n".join(path.read_text() for path in sorted(runs.glob(".jobs/cluster/*_log.*")))
+    return "\n".join(path.read_text() for path in sorted(runs.glob(".jobs/cluster/*/*_log.*")))
 
 
 def queue() -> list[str]:
@@ -155,7 +155,7 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(
     assert not set(queue()) & set(queued)
     assert sorted(models(runs)) == sorted(models(place / "whole"))
     assert models(runs) == models(place / "whole")
-    assert len(list(runs.glob(".jobs/cluster/*_submission.sh"))) == 1, (
+    assert len(list(runs.glob(".jobs/cluster/*/*_submission.sh"))) == 1, (
         "the trials were submitted a second time"
     )
     assert "Requeued job" in logs
@@ -219,7 +219,7 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(
 
     second = gsbench(place, environment, *sweep, pause=PAUSE)
     assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr
-    assert len(list(place.glob("runs/.jobs/cluster/*_submission.sh"))) == 1, (
+    assert len(list(place.glob("runs/.jobs/cluster/*/*_submission.sh"))) == 1, (
         "the trials were submitted a second time"
     )
 
