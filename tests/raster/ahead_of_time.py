@@ -3,8 +3,6 @@
 Then read registers, spills and loops from the machine code.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile
