@@ -205,9 +205,13 @@ def test_a_users_rasterizer_needs_a_name_of_its_own(own_module, name, sound):
         if sound and densify == "adc":
             parts.check(on_this_machine=True)
         elif sound:
-            with pytest.raises(InputError, match="raster=named does not give them"):
+            with pytest.raises(
+                InputError, match="raster=named does not give; take raster=reference"
+            ):
                 parts.check(on_this_machine=False)
-            with pytest.raises(InputError, match="raster=named does not give them"):
+            with pytest.raises(
+                InputError, match="raster=named does not give; take raster=reference"
+            ):
                 _ = parts.rasterizer
     assert build_own_rasterizer({"name": "cpu"}, []) is None
 

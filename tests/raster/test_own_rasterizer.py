@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -112,15 +113,23 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder: Path) -> None:
         compose_one(OWN[:1])
 
 
-def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("arm", "output", "gives"),
+    [
+        ("pixelgs", "footprints", {"has_footprint": True}),
+        ("steepgs", "the extra output splitting_matrix", {"extras": {"splitting_matrix": (3, 3)}}),
+    ],
+)
+def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(
+    folder: Path, arm: str, output: str, gives: dict[str, Any]
+) -> None:
     Parts(composed(*OWN)).check(on_this_machine=False)
-    parts = Parts(composed(*OWN, "densify=pixelgs"))
-    with pytest.raises(
-        InputError,
-        match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference",
-    ):
+    parts = Parts(composed(*OWN, f"densify={arm}"))
+    able = "raster=reference or raster=cpu or raster=triton"
+    line = f"{output}, which raster=untiled does not give; take {able}"
+    with pytest.raises(InputError, match=f"densify={arm} needs {line}"):
         parts.check(on_this_machine=False)
-    parts.own_rasterizer.has_footprint = True  # type: ignore[union-attr]
+    vars(parts.own_rasterizer).update(gives)
     parts.check(on_this_machine=False)
 
 

@@ -12,7 +12,7 @@ from torch.autograd.functional import hessian, jacobian
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.contract import Case
-from gsbench.raster.reference import Projection, ReferenceRasterizer, project, tile_rectangles
+from gsbench.raster.reference import Projection, project, tile_rectangles
 from gsbench.scene.types import Camera
 
 CASES = (
@@ -114,10 +114,10 @@ class Slow:
         )
         executor = create_rasterizer(rasterizer, torch.device("cpu"), threads=1)
         output = executor.render(
-            gaussians, self.camera, 0, self.background.to(dtype), splitting_matrix=True
+            gaussians, self.camera, 0, self.background.to(dtype), extra="splitting_matrix"
         )  # type: ignore[call-arg]
         (output.image * self.weights.to(dtype)).sum().backward()
-        return output.require_splitting_matrix().double()
+        return output.require_extra().double()
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -174,11 +174,13 @@ def test_the_matrix_predicts_how_a_split_changes_the_loss() -> None:
     assert compared >= 5
 
 
-def test_matrices_are_computed_only_on_request() -> None:
-    case = CASES[0]
-    plain = ReferenceRasterizer().render(
-        case.gaussians(), case.camera(), 0, torch.zeros(3).double()
-    )
-    assert plain.splitting_probe is None
-    with pytest.raises(RuntimeError, match="splitting_matrix=True"):
-        plain.require_splitting_matrix()
+@pytest.mark.parametrize("name", ["reference", "cpu"])
+def test_an_extra_output_is_given_only_on_request_and_by_its_name(name: str) -> None:
+    case, executor = CASES[0], create_rasterizer(name, torch.device("cpu"), threads=1)
+    inputs = case.gaussians().map(Tensor.float), case.camera(), 0, torch.zeros(3)
+    plain = executor.render(*inputs)
+    assert plain.extra is None
+    with pytest.raises(RuntimeError, match="extra=NAME, then backward"):
+        plain.require_extra()
+    with pytest.raises(ValueError, match=f"raster={name} gives splitting_matrix, not hessian"):
+        executor.render(*inputs, extra="hessian")  # type: ignore[call-arg]

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, NoDensifier, Volumetric
-from gsbench.errors import TrainingError
+from gsbench.densify import ADC, NoDensifier, SteepGS, Volumetric
+from gsbench.errors import InputError, TrainingError
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
 from gsbench.raster.base import RenderOutput
@@ -144,6 +144,17 @@ def test_the_learning_rate_of_the_means_is_log_linear() -> None:
     assert rates.position(99_000) == pytest.approx(1.6e-6)
 
 
+def test_a_rasterizer_without_an_output_that_the_densifier_needs_is_refused_at_once(
+    lab: Lab,
+) -> None:
+    class Plain:
+        name = "plain"
+
+    lab.rasterizer = Plain()  # type: ignore[assignment]
+    with pytest.raises(InputError, match="SteepGS needs the extra output splitting_matrix, which"):
+        lab.new(SteepGS())
+
+
 def test_too_few_rounds_of_a_densifier_cause_a_warning(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -239,7 +250,7 @@ def test_the_context_of_a_densifier_knows_a_white_background(
     context = lab.new(NoDensifier(), background=background).context
     assert context.white_background is white
     assert context.extent == lab.scene.extent
-    assert context.limit is None
+    assert context.schedule is None
 
 
 @pytest.mark.parametrize(("spare", "resident"), [(0, True), (-2, False)])

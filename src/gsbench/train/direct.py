@@ -24,7 +24,13 @@ from torch import Tensor
 
 from gsbench.gaussians.trainable import AdamState, KnownGradients, TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.staged import Lifetime, Readback, RenderRequest, raise_for_values
+from gsbench.raster.staged import (
+    Lifetime,
+    Readback,
+    RenderRequest,
+    make_probe,
+    raise_for_values,
+)
 from gsbench.raster.triton.executor import Started, TritonFrame, TritonRasterizer, camera_numbers
 from gsbench.raster.triton.launch import Workspace
 from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, check_pairs
@@ -57,7 +63,7 @@ class Shape(NamedTuple):
     height: int
     degree: int
     absolute: bool
-    splitting: bool
+    extra: str | None
     target: torch.dtype
 
 
@@ -88,14 +94,14 @@ class DirectStep:
         target: Tensor,
         degree: int,
         absolute: bool,
-        splitting: bool,
+        extra: str | None,
     ) -> Differentiated:
         """Render ``camera``, and differentiate the loss against ``target`` [H, W, 3].
 
         Raises ValueError for bad values of parameters.
         """
         size = camera.width, camera.height
-        shape = Shape(*size, degree, absolute, splitting, target.dtype)
+        shape = Shape(*size, degree, absolute, extra, target.dtype)
         memory = self._memory_of(size)
         plan = self._plan.get(size)
         if plan is None or not plan.suits(gaussians, shape):
@@ -196,13 +202,11 @@ class _Plan:
         self.factors_on_host = torch.empty(
             (FACTORS_KEPT, *self.factors.shape), pin_memory=memory.device.type == "cuda"
         )
-        self.request = RenderRequest(camera, shape.degree, step.background, absolute, Lifetime())
-        self.screen_points = torch.zeros_like(self.values.means[:, :2], requires_grad=True)
-        self.probe = (
-            self.values.means.new_zeros(count, 3, 3, requires_grad=True)
-            if shape.splitting
-            else None
+        self.request = RenderRequest(
+            camera, shape.degree, step.background, absolute, shape.extra, Lifetime()
         )
+        self.screen_points = torch.zeros_like(self.values.means[:, :2], requires_grad=True)
+        self.probe = make_probe(step.rasterizer, shape.extra, self.values.means)
         self.runs = 0
         self.started: Started | None = None
         self.finished: tuple[Tensor, Tensor, Tensor, TritonFrame] | None = None
@@ -297,14 +301,13 @@ class _Plan:
             self.request,
             self.g_image,
             None,
-            self.shape.splitting,
             memory.scratch,
             memory.allocate,
             self.gradients,
         )
         self.screen_points.grad = found.screen
         if self.probe is not None:
-            self.probe.grad = found.splitting
+            self.probe.grad = found.extra
         seen = frame.projected.row_counts
         self.known = KnownGradients(self.parameters, self.gradients, seen, self.shape.degree)
 

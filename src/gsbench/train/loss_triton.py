@@ -270,10 +270,18 @@ class Measured:
     def grid(self) -> tuple[int, int]:
         return triton.cdiv(self.numbers, STRIP), triton.cdiv(self.height, self.rows)
 
-    @property
-    def scale(self) -> float:
-        """The factor of the target's numbers."""
-        return 1 / 255 if self.target.dtype == torch.uint8 else 1.0
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that both kernels over an image have in common."""
+        return {
+            "image": self.image,
+            "target": self.target,
+            "scale": 1 / 255 if self.target.dtype == torch.uint8 else 1.0,
+            "height": self.height,
+            "numbers": self.numbers,
+            "derivatives": self.derivatives,
+            "rows": self.rows,
+            "STRIP": STRIP,
+        }
 
 
 class TritonLoss:
@@ -304,36 +312,22 @@ class TritonLoss:
         columns, lines = measured.grid
         sums = memory.take("sums", 2 * columns * lines, torch.float32)
         launch_grid(measure_similarity, columns, lines)(
-            image,
-            target,
-            measured.scale,
-            measured.height,
-            measured.numbers,
-            derivatives,
-            sums,
-            measured.rows,
-            DIFFERENTIATE=differentiated,
-            STRIP=STRIP,
+            **measured.arguments(), sums=sums, DIFFERENTIATE=differentiated
         )
         launch_grid(add_up, 1)(
-            sums, columns * lines, float(image.numel()), self.ssim_weight, values, GROUP=1024
+            sums=sums,
+            programs=columns * lines,
+            size=float(image.numel()),
+            ssim_weight=self.ssim_weight,
+            values=values,
+            GROUP=1024,
         )
         return measured
 
     def differentiate(self, measured: Measured, g_loss: Tensor, gradient: Tensor) -> None:
         """Write the gradient by the image to ``gradient`` [H, W, 3], times ``g_loss`` []."""
         launch_grid(differentiate, *measured.grid)(
-            measured.image,
-            measured.target,
-            measured.scale,
-            measured.height,
-            measured.numbers,
-            measured.derivatives,
-            g_loss,
-            self.ssim_weight,
-            gradient,
-            measured.rows,
-            STRIP=STRIP,
+            **measured.arguments(), g_loss=g_loss, ssim_weight=self.ssim_weight, gradient=gradient
         )
 
 

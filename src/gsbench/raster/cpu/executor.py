@@ -1,5 +1,6 @@
 """The compiled CPU rasterizer: runs the stages of both passes on several threads."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ from gsbench.raster.cpu.composite import (
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.splitting import SPLITTING_MATRIX
 from gsbench.raster.staged import (
     Gradients,
     Lifetime,
@@ -62,6 +64,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
     """
 
     name = "cpu"
+    extras = SPLITTING_MATRIX
 
     def __init__(self, threads: int | None = None) -> None:
         if threads is not None and threads < 1:
@@ -184,7 +187,6 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
-        want_splitting: bool,
     ) -> Gradients:
         """See `StagedRasterizer`."""
         lifetime = Lifetime()
@@ -201,7 +203,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
 
         try:
             self._runner.run(TILE_SHARDS, composite_backward)
-            return self._backproject(passed, gaussians, request, rows, want_splitting)
+            return self._backproject(passed, gaussians, request, rows)
         except BaseException:
             # The kernels need rows of zeros and clear them after use; an interrupt may have left
             # sums in them.
@@ -214,13 +216,13 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         gaussians: Gaussians,
         request: RenderRequest,
         rows: NDArray[np.float32],
-        want_splitting: bool,
     ) -> Gradients:
         """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``."""
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
-        g_splitting = take((count, 3, 3)) if want_splitting else None
+        shape = self.extras[request.extra] if request.extra else ()
+        g_extra = take((count, *shape)) if shape else None
         arguments = (
             _edges(count),
             passed.visible,
@@ -232,7 +234,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
                 _arrays(gradients),
                 g_screen.numpy(),
                 _rows_or_none(request.absolute, 2),
-                _rows_or_none(g_splitting, 9),
+                _rows_or_none(g_extra, math.prod(shape)),
             ),
         )
 
@@ -240,7 +242,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             backproject_shards(at.kernel_memory(), first, past, *arguments)
 
         self._runner.run(GAUSSIAN_SHARDS, backproject)
-        return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
+        return Gradients(list(gradients.tensors().values()), g_screen, g_extra)
 
     def footprint(
         self,
