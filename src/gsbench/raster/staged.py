@@ -39,6 +39,7 @@ def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
     It is always True if there is a bad value. It is also True if only a sum overflows.
     """
     tensors = [background, *gaussians.tensors().values()]
+    # A sum is not finite if one of its values is not. Unlike a mask, it needs no memory.
     bad = ~torch.stack([tensor.detach().sum() for tensor in tensors]).isfinite().all()
     if len(gaussians):
         bad = bad | (gaussians.quaternions.detach().norm(dim=-1).amin() < MIN_QUATERNION_NORM)
@@ -265,6 +266,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         image, alpha, radii, frame = _Render.apply(
             self, request, background, screen_points, probe, *tensors
         )
+        # Detached: the output would otherwise keep the caller's graph alive.
         footprint = partial(self.footprint, frame, gaussians.detach(), request)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
 
@@ -290,6 +292,7 @@ class _Render(torch.autograd.Function):
         ctx.rasterizer, ctx.frame, ctx.request = rasterizer, frame, request
         _, _, wants_background, *_ = ctx.needs_input_grad
         ctx.save_for_backward(alpha if wants_background else None, *gaussians.tensors().values())
+        # Most losses have no gradient by alpha: None saves a picture of zeros and the pass over it.
         ctx.set_materialize_grads(False)
         return image, alpha, radii, frame
 
@@ -300,6 +303,7 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         alpha, *tensors = ctx.saved_tensors
         request: RenderRequest = ctx.request
+        # Only alpha was differentiated.
         if g_image is None:
             g_image = request.background.new_zeros(request.camera.height, request.camera.width, 3)
         g_image = g_image.contiguous()

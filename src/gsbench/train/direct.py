@@ -111,6 +111,7 @@ class DirectStep:
             self._plan[size] = plan
         self._last = plan
         plan.camera = camera
+        # A graph always reads the same memory, so what differs from step to step is copied to it.
         plan.view.copy_(self._numbers(camera), non_blocking=True)
         plan.target.copy_(target, non_blocking=True)
         with torch.cuda.device_of(self.background):
@@ -123,6 +124,7 @@ class DirectStep:
         plan = self._last
         assert plan is not None, "optimize follows step"
         states = gaussians.advance(plan.known)
+        # After a refinement, a graph would write to the parameters that were replaced.
         if plan.suits(gaussians, plan.shape) and plan.adam_graph is not None:
             plan.replay_adam(states)
         else:
@@ -150,6 +152,7 @@ class DirectStep:
 
     def _numbers(self, camera: Camera) -> Tensor:
         """The numbers of ``camera`` on the device; kept, since training views come back."""
+        # A freed camera's id may come back for another, so the camera is kept and compared.
         known = self._cameras.get(id(camera))
         if known is None or known[0] is not camera:
             known = camera, camera_numbers(camera, self.background.device)
@@ -247,6 +250,7 @@ class _Plan:
     def result(self) -> Differentiated:
         assert self.finished is not None
         image, alpha, radii, frame = self.finished
+        # The plan's own request has the camera of its first step.
         request = self.request._replace(camera=self.camera)
         footprint = partial(self.owner.rasterizer.footprint, frame, self.values, request)
         render = RenderOutput(
@@ -335,6 +339,7 @@ class _Plan:
         self.memory.room = Room(
             max(known.units, int(MARGIN * units) + 1), max(known.pairs, int(MARGIN * pairs) + 1)
         )
+        # The graphs launch with the old room. The next step may allocate: it is not recorded yet.
         self.render_graphs = self.adam_graph = None
         self.runs = 0
 

@@ -177,6 +177,7 @@ class Trainer:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
         writer = CheckpointWriter(folder, background=self.device.type != "cpu")
         try:
+            # Signals wait for the end of the iteration: half a step could not be resumed.
             with deferred(), self._explained(folder):
                 self._loop(folder, writer, on_status)
         finally:
@@ -195,6 +196,7 @@ class Trainer:
         last_checkpoint = time.monotonic()
         with (folder / CURVES).open("a") as metrics, (folder / EVENTS).open("a") as events:
             while self.step < options.iterations:
+                # Before the refinement: the losses of this iteration are those of this model.
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
                 self.seconds = earlier_seconds + time.perf_counter() - started
@@ -263,6 +265,7 @@ class Trainer:
         event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
         if event is not None:
             self.growth.observe(event)
+        # As in 3DGS, parameters that the refinement has replaced have no gradient: no step.
         if not options.step_after_refine:
             self._optimize(render.visible)
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
@@ -282,6 +285,7 @@ class Trainer:
         target, mask = targets.get(index), targets.mask(index)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         direct = self.direct
+        # Direct steps know only the loss of whole pictures; whatever else enters it needs autograd.
         self.is_direct = direct is not None and mask is None and regularizer is None
         if direct is not None and self.is_direct:
             step = direct.step(

@@ -110,8 +110,10 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             )
 
         self._runner.run(GAUSSIAN_SHARDS, project)
+        # The kernels only notice that some value is bad; this search names it.
         if flags[:, BAD_VALUE].any():
             raise_for_values(gaussians)
+        # Only now is it known how many Gaussians are visible.
         order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
         spare = arena.take("spare", order.shape, np.uint64)
         sort_by_depth(
@@ -164,6 +166,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         def pair(first: int, past: int) -> None:
             pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
 
+        # How many pairs there are is known only when all are made. So they are made with the room
+        # that has sufficed so far; a second pass is needed only if the scene has grown.
         room = self._pairs_of_shard
         pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
         self._runner.run(GAUSSIAN_SHARDS, pair)
@@ -265,6 +269,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             cover_tiles(*_tiles(passed.frame, first, past), given, covered, sums, distances)
 
         self._runner.run(TILE_SHARDS, cover)
+        # The shards are added in one order, whatever the number of threads.
         totals = (
             torch.from_numpy(shards.sum(0, dtype=shards.dtype))
             for shards in (covered, sums, distances)
