@@ -3,7 +3,6 @@
 import ast
 import functools
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -53,7 +52,6 @@ ONLY = {
     ("config", "external"): {"gsbench.external.settings"},
 }
 
-Graph = Mapping[str, set[str]]
 TYPES_ONLY = "if TYPE_CHECKING:\n    {}\nelse:\n    pass"
 
 

@@ -43,6 +43,7 @@ def test_help_and_reading_verbs_load_no_torch(runs):
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert "volumetric" in done.stdout
     assert "2 trials: 2 missing" in done.stdout
 
 

@@ -1,6 +1,7 @@
 """Clouds of points from files of all formats, against the written arrays and pycolmap."""
 
 import codecs
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -80,6 +81,10 @@ def rows(*columns, between=" "):
 INTENSITY = np.arange(len(XYZ)) - 1200.0
 NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
 
+ALPHA = np.full(len(XYZ), 255)
+COUNTED = rows(np.arange(len(XYZ)), XYZ, RGB, between=",")
+WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
+
 
 @pytest.mark.parametrize(
     "name, text, colored",
@@ -97,6 +102,13 @@ NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
         ("a.xyz", rows(XYZ, NORMALS, RGB), True),
         ("a.xyz", rows(XYZ, RGB, INTENSITY), True),
         ("a.xyz", rows(XYZ, between="\t"), False),
+        ("a.xyz", rows(XYZ, RGB, ALPHA), True),
+        ("a.xyz", rows(XYZ, RGB, 257 * ALPHA), True),
+        ("a.csv", f"Easting,Northing,Height,R,G,B\n{rows(XYZ, RGB, between=',')}", True),
+        ("a.csv", f"n,pos_x,pos_y,pos_z,Color R,Color G,Color B\n{COUNTED}", True),
+        ("a.csv", f"x,y,z,r,g,b,Scalar field,Cloud index\n{WITH_FIELDS}", True),
+        ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
+        ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
     ],
 )
 def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
@@ -104,6 +116,35 @@ def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, co
     points, colors = read_points(tmp_path / name)
     assert_array_equal(points, XYZ)
     assert_array_equal(colors, RGB if colored else None)
+
+
+@pytest.mark.parametrize(
+    "name, text, message",
+    [
+        ("a.csv", "lat,lon,alt\n47.1,8.5,400\n", "degrees of latitude and longitude: convert them"),
+        ("a.csv", "X;Y;Z;R\n1,5;2,5;3,5;7\n", "decimal commas: write points"),
+        ("a.txt", "1,5\t2,5\t3\n", "decimal commas: write points"),
+        ("a.xyz", "1 2 3 #ff8000\n", "colours such as #ff8000: write red, green and blue"),
+        ("a.txt", "#   POINT3D_ID, X, Y, Z, R, G, B\n1 2 3 4 5 6 7 8\n", "init=dataset reads its"),
+        ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "no line is a row of numbers"),
+        ("a.las", "LASF", "convert it to PLY, for example with CloudCompare"),
+    ],
+)
+def test_tables_that_would_be_read_wrong_are_refused_with_the_remedy(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with refusal(message):
+        read_points(tmp_path / name)
+
+
+def test_a_line_says_how_columns_without_names_are_read(tmp_path, caplog):
+    path = tmp_path / "a.xyz"
+    path.write_text(rows(XYZ, RGB, ALPHA))
+    read_points(path)
+    assert "read as x y z red green blue ?; a first line of names decides" in caplog.text
+    caplog.clear()
+    path.write_text(rows(XYZ, RGB))
+    read_points(path)
+    assert not caplog.text
 
 
 def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from shlex import split
 
 import pytest
 
@@ -46,7 +47,7 @@ def write(files, folder):
 def made(tmp_path, tiny_scene):
     """A function that makes the results of a trial with the training ``TRAINING`` and changes."""
     values = compose_one(
-        ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]
+        split(f"scene=courtyard name=x runs={tmp_path} eval.primary=psnr seed=4")
     ).values
     store = Store(tmp_path / "store")
     capture = Capture("made", tmp_path, (), (), None, False, "0abc", "every eighth view")

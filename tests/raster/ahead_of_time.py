@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +18,8 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, make_backend
 from triton.runtime.jit import JITFunction, create_function_from_signature
+
+from tests.processes import completed
 
 TARGETS = (80, 86, 89, 90, 120)  # A100, RTX 30, RTX 40, H100/H200, RTX 50
 BINARIES = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
@@ -126,6 +127,4 @@ def _run(tool, *arguments):
     command = str(path) if path.exists() else shutil.which(tool)
     if command is None:
         pytest.skip(f"this Triton has no {tool}")
-    return subprocess.run(
-        [command, *arguments], capture_output=True, text=True, check=True, timeout=120
-    ).stdout
+    return completed([command, *arguments]).stdout

@@ -2,8 +2,8 @@
 
 import os
 import re
-import subprocess
 import sys
+from shlex import split
 
 import pytest
 import torch
@@ -16,24 +16,15 @@ from gsbench.runs.keys import rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
 from tests.helpers import read_json, refusal
+from tests.processes import completed
 
 CPU = torch.device("cpu")
-TINY = [
-    "scene.views=10",
-    "scene.width=48",
-    "scene.height=36",
-    "init=random",
-    "init.count=150",
-    "init.size=1.2",
-]
-TINY += [
-    "scene=courtyard",
-    "train.iterations=12",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "device=cpu",
-]
+TINY = split(
+    "scene.views=10 scene.width=48 scene.height=36 init=random init.count=150 init.size=1.2"
+)
+TINY += split(
+    "scene=courtyard train.iterations=12 eval.lpips=[] eval.flip=false tracking=none device=cpu"
+)
 OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
 
 
@@ -53,21 +44,12 @@ def folder(tmp_path, monkeypatch):
 
 def gsbench(folder, *words):
     environment = os.environ | {"GSBENCH_RUNS": str(folder / "runs")}
-    return subprocess.run(
-        [sys.executable, "-m", "gsbench.cli", *words],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    return completed([sys.executable, "-m", "gsbench.cli", *words], cwd=folder, env=environment)
 
 
 @pytest.mark.slow
 def test_the_real_program_trains_with_it_and_records_its_source(folder):
-    first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
-    assert first.returncode == 0, first.stderr
+    gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
     assert read_json(path)["raster"] == "untiled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")

@@ -433,6 +433,53 @@ def test_focal_lengths_follow_from_every_way_to_give_a_field_of_view(
         assert camera.params[:2] == pytest.approx((focal_x, focal_y))
 
 
+def test_a_frame_with_a_field_of_view_of_its_own_uses_no_focal_length_of_the_file(tmp_path):
+    def edit(document):
+        document["frames"][1]["camera_angle_x"] = 0.5
+        document["frames"][2]["x_fov"] = 40.0
+        document["frames"][3]["fl_x"] = 70.0
+
+    images = read_transforms(write(tmp_path, edit)).images
+    found = [camera.params[0] for camera, *_ in images.values()]
+    assert found == pytest.approx([50, focal(40, math.degrees(0.5)), focal(40, 40), 70, 50, 50])
+
+
+def test_a_focal_length_that_contradicts_the_field_of_view_is_used_with_one_line(tmp_path, caplog):
+    folder = write(tmp_path, camera_angle_x=2 * math.atan(20 / 50 * 1.02))
+    read_transforms(folder)
+    assert not caplog.text
+    images = read_transforms(write(tmp_path, camera_angle_x=0.3)).images
+    assert images["images/3.png"][0].params[0] == 50
+    assert caplog.text.count("its focal length is 50 px, but its field of view means 132.") == 1
+
+
+@pytest.mark.parametrize(
+    "own, message",
+    [
+        ({"w": 20, "h": 15}, "whose fl_x, fl_y, cx, cy are px of the file's size"),
+        ({"w": 20, "h": 15, "fl_x": 25, "fl_y": 25}, "whose cx, cy are px"),
+        ({"w": 20, "h": 15, "fl_x": 25, "fl_y": 25, "cx": 10, "cy": 7}, None),
+    ],
+)
+def test_intrinsics_of_another_size_are_not_given_to_a_frame(tmp_path, own, message):
+    folder = write(tmp_path, lambda document: document["frames"][2].update(own))
+    if message is None:
+        assert read_transforms(folder).images["images/2.png"][0].params == (25, 25, 10, 7)
+    else:
+        with refusal(message):
+            read_transforms(folder)
+
+
+@pytest.mark.parametrize("cx, cy, refused", [(40, 30, True), (10, 7, True), (40, 15, False)])
+def test_a_principal_point_of_a_larger_photograph_asks_for_its_size(tmp_path, cx, cy, refused):
+    folder = write(tmp_path, w=None, h=None, cx=cx, cy=cy)
+    if refused:
+        with refusal("another size than 40x30 px: add w and h"):
+            read_transforms(folder)
+    else:
+        assert read_transforms(folder).images["images/2.png"][0].params[2:] == (cx, cy)
+
+
 @pytest.mark.parametrize(
     "said", [{"k3": 0.05}, {"camera_model": "FULL_OPENCV", "k3": 0.05, "k4": 0.02, "k6": 0.01}]
 )
@@ -514,3 +561,10 @@ def test_a_byte_order_mark_of_utf8_is_skipped_and_other_encodings_are_named(tmp_
         file.write_text(text, encoding=encoding)
         with refusal(said):
             read_transforms(folder)
+
+
+def test_a_file_in_a_code_page_names_its_line(tmp_path):
+    file = write(tmp_path) / "transforms.json"
+    file.write_bytes(file.read_bytes().replace(b"images/3", b"K\xfcche/3"))
+    with refusal(r"line 1 is not UTF-8 .*: save it as UTF-8"):
+        read_transforms(tmp_path)
