@@ -361,8 +361,8 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
     ones. Other trials' files are not opened here, which saves time.
     """
     faults: dict[str, str] = {}
-    for own in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
-        by_key = group_by(own, lambda trial: trial.key)
+    for of_arm in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
+        by_key = group_by(of_arm, lambda trial: trial.key)
         if len(by_key) > 1:
             faults |= {
                 key: settings.read(key, [trial.path for trial in same])

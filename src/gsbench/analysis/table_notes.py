@@ -66,7 +66,9 @@ def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
             notes.append(
                 f"{trial.scene}: {left_out} left out, since another one has its name or content."
             )
-    notes += [line for own in group_by(trials, arm_of).values() if (line := rounds_note(own[0]))]
+    notes += [
+        line for of_arm in group_by(trials, arm_of).values() if (line := rounds_note(of_arm[0]))
+    ]
     for trial in trials:
         cloud = trial.record.initial_cloud
         lines = [] if cloud is None else cloud.warnings
@@ -94,13 +96,13 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
     notes = []
     not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
     for trained_here, measured, what in ORIGINS:
-        own = [
+        of_kind = [
             t
             for t in not_ours
             if bool(t.program) == trained_here and t.record.evaluated_from == measured
         ]
         versions = sorted(
-            {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own}
+            {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in of_kind}
         )
         arms = ", ".join(
             f"{arm} (version {version})" if trained_here else arm for arm, version in versions
@@ -110,7 +112,7 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
             if trained_here
             else "its conditions are not known"
         )
-        notes += [f"{what} ({limits}): {arms}."] if own else []
+        notes += [f"{what} ({limits}): {arms}."] if of_kind else []
     return notes
 
 
@@ -121,10 +123,10 @@ def edited_notes(trials: Sequence[TrialResult]) -> list[str]:
         for edit in trial.edits:
             of_module.setdefault(edit.name, []).append(trial)
     return [
-        f"{module} was edited since: {counted(len(own), 'trial')} of "
-        f"{some_of(sorted({f'{one.init}-{one.densify}' for one in own}))} are of the old code. "
+        f"{module} was edited since: {counted(len(older), 'trial')} of "
+        f"{some_of(sorted({f'{t.init}-{t.densify}' for t in older}))} are of the old code. "
         "Give the command again to run the new one."
-        for module, own in of_module.items()
+        for module, older in of_module.items()
     ]
 
 
@@ -169,7 +171,9 @@ def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
     for (scene, init, _), group in groups.items():
         clouds = group_by([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
         if len(clouds) > 1:
-            listed = "; ".join(f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items())
+            listed = "; ".join(
+                f"{cloud[:SHOWN]}: {_arms(of_cloud)}" for cloud, of_cloud in clouds.items()
+            )
             notes.append(
                 f"{scene}: trials of init {init} started from {len(clouds)} different clouds "
                 f"({listed})."
@@ -225,4 +229,4 @@ def _points_from(trial: TrialResult) -> str:
 def _arms(trials: Sequence[TrialResult]) -> str:
     """``adc seeds 0, 1; volumetric seed 0``"""
     groups = group_by(trials, lambda trial: trial.densify)
-    return "; ".join(f"{densify} {seeds_text(own)}" for densify, own in groups.items())
+    return "; ".join(f"{densify} {seeds_text(of_arm)}" for densify, of_arm in groups.items())

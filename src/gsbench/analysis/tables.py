@@ -79,10 +79,10 @@ def build_table(
     scenes = sorted({trial.scene for trial in trials})
     scene_index = fields.index("scene") if "scene" in fields else None
     cells: dict[Position, Cell] = {}
-    for row, one, column in itertools.product(row_labels, quantities, column_labels):
+    for row, quantity, column in itertools.product(row_labels, quantities, column_labels):
         own_scenes = scenes if scene_index is None else [(*row, *column)[scene_index]]
-        cells[row, column, one.key] = make_cell(
-            groups.get((*row, *column), []), one, own_scenes, expected
+        cells[row, column, quantity.key] = make_cell(
+            groups.get((*row, *column), []), quantity, own_scenes, expected
         )
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
@@ -95,11 +95,11 @@ def build_table(
         best = set() if notes else _best(means, quantities, None)[0]
         shown += _rows(means, best, quantities, ruled=True)
     headings = []
-    for one, column in itertools.product(quantities, column_labels):
-        above, text = "", one.heading
+    for quantity, column in itertools.product(quantities, column_labels):
+        above, text = "", quantity.heading
         if columns:
             above, text = text, " + ".join(names.get(value, value) for value in column)
-        headings.append(Column(above, text, (one.key, "+".join(column))))
+        headings.append(Column(above, text, (quantity.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
     notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
@@ -131,7 +131,7 @@ def _rows(
 
     A cell over fewer scenes than the others says how many.
     """
-    quantity_of = {one.key: one for one in quantities}
+    quantity_of = {quantity.key: quantity for quantity in quantities}
     most_scenes = max((cell.scenes for cell in cells.values()), default=0)
     rows: list[Row] = []
     for labels, positions in group_by(cells, lambda position: position[0]).items():
@@ -167,8 +167,8 @@ def _best(
             (position for position in cells if position[2] == quantity.key), scene_and_split
         )
         for (scene, _), positions in rivals.items():
-            own = {position: cells[position] for position in positions}
-            shown = itertools.chain(*(cell.trials for cell in own.values()))
+            compared = {position: cells[position] for position in positions}
+            shown = itertools.chain(*(cell.trials for cell in compared.values()))
             by_scene = group_by(shown, lambda trial: trial.scene).values()
             differing = sorted(set().union(*map(differing_conditions, by_scene)))
             if differing:
@@ -177,7 +177,7 @@ def _best(
                     f"{place}: not compared, no best marked: {', '.join(differing)} differ."
                 )
             else:
-                bold |= best_cells(own, quantity)
+                bold |= best_cells(compared, quantity)
     return bold, list(dict.fromkeys(notes))
 
 
@@ -212,17 +212,17 @@ def _means(
                     left.remove(scene)
         return left
 
-    shared_scenes = {one.key: shared(one) for one in quantities}
+    shared_scenes = {quantity.key: shared(quantity) for quantity in quantities}
     most_scenes = max(map(len, shared_scenes.values()))
     if most_scenes == 0:
         return {}
     label = f"mean of {counted(most_scenes, 'scene')}"
     cells: dict[Position, Cell] = {}
-    for row, one, column in itertools.product(mean_rows, quantities, column_labels):
-        own_scenes = shared_scenes[one.key]
-        own = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
+    for row, quantity, column in itertools.product(mean_rows, quantities, column_labels):
+        own_scenes = shared_scenes[quantity.key]
+        averaged = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
         labels = (*row[:scene_index], label, *row[scene_index:])
-        cells[labels, column, one.key] = make_cell(own, one, own_scenes, expected)
+        cells[labels, column, quantity.key] = make_cell(averaged, quantity, own_scenes, expected)
     return cells
 
 
@@ -232,7 +232,7 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
     ``trials`` have their variants.
     """
     by_arm = group_by(trials, lambda trial: trial.arm).values()
-    return any(conditions_between_scenes(own) or differing_code(own) for own in by_arm)
+    return any(conditions_between_scenes(of_arm) or differing_code(of_arm) for of_arm in by_arm)
 
 
 def _reading_notes(
@@ -250,10 +250,10 @@ def _reading_notes(
     trials = itertools.chain(*(cell.trials for cell in cells.values()))
     protocols = {trial.record.protocol for trial in trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
-    for one in quantities:
-        own = [cell for position, cell in cells.items() if position[2] == one.key]
-        reasons = {cell.reason for cell in own if cell.trials and cell.reason}
-        notes += [f"{one.name}: n/a, {reason}." for reason in sorted(reasons)]
+    for quantity in quantities:
+        shown = [cell for position, cell in cells.items() if position[2] == quantity.key]
+        reasons = {cell.reason for cell in shown if cell.trials and cell.reason}
+        notes += [f"{quantity.name}: n/a, {reason}." for reason in sorted(reasons)]
     return notes
 
 
