@@ -280,7 +280,9 @@ def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -
                 if one not in made:
                     level = 25 - loss * LEAST * (one >= worse)
                     noise = deviation * LEAST * math.sqrt(0.5)
-                    made[one] = trials("adc", rng.normal(level, noise, (scenes, seeds)))
+                    version = {0: gates.BASELINE, count: gates.LAST}.get(one, gates.NEW)
+                    drawn = rng.normal(level, noise, (scenes, seeds))
+                    made[one] = trials("adc", drawn, version)
                     most[one] = 0
             places = {gates.BASELINE: 0, gates.LAST: count, gates.NEW: number}
 

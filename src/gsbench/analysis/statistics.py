@@ -144,6 +144,18 @@ def outcome_of(interval: Interval, sign: int, least: float | None) -> Outcome:
     return "supported" if sign * interval.low > 0.0 else "refuted"
 
 
+def favoured(outcome: Outcome, sign: int, direction: int) -> tuple[int, ...]:
+    """The sides that an outcome favours: 0 for the baseline, 1 for the arm.
+
+    ``sign`` is that of the claim, ``direction`` says whether more is better. If neither side is
+    better by the outcome, or if that is not known, both are favoured.
+    """
+    if outcome == UNDECIDED:
+        return ()
+    toward = sign * direction * (1 if outcome == SUPPORTED else -1)
+    return (0, 1) if outcome == TOO_SMALL or not toward else (int(toward > 0),)
+
+
 @dataclass(frozen=True)
 class Answer:
     """A mean difference with its test, as a member of a family with the error rate ``level``.

@@ -89,6 +89,8 @@ class ClaimVerdict:
         if not verdict.final:
             failed = f"; failed: {some_of(list(self.failed))}" if self.failed else ""
             return f"trials are missing: the next look waits for them{failed}"
+        if verdict.favours_lacking:
+            return "trials of one arm alone failed"
         if verdict.rests_on_outlying:
             return "it depends on trials far outside the others"
         seeds = verdict.pairs.seeds
@@ -129,7 +131,8 @@ class Check:
 
     def judged(self) -> list[Verdict]:
         """The verdicts on the declared questions from the trials that are done."""
-        return judge(read_experiment(self.home).trials, self.declaration)
+        experiment = read_experiment(self.home)
+        return judge(experiment.trials, self.declaration, experiment.lacking)
 
     def verdicts(self, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
         """All claims in the order of the file, with the reasons why trials failed."""

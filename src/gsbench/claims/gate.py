@@ -214,7 +214,9 @@ def _not_worse(verdict: Verdict) -> bool:
 
 
 def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult]:
-    return [replace(trial, config_hash=version) for trial in trials]
+    return [
+        one if one.config_hash == version else replace(one, config_hash=version) for one in trials
+    ]
 
 
 # ---- bisection: the search for the commit that made a trainer worse

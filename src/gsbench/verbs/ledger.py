@@ -280,7 +280,8 @@ def _run_confirmation(
     trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
-    verdicts = judge(finished_trials(home, trials.values()), declaration)
+    done, lacking = finished_trials(home, trials.values()), read_experiment(home).lacking
+    verdicts = judge(done, declaration, lacking)
 
     def make(now: Ledger) -> records.Confirmed | None:
         if now.confirmations[number][1] is not None:  # by a process that ran the same command
