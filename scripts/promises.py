@@ -22,10 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.analysis.designs import estimate_components
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.planning import Purpose, deviation_range
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, estimate_components, plan_looks
+from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules

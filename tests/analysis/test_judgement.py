@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.judgement import _contradicts, find_outlying, judge
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import read_experiment
-from gsbench.analysis.statistics import answer_family, seeds_needed
+from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.verdicts import judge_pairs, outlying_words, seeds_to_resolve
 from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.runs.trial_record import Budget

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.statistics import plan_looks
 from gsbench.claims.stopping import plan_sweep, run_looks, trials_of_look
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Declaration, Question

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsbench.analysis.differences import between_scenes_notes
+from gsbench.analysis.looks import look_levels
 from gsbench.analysis.pairing import Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import TrialResult, group_by
@@ -25,7 +26,6 @@ from gsbench.analysis.statistics import (
     answer_family,
     favoured,
     judge_like_these,
-    look_levels,
     t_test,
 )
 from gsbench.analysis.unfinished import Unfinished, one_sided

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration, Standing
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import (
     NO_DIRECTION,
@@ -25,14 +26,7 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import (
-    ALPHA,
-    TOO_SMALL,
-    UNDECIDED,
-    Outcome,
-    exact_for,
-    seeds_needed,
-)
+from gsbench.analysis.statistics import ALPHA, TOO_SMALL, UNDECIDED, Outcome, exact_for
 from gsbench.analysis.unfinished import lacking_words
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import some_of

@@ -15,11 +15,12 @@ from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_words
-from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words

@@ -9,8 +9,8 @@ from typing import Any
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
+from gsbench.analysis.looks import FIRST_LOOK
 from gsbench.analysis.results import read_experiment
-from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.app.command import check_trackers, compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
