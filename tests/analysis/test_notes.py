@@ -9,13 +9,8 @@ import pytest
 from gsbench.analysis.fairness import counts_sentence
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.tables import (
-    build_table,
-    doubt_notes,
-    held_out_notes,
-    origin_notes,
-    points_notes,
-)
+from gsbench.analysis.table_notes import doubt_notes, held_out_notes, origin_notes, points_notes
+from gsbench.analysis.tables import build_table
 from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import (
     FROM_MODEL,

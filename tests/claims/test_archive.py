@@ -11,7 +11,8 @@ import yaml
 
 from gsbench.analysis.images import textured_error
 from gsbench.analysis.results import load_experiment, read_views
-from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
 from tests.helpers import read_json, refusal, write

@@ -8,7 +8,8 @@ import pytest
 
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.export import write_archive
 from gsbench.claims.site import _by_quantity, _unique_key
 from gsbench.cli import run
 from gsbench.runs.experiments import Question, declared_now, record_text

@@ -65,7 +65,7 @@ def test_the_cpu_kernels_pass_with_small_errors():
     assert {
         "image",
         "gradient of means",
-        "splitting matrix",
+        "splitting_matrix",
         "footprint (pixels)",
         "loss",
     } <= proof.errors.keys()
