@@ -104,7 +104,7 @@ def arrows(inside_functions=True, for_types=False):
 
 def reached(start):
     """The module ``start`` and all modules of gsbench that it imports, also through others."""
-    found, waiting = set[str](), [start]
+    found, waiting = set(), [start]
     while waiting:
         name = waiting.pop()
         if name not in found and name in arrows():

@@ -173,7 +173,7 @@ def _age(trial: TrialState) -> str:
 
 def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
-    from gsbench.app.command import check_trackers, run_trials
+    from gsbench.app.command import run_trials
 
     parser = ArgumentParser("retry")
     parser.add_argument("experiment")
@@ -203,7 +203,6 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         recompose(folder, planned.get(folder), runs, options.changes, modules)
         for folder in unfinished
     ]
-    check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -237,7 +236,7 @@ def recompose(
             kept = [word for word in kept if not word.startswith("launch.")]
         # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
         # theirs.
-        trial = compose_one([*kept, *changes], modules=modules)
+        trial = compose_one([*kept, *changes], typed=changes, modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):
