@@ -3,7 +3,6 @@
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -31,7 +30,7 @@ PROGRAM_OF_A_FILE = {
     "+densify.version": "a",
     "+densify.result": "x.ply",
 }
-STRANGE: dict[str, tuple[dict[str, Any], str]] = {
+STRANGE = {
     "an address": ({"tracking.uri": ADDRESS}, f"add allow_targets=[{ADDRESS}]"),
     "a database": ({"tracking.uri": DATABASE}, f"add allow_targets=[{DATABASE}]"),
     "an address of W&B": (
@@ -68,7 +67,7 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-def nested(settings: dict[str, Any], values: dict[str, Any] | None = None) -> dict[str, Any]:
+def nested(settings, values=None):
     """The ``values`` with settings by their dotted keys."""
     values = {} if values is None else values
     for key, value in settings.items():
@@ -80,7 +79,7 @@ def nested(settings: dict[str, Any], values: dict[str, Any] | None = None) -> di
     return values
 
 
-def strange_runs(settings: dict[str, Any]) -> Path:
+def strange_runs(settings):
     """A stranger's failed trial that is in no plan; its configuration allows itself everything."""
     (trial,) = compose_trials(["name=x"])
     values = json.loads(json.dumps(trial.values)) | {
@@ -94,11 +93,11 @@ def strange_runs(settings: dict[str, Any]) -> Path:
     return folder
 
 
-def _words(settings: dict[str, Any]) -> list[str]:
+def _words(settings):
     return [f"{key}={value_text(value)}" for key, value in settings.items()]
 
 
-def _claims(settings: dict[str, Any]) -> list[list[str]]:
+def _claims(settings):
     """A stranger's file of claims, and the commands that read it."""
     claim = {"id": "a", "says": "s", "where": "w", "baseline": "adc", "arm": "mcmc"}
     claim |= {"metric": "psnr", "direction": "higher", "least": 1, "refuted_if": "not"}
@@ -108,13 +107,13 @@ def _claims(settings: dict[str, Any]) -> list[list[str]]:
     return [["check", "claims.yaml"], ["check", "claims.yaml", "--dry-run"]]
 
 
-def _plan(settings: dict[str, Any]) -> list[list[str]]:
+def _plan(settings):
     (trial,) = compose_trials(["name=x"])
     add_to_plan([Trial(trial.values, ("name=x", *_words(settings)))])
     return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
 
 
-def _ledger(settings: dict[str, Any]) -> list[list[str]]:
+def _ledger(settings):
     """A stranger's ledger with a kept idea, whose baseline has the settings."""
     home = Path("runs/x")
     home.mkdir(parents=True)
@@ -148,12 +147,12 @@ def _ledger(settings: dict[str, Any]) -> list[list[str]]:
     ]
 
 
-def _configuration(settings: dict[str, Any]) -> list[list[str]]:
+def _configuration(settings):
     strange_runs(settings)
     return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
 
 
-def _experiment(settings: dict[str, Any]) -> list[list[str]]:
+def _experiment(settings):
     words = experiment(nested(settings))
     return [words, [*words, "--dry-run"], ["-m", *words, "seed=0,1"]]
 
@@ -174,7 +173,7 @@ CANNOT_SET |= {("experiment", "a package of settings")}
 
 
 @pytest.mark.parametrize(
-    ("file", "case"),
+    "file, case",
     [(file, case) for file in FILES for case in STRANGE if (file, case) not in CANNOT_SET],
 )
 def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
@@ -209,7 +208,7 @@ def test_permissions_in_a_trials_configuration_are_dropped():
 
 def test_retry_runs_what_its_command_allows(monkeypatch):
     strange_runs({"densify._target_": "mine.Mine"})
-    began: list[Any] = []
+    began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
     assert [trial.values["allow_targets"] for trial in began] == [["mine"]]
@@ -227,7 +226,7 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     assert str(theirs) in strange
     assert "allow_targets=[mine]" in strange
     plan.write_text(strange)
-    began: list[Any] = []
+    began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert "add allow_targets=[mine] to the command" in refused("retry", "x")
     monkeypatch.chdir(place)
@@ -272,7 +271,7 @@ PROGRAM = [
 
 
 @pytest.mark.parametrize(
-    ("words", "missing"),
+    "words, missing",
     [
         ([], "python"),
         (["densify.version_command=[curl,strange]"], "python,curl"),
@@ -337,7 +336,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
     """It counts as typed if a typed choice of a tracker has it, not if another file changes it."""
     for variable in ADDRESS_VARIABLES:
         monkeypatch.delenv(variable, raising=False)
-    began: list[Any] = []
+    began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     strange_runs({"tracking.uri": ADDRESS})
     assert cli.run(["retry", "x", f"allow_targets=[{ADDRESS}]"]) == 0
@@ -356,7 +355,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
 
 
 @pytest.mark.parametrize(
-    ("tracking", "allowed", "found"),
+    "tracking, allowed, found",
     [
         ({"uri": None}, [], ""),
         ({"uri": "http://a"}, [], "http://a"),
