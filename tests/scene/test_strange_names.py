@@ -1,7 +1,5 @@
 """Names of photographs, masks and folders that are not UTF-8: one line, and no traceback."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

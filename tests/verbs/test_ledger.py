@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.results import read_experiment
-from gsbench.claims.archive import _shared_ledger, without_private_words
+from gsbench.claims.export import _shared_ledger, without_private_words
 from gsbench.cli import run
 from gsbench.runs import ledger as records
 from gsbench.runs.layout import LEDGER

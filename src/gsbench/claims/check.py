@@ -21,7 +21,7 @@ from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_text
 from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, plan_looks
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import cloud_notes, machine_notes
+from gsbench.analysis.table_notes import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile

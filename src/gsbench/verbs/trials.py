@@ -126,7 +126,7 @@ def _cell(counts: dict[str, int]) -> str:
 def progress_with_superseded(home: Path) -> list[TrialState]:
     """The state of every trial in ``home``; those that older code made are ``superseded``."""
     states = states_of_experiment(home)
-    folders = {one.folder: one.planned.cwd for one in states if one.planned is not None}
+    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
     # The user's modules are read in the folder where the trial's command was given: another may
     # have a namesake.
     reasons = find_superseded(read_experiment(home).trials, folders)
