@@ -7,22 +7,23 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from gsbench.analysis.statistics import (
-    ALPHA,
+from gsbench.analysis.designs import (
     Components,
     Design,
-    Interval,
-    answer_family,
     designs_needed,
     estimate_components,
-    holm_factors,
-    judge_like_these,
-    look_levels,
-    median_interval,
-    outcome_of,
-    plan_looks,
     power,
     seeds_needed,
+)
+from gsbench.analysis.looks import look_levels, plan_looks
+from gsbench.analysis.statistics import (
+    ALPHA,
+    Interval,
+    answer_family,
+    holm_factors,
+    judge_like_these,
+    median_interval,
+    outcome_of,
     t_test,
 )
 from tests.analysis.untruths import KINDS, rates

@@ -6,9 +6,9 @@ from shlex import split
 import pytest
 
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.statistics import plan_looks
 from gsbench.claims.stopping import plan_sweep, run_looks, trials_of_look
 from gsbench.runs.experiments import Arm, Declaration, Question
 from tests.composed import composed

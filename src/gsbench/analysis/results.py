@@ -36,6 +36,7 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
+FOREIGN = "foreign"  # first word about a folder that is no trial of the experiment
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
 
 
@@ -159,7 +160,7 @@ class TrialResult:
         """The hash of the initial model's files (cameras, poses, points); "" if unrecorded."""
         return self.record.hashes.get("cloud", "")
 
-    @property
+    @cached_property
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of the file."""
         moment = unix_time(self.record.measured)
@@ -240,7 +241,8 @@ TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one o
 class Experiment:
     """The usable trials of an experiment, and a line for each trial folder that cannot be used.
 
-    ``older`` are trials of earlier code that `newest_code` left out.
+    ``older`` are trials of earlier code that `newest_code` left out. ``lacking`` are the folders of
+    trials without a usable result: they failed, were stopped, or are damaged.
     """
 
     name: str
@@ -248,6 +250,7 @@ class Experiment:
     trials: tuple[TrialResult, ...]
     warnings: tuple[str, ...]
     older: tuple[TrialResult, ...] = ()
+    lacking: tuple[Path, ...] = ()
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -309,7 +312,12 @@ def read_experiment(folder: Path) -> Experiment:
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
-    return Experiment(folder.name, folder, tuple(usable), tuple(warnings))
+    lacking = tuple(
+        path
+        for path, fault in sorted(faults.items())
+        if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
+    )
+    return Experiment(folder.name, folder, tuple(usable), tuple(warnings), lacking=lacking)
 
 
 def newest_code(experiment: Experiment) -> Experiment:
@@ -421,7 +429,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         raise _UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
-        raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
+        raise _UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
     recorded = {
         "experiment": record.experiment,
         "scene": record.scene,
@@ -431,11 +439,13 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     names = (*path.relative_to(runs_dir).parts[-4:-1], match["seed"])
     for (key, value), name in zip(recorded.items(), names, strict=True):
         if value != name:
-            raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
+            raise _UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
 
 
 def _why_unfinished(path: Path) -> str:
     if (path / FAILED).exists():
         return f"failed, {TrialFolder(path).failure().reason}"
-    return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
+    return (
+        f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else f"{FOREIGN}, not a trial"
+    )

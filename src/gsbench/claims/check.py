@@ -15,11 +15,12 @@ from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_text
-from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.table_notes import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
@@ -89,6 +90,8 @@ class ClaimVerdict:
         if not verdict.final:
             failed = f"; failed: {some_of(list(self.failed))}" if self.failed else ""
             return f"trials are missing: the next look waits for them{failed}"
+        if verdict.favours_lacking:
+            return "trials of one arm alone failed"
         if verdict.rests_on_outlying:
             return "it depends on trials far outside the others"
         seeds = verdict.pairs.seeds
@@ -129,7 +132,8 @@ class Check:
 
     def judged(self) -> list[Verdict]:
         """The verdicts on the declared questions from the trials that are done."""
-        return judge(read_experiment(self.home).trials, self.declaration)
+        experiment = read_experiment(self.home)
+        return judge(experiment.trials, self.declaration, experiment.lacking)
 
     def verdicts(self, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
         """All claims in the order of the file, with the reasons why trials failed."""

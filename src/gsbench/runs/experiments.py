@@ -167,6 +167,11 @@ class Arm:
         values = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)
         return f"{self.densify}[{values}]" if values else self.densify
 
+    def has(self, name: str, config: Mapping[str, Any]) -> bool:
+        """Return whether a trial of the arm called ``name`` with these settings belongs to it."""
+        own = f"{self.init}-{self.densify}"
+        return name == own and all(str(config.get(key)) == value for key, value in self.variant)
+
     def answers_to(self, word: str) -> bool:
         """Return whether ``word`` names this arm, with or without initialiser and settings."""
         return word in (str(self), self.short, f"{self.init}-{self.densify}", self.densify)

@@ -9,8 +9,8 @@ from typing import Any
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
+from gsbench.analysis.looks import FIRST_LOOK
 from gsbench.analysis.results import read_experiment
-from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
@@ -280,7 +280,8 @@ def _run_confirmation(
     trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
-    verdicts = judge(finished_trials(home, trials.values()), declaration)
+    done, lacking = finished_trials(home, trials.values()), read_experiment(home).lacking
+    verdicts = judge(done, declaration, lacking)
 
     def make(now: Ledger) -> records.Confirmed | None:
         if now.confirmations[number][1] is not None:  # by a process that ran the same command
