@@ -12,6 +12,9 @@ os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.helpers import words_of
+from tests.processes import completed
+
 # The same examples on every machine and however loaded it is: `pytest --hypothesis-profile=explore`
 # tries new ones.
 settings.register_profile(
@@ -72,6 +75,26 @@ def caplog(caplog):
 
 
 @pytest.fixture
+def small_disk(tmp_path):
+    """A file system of three MiB; skips the test if this user may not mount one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", disk]
+    if completed(mount, code=None).returncode != 0:
+        pytest.skip("needs the right to mount a small tmpfs (root)")
+    yield disk
+    completed(["umount", "-l", disk])
+
+
+@pytest.fixture
+def plain_git(tmp_path, monkeypatch):
+    """Let git read no settings of the user's or the machine's."""
+    monkeypatch.setenv("GIT_CONFIG_GLOBAL", "/dev/null")
+    monkeypatch.setenv("GIT_CONFIG_NOSYSTEM", "1")
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+
+@pytest.fixture
 def runs(tmp_path, monkeypatch):
     """The runs folder of a test that works in its own folder; it is not made yet."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
@@ -84,9 +107,9 @@ def said(capsys):
     """A function that runs a command line, which must succeed, and returns what it prints."""
     from gsbench.cli import run
 
-    def call(*words):
+    def call(*command):
         capsys.readouterr()
-        assert run([*map(str, words)]) == 0
+        assert run(words_of(*command)) == 0
         return capsys.readouterr().out
 
     return call
@@ -97,9 +120,9 @@ def refused(capsys):
     """A function that runs a command line, which must be refused, and returns the error's line."""
     from gsbench.cli import run
 
-    def call(*words):
+    def call(*command):
         capsys.readouterr()
-        assert run([*map(str, words)]) == 2
+        assert run(words_of(*command)) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("gsbench: ")
         return line

@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager
+from shlex import split
 
 import pytest
 
@@ -10,7 +11,13 @@ from gsbench.errors import InputError
 
 @contextmanager
 def refusal(pattern):
-    """Expect an error of the user's in the block: one line, in which ``pattern`` is found."""
+    """Expect an error of the user's in the block: one line, in which ``pattern`` is found.
+
+    If that is None, expect none.
+    """
+    if pattern is None:
+        yield
+        return
     with pytest.raises(InputError, match=pattern) as caught:
         yield caught
     assert "\n" not in str(caught.value)
@@ -24,6 +31,11 @@ def write(path, content):
     else:
         path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
+
+
+def words_of(first, *more):
+    """The words of a command; the first argument may be a verb or an option with words after it."""
+    return [*([first] if "=" in first.partition(" ")[0] else split(first)), *map(str, more)]
 
 
 def read_json(path):

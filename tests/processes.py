@@ -1,9 +1,21 @@
 """Child processes of tests: their signals, whether they run, and the files that they write."""
 
 import signal
+import subprocess
 from contextlib import suppress
 
 import psutil
+
+
+def completed(command, code=0, **options):
+    """Run a command to its end and return it with its output as text.
+
+    Its exit code must be ``code``, unless that is None.
+    """
+    options = {"capture_output": True, "text": True, "timeout": 600} | options
+    done = subprocess.run([*map(str, command)], check=False, **options)
+    assert code in (None, done.returncode), done.stderr
+    return done
 
 
 def heed_interrupts():

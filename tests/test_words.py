@@ -14,7 +14,7 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.settings import check_values, option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it
@@ -133,7 +133,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a "
     "whole "
     "number, got 'x'",
-    "densify=pixelgs raster=gsplat": "does not give them; take raster=reference or raster=cpu or "
+    "densify=pixelgs raster=gsplat": "does not give; take raster=reference or raster=cpu or "
     "raster=triton",
     "init._target_=5": "the import path of a class",
     # verbs and questions

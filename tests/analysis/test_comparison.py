@@ -24,7 +24,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import t_test
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdicts import sentence
-from gsbench.claims.archive import write_archive
+from gsbench.claims.export import write_archive
 from gsbench.claims.site import write_site
 from gsbench.runs.experiments import Declaration, open_question, record_text
 from gsbench.tracking.comparison import description
@@ -118,19 +118,31 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
 
+BOTH_CAPS = ("sfm-adc[cap=2]", "sfm-adc[cap=1]")
+
+
+def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
+    write(tmp_path, [*grid("adc", cap=2), *grid("adc", day=3, cap=1)])
+    before = answer(tmp_path).sentences
+    write(tmp_path, [*grid("absgs", day=4), *grid("mine", day=4, cap=1)])
+    after = answer(tmp_path)
+    assert before[0].startswith("sfm-adc[cap=1] against sfm-adc[cap=2]")  # the older one
+    assert set(before) < set(after.sentences)
+
+
 @pytest.mark.parametrize(
     "arms, pairs, named",
     [
         # the settings that both have decide
         (
             [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 2, "lr": 3})],
-            [("sfm-mine", "sfm-adc[cap=2]")],
-            "sfm-adc[cap=1] is not compared: other arms have a baseline with settings nearer",
+            [("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
+            "",
         ),
         ([("adc", {"cap": 1}), ("mine", {"cap": 2})], [("sfm-mine", "sfm-adc")], ""),
         (
             [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 4})],
-            [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]")],
+            [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
             "",
         ),
         # without a baseline: an external trainer swept over an option, and no densification

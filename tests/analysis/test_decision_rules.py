@@ -45,7 +45,6 @@ def test_the_simulator_has_the_test_of_the_judge():
         p = rules.p_values(mean, error, shape)
         for draw in range(50):
             test = t_test(draws.arm[draw, :, :seeds] - draws.baseline[draw, :, :seeds])
-            assert test is not None
             assert (mean[draw], error[draw], p[draw]) == pytest.approx(
                 (test.mean, test.error, test.p), rel=1e-9
             )

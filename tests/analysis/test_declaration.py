@@ -3,6 +3,7 @@
 import calendar
 import json
 import os
+import shutil
 import time
 
 import numpy as np
@@ -419,3 +420,12 @@ def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
     assert page.count("better in LPIPS VGG raw") == 1
     seeds = one.verdicts[0].pairs.seeds
     assert f"with {seeds} of at most 3 seeds. The metric was declared beforehand." in page
+    # A look waits for the same seeds of both arms, and without pairs nothing is equal.
+    lost = next((tmp_path / "exp/garden/sfm-adc").glob("*-seed1"))
+    shutil.rmtree(lost)
+    answers = compare(load_experiment(tmp_path, "exp"))
+    assert (
+        "no verdict yet, not all of the first 2 seeds are there in both arms"
+        in (answers.sentences[0])
+    )
+    assert "since garden has no more" in answers.unused[0]

@@ -1,12 +1,10 @@
 """``gsbench bench``: what it prints and measures. No test looks at how long anything takes."""
 
-from __future__ import annotations
-
 import json
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
-from typing import ClassVar
 
 import pytest
 import torch
@@ -32,7 +30,7 @@ from gsbench.verbs.machine import _bench_parser, bench
 from tests.helpers import refusal
 
 KEYS = {"raster", "size", "count", "forward_ms", "backward_ms", "step_ms", "peak_memory_mb"}
-QUICK = ["--size", "40x30", "--repeats", "1", "--no-memory"]
+QUICK = split("--size 40x30 --repeats 1 --no-memory")
 # Step times of the turns: two of warm-up, and three that count
 TURNS = {"cpu": (900.0, 800.0, 1.0, 5.0, 3.0), "reference": (900.0, 800.0, 6.0, 5.0, 12.0)}
 
@@ -40,7 +38,7 @@ TURNS = {"cpu": (900.0, 800.0, 1.0, 5.0, 3.0), "reference": (900.0, 800.0, 6.0, 
 class ScriptedStepper:
     """A stepper whose times are those in ``TURNS``; ``calls`` are the rasterizers in turn."""
 
-    calls: ClassVar[list[str]] = []
+    calls = []  # noqa: RUF012
     device = torch.device("cpu")
 
     def __init__(self, raster, setting):
@@ -283,10 +281,7 @@ def test_a_users_rasterizer_is_timed(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_json_with_memory(capsys):
-    assert (
-        bench(["--raster", "cpu", "--size", "40x30", "--count", "60", "--json", "--repeats", "1"])
-        == 0
-    )
+    assert bench(split("--raster cpu --size 40x30 --count 60 --json --repeats 1")) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row.keys() >= KEYS
     assert (row["raster"], row["size"], row["count"]) == ("cpu", "40x30", 60)
@@ -331,7 +326,7 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails():
     [
         (["--size", "500"], "500x375"),
         (["--count", "0"], "at least 1"),
-        (["--raster", "nosuch", "--no-memory"], "nosuch"),
+        (split("--raster nosuch --no-memory"), "nosuch"),
         (["--ply", "/no/such.ply"], "such.ply"),
     ],
 )

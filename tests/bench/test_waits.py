@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 
 import pytest
@@ -11,6 +10,7 @@ import torch
 from benchmarks.counters import counting_waits
 from gsbench.raster.staged import Readback
 from tests.conftest import ROOT
+from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 
@@ -90,10 +90,7 @@ def test_a_training_step_with_triton_waits_once(raster):
         "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
     }
     command = [sys.executable, "-m", "tests.train.one_step", raster]
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed(command, cwd=ROOT, env=environment)
     counts = {
         name: count for line in done.stdout.splitlines() for name, count in json.loads(line).items()
     }

@@ -20,7 +20,7 @@ from gsbench.config.compose import compose_one
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY

@@ -16,7 +16,7 @@ from gsbench.config.compose import compose_one
 from gsbench.config.schema import checked_values, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build, build_metrics
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS, TrainConfig
 

@@ -17,7 +17,7 @@ from gsbench.config.compose import compose_one
 from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variables, load_class
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build
-from gsbench.runs.keys import module_digest
+from gsbench.runs.user_code import module_digest
 from gsbench.system.own_modules import allow_modules
 from tests.strange import BOMB, ask, experiment
 from tests.strange import place as place

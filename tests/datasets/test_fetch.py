@@ -3,7 +3,7 @@
 import logging
 import shutil
 import zipfile
-from collections.abc import Callable
+from shlex import split
 
 import pytest
 
@@ -14,7 +14,6 @@ from gsbench.system.install import conf_dir
 from tests.datasets.conftest import archive_content, write_archive
 from tests.datasets.server import Manners
 
-Fetch = Callable[..., int]
 BAD_INPUT, FAILED = 2, 1
 
 
@@ -144,10 +143,10 @@ def test_damaged_bytes_are_detected_and_not_kept(fetch, server, data, capsys):
 
 
 def test_a_folder_can_be_the_mirror(archives, data, capsys):
-    assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == 0
+    assert run(split(f"fetch mipnerf360 room --mirror {archives}")) == 0
     assert files_below(data / "room") == wanted("room", "images_2")
     (archives / "360_v2.zip").unlink()
-    assert run(["fetch", "mipnerf360", "garden", "--mirror", str(archives)]) == BAD_INPUT
+    assert run(split(f"fetch mipnerf360 garden --mirror {archives}")) == BAD_INPUT
     assert "360_v2.zip cannot be read" in capsys.readouterr().err
 
 
@@ -159,16 +158,15 @@ def test_another_image_folder_is_added_to_the_first(fetch, data):
     assert files_below(data / "garden") == both
 
 
-def test_the_list_tells_which_scenes_are_here(fetch, data, capsys):
+def test_the_list_tells_which_scenes_are_here(fetch, data, capsys, said):
     fetch("mipnerf360", "garden")
     capsys.readouterr()
-    assert run(["fetch", "--list"]) == 0
-    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    lines = {line.split()[0]: line for line in said("fetch --list").splitlines()}
     assert lines["garden"].endswith(" here")
     assert lines["bicycle"].endswith("not here")
     assert "about 12.5 GB" in lines["https://storage.googleapis.com/gresearch/refraw360/360_v2.zip"]
     shutil.rmtree(data / "garden" / "images_4")
-    run(["fetch", "--list", "mipnerf360"])
+    run(split("fetch --list mipnerf360"))
     assert "images_4 is missing" in capsys.readouterr().out
 
 
@@ -197,7 +195,7 @@ def test_unknown_names_and_addresses_are_refused(archives, data, capsys, words, 
 def test_a_data_folder_that_cannot_be_made_is_refused(archives, data, capsys, monkeypatch, place):
     (data.parent / "a-file").touch()
     monkeypatch.setenv("GSBENCH_DATA", str(data.parent / place))
-    assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == BAD_INPUT
+    assert run(split(f"fetch mipnerf360 room --mirror {archives}")) == BAD_INPUT
     error = capsys.readouterr().err
     assert "cannot be the data folder" in error
     assert error.count("\n") == 1

@@ -6,11 +6,9 @@ then all second ones.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
-Row = dict[str, Any]
 DIFFERENCES = []  # found by comparisons with the real code, for scripts/fidelity.py
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 

@@ -385,12 +385,12 @@ def test_splitting_matrices_are_summed_until_the_window_ends():
     before = densifier.statistics["splitting_sum"].clone()
     probe = torch.zeros(count, 3, 3, requires_grad=True)
     probe.grad = torch.arange(9.0).reshape(3, 3).expand(count, 3, 3)
-    render = rendered(torch.zeros(count, 2), splitting_probe=probe)
+    render = rendered(torch.zeros(count, 2), extra=probe)
     for step in (7, 8, densifier.stop):  # the last is after the window
         densifier.observe(step, render)
     assert_close(densifier.statistics["splitting_sum"] - before, 2 * probe.grad)
-    render.splitting_probe = None
-    with pytest.raises(RuntimeError, match="splitting_matrix=True"):
+    render.extra = None
+    with pytest.raises(RuntimeError, match="extra=NAME"):
         densifier.observe(9, render)
 
 
@@ -528,20 +528,20 @@ def test_a_short_window_has_no_pause_and_phase_ends_must_rise():
         ResGS(phase_ends=[0.5, 0.2])
 
 
-def test_a_governed_round_of_res_gs_ends_at_its_target():
-    densifier = ResGS(max_gaussians=90, cap="governor", start=500, stop=1200)
+def round_of_res_gs(densifier, step, gradient):
     trainable, _ = prepared(densifier, 2)
     trainable.values.opacity_logits.data[:] = 1.0
-    gathered(densifier, 1e-3 * torch.rand(60, generator=generator()))
-    event = densifier.refine(1100, trainable, generator())
+    gathered(densifier, gradient)
+    return densifier.refine(step, trainable, generator())
+
+
+def test_a_governed_round_of_res_gs_ends_at_its_target():
+    densifier = ResGS(max_gaussians=90, cap="governor", start=500, stop=1200)
+    event = round_of_res_gs(densifier, 1100, 1e-3 * torch.rand(60, generator=generator()))
     assert event.target == event.after == 90
 
 
 def test_under_a_hard_cap_res_gs_grows_the_largest_gradients():
     densifier = ResGS(max_gaussians=63, cap="hard", **WINDOW)
-    trainable, _ = prepared(densifier, 2)
-    trainable.values.opacity_logits.data[:] = 1.0
-    gathered(densifier, torch.arange(60, dtype=torch.float64))
-    event = densifier.refine(800, trainable, generator())
-    assert (event.split_gradient, event.after) == (3, 63)
-    assert event.blocked_by_cap == 56
+    event = round_of_res_gs(densifier, 800, torch.arange(60, dtype=torch.float64))
+    assert (event.split_gradient, event.after, event.blocked_by_cap) == (3, 63, 56)

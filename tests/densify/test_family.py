@@ -79,19 +79,21 @@ def test_mcmc_adds_mean_opacity_and_mean_scale_to_the_loss():
     ) == pytest.approx(expected)
 
 
-def test_mcmc_can_move_and_add_a_single_gaussian():
-    densifier, trainable = mcmc_state(8, max_gaussians=9, growth=0.5)
-    trainable.values.opacity_logits.data[1] = 0.0  # only one of two stays dead
-    event = densifier.refine(600, trainable, generator(0))
-    assert (event.relocated, event.added, event.after) == (1, 1, 9)
-    assert len(trainable) == 9
-
-
-def test_mcmc_does_not_change_a_model_whose_gaussians_are_all_dead():
-    densifier, trainable = mcmc_state(8, max_gaussians=50, growth=0.5)
-    trainable.values.opacity_logits.data[:] = -9.0
+@pytest.mark.parametrize(
+    "most, changed, logit, counts",
+    [
+        (9, slice(1, 2), 0.0, (1, 1, 9)),  # only one of two stays dead
+        (50, slice(None), -9.0, (0, 0, 8)),  # all are dead
+    ],
+)
+def test_mcmc_can_move_and_add_a_single_gaussian_and_none_if_all_are_dead(
+    most, changed, logit, counts
+):
+    densifier, trainable = mcmc_state(8, max_gaussians=most, growth=0.5)
+    trainable.values.opacity_logits.data[changed] = logit
     event = densifier.refine(600, trainable, generator())
-    assert (event.relocated, event.added, event.after) == (0, 0, 8)
+    assert (event.relocated, event.added, event.after) == counts
+    assert len(trainable) == counts[-1]
 
 
 def test_copies_of_an_opaque_gaussian_have_a_finite_logit():
@@ -153,7 +155,7 @@ def seen_by_one_view():
     probe.grad = torch.zeros(3, 3, 3)
     ones = torch.ones(3)
     covered = Footprint(ones.int(), ones, ones, ones)
-    more = {"splitting_probe": probe, "footprint": lambda values=None: covered}
+    more = {"extra": probe, "footprint": lambda values=None: covered}
     return rendered(gradient, radii=[3, 7, 0], absolute=gradient, **more)
 
 

@@ -42,7 +42,7 @@ def observe(densifier, trainable, rng, step):
     probe = torch.zeros(count, 3, 3, dtype=torch.float64, requires_grad=True)
     probe.grad = torch.zeros_like(probe)
     absolute = torch.from_numpy(gradient)
-    densifier.observe(step, rendered(gradient, radii, absolute, splitting_probe=probe))
+    densifier.observe(step, rendered(gradient, radii, absolute, extra=probe))
     return gradient, radii
 
 
@@ -99,12 +99,18 @@ def test_gaussians_whose_children_would_be_split_again_are_not_split(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("step", [600, 3100])
-def test_a_volumetric_round_matches_the_restatement(seed, step):
-    trainable, gradient = prepared(densifier := Volumetric(volume_threshold=0.03), seed)
+@pytest.mark.parametrize("order, threshold", [("after_adc", 0.03), ("after_prune", 0.003)])
+def test_a_volumetric_round_matches_the_restatement(order, threshold, seed, step):
+    densifier = Volumetric(volume_threshold=threshold, volume_order=order)
+    trainable, gradient = prepared(densifier, seed)
     real = Round(densifier, trainable, step, seed)
     noise = noise_of(seed, real.event.split_gradient, real.event.split_volume)
     rows = restatement.adc_growth(real.rows, gradient, EXTENT, noise, real.counts)
-    real.check(restatement.volume_growth(rows, 0.03, noise, real.counts))
+    pruned = order == "after_prune"
+    if pruned:
+        rows = restatement.prune(rows, step, EXTENT, real.counts)
+        assert real.event.pruned_opacity > 0
+    real.check(restatement.volume_growth(rows, threshold, noise, real.counts), pruned)
     assert real.event.split_volume > 0
 
 
@@ -122,19 +128,6 @@ def test_volumes_may_be_split_before_the_gradient_rule(seed, step):
     gradient = np.concatenate([staying, np.zeros(len(rows) - len(staying))])
     real.check(restatement.adc_growth(rows, gradient, EXTENT, noise, real.counts))
     assert min(real.event.split_volume, real.event.split_gradient) > 0
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("step", [600, 3100])
-def test_volumes_may_be_split_after_pruning(seed, step):
-    densifier = Volumetric(volume_threshold=0.003, volume_order="after_prune")
-    trainable, gradient = prepared(densifier, seed)
-    real = Round(densifier, trainable, step, seed)
-    noise = noise_of(seed, real.event.split_gradient, real.event.split_volume)
-    rows = restatement.adc_growth(real.rows, gradient, EXTENT, noise, real.counts)
-    rows = restatement.prune(rows, step, EXTENT, real.counts)
-    real.check(restatement.volume_growth(rows, 0.003, noise, real.counts), pruned=True)
-    assert min(real.event.split_volume, real.event.pruned_opacity) > 0
 
 
 SWITCHES = {

@@ -5,37 +5,24 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from shlex import split
 
 import pytest
 from filelock import FileLock
 
 from gsbench.cli import run
-from tests.helpers import read_json
-from tests.processes import heed_interrupts
-
-Run = Callable[..., "subprocess.CompletedProcess[str]"]
+from tests.helpers import read_json, words_of
+from tests.processes import completed, heed_interrupts
 
 # A whole trial in seconds: a small courtyard, its exact cameras, a random cloud, few iterations,
 # nothing downloaded.
-SMALL = [
-    "scene=courtyard",
-    "scene.views=12",
-    "scene.width=96",
-    "scene.height=72",
-    "init=random",
-    "init.count=3000",
-    "init.size=1.2",
-    "train.iterations=300",
-    "train.position_steps=300",
-    "train.densify_start=50",
-    "train.densify_interval=50",
-    "train.densify_stop=250",
-    "train.opacity_reset_interval=1000",
-    "train.checkpoint_every=40",
-    "eval.download=false",
-    "eval.lpips=[squeeze]",
-]
+SMALL = split(
+    "scene=courtyard scene.views=12 scene.width=96 scene.height=72 init=random "
+    "init.count=3000 init.size=1.2 train.iterations=300 train.position_steps=300 "
+    "train.densify_start=50 train.densify_interval=50 train.densify_stop=250 "
+    "train.opacity_reset_interval=1000 train.checkpoint_every=40 eval.download=false "
+    "eval.lpips=[squeeze]"
+)
 FINISHED = "finished"  # the name of the experiment that all tests may copy
 
 
@@ -62,15 +49,10 @@ def finished_runs(environment, tmp_path_factory):
                 "seed=0,1",
                 "tracking=none",
             ]
-            done = subprocess.run(
+            completed(
                 [sys.executable, "-m", "gsbench.cli", *sweep],
                 env=environment | {"GSBENCH_RUNS": str(runs)},
-                capture_output=True,
-                text=True,
-                timeout=600,
-                check=False,
             )
-            assert done.returncode == 0, done.stderr
             (runs / "complete").touch()
     return runs
 
@@ -101,18 +83,11 @@ def environment(tmp_path_factory):
 
 @pytest.fixture
 def gsbench(environment, tmp_path):
-    """Call ``gsbench`` with arguments; returns the finished process with its output as text."""
+    """Call ``gsbench`` with arguments, as `completed`; words in capitals are of its environment."""
 
-    def run(*arguments, timeout=240, cwd=tmp_path, **changes):
-        return subprocess.run(
-            [sys.executable, "-m", "gsbench.cli", *arguments],
-            cwd=cwd,
-            env=environment | changes,
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-            check=False,
-        )
+    def run(*arguments, code=0, timeout=240, cwd=tmp_path, **changes):
+        command = [sys.executable, "-m", "gsbench.cli", *words_of(*arguments)]
+        return completed(command, code, cwd=cwd, env=environment | changes, timeout=timeout)
 
     return run
 

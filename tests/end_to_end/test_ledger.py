@@ -4,6 +4,7 @@ import json
 import signal
 import time
 import zipfile
+from shlex import split
 
 import pytest
 
@@ -15,19 +16,13 @@ pytestmark = pytest.mark.slow
 
 TINY = [
     *SMALL,
-    "train.iterations=60",
-    "train.densify_start=10",
-    "train.densify_interval=10",
-    "train.densify_stop=55",
-    "init.count=500",
-    "scene.width=48",
-    "scene.height=36",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "raster=cpu",
+    *split(
+        "train.iterations=60 train.densify_start=10 train.densify_interval=10 "
+        "train.densify_stop=55 init.count=500 scene.width=48 scene.height=36 eval.lpips=[] "
+        "eval.flip=false tracking=none raster=cpu"
+    ),
 ]
-NEW = ["ledger", "new", "night", "--metric", "psnr", "--least", "0.1", *TINY, "densify=adc"]
+NEW = [*split("ledger new night --metric psnr --least 0.1"), *TINY, "densify=adc"]
 CLASS = """\
 from gsbench.densify import ADC
 
@@ -35,11 +30,11 @@ class Idea(ADC):
     def grow_by_gradient(self, refinement):
         {body}
 """
-OWN = ["densify._target_=mine.Idea", "densify.name=mine", "allow_targets=[mine]"]
+OWN = split("densify._target_=mine.Idea densify.name=mine allow_targets=[mine]")
 
 
 def do(gsbench, folder, *words):
-    return gsbench(*words, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
+    return gsbench(*words, code=None, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
 
 
 def attempt(environment, folder, *words):

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import shutil
 from functools import partial
+from shlex import split
 
 import numpy as np
 import pycolmap
@@ -23,25 +24,12 @@ from tests.helpers import read_json
 pytestmark = pytest.mark.slow
 
 SIZE = 192, 144
-QUICK = [
-    "scene=colmap",
-    "densify=adc",
-    "train.iterations=80",
-    "train.densify_start=20",
-    "train.densify_interval=20",
-    "train.densify_stop=70",
-    "eval.download=false",
-    "eval.lpips=[]",
-    "tracking=none",
-    "device=cpu",
-    "scene.masks=masks",
-]
-SIFT = [
-    "init=sfm",
-    "init.first_octave=0",
-    "init.max_num_features=1500",
-    "init.two_view_tracks=true",
-]
+QUICK = split(
+    "scene=colmap densify=adc train.iterations=80 train.densify_start=20 "
+    "train.densify_interval=20 train.densify_stop=70 eval.download=false eval.lpips=[] "
+    "tracking=none device=cpu scene.masks=masks"
+)
+SIFT = split("init=sfm init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true")
 SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 
@@ -91,7 +79,7 @@ def bits(folder):
         SIFT,
         ["init=sift_kornia"],
         [*SIFT, "scene.max_size=96"],
-        ["init=random", "densify=taming", "init.count=3000", "densify.max_gaussians=6000"],
+        split("init=random densify=taming init.count=3000 densify.max_gaussians=6000"),
         ["init=random", "densify=fastgs"],
         ["init=random", "train.resolution_schedule=pictures"],
     ],
@@ -137,7 +125,7 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
 ):
     capture = tmp_path / "edited"
     shutil.copytree(captures[0], capture)
-    words = ["init=random", "init.count=500", "densify=none", "train.iterations=5"]
+    words = split("init=random init.count=500 densify=none train.iterations=5")
     folder = trial(tmp_path / "runs", capture, *words)
     first = read_json(folder / "results.json")
     mask = sorted((capture / "masks").iterdir())[3]  # of a training view
@@ -174,18 +162,15 @@ def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, c
     mask.unlink()
     assert f"add {mask.name}" in said("init=random")
     assert "no such folder; set scene.masks to one of: images, masks, sparse" in said(
-        "init=random", "scene.masks=msk"
+        "init=random scene.masks=msk"
     )
 
 
 def test_another_program_is_refused_with_masks(captures, tmp_path, capfd):
     words = ["init=random", "densify=external/program", "densify.command='echo {data} {output}'"]
-    words += [
-        "allow_targets=[echo]",
-        "densify.version=1",
-        "densify.result=point_cloud.ply",
-        f"runs={tmp_path}",
-    ]
+    words += split(
+        f"allow_targets=[echo] densify.version=1 densify.result=point_cloud.ply runs={tmp_path}"
+    )
     assert (
         run(
             [

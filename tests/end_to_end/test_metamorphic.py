@@ -8,9 +8,9 @@ import math
 import shutil
 import statistics
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pycolmap
@@ -31,25 +31,15 @@ from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    "densify=adc",
-    "train.iterations=400",
-    "train.position_steps=400",
-    "train.densify_start=100",
-    "train.densify_interval=100",
-    "train.densify_stop=350",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "threads=1",
-    "raster=cpu",
-    "init=dataset",
-]
+QUICK = split(
+    "densify=adc train.iterations=400 train.position_steps=400 train.densify_start=100 "
+    "train.densify_interval=100 train.densify_stop=350 eval.lpips=[] eval.flip=false "
+    "tracking=none threads=1 raster=cpu init=dataset"
+)
 train = partial(trial_of, QUICK)
 COLMAP = "scene=colmap"
 VIEWS, WIDTH, HEIGHT = 14, 96, 72
 SEEDS = 4
-Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +136,7 @@ def require_given_coordinates(trial, untouched, similarity, exported, capture):
         )
     sizes, sizes_before = (np.median(table["scale_0"]) for table in (own, before))
     assert sizes - math.log(similarity.scale) == pytest.approx(sizes_before, abs=0.5)
-    assert run(["export", "init", str(trial), "--out", str(exported)]) == 0
+    assert run(split(f"export init {trial} --out {exported}")) == 0
     given_model, exported_model = (
         pycolmap.Reconstruction(folder / "sparse/0") for folder in (capture, exported)
     )

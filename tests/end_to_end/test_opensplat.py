@@ -1,6 +1,7 @@
 """OpenSplat as an arm, where it is installed: its model lies at the right place, and it grows."""
 
 import shutil
+from shlex import split
 
 import numpy as np
 import pytest
@@ -27,31 +28,19 @@ pytestmark = [
 def trial(tmp_path_factory):
     """The folder of a short trial of OpenSplat on a small courtyard, with a schedule of growth."""
     runs = tmp_path_factory.mktemp("runs")
-    scene = [
-        "scene.views=16",
-        "scene.width=128",
-        "scene.height=96",
-        "init=random",
-        "init.count=3000",
-    ]
-    growth = [
-        "densify_from=50",
-        "densify_until=200",
-        "refine_every=50",
-        "loss_threshold=0.02",
-        "sh_degree_interval=50",
-    ]
+    scene = split("scene.views=16 scene.width=128 scene.height=96 init=random init.count=3000")
+    growth = split(
+        "densify_from=50 densify_until=200 refine_every=50 loss_threshold=0.02 "
+        "sh_degree_interval=50"
+    )
     words = [
         f"densify=external/{PROGRAM}",
         f"densify.version={VERSION}",
         *(f"densify.options.{one}" for one in growth),
     ]
-    words += [
-        f"allow_targets=[{PROGRAM}]",
-        f"train.iterations={ITERATIONS}",
-        "tracking=none",
-        "eval.lpips=[]",
-    ]
+    words += split(
+        f"allow_targets=[{PROGRAM}] train.iterations={ITERATIONS} tracking=none eval.lpips=[]"
+    )
     assert run([*scene, *words, f"runs={runs}"]) == 0
     return next(runs.glob("default/courtyard/*/*-seed0"))
 

@@ -9,6 +9,7 @@ import sys
 import time
 import zipfile
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
 from tests.helpers import read_json, write
-from tests.processes import heed_interrupts, is_running
+from tests.processes import completed, heed_interrupts, is_running
 
 pytestmark = pytest.mark.slow
 
@@ -45,13 +46,10 @@ command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", -
 result: renders/*.png
 """
 QUICK = [
-    "init=random",
-    "init.count=2000",
-    "train.iterations=40",
-    "train.densify_start=500",
-    "tracking=none",
-    "eval.lpips=[squeeze]",
-    "eval.download=false",
+    *split(
+        "init=random init.count=2000 train.iterations=40 train.densify_start=500 tracking=none "
+        "eval.lpips=[squeeze] eval.download=false"
+    ),
     f"allow_targets=['{sys.executable}',PAINTER]",
 ]
 COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
@@ -81,28 +79,17 @@ def home(tmp_path_factory, environment, trainers):
             content.write(file, f"{archive.scenes['garden']}/{name}")
     with serve(archives) as server:
         program(environment, home, "fetch", "mipnerf360", "garden", "--mirror", server.url)
-    sweep = [
-        "densify=adc,cloud,painter",
-        "seed=0,1",
-        "name=three",
-        "scene=garden",
-        "eval.maps=true",
-    ]
+    sweep = split("densify=adc,cloud,painter seed=0,1 name=three scene=garden eval.maps=true")
     program(environment, home, "--config-dir", str(trainers), "-m", *QUICK, *sweep)
     return home
 
 
 def program(environment, home, *words):
-    done = subprocess.run(
+    done = completed(
         [sys.executable, "-m", "gsbench.cli", *words],
         cwd=home,
-        capture_output=True,
-        text=True,
         env=environment | {"GSBENCH_RUNS": str(home / "runs")},
-        timeout=500,
-        check=False,
     )
-    assert done.returncode == 0, done.stderr
     return done.stdout
 
 
@@ -127,7 +114,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         for file in (trial(home, "adc", seed) / "renders").glob("*.png"):
             truth = Image.open(trial(home, "adc") / "ground_truth" / file.name)
             Image.blend(Image.open(file), truth, 0.5).save(folder / file.name)
-        words = ["--truth", "three:garden:adc", "--as", "three:folder", "--seed", str(seed)]
+        words = split(f"--truth three:garden:adc --as three:folder --seed {seed}")
         assert run(["evaluate", str(folder), *words]) == 0
     capsys.readouterr()
     assert run(["tables", "three"]) == 0

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import shutil
 from functools import partial
+from shlex import split
 
 import numpy as np
 import pytest
@@ -19,18 +20,11 @@ from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    "scene=colmap",
-    "densify=adc",
-    "train.iterations=120",
-    "train.densify_start=20",
-    "train.densify_interval=20",
-    "train.densify_stop=100",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "device=cpu",
-]
+QUICK = split(
+    "scene=colmap densify=adc train.iterations=120 train.densify_start=20 "
+    "train.densify_interval=20 train.densify_stop=100 eval.lpips=[] eval.flip=false "
+    "tracking=none device=cpu"
+)
 TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 
@@ -68,7 +62,7 @@ def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path
     """Poses are given here. Renders are equal, too, and only their photographs differ."""
     words = [f"init={init}", f"init.points_from={choice}"]
     words += (
-        ["init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
+        split("init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true")
         if init == "sfm"
         else []
     )
@@ -83,24 +77,15 @@ def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path
 
 def test_with_points_from_all_photographs_the_noise_changes_the_trial(captures, tmp_path):
     """This shows that the test above can fail."""
-    words = [
-        "init=sfm",
-        "init.first_octave=0",
-        "init.max_num_features=1500",
-        "init.two_view_tracks=true",
-    ]
+    words = split(
+        "init=sfm init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true"
+    )
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
     assert bits(clean) != bits(noisy)
 
 
 def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_path):
-    words = [
-        "init=dataset",
-        "densify=none",
-        "scene.split=sector",
-        "scene.sectors=4",
-        "scene.sector=3",
-    ]
+    words = split("init=dataset densify=none scene.split=sector scene.sectors=4 scene.sector=3")
     folder = trial(tmp_path, captures[0], *words)
     results = read_json(folder / "results.json")
     assert results["split"] == "sector 3 of 4"
@@ -118,7 +103,7 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_p
 
 def test_a_search_with_validation_views_never_sees_a_test_view(captures, tmp_path):
     """Noise in place of test photographs changes nothing, not even the fingerprint."""
-    words = ["init=dataset", "densify=none", "scene.validation=true"]
+    words = split("init=dataset densify=none scene.validation=true")
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
     one, other = (read_json(folder / "results.json") for folder in (clean, noisy))
     assert one["split"] == "every_nth, validation"

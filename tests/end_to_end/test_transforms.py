@@ -3,6 +3,7 @@
 import hashlib
 import math
 import shutil
+from shlex import split
 
 import numpy as np
 import pycolmap
@@ -24,17 +25,10 @@ pytestmark = pytest.mark.slow
 
 # What `ns-process-data` does to COLMAP's coordinates: x and y exchanged, z turned round.
 APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
-QUICK = [
-    "init=dataset",
-    "train.iterations=40",
-    "train.densify_start=10",
-    "train.densify_interval=10",
-    "train.densify_stop=30",
-    "eval.download=false",
-    "eval.lpips=[]",
-    "tracking=none",
-    "device=cpu",
-]
+QUICK = split(
+    "init=dataset train.iterations=40 train.densify_start=10 train.densify_interval=10 "
+    "train.densify_stop=30 eval.download=false eval.lpips=[] tracking=none device=cpu"
+)
 
 
 def as_nerfstudio(model, folder):

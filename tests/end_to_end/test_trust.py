@@ -2,12 +2,12 @@
 
 import importlib.metadata
 import os
-import subprocess
 import sys
 
 import pytest
 
 from tests.end_to_end.test_hydra import TINY
+from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 SECONDS = 900
@@ -47,15 +47,7 @@ def gsbench(folder, *words, start=("../gsbench",)):
         "TORCH_HOME": str(folder.parent / "hub"),
     }
     command = [sys.executable, *start, *words]
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=SECONDS,
-        check=False,
-    )
+    return completed(command, cwd=folder, env=environment, timeout=SECONDS)
 
 
 def test_no_module_of_the_current_folder_is_imported(capture):
@@ -71,8 +63,7 @@ def test_no_module_of_the_current_folder_is_imported(capture):
         ["tables", "one"],
         ["status", "one"],
     ):
-        done = gsbench(capture, *words)
-        assert done.returncode == 0, done.stderr
+        gsbench(capture, *words)
         assert not (capture.parent / "exploded").exists(), (
             words,
             (capture.parent / "exploded").read_text(),
@@ -90,14 +81,11 @@ def test_an_isolated_process_imports_no_module_of_the_current_folder(capture):
 
 def test_python_m_gsbench_imports_no_module_of_the_current_folder(capture):
     code = "import runpy, sys; print(*sys.modules)"
-    before = subprocess.run(
-        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    before = completed([sys.executable, "-P", "-c", code]).stdout
     for name in {name.split(".")[0] for name in before.split()} | {"gsbench"}:
         (capture / f"{name}.py").unlink(missing_ok=True)
     for words in (["--help"], ["--cfg", "job"], ["seed=1", "--dry-run"]):
-        done = gsbench(capture, *words, start=("-m", "gsbench"))
-        assert done.returncode == 0, done.stderr
+        gsbench(capture, *words, start=("-m", "gsbench"))
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 

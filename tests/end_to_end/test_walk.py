@@ -9,6 +9,7 @@ import inspect
 import itertools
 from collections import Counter
 from pathlib import Path
+from shlex import split
 
 import pytest
 
@@ -27,24 +28,13 @@ MAX_CROSSINGS = 18
 KEY = "densify.volume_threshold"
 TRIAL = [
     *SMALL,
-    "train.iterations=4",
-    "train.densify_start=1",
-    "train.densify_interval=2",
-    "train.densify_stop=4",
-    "scene.views=9",
-    "scene.width=48",
-    "scene.height=36",
-    "init.count=200",
-    "raster=reference",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "eval.maps=false",
-    "tracking=none",
-    "device=cpu",
-    "densify=volumetric",
-    f"{KEY}=1e-9",
+    *split(
+        "train.iterations=4 train.densify_start=1 train.densify_interval=2 train.densify_stop=4 "
+        "scene.views=9 scene.width=48 scene.height=36 init.count=200 raster=reference "
+        "eval.lpips=[] eval.flip=false eval.maps=false tracking=none device=cpu "
+        f"densify=volumetric {KEY}=1e-9"
+    ),
 ]
-Frame = tuple[int, str]  # its identity while it lives, and its file below gsbench/
 
 
 def stack():

@@ -3,13 +3,10 @@
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from gsbench.eval.lpips import BACKBONES, Lpips, load_lpips
 from gsbench.weights import MissingWeightsError, load_state
 from tests.helpers import refusal
-
-State = dict[str, Tensor]
 
 
 def random_weights(net, prefix="features."):

@@ -45,15 +45,24 @@ def test_metrics_are_computed_from_the_pixels_of_the_files(pairs):
         assert per_view[pair.view]["psnr"] == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_picture_of_another_size_is_refused(pairs):
-    Image.open(pairs[1].picture).resize((25, 20)).save(pairs[1].picture)
-    with refusal(r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"):
-        measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
+def reduced(path):
+    Image.open(path).resize((25, 20)).save(path)
 
 
-def test_a_truncated_picture_is_named(pairs):
-    pairs[0].picture.write_bytes(pairs[0].picture.read_bytes()[:500])
-    with refusal(r"b_render\.png: the image is damaged"):
+def truncated(path):
+    path.write_bytes(path.read_bytes()[:500])
+
+
+@pytest.mark.parametrize(
+    "harm, index, said",
+    [
+        (reduced, 1, r"a_render\.png is 25x20 px, but its photograph .*a.png 50x40"),
+        (truncated, 0, r"b_render\.png: the image is damaged"),
+    ],
+)
+def test_a_picture_that_cannot_be_compared_is_named(pairs, harm, index, said):
+    harm(pairs[index].picture)
+    with refusal(said):
         measure(pairs, Evaluator(PAPER, lpips=(), flip=False))
 
 

@@ -27,7 +27,7 @@ from gsbench.external.settings import External, fill_placeholders, split_command
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init.base import PointCloud
 from gsbench.normalization import IDENTITY, Normalization
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.scene.types import Camera, View
 from gsbench.system.isolate import CrashError, error_tail
 from tests.config.test_schema import composed

@@ -5,8 +5,6 @@ It causes neither a crash nor a hang, but one line that names the file.
 
 import ast
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,8 +15,6 @@ from tests.fuzz.records import EXPERIMENT, NAMES, write_original
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
-CASES = 15 * 20  # in CI; `python -m tests.fuzz.records FOLDER 0 10000` tries more
 DEEP = b"[" * 100_000
 DAMAGES = {
     "deep": DEEP,
@@ -31,16 +27,6 @@ DAMAGES = {
     "binary": bytes(range(256)),
     "empty": b"",
 }
-
-
-def test_damaged_files_are_left_out_or_read_with_right_values(tmp_path):
-    command = [sys.executable, "-m", "tests.fuzz.records", str(tmp_path), "0", str(CASES)]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
-    )
-    case = (tmp_path / "current").read_text()
-    assert done.returncode == 0, f"case {case}: {done.stderr[-2000:]}"
-    assert done.stdout.startswith(f"{CASES} cases: ")
 
 
 @pytest.fixture
@@ -96,6 +82,7 @@ READS_ITSELF = {
     "claims/stopping.py",  # text of this process
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
+    "claims/export.py",  # text of this very process
     "parsing.py",
 }
 LOADERS = {

@@ -27,7 +27,6 @@ from gsbench.init.networks.extractors import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
 
-Pair = tuple[str, str]
 SIFT = FeatureSettings(
     extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
 )

@@ -251,18 +251,21 @@ def test_a_wrong_reference_gives_a_warning(courtyard, tmp_path):
     assert any("degrees against the true ones" in warning for warning in report.warnings)
 
 
-def test_photos_without_texture_are_refused(tmp_path):
-    for index in range(4):
-        picture(tmp_path / f"{index}.png", np.full((60, 80, 3), 40 * index))
-    with refusal("no keypoint in any image"):
-        Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
+NOISE = np.random.default_rng(0).integers(0, 255, (4, 120, 160, 3))
 
 
-def test_photos_without_overlap_are_refused(tmp_path):
-    rng = np.random.default_rng(0)
-    for index in range(4):
-        picture(tmp_path / f"{index}.png", rng.integers(0, 255, (120, 160, 3)))
-    with refusal("no pair of images shares enough matches"):
+@pytest.mark.parametrize(
+    "pixels, said",
+    [
+        ([np.full((60, 80, 3), 40 * index) for index in range(4)], "no keypoint in any image"),
+        (NOISE, "no pair of images shares enough matches"),
+    ],
+    ids=["without texture", "without overlap"],
+)
+def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
+    for index, own in enumerate(pixels):
+        picture(tmp_path / f"{index}.png", own)
+    with refusal(said):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
 

@@ -24,7 +24,8 @@ from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import add_to_plan, forget, read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
-from gsbench.runs.keys import TRAIN, Step, config_hash
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.keys import TRAIN, Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
@@ -241,9 +242,9 @@ def test_own_and_allowed_targets_pass():
 
 def test_finished_trial_is_recognised_until_something_changes(runs):
     values = trial_values()
-    assert why_not_done(values) == "results.json is not there, or not complete"
+    assert str(why_not_done(values)) == "results.json is not there, or not complete"
     results = finish(values)
-    assert why_not_done(values) == ""
+    assert why_not_done(values) is None
     assert TrialFolder.of(values).record() == results
     assert TrialFolder.of(values).state() == "done"
     assert why_not_done(trial_values("seed=1"))
@@ -287,7 +288,7 @@ def test_changes_are_noticed_and_named(change, names, runs):
         del content["made_of"]
     text = json.dumps(content)
     (folder / "results.json").write_text(text[:100] if change == "half a file" else text)
-    reason = why_not_done(values)
+    reason = str(why_not_done(values))
     assert re.search(names.replace("read (No", r"read \(No"), reason), reason
     assert "\n" not in reason
 

@@ -9,7 +9,7 @@ from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import view_versions
 from gsbench.pipeline.trial import TrialSteps
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.store import Store
 from gsbench.system.own_modules import allowed_modules
 from tests.pipeline.test_keys import WORDS, BareSource

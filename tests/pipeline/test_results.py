@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from shlex import split
 
 import pytest
 
@@ -10,7 +11,8 @@ from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.pipeline.trial import cloud_hash, results_of, source_files, versions
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.experiments import Declaration, Question, open_question, record_text
-from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step, sha256_of
+from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Capture
@@ -45,7 +47,7 @@ def write(files, folder):
 def made(tmp_path, tiny_scene):
     """A function that makes the results of a trial with the training ``TRAINING`` and changes."""
     values = compose_one(
-        ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]
+        split(f"scene=courtyard name=x runs={tmp_path} eval.primary=psnr seed=4")
     ).values
     store = Store(tmp_path / "store")
     capture = Capture("made", tmp_path, (), (), None, False, "0abc", "every eighth view")

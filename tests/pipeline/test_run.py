@@ -14,7 +14,8 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.pipeline import trial as trials
 from gsbench.pipeline.trial import TrialSteps, _publish, _recorded_failures, run_trial
-from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Step, config_hash
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Step
 from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS

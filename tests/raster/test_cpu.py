@@ -5,7 +5,6 @@ Results have the same bits on every run, their memory is not overwritten, and an
 
 import math
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -30,6 +29,7 @@ from gsbench.raster.cpu import (
 )
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import project, tile_rectangles
+from tests.processes import completed
 from tests.raster.promises import BLACK, PROMISES, Subject, bits_of, leaves
 from tests.raster.strategies import Case, render_with_gradients
 
@@ -242,10 +242,7 @@ print(float((output.image.double() - expected.image).abs().max()), worst)
     }
     root = Path(__file__).resolve().parents[2]
     command = [sys.executable, "-c", script]
-    run = subprocess.run(
-        command, env=environment, cwd=root, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert run.returncode == 0, run.stderr
+    run = completed(command, env=environment, cwd=root)
     value_error, gradient_error = map(float, run.stdout.split())
     assert value_error < 1e-4
     assert gradient_error < 1e-3

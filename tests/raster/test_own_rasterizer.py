@@ -2,8 +2,8 @@
 
 import os
 import re
-import subprocess
 import sys
+from shlex import split
 
 import pytest
 import torch
@@ -11,28 +11,20 @@ import torch
 from gsbench.config.compose import compose_one
 from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.raster import create_rasterizer
-from gsbench.runs.keys import config_hash, rasterizer_inputs
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.keys import rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
 from tests.helpers import read_json, refusal
+from tests.processes import completed
 
 CPU = torch.device("cpu")
-TINY = [
-    "scene.views=10",
-    "scene.width=48",
-    "scene.height=36",
-    "init=random",
-    "init.count=150",
-    "init.size=1.2",
-]
-TINY += [
-    "scene=courtyard",
-    "train.iterations=12",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "device=cpu",
-]
+TINY = split(
+    "scene.views=10 scene.width=48 scene.height=36 init=random init.count=150 init.size=1.2"
+)
+TINY += split(
+    "scene=courtyard train.iterations=12 eval.lpips=[] eval.flip=false tracking=none device=cpu"
+)
 OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
 
 
@@ -52,21 +44,12 @@ def folder(tmp_path, monkeypatch):
 
 def gsbench(folder, *words):
     environment = os.environ | {"GSBENCH_RUNS": str(folder / "runs")}
-    return subprocess.run(
-        [sys.executable, "-m", "gsbench.cli", *words],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    return completed([sys.executable, "-m", "gsbench.cli", *words], cwd=folder, env=environment)
 
 
 @pytest.mark.slow
 def test_the_real_program_trains_with_it_and_records_its_source(folder):
-    first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
-    assert first.returncode == 0, first.stderr
+    gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
     assert read_json(path)["raster"] == "untiled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
@@ -93,7 +76,6 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder):
     values = composed(*OWN, "+raster.rows=7")
     rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
-    assert isinstance(key, dict)
     assert key["rows"] == 7
     assert rasterizer_inputs(create_rasterizer("reference", CPU)) == "reference"
     for words, message in (
@@ -108,14 +90,21 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder):
         compose_one(OWN[:1])
 
 
-def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder):
+@pytest.mark.parametrize(
+    "arm, output, gives",
+    [
+        ("pixelgs", "footprints", {"has_footprint": True}),
+        ("steepgs", "the extra output splitting_matrix", {"extras": {"splitting_matrix": (3, 3)}}),
+    ],
+)
+def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(folder, arm, output, gives):
     Parts(composed(*OWN)).check(on_this_machine=False)
-    parts = Parts(composed(*OWN, "densify=pixelgs"))
-    with refusal(
-        r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
-    ):
+    parts = Parts(composed(*OWN, f"densify={arm}"))
+    able = "raster=reference or raster=cpu or raster=triton"
+    line = f"{output}, which raster=untiled does not give; take {able}"
+    with refusal(f"densify={arm} needs {line}"):
         parts.check(on_this_machine=False)
-    parts.own_rasterizer.has_footprint = True
+    vars(parts.own_rasterizer).update(gives)
     parts.check(on_this_machine=False)
 
 

@@ -3,16 +3,14 @@
 It is made once for each version.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
 import shutil
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 
 import numpy as np
@@ -34,6 +32,7 @@ from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.proof import create_proven, known_proof, proof_of, prove, stamp_of
 from tests.conftest import ROOT
 from tests.helpers import read_json, refusal, write
+from tests.processes import completed
 from tests.raster.conftest import interpreter_fault
 
 CPU = torch.device("cpu")
@@ -66,7 +65,7 @@ def test_the_cpu_kernels_pass_with_small_errors():
     assert {
         "image",
         "gradient of means",
-        "splitting matrix",
+        "splitting_matrix",
         "footprint (pixels)",
         "loss",
     } <= proof.errors.keys()
@@ -150,7 +149,7 @@ def test_an_executor_apart_from_the_contract_is_not_held_to_radii_bits_and_clamp
 
 def test_a_driver_error_is_a_failure_and_a_lack_of_memory_is_raised():
     class Broken(ReferenceRasterizer):
-        error: Exception = RuntimeError("CUDA error: an illegal memory access\nmore")
+        error = RuntimeError("CUDA error: an illegal memory access\nmore")
 
         def render(self, *arguments, **options):
             raise self.error
@@ -326,14 +325,7 @@ def test_two_processes_make_one_proof(tmp_path):
     script = f"import logging; logging.basicConfig(level=logging.INFO)\n{code}"
 
     def process(_):
-        done = subprocess.run(
-            [sys.executable, "-c", script],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=600,
-            check=True,
-        )
+        done = completed([sys.executable, "-c", script], env=environment)
         return done.stderr
 
     with ThreadPoolExecutor(2) as pool:
@@ -418,11 +410,11 @@ def test_nothing_is_proven_on_a_cpu(monkeypatch):
 def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(monkeypatch, capsys):
     made = {"cpu": passing("cpu")}
     monkeypatch.setattr(module, "prove_apart", lambda raster, device: made[raster])
-    assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu", "--json"]) == 0
+    assert run(split("doctor --prove --raster cpu --device cpu --json")) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["raster"], told["passed"], told["seconds"]) == ("cpu", True, 1.0)
     made["cpu"] = passing("cpu", ("image is off",))
-    assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu"]) == 1
+    assert run(split("doctor --prove --raster cpu --device cpu")) == 1
     assert (
         f"image is off\ntorch 2; please report it with {stamp_of('cpu', CPU)}"
         in capsys.readouterr().out
@@ -522,15 +514,6 @@ def test_a_planted_fault_is_found(tmp_path, fault):
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }
     words = [sys.executable, "-c", PROVE]
-    done = subprocess.run(
-        words,
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed(words, cwd=tmp_path, env=environment, timeout=900)
     failures = json.loads(done.stdout.splitlines()[-1])
     assert bool(failures) == (fault != "none"), failures

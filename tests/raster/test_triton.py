@@ -4,12 +4,14 @@ Each part runs in a separate process.
 """
 
 import os
-import subprocess
 import sys
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
+
+from tests.processes import completed
 
 pytest.importorskip("triton")
 
@@ -44,19 +46,10 @@ def test_a_part_passes_in_the_interpreter(part):
     }
     words = [
         sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "--no-header",
-        "-p",
-        "no:cacheprovider",
+        *split("-m pytest -q -x --no-header -p no:cacheprovider"),
         *PARTS[part],
     ]
-    done = subprocess.run(
-        words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False
-    )
-    assert done.returncode == 0, done.stdout
+    done = completed(words, cwd=ROOT, env=environment, timeout=LIMIT)
     assert " passed" in done.stdout
 
 
@@ -81,17 +74,10 @@ def test_every_test_is_in_exactly_one_part():
     def collected(arguments):
         words = [
             sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            "--collect-only",
-            "-p",
-            "no:cacheprovider",
+            *split("-m pytest -q --collect-only -p no:cacheprovider"),
             *arguments,
         ]
-        done = subprocess.run(
-            words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-        )
+        done = completed(words, cwd=ROOT, env=environment)
         return [line for line in done.stdout.splitlines() if "::" in line]
 
     everything = [name for name in collected([CONTRACT, INTERPRETED]) if "triton" in name]

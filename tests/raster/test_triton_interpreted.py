@@ -30,14 +30,13 @@ from gsbench.scene.types import Camera, Scene, View
 from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.direct import MOST_SIZES, DirectStep
 from gsbench.train.direct_proof import direct_fault
-from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import Trainer
 from tests.gaussians.helpers import random_gaussians
 from tests.raster.promises import BLACK, PROMISES, Subject, bits, bits_of, leaves
 from tests.train.conftest import orbit_camera
-from tests.train.test_loss import _images as picture
+from tests.train.test_loss import check_equal_images, check_loss, images
 
 pytestmark = pytest.mark.slow
 
@@ -359,33 +358,17 @@ def test_training_matches_that_of_the_reference(tmp_path):
 )
 def test_the_loss_matches_float64(size, weight):
     """The last size is wider than one strip and higher than one program."""
-    image, target = picture(*size)
-    for wanted in (target, target / 255):
-        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
-        values = TritonLoss(weight)(leaf, wanted)
-        expected = torch_photometric_loss(precise, target.double() / 255, weight)
-        for value, reference in zip(values, expected, strict=True):
-            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
-        (3 * values[0]).backward()
-        (3 * expected[0]).backward()
-        error = (leaf.grad - precise.grad).abs().max() / precise.grad.abs().max()
-        assert error < 1e-4
-        assert not values[1].requires_grad
-        assert not values[2].requires_grad
+    for _, *terms in check_loss(TritonLoss(weight), *images(*size), weight):
+        assert not any(term.requires_grad for term in terms)
 
 
 def test_equal_images_have_no_loss_and_an_image_without_gradient_has_the_same_loss():
-    image, target = picture(11, 16)
-    leaf = image.clone().requires_grad_()
-    loss, l1, similarity = TritonLoss(0.2)(leaf, image)
-    assert l1 == 0
-    assert similarity.item() == pytest.approx(1, abs=1e-6)
-    loss.backward()
-    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+    image, target = images(11, 16)
+    check_equal_images(TritonLoss(0.2), image)
     transposed = image.transpose(0, 1).contiguous().transpose(0, 1)
     value = TritonLoss(0.2)(transposed, target)[0]
     assert not value.requires_grad
-    assert value == TritonLoss(0.2)(leaf, target)[0]
+    assert value == TritonLoss(0.2)(image.clone().requires_grad_(), target)[0]
 
 
 class FixedViews:

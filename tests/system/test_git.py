@@ -7,19 +7,14 @@ import pytest
 
 from gsbench.system.install import checkout_of
 from tests.helpers import write
+from tests.processes import completed
 
 MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 
 
 @pytest.fixture
-def repository(tmp_path, monkeypatch):
+def repository(plain_git, tmp_path, monkeypatch):
     """A repository with one commit as the current folder; ``run.sh`` beside it leaves a mark."""
-    for name, value in {
-        "GIT_CONFIG_GLOBAL": "/dev/null",
-        "GIT_CONFIG_NOSYSTEM": "1",
-        "HOME": str(tmp_path),
-    }.items():
-        monkeypatch.setenv(name, value)
     folder = tmp_path / "capture"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -33,9 +28,7 @@ def repository(tmp_path, monkeypatch):
 
 
 def git(*words):
-    return subprocess.run(
-        ["git", *words], check=True, capture_output=True, text=True
-    ).stdout.strip()
+    return completed(["git", *words]).stdout.strip()
 
 
 def test_commit_and_changes_are_reported(repository):

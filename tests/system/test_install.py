@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import subprocess
 import tomllib
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from gsbench.system import install
 from gsbench.system.install import DISTRIBUTION, checkout, install_command
 from tests.conftest import ROOT
+from tests.processes import completed
 
 
 def test_the_name_is_that_of_the_project_file():
@@ -75,10 +75,7 @@ def test_the_dockerfile_calls_existing_make_targets():
     targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
     assert {"demo", "test"} < set(targets)
     for target in targets:
-        done = subprocess.run(
-            ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
+        completed(["make", "-n", target], cwd=ROOT)
     # In .dockerignore, names without a wildcard match in the root only.
     ignored = (ROOT / ".dockerignore").read_text().split()
     assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(

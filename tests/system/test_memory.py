@@ -1,6 +1,5 @@
 """Peak memory of a process, on systems that count it differently."""
 
-import subprocess
 import sys
 import types
 
@@ -10,6 +9,7 @@ import torch
 
 from gsbench.system import resources as memory
 from gsbench.system.resources import peak_memory_mb, peak_resident_mb, reset_peak_memory
+from tests.processes import completed
 
 CPU = torch.device("cpu")
 MIB = 1_048_576
@@ -60,5 +60,4 @@ def test_the_pipeline_can_be_imported_without_the_resource_module():
         "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.keys, "
         "gsbench.bench"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    completed([sys.executable, "-c", code])

@@ -3,6 +3,7 @@
 import os
 import socket
 import subprocess
+from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -88,7 +89,7 @@ def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assign_gpu(3, None)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
-    assert asked == [["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]]
+    assert asked == [split("nvidia-smi --query-gpu=index --format=csv,noheader")]
     assign_gpu(0, " 7 , ")
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "7"
     for error in (  # noqa: B007 - raised by the driver's program

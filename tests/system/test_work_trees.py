@@ -1,32 +1,24 @@
 """Work trees of a stranger's repository: its programs do not run, its checkout does not change."""
 
-import subprocess
-from collections.abc import Callable
+from shlex import split
 
 import pytest
 
 from gsbench.errors import InputError
 from gsbench.system.install import WorkTrees
 from tests.helpers import refusal
-
-Git = Callable[..., str]
+from tests.processes import completed
 
 
 @pytest.fixture
-def git(tmp_path, monkeypatch):
+def git(plain_git, tmp_path):
     """git in the folder ``theirs``, which is a repository with three commits of a file."""
-    for name, value in {
-        "GIT_CONFIG_GLOBAL": "/dev/null",
-        "GIT_CONFIG_NOSYSTEM": "1",
-        "HOME": str(tmp_path),
-    }.items():
-        monkeypatch.setenv(name, value)
     folder = tmp_path / "theirs"
     (folder / "inner").mkdir(parents=True)
 
     def run(*words):
-        command = ["git", "-C", str(folder), "-c", "user.name=x", "-c", "user.email=x@y", *words]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+        command = [*split(f"git -C {folder} -c user.name=x -c user.email=x@y"), *words]
+        return completed(command).stdout.strip()
 
     run("init", "-q", "-b", "main")
     (folder / ".gitattributes").write_text("*.py filter=theirs\n")

@@ -1,6 +1,7 @@
 """The photometric loss compared with scikit-image, float64 autograd, and itself on more threads."""
 
 import sys
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +18,33 @@ from gsbench.train.loss_cpu import CompiledLoss
 SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 
 
-def _images(height, width):
+def check_loss(loss, image, target, weight):
+    """Compare a loss and its gradient with float64 for targets of both types; return the values."""
+    found = []
+    for wanted in (target, target / 255):
+        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
+        values = loss(leaf, wanted)
+        expected = torch_photometric_loss(precise, target.double() / 255, weight)
+        for value, reference in zip(values, expected, strict=True):
+            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
+        (3 * values[0]).backward()
+        (3 * expected[0]).backward()
+        assert (leaf.grad - precise.grad).abs().max() < 1e-4 * precise.grad.abs().max()
+        found.append(values)
+    return found
+
+
+def check_equal_images(loss, image):
+    """Equal images have no loss and no gradient."""
+    leaf = image.clone().requires_grad_()
+    value, l1, similarity = loss(leaf, image)
+    assert l1 == 0
+    assert similarity.item() == pytest.approx(1, abs=1e-6)
+    value.backward()
+    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+
+
+def images(height, width):
     """A smooth image with noise and, as target, the smooth image in 8 bits."""
     generator = torch.Generator().manual_seed(height)
     y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
@@ -34,7 +61,7 @@ def test_the_window_has_eleven_weights_of_a_gaussian():
 
 
 def test_ssim_matches_scikit_image_in_the_interior():
-    image, target = _images(40, 50)
+    image, target = images(40, 50)
     target = target / 255
     _, expected = structural_similarity(
         image.double().numpy(),
@@ -61,7 +88,7 @@ def test_ssim_pads_images_with_zeros():
 
 
 def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise():
-    loss, (image, target) = PhotometricLoss(0.3, threads=1), _images(12, 13)
+    loss, (image, target) = PhotometricLoss(0.3, threads=1), images(12, 13)
     expected, _, _ = loss(image.double(), target)
     assert not loss._compiled
     assert float(loss(image, target)[0]) == pytest.approx(float(expected), rel=1e-5)
@@ -87,31 +114,15 @@ def test_tritons_loss_is_taken_where_triton_runs(monkeypatch):
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("weight", [0.2, 0.0, 1.0])
 def test_the_compiled_loss_matches_float64(size, weight):
-    image, target = _images(*size)
-    for wanted in (target, target / 255):
-        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
-        values = photometric_loss(leaf, wanted, weight)
-        expected = torch_photometric_loss(precise, target.double() / 255, weight)
-        for value, reference in zip(values, expected, strict=True):
-            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
-        (3 * values[0]).backward()
-        (3 * expected[0]).backward()
-        error = (leaf.grad - precise.grad).abs().max() / precise.grad.abs().max()
-        assert error < 1e-4
+    check_loss(partial(photometric_loss, ssim_weight=weight), *images(*size), weight)
 
 
 def test_equal_images_have_no_loss_and_no_gradient():
-    image, _ = _images(20, 33)
-    leaf = image.clone().requires_grad_()
-    loss, l1, similarity = photometric_loss(leaf, image)
-    assert l1 == 0
-    assert similarity.item() == pytest.approx(1, abs=1e-6)
-    loss.backward()
-    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+    check_equal_images(photometric_loss, images(20, 33)[0])
 
 
 def test_any_number_of_threads_gives_the_same_bits():
-    image, target = _images(64, 65)
+    image, target = images(64, 65)
     results = []
     for threads in (1, 1, 2, 4):
         loss = PhotometricLoss(threads=threads)
@@ -124,7 +135,7 @@ def test_any_number_of_threads_gives_the_same_bits():
 
 
 def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images():
-    image, target = _images(16, 18)
+    image, target = images(16, 18)
     loss = PhotometricLoss(threads=1)
     with torch.no_grad():
         value = loss(image, target)[0]
@@ -134,7 +145,7 @@ def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images():
 
 
 def test_inputs_that_do_not_fit_are_refused():
-    image, target = _images(16, 18)
+    image, target = images(16, 18)
     with pytest.raises(ValueError, match="shape"):
         photometric_loss(image, target[:-1])
     for wrong in (image[..., :2], image[0], image[None]):

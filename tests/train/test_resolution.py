@@ -10,7 +10,7 @@ import torch
 from gsbench.analysis.differences import ingredients
 from gsbench.densify import EdgeAware, Refinement
 from gsbench.events import RefineEvent
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.scene.types import View
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import (

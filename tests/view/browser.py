@@ -12,22 +12,17 @@ import shutil
 import subprocess
 import time
 import urllib.request
+from shlex import split
 
 import numpy as np
 import pytest
 from PIL import Image
 
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-    "--no-first-run",
-    "--disable-sync",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--remote-debugging-port=0",
-]
+FLAGS = split(
+    "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run "
+    "--disable-sync --disable-background-networking --disable-component-update "
+    "--remote-debugging-port=0"
+)
 SECONDS = 300  # a limit for a page that never changes; a slow machine needs less
 SECONDS_BETWEEN_LOOKS = 0.5
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 
-from gsbench.analysis.results import TrialResult, load_flat_config, settings_text
+from gsbench.analysis.results import TrialResult
+from gsbench.analysis.trial_settings import load_flat_config, settings_text
 from gsbench.parsing import DamagedError
 from gsbench.runs.experiments import Declaration, merge_planned, read_declarations
 from gsbench.runs.layout import SEED

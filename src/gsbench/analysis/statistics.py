@@ -28,13 +28,11 @@ from gsbench.runs.experiments import ERROR_RATE
 ALPHA = ERROR_RATE
 # for a statement about scenes like these: the fewest with which the sign test can reach 5 %
 MIN_SCENES = 6
-SUPPORTED, REFUTED, TOO_SMALL, UNDECIDED = (
-    "supported",
-    "refuted",
-    "too small to matter",
-    "undecided",
-)
 Outcome = Literal["supported", "refuted", "too small to matter", "undecided"]
+SUPPORTED: Outcome = "supported"
+REFUTED: Outcome = "refuted"
+TOO_SMALL: Outcome = "too small to matter"
+UNDECIDED: Outcome = "undecided"
 
 Array = NDArray[np.floating]
 

@@ -10,7 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.results import TrialResult, load_flat_config
+from gsbench.analysis.results import TrialResult
+from gsbench.analysis.trial_settings import load_flat_config
 from gsbench.parsing import DamagedError
 from gsbench.runs.experiments import Question, trial_key
 from gsbench.runs.layout import SEED
@@ -70,8 +71,8 @@ def one_sided(
     done: tuple[set[tuple[str, int]], set[tuple[str, int]]] = (set(), set())
     of_arm = {arm for _, arm in question.scenes.values()}
     for trial in trials:
-        side = trial.key in of_arm if question.scenes else trial.arm == question.arm
-        done[side].add((trial.scene, trial.seed))
+        is_arm = trial.key in of_arm if question.scenes else trial.arm == question.arm
+        done[ARM if is_arm else BASELINE].add((trial.scene, trial.seed))
     lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
     for one in unfinished:
         for side in (BASELINE, ARM):

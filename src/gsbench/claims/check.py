@@ -19,10 +19,10 @@ from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_words
+from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_text
 from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import cloud_notes, machine_notes
+from gsbench.analysis.table_notes import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
@@ -175,7 +175,7 @@ def prepare(
                 words = (*own, f"name={file.name}", "seed=0", *permissions)
                 if words not in composed:
                     where = f"claim {claim.id}, scene {scene}, arm {arm}"
-                    composed[words] = _compose(words, runs, where)
+                    composed[words] = _compose(words, permissions, runs, where)
                 trials.append(composed[words])
             if lacking := [*find_missing(trials[:1]), *find_missing(trials[1:])]:
                 reasons.setdefault(lacking[0], []).append(scene)
@@ -265,9 +265,9 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
         raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
 
 
-def _compose(words: Sequence[str], runs: Path, where: str) -> Trial:
+def _compose(words: Sequence[str], typed: Sequence[str], runs: Path, where: str) -> Trial:
     try:
-        trial = compose_one(words)
+        trial = compose_one(words, typed)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return Trial(trial.values | {"runs": str(runs.resolve())}, trial.overrides)
@@ -440,7 +440,7 @@ def _chart(one: ClaimVerdict) -> str:
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each scene and arm."""
     groups = group_by(trials, lambda trial: trial.label.rpartition(SEED)[0])
-    return tuple((folder, seeds_words(own)) for folder, own in groups.items())
+    return tuple((folder, seeds_text(own)) for folder, own in groups.items())
 
 
 def _number(value: float) -> str:
