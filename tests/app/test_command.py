@@ -3,18 +3,16 @@
 import copy
 import logging
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
 
-from gsbench.app import command
-from gsbench.app.command import (
-    check_sweep_settings,
-    one_trial_per_scene,
-    summarize,
-    words_for_hydras_files,
-)
+from gsbench.app import command, plugins
+from gsbench.app.command import one_trial_per_scene, summarize
+from gsbench.app.plugins import words_for_hydras_files
+from gsbench.app.sweep import Ended, check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
@@ -67,7 +65,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 ):
     caplog.set_level(logging.INFO, "gsbench")
     own = copy.deepcopy(OWN_FILES)
-    monkeypatch.setattr(command.compose, "installed_nodes", lambda words: own)
+    monkeypatch.setattr(plugins, "installed_nodes", lambda words: own)
     runtime = {"choices": {"hydra/launcher": "gsbench"}}
     config = OmegaConf.create(
         {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}
@@ -197,19 +195,27 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
 
 
 @pytest.mark.parametrize(
-    ("words", "trials", "code"),
-    [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)],
+    ("words", "other", "trials", "did", "code"),
+    [
+        (["--dry-run"], "", 2, "dry_run", 0),
+        (["--dry-run"], "optuna", 2, "dry_run", 0),
+        ([], "", 0, "own_sweep", 0),
+        ([], "", 2, "own_sweep", 1),
+        ([], "optuna", 2, "other_sweep", 1),
+    ],
 )
-def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
-    made = [trial(tmp_path, seed) for seed in range(trials)]
-
-    def run_app(words: Sequence[str], multirun: bool, task: Any) -> None:
-        assert task.look_only == (task.handle is command.list_trials)
-        task.trials = made
-
-    monkeypatch.setattr(command, "run_app", run_app)
-    monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is made))
+def test_only_trials_that_ran_are_summarized(
+    tmp_path, monkeypatch, words, other, trials, did, code
+):
+    ended, done = Ended([trial(tmp_path, seed) for seed in range(trials)]), []
+    sweep = SimpleNamespace(other_sweeper=other)
+    monkeypatch.setattr(command, "_read", lambda words, multirun: sweep)
+    for name in ("dry_run", "own_sweep", "other_sweep"):
+        run = lambda asked, *_, name=name: done.append((name, asked)) or ended  # noqa: E731
+        monkeypatch.setattr(command, name, run)
+    monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is ended.trials))
     assert command.launch(words) == code
+    assert done == [(did, sweep)]
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):

@@ -14,12 +14,10 @@ from gsbench.config.command_words import (
     check_text,
     check_words,
     grid_points,
-    hint_for,
     is_interval,
     is_sweep,
     key_of,
     makes_other_trials,
-    options,
     parse,
     parse_word,
     search_path,
@@ -27,6 +25,7 @@ from gsbench.config.command_words import (
     typed_permissions,
     value_text,
 )
+from gsbench.config.groups import hint_for, options
 from gsbench.errors import InputError
 
 

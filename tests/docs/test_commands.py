@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 import yaml
 
-from gsbench.config.command_words import GROUPS, OPTIONS, options
+from gsbench.config.command_words import OPTIONS
+from gsbench.config.groups import GROUPS, options
 from gsbench.config.schema import ComponentConfig, LaunchConfig, TrackingConfig
 from gsbench.eval.options import EvalConfig
 from gsbench.external.settings import External

@@ -12,15 +12,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
+from gsbench.config.groups import GROUPS, options
 from gsbench.config.schema import COMPONENTS
 from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
 from gsbench.runs.keys import DECLARED, NOT_HASHED, WITHOUT_EFFECT
-from gsbench.system.install import conf_dir
 from gsbench.words import did_you_mean
 
-GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
-EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
 # not in the configuration's hash, but in the path of the trial's folder
 IN_TRIAL_PATH = ("name", "seed")
 OPTIONS = (
@@ -192,12 +190,13 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
     return allowed
 
 
-def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
+def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> list[str]:
     """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
 
-    Hydra imports such a package while it composes. Hydra 1.4 also takes ``hydra[searchpath]`` and
+    Returns the packages. Hydra imports such a package while it composes. Hydra 1.4 also takes ``hydra[searchpath]`` and
     ``extend_list(pkg://package)``.
     """
+    packages: list[str] = []
     for word in words:
         override = parse_word(word)
         key = key_of(word).replace("[", ".").replace("]", "")
@@ -218,6 +217,8 @@ def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
                 raise InputError(
                     f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
                 )
+            packages.append(package)
+    return packages
 
 
 @cache
@@ -261,18 +262,6 @@ def value_text(value: object) -> str:
     return (
         "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
     )
-
-
-def hint_for(word: str) -> str:
-    """A hint for a word that is no setting: the nearest choice, or how to choose in a group.
-
-    Empty for any other word.
-    """
-    if word in GROUPS:
-        return f"; {word} is a group: choose one by {word}=NAME ({', '.join(options(word))})"
-    groups = [group for group in GROUPS if word in options(group)]
-    meant = [f"{'+' * (group == 'experiment')}{group}={word}" for group in groups]
-    return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def _quoted(word: str) -> str:
@@ -362,19 +351,6 @@ def makes_other_trials(key: str) -> bool:
     first, _, last = key.partition(".")
     without_effect = last in (*WITHOUT_EFFECT, *DECLARED.get(first, ()))
     return not without_effect and (first not in NOT_HASHED or first in IN_TRIAL_PATH)
-
-
-def options(group: str, folders: Sequence[Path] = ()) -> list[str]:
-    """The choices of a group: gsbench's YAML files, then those in the user's ``folders``.
-
-    Other programs are named with their subfolder, ``external/NAME``.
-    """
-    names: dict[str, None] = {}  # a set that keeps its order
-    for folder in (Path(conf_dir()), *folders):
-        names |= dict.fromkeys(sorted(path.stem for path in Path(folder, group).glob("*.yaml")))
-        programs = Path(folder, group, EXTERNAL_FOLDER).glob("*.yaml")
-        names |= dict.fromkeys(sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in programs))
-    return list(names)
 
 
 def searched_folders(words: Sequence[str]) -> list[Path]:
