@@ -90,6 +90,16 @@ def test_settings_can_read_hydras_node():
     ]
     (trial,) = compose_trials(["name=x-${hydra:runtime.choices.densify}"])
     assert trial.values["name"] == "x-volumetric"
+    words = ["+hydra.job.config.override_dirname.exclude_keys=[name]", "init=random", "seed=0,1"]
+    trials = compose_trials([*words, "name='${hydra:job.override_dirname}'"], multirun=True)
+    assert [trial.values["name"] for trial in trials] == ["init=random,seed=0", "init=random,seed=1"]
+
+
+@pytest.mark.parametrize("value", ["x-${seed}", "x-${oc.select:seed,5}", "x-${${scene.name}}"])
+def test_settings_can_read_the_seed(value):
+    words = ["init=random", "scene.name=seed", f"name='{value}'", "seed=3,4"]
+    trials = compose_trials(words, multirun=True)
+    assert [trial.values["name"] for trial in trials] == ["x-3", "x-4"]
 
 
 def test_a_dry_run_calls_an_interval_a_search_and_not_a_trial(said):

@@ -12,7 +12,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from gsbench.app import plugins
+from gsbench.app import plugins, sweep
 from gsbench.app.plugins import Objective, TrialTask, metric_of
 from gsbench.app.sweep import Ended
 from gsbench.config.compose import Trial
@@ -53,7 +53,7 @@ def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_
     write_results(third.folder, third.values)  # without this metric
     with pytest.raises(GsbenchError, match="has no lpips_vgg"):
         Objective(1).value([*trials, third])
-    monkeypatch.setattr(plugins, "facts_for", lambda metric, values: SimpleNamespace(direction=0))
+    monkeypatch.setattr(sweep, "facts_for", lambda metric, values: SimpleNamespace(direction=0))
     with pytest.raises(InputError, match="whether more or less of it is better is not known"):
         metric_of(third.values)
 
@@ -164,7 +164,8 @@ def run_by(
     """Run ``trials`` twice as gsbench's sweeper does by the launcher ``name``."""
     hydra = {"runtime": {"choices": {"hydra/launcher": name}}, "verbose": False}
     config = OmegaConf.create({"hydra": hydra})
-    task = TrialTask(done, sweep=object())  # type: ignore[arg-type]
+    own: Any = SimpleNamespace(composer=SimpleNamespace(keep_times=lambda config: None))
+    task = TrialTask(done, sweep=own)
     hydras = SimpleNamespace(instantiate_launcher=lambda **_: SimpleNamespace(launch=launch))
     monkeypatch.setattr(plugins.Plugins, "instance", lambda: hydras)
     monkeypatch.setattr(plugins, "run_sweep", lambda sweep, run: [run(trials), run(trials)])
@@ -223,7 +224,7 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
             for seed, job in zip(seeds, jobs, strict=True)
         ]
 
-    sweep: Any = SimpleNamespace(composer=SimpleNamespace(trials=compose_jobs))
+    own: Any = SimpleNamespace(composer=SimpleNamespace(trials=compose_jobs))
 
     def run(trials: Sequence[Trial]) -> list[Outcome]:
         outcomes = []
@@ -236,7 +237,7 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
         return outcomes[::-1]
 
     jobs = [["a=1"], ["a=2"], ["a=3"]]
-    task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")), sweep=sweep)
+    task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")), sweep=own)
     config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "new" / "dir")}}})
     first, second, third = task.run_jobs(jobs, config)
     assert composed == [[*job, seed] for job in jobs for seed in ("seed=1", "seed=2")]

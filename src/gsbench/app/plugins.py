@@ -6,6 +6,7 @@ trials run without `hydra.main`.
 """
 
 import copy
+import itertools
 import logging
 import os
 import statistics
@@ -13,7 +14,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr
 from dataclasses import dataclass, field
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,14 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.grids import GRIDS, run_sweep
-from gsbench.app.sweep import DEFAULT_METRIC, HYDRA_ERRORS, OWN, Ended, Sweep
-from gsbench.claims.stopping import facts_for
+from gsbench.app.sweep import (
+    DEFAULT_METRIC,
+    HYDRA_ERRORS,
+    OWN,
+    Ended,
+    Sweep,
+    better_direction,
+)
 from gsbench.config.command_words import bare_key, grid_points, is_sweep, key_of, parse_word
 from gsbench.config.compose import (
     CONFIG_NAME,
@@ -95,12 +101,7 @@ class Objective:
 def metric_of(values: Mapping[str, Any]) -> tuple[str, int]:
     """The metric that judges a trial (``eval.primary``, else PSNR); 1 if more is better, or -1."""
     metric = metric_and_question(str(values["eval"].get("primary") or ""))[0] or DEFAULT_METRIC
-    direction = facts_for(metric, values).direction
-    if not direction:
-        raise InputError(
-            f"eval.primary={metric}: whether more or less of it is better is not known"
-        )
-    return metric, 1 if direction > 0 else -1
+    return metric, better_direction(metric, values, "eval.primary")
 
 
 @dataclass
@@ -183,7 +184,13 @@ class TrialTask:
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=context, task_function=self, config=config
         )
-        run_sweep(self.sweep, lambda trials: self._launch(trials, launcher, name))
+        composer = self.sweep.composer
+
+        def run(trials: Sequence[Trial]) -> None:
+            composer.keep_times(config)  # the launcher composes its jobs from it
+            self._launch(trials, launcher, name)
+
+        run_sweep(self.sweep, run)
 
     def _launch(self, trials: Sequence[Trial], launcher: Launcher, name: str) -> None:
         """Run trials by another launcher than gsbench's; all are checked before the first."""
@@ -216,28 +223,16 @@ class TrialTask:
         # where sweepers write what they found
         Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
         by_folder = {outcome.folder: outcome for outcome in outcomes}
-        return [
-            _returned(job, trials[first : first + len(seeds)], by_folder, self.objective)
-            for job, first in zip(jobs, range(0, len(trials), len(seeds)), strict=True)
-        ]
-
-
-def _returned(
-    job: Sequence[str],
-    trials: Sequence[Trial],
-    outcomes: Mapping[Path, Outcome],
-    objective: Objective,
-) -> JobReturn:
-    """The value or the error of a job, as a launcher returns it to another sweeper."""
-    returned = JobReturn(overrides=job)
-    try:
-        for outcome in (outcomes[trial.folder] for trial in trials):
-            if outcome.status != "done":
-                raise (InputError if outcome.bad_input else GsbenchError)(outcome.message)
-        returned.return_value, returned.status = objective.value(trials), JobStatus.COMPLETED
-    except GsbenchError as error:
-        returned.return_value, returned.status = error, JobStatus.FAILED
-    return returned
+        rest, returned = iter(trials), []
+        for job in jobs:
+            own = list(itertools.islice(rest, len(seeds)))
+            ended = JobReturn(overrides=job, status=JobStatus.COMPLETED)
+            try:
+                ended.return_value = self._report(own, [by_folder[one.folder] for one in own])
+            except GsbenchError as error:
+                ended.return_value, ended.status = error, JobStatus.FAILED
+            returned.append(ended)
+        return returned
 
 
 def _outcome(trial: Trial, returned: JobReturn) -> Outcome:
@@ -364,7 +359,7 @@ def prepare_other_sweeper(sweep: Sweep) -> tuple[list[str], Objective]:
         for key, word in lists.items()
         if "." not in key and key != "seed"
     ]
-    for number, point in enumerate(product(*choices)):
+    for number, point in enumerate(itertools.product(*choices)):
         if number == MAX_CHOICES:
             raise InputError(
                 f"hydra/sweeper={name}: more than {MAX_CHOICES} combinations of choices"

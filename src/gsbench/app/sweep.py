@@ -1,9 +1,9 @@
 """A command line that was read: its words, its configuration, and how its trials ended."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Self
+from typing import Any, Literal, Self
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -12,6 +12,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gsbench.claims.stopping import facts_for
 from gsbench.config.command_words import check_removal, check_words, is_sweep, parse_word
 from gsbench.config.compose import Composer, Trial, config_loader, hydra_config, hydra_ready
 from gsbench.config.explain import explained
@@ -88,6 +89,14 @@ class Sweep:
                 check_removal(override)
         with hydra_ready(), explained(words):
             return OverridesParser.create(config_loader()).parse_overrides(list(words))
+
+
+def better_direction(metric: str, values: Mapping[str, Any], key: str) -> Literal[-1, 1]:
+    """1 if more of a metric is better, else -1. Raises InputError, for ``key``, if neither is."""
+    direction = facts_for(metric, values).direction
+    if not direction:
+        raise InputError(f"{key}={metric}: whether more or less of it is better is not known")
+    return 1 if direction > 0 else -1
 
 
 def check_sweep_settings(config: DictConfig, multirun: bool) -> None:

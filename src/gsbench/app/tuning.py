@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.types import Override
 
-from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep
-from gsbench.claims.stopping import facts_for
+from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep, better_direction
 from gsbench.config.command_words import (
     bare_key,
     check_makes_trials,
@@ -327,11 +326,7 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
         raise InputError(
             f"{TUNE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}"
         )
-    sign = facts_for(metric, values).direction
-    if not sign:
-        raise InputError(
-            f"{TUNE}.metric={metric}: whether more or less of it is better is not known"
-        )
+    direction = better_direction(metric, values, f"{TUNE}.metric")
     try:
         seeds = [
             int(word.partition("=")[2])
@@ -346,7 +341,7 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
             f"{TUNE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
             "others"
         )
-    return metric, 1 if sign > 0 else -1, seeds
+    return metric, direction, seeds
 
 
 # ---- ranges

@@ -190,34 +190,41 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
     return allowed
 
 
-def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> list[str]:
-    """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
+def search_places(words: Sequence[str]) -> list[str]:
+    """The places that ``hydra.searchpath`` names.
 
-    Returns the packages. Hydra imports such a package while it composes. Hydra 1.4 also takes ``hydra[searchpath]`` and
-    ``extend_list(pkg://package)``.
+    Hydra 1.4 also takes ``hydra[searchpath]`` and ``extend_list(pkg://package)``.
     """
-    packages: list[str] = []
+    places: list[str] = []
     for word in words:
         override = parse_word(word)
         key = key_of(word).replace("[", ".").replace("]", "")
-        if key != "hydra.searchpath" or override.is_sweep_override():
+        if key == "hydra.searchpath" and not override.is_sweep_override():
+            value: Any = override.value()
+            places += map(str, value if isinstance(value, list) else getattr(value, "values", ()))
+    return places
+
+
+def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> list[str]:
+    """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
+
+    Hydra imports such a package while it composes. Returns the packages.
+    """
+    packages: list[str] = []
+    for place in search_places(words):
+        scheme, colon, path = place.partition("://")
+        if not colon or scheme == "file":
             continue
-        value: Any = override.value()
-        for place in value if isinstance(value, list) else getattr(value, "values", ()):
-            scheme, colon, path = str(place).partition("://")
-            if not colon or scheme == "file":
-                continue
-            package = path.replace("/", ".")
-            if scheme != "pkg":
-                raise InputError(
-                    f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)"
-                )
-            if not is_allowed(package, (PACKAGE, *allowed)):
-                advice = permission_advice([package.split(".")[0]], allowed)
-                raise InputError(
-                    f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
-                )
-            packages.append(package)
+        packages.append(path.replace("/", "."))
+        if scheme != "pkg":
+            raise InputError(
+                f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)"
+            )
+        if not is_allowed(packages[-1], (PACKAGE, *allowed)):
+            advice = permission_advice([packages[-1].split(".")[0]], allowed)
+            raise InputError(
+                f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
+            )
     return packages
 
 
@@ -355,11 +362,8 @@ def makes_other_trials(key: str) -> bool:
 
 def searched_folders(words: Sequence[str]) -> list[Path]:
     """The user's folders that ``hydra.searchpath`` among ``words`` names."""
-    values = [parse_word(word).value() for word in words if word.startswith("hydra.searchpath=")]
-    places = [str(place) for value in values if isinstance(value, list) for place in value]
-    return [
-        Path(place.removeprefix("file://")) for place in places if not place.startswith("pkg://")
-    ]
+    places = search_places(words)
+    return [Path(place.removeprefix("file://")) for place in places if "pkg://" not in place]
 
 
 def _check_experiment_word(word: str, override: Override, folders: Sequence[Path]) -> None:

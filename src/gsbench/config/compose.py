@@ -7,7 +7,7 @@ set in a copy, and the resolved copy is checked: a trial.
 import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.util import find_spec
@@ -21,7 +21,6 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -109,9 +108,10 @@ class Composer:
         self._own_choices = _choices(own)
         # The settings of a group whose choices are listed are checked with each choice.
         listed = set(map(key_of, words)) - set(map(key_of, single))
-        self.config = self.whole(
-            [word for word in own if key_of(word).partition(".")[0] not in listed]
-        )
+        values = [word for word in own if key_of(word).partition(".")[0] not in listed]
+        self.config = self.settings(values)
+        with open_dict(self.config):
+            self.config.hydra = self._choose(values).hydra
 
     def settings(self, words: Sequence[str]) -> DictConfig:
         """The configuration of ``words`` without Hydra's node; what it may run is checked."""
@@ -127,13 +127,6 @@ class Composer:
         config[PERMISSIONS] = list(self.allowed)  # any in a file counts nothing
         return config
 
-    def whole(self, words: Sequence[str]) -> DictConfig:
-        """The configuration of ``words`` with Hydra's node."""
-        config = self.settings(words)
-        with open_dict(config):
-            config.hydra = self._choose(words).hydra
-        return config
-
     def has_key(self, key: str) -> bool:
         """Return whether the whole configuration has a value for the dotted ``key``."""
         return OmegaConf.select(self.config, key) is not None
@@ -141,61 +134,69 @@ class Composer:
     def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
         """The trials of ``jobs``, each the list of its words.
 
-        Jobs that differ only in the seed are resolved once, unless a setting reads the seed, or
-        Hydra's node, which has the number and the words of a job.
+        Jobs that differ only in the seed are resolved once, unless a setting reads the seed.
         """
-        resolved: dict[tuple[str, ...], Trial | None] = {}
+        any_seed: dict[tuple[str, ...], Trial | None] = {}
         trials = []
         for number, words in enumerate(jobs):
             others, seed = _without_seed(words)
-            overrides = (*self.hydra_words, *words)
-            if others not in resolved:
-                resolved[others] = self._trial_of_any_seed(others, seed, overrides)
-            trial = resolved[others]
+            if others not in any_seed:
+                any_seed[others] = self._trial(words, others, seed)
+            trial = any_seed[others]
             if trial is None:
-                trial = self._trial_alone(words, overrides, number)
+                trial = self._trial(words, words) or self._trial_of_hydra(words, number)
             trials.append(trial if seed is None else with_seed(trial, seed))
         return trials
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
         words = [word for word in overrides if not parse_word(word).is_hydra_override()]
-        trial = self._trial_of_any_seed(*_without_seed(words), overrides)
-        return trial or self._trial_alone(words, overrides, None)
+        trial = self._trial(words, words) or self._trial_of_hydra(words)
+        return replace(trial, overrides=tuple(overrides))
 
-    def _trial_of_any_seed(
-        self, words: Sequence[str], seed: int | None, overrides: Sequence[str]
+    def keep_times(self, config: DictConfig) -> None:
+        """Let ``${now:…}`` in ``config`` stand for what it stands for in the trials."""
+        OmegaConf.set_cache(config, defaultdict(dict, now=self._times))
+
+    def _trial(
+        self, words: Sequence[str], others: Sequence[str], seed: int | None = None
     ) -> Trial | None:
-        """The trial of ``words`` and ``seed``; None if a setting reads the seed or Hydra's node."""
-        config = self.settings(words)
+        """The trial of ``words``, which are the ``others`` and the ``seed``.
+
+        None if a setting reads this seed, or Hydra's node.
+        """
+        config = self.settings(others)
         if seed is not None:
             config.seed = ANY_SEED
-        try:
-            values = self._resolve(config, None, {} if seed is None else {"seed": seed})
-        except OmegaConfBaseException:  # or it has a fault, which `_trial_alone` explains
-            return None
-        return Trial(check(values), tuple(overrides))
+        with suppress(OmegaConfBaseException):  # or it has a fault: Hydra's composition says it
+            return self._checked(config, None, words, {} if seed is None else {"seed": seed})
+        return None
 
-    def _trial_alone(
-        self, words: Sequence[str], overrides: Sequence[str], number: int | None
+    def _trial_of_hydra(self, words: Sequence[str], number: int | None = None) -> Trial:
+        """The trial of ``words`` as Hydra composes its job, with its number and its node."""
+        with hydra_ready(), explained(words):
+            config = hydra.compose(
+                CONFIG_NAME, [*self.hydra_words, *words], return_hydra_config=True
+            )
+            with open_dict(config):
+                config[PERMISSIONS] = list(self.allowed)
+                config.hydra.mode = self.config.hydra.mode
+                if number is not None:
+                    config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
+            return self._checked(config, config, words, {})
+
+    def _checked(
+        self,
+        config: DictConfig,
+        hydras: DictConfig | None,
+        words: Sequence[str],
+        given: Mapping[str, Any],
     ) -> Trial:
-        """The trial of ``words``, resolved beside Hydra's node for the job of this number."""
-        config = self.whole(words)
-        with explained(overrides), open_dict(config):
-            config.hydra.mode = self.config.hydra.mode
-            config.hydra.overrides.task = list(words)
-            if number is not None:
-                config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
-            return Trial(check(self._resolve(config, config, {})), tuple(overrides))
-
-    def _resolve(
-        self, config: DictConfig, hydras: DictConfig | None, given: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        OmegaConf.set_cache(config, defaultdict(dict, now=self._times))
+        self.keep_times(config)
         with hydra_config(hydras):
             values = plain(config, given)
         self._times = OmegaConf.get_cache(config)["now"]
-        return values
+        return Trial(check(values), (*self.hydra_words, *words))
 
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
@@ -220,8 +221,8 @@ class Composer:
             config = hydra.compose(
                 CONFIG_NAME, [*self.hydra_words, *choices], return_hydra_config=True
             )
-        # Without words for Hydra, all files are gsbench's own.
-        check_permitted(config, self.allowed, foreign=bool(self.hydra_words))
+        if self.hydra_words:  # without them, all files are gsbench's own
+            check_permitted(config, self.allowed)
         return config
 
     def _are_own(self, choices: Mapping[str, str]) -> bool:
@@ -324,45 +325,28 @@ def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
     return sizes[id(node)]
 
 
-def check_permitted(config: DictConfig, allowed: Sequence[str], foreign: bool = True) -> None:
-    """Run `check_composed` against Hydra's nodes as the installed packages write them.
-
-    Unless ``foreign``, the nodes are known to be theirs.
-    """
-    choices = config.hydra.runtime.choices if foreign else {}
-    words = [
-        f"{group}={choice}"
-        for group, choice in sorted(choices.items())
-        if str(group).startswith(MADE_GROUPS)
-    ]
-    installed: Any = (
-        installed_nodes(tuple(words))
-        if foreign
-        else OmegaConf.to_container(config.hydra, resolve=False)
-    )
-    check_composed(config, allowed, installed)
+def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
+    """Run `check_composed` against Hydra's nodes as the installed packages write them."""
+    choices = config.hydra.runtime.choices
+    made = tuple(f"{group}={choices[group]}" for group in MADE_GROUPS)
+    check_composed(config, allowed, installed_nodes(made))
 
 
 @cache
-def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
-    """Hydra's node for the choices ``words``, from installed packages only.
+def installed_nodes(choices: tuple[str, ...]) -> Mapping[str, Any]:
+    """Hydra's node for ``choices`` of plug-ins and logs, from installed packages only.
 
-    It includes what gsbench's own ``conf/config.yaml`` sets. Choices from a user's folder are left
-    out.
+    It includes what gsbench's own ``conf/config.yaml`` sets. Choices that only a user's folder has
+    are left out.
     """
     with hydra_ready():
-        try:
-            config = hydra.compose(CONFIG_NAME, list(words), return_hydra_config=True)
-        except (HydraException, OmegaConfBaseException):
-            if len(words) < 2:
-                return installed_nodes(())
-            # One by one, so that a choice that no package has does not drop the others.
-            nodes: dict[str, Any] = {}
-            for word in words:
-                own = installed_nodes((word,))
-                nodes |= {name: own[name] for name in own if name in word}
-            return nodes
-        return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
+        known = [
+            word
+            for word in choices
+            if word.partition("=")[2] in config_loader().get_group_options(word.partition("=")[0])
+        ]
+        config = hydra.compose(CONFIG_NAME, known, return_hydra_config=True)
+    return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 
 def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:

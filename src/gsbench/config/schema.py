@@ -264,6 +264,12 @@ def plain(values: Any, given: Mapping[str, Any] = MappingProxyType({})) -> Any:
     return [plain(value) for value in values] if isinstance(values, list | tuple) else values
 
 
+FIXED_IN_PROGRAMS: tuple[tuple[str, str, Any, str], ...] = (
+    ("eval", "at", [], "shows its model only at the end: leave eval.at empty"),
+    ("train", "max_seconds", None, "cannot be stopped early: give it fewer train.iterations"),
+    ("train", "resolution_schedule", "none", "has its own sizes: leave it at none"),
+)
+
 # ---- rules: each checks the values of a configuration, or converts some in place
 
 
@@ -326,21 +332,9 @@ def nothing_grows_untrained(values: dict[str, Any]) -> None:
 
 
 def another_program_can_follow(values: dict[str, Any]) -> None:
-    if not is_external(values["densify"]):
-        return
-    if values["eval"]["at"]:
-        raise InputError(
-            "eval.at: another program shows its model only at the end: leave eval.at empty"
-        )
-    if values["train"]["max_seconds"] is not None:
-        raise InputError(
-            "train.max_seconds: another program cannot be stopped early: give it fewer "
-            "train.iterations"
-        )
-    if values["train"]["resolution_schedule"] != "none":
-        raise InputError(
-            "train.resolution_schedule: another program has its own sizes: leave it at none"
-        )
+    for group, key, free, why in FIXED_IN_PROGRAMS if is_external(values["densify"]) else ():
+        if values[group][key] != free:
+            raise InputError(f"{group}.{key}: another program {why}")
 
 
 def machine_decides_auto(values: dict[str, Any]) -> None:
