@@ -46,8 +46,7 @@ def launch(argv: list[str]) -> int:
     sweep = _read(words, multirun)
     with explained(words, HYDRA_ERRORS):
         if is_dry_run:
-            dry_run(sweep)
-            return 0
+            return dry_run(sweep)
         ended = other_sweep(sweep, run_batch) if sweep.other_sweeper else own_sweep(sweep)
     if not ended.trials:  # a sweep whose question is decided needs no trial
         return 0
@@ -81,11 +80,12 @@ def trials_of(sweep: Sweep) -> tuple[list[Trial], bool]:
     return [sweep.composer.trial(sweep.words)], True
 
 
-def dry_run(sweep: Sweep) -> None:
+def dry_run(sweep: Sweep) -> int:
     """List the trials of a command; those that a search will choose are only described."""
     trials, are_known = trials_of(sweep)
     if are_known:
         list_trials(trials)
+    return 0
 
 
 def own_sweep(sweep: Sweep) -> Ended:

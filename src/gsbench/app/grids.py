@@ -56,18 +56,10 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
     # for each job, the settings that are searched for its arm
     intervals: list[dict[str, Override]] = []
     for grid_words in words_of_grids(params, grids, sweep.own_words):
-        by_key = {
-            bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)
-        }
-        points = grid_points(
-            [override for override in by_key.values() if not is_interval(override)]
-        )
+        own = {bare_key(word.get_key_element()): word for word in sweep.parse(grid_words)}.values()
+        points = grid_points([word for word in own if not is_interval(word)])
         jobs += points
-        searched = {
-            override.get_key_element(): override
-            for override in by_key.values()
-            if is_interval(override)
-        }
+        searched = {word.get_key_element(): word for word in own if is_interval(word)}
         intervals += [searched] * len(points)
     try:
         jobs, are_known = tuned_jobs(sweep, tune or {}, jobs, intervals, run)
