@@ -1,11 +1,8 @@
 """A working folder with a stranger's files: modules that leave a mark when they are imported."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from shlex import split
 
 import pytest
 import yaml
@@ -13,6 +10,7 @@ import yaml
 from gsbench import cli
 from gsbench.errors import InputError
 from gsbench.system.own_modules import allowed_modules
+from tests.helpers import write
 
 BOMB = "from pathlib import Path\nPath('exploded').touch()\nclass Bomb:\n    pass\n"
 MINE = """
@@ -32,14 +30,13 @@ class Calls(Callback):
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def place(tmp_path, monkeypatch):
     """The working folder of a command, with modules that were never allowed, and ``mine``."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     (tmp_path / "bomb.py").write_text(BOMB)
-    (tmp_path / "bombs").mkdir()
-    (tmp_path / "bombs" / "__init__.py").write_text(BOMB)
+    write(tmp_path / "bombs" / "__init__.py", BOMB)
     (tmp_path / "bombs" / "one.yaml").write_text("name: one\n")
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "hydra_plugins").mkdir()  # Hydra imports whatever it finds below this name
@@ -50,14 +47,12 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     allowed_modules().clear()
 
 
-def no_trial(trials: Any) -> Any:
+def no_trial(trials):
     """Stand in for a function that runs trials."""
     raise InputError("the trials began")
 
 
-def ask(
-    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> str:
+def ask(words, capsys, monkeypatch):
     """The one line with which a command is refused."""
     monkeypatch.setattr("gsbench.app.command.run_batch", no_trial)
     monkeypatch.setattr("gsbench.app.command.list_trials", no_trial)
@@ -66,9 +61,8 @@ def ask(
     return line
 
 
-def experiment(settings: dict[str, Any]) -> list[str]:
+def experiment(settings):
     """The words that run an experiment from a stranger's file."""
     folder = Path("conf/experiment")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "strange.yaml").write_text("# @package _global_\n" + yaml.safe_dump(settings))
-    return ["--config-dir", "conf", "+experiment=strange"]
+    write(folder / "strange.yaml", "# @package _global_\n" + yaml.safe_dump(settings))
+    return split("--config-dir conf +experiment=strange")

@@ -2,9 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -19,14 +17,14 @@ from gsbench.launch.jobs import Outcome
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
 
-OWN_FILES: dict[str, Any] = {
+OWN_FILES = {
     **{"run": {"dir": "."}, "sweep": {"dir": ".", "subdir": "."}},
     **{"output_subdir": None, "job_logging": {}},
 }
 
 
 @pytest.mark.parametrize(
-    ("changes", "typed", "multirun", "launch", "added"),
+    "changes, typed, multirun, launch, added",
     [
         ({}, [], True, "serial", []),
         (
@@ -75,7 +73,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("changes", "multirun", "said"),
+    "changes, multirun, said",
     [
         ({}, False, None),
         ({"hydra.sweeper.params": {"seed": "0,1"}}, True, None),
@@ -119,7 +117,7 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 
 
 @pytest.mark.parametrize(
-    ("ends", "code", "advice"),
+    "ends, code, advice",
     [
         ("dd", 0, "2 of 2 trials done; the table: gsbench tables x"),
         ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
@@ -132,7 +130,7 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 )
 def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
     caplog.set_level(logging.INFO, "gsbench")
-    status: Any = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
+    status = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
     trials = [trial(tmp_path, seed) for seed in range(len(ends))]
     outcomes = [
         Outcome(one.folder, status[end], "why", end == "b")
@@ -158,10 +156,10 @@ def test_the_failure_of_a_single_trial_is_raised(tmp_path):
 
 
 def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatch):
-    asked: list[Any] = []
+    asked = []
     made = [trial(tmp_path, scene={"name": name}) for name in ("a", "b")]
 
-    def compose_trials(words: Sequence[str], multirun: bool) -> list[Trial]:
+    def compose_trials(words, multirun):
         asked.append((words, multirun))
         return made
 
@@ -195,7 +193,7 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
 
 
 @pytest.mark.parametrize(
-    ("words", "other", "trials", "did", "code"),
+    "words, other, trials, did, code",
     [
         (["--dry-run"], "", 2, "dry_run", 0),
         (["--dry-run"], "optuna", 2, "dry_run", 0),
@@ -210,8 +208,8 @@ def test_only_trials_that_ran_are_summarized(
     ended, done = Ended([trial(tmp_path, seed) for seed in range(trials)]), []
     sweep = SimpleNamespace(other_sweeper=other)
     monkeypatch.setattr(command, "_read", lambda words, multirun: sweep)
-    for name in ("dry_run", "own_sweep", "other_sweep"):
-        run = lambda asked, *_, name=name: done.append((name, asked)) or ended  # noqa: E731
+    for name, end in (("dry_run", 0), ("own_sweep", ended), ("other_sweep", ended)):
+        run = lambda asked, *_, did=(name, end): done.append((did[0], asked)) or did[1]  # noqa: E731
         monkeypatch.setattr(command, name, run)
     monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is ended.trials))
     assert command.launch(words) == code
@@ -219,7 +217,7 @@ def test_only_trials_that_ran_are_summarized(
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):
-    asked: list[Any] = []
+    asked = []
     monkeypatch.setattr(command, "set_up_logging", asked.append)
     command.compose_trials(["hydra.verbose=true"])
     command.compose_trials(["hydra.verbose=[gsbench.scene]", "seed=0,1"], multirun=True)

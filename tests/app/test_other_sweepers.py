@@ -2,7 +2,6 @@
 
 import logging
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -12,10 +11,10 @@ from gsbench.app.plugins import Objective, prepare_other_sweeper, words_without_
 from gsbench.errors import InputError
 
 
-def sweep_of(words: list[str], name: str = "optuna", **sweeper: Any) -> Any:
+def sweep_of(words, name="optuna", **sweeper):
     """A sweep by another sweeper, whose composer notes what it composes."""
     values = {"eval": {"primary": "lpips_vgg", "extra": {}}}
-    composed: list[Any] = []
+    composed = []
     composer = SimpleNamespace(
         composed=composed,
         settings=composed.append,
@@ -26,7 +25,7 @@ def sweep_of(words: list[str], name: str = "optuna", **sweeper: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("sweeper", "sign"),
+    "sweeper, sign",
     [
         ({"direction": "maximize"}, 1),
         ({"direction": "MAXIMIZE"}, 1),
@@ -82,7 +81,7 @@ def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(caps
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (
             RuntimeError("study is\ngone"),
@@ -92,7 +91,7 @@ def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(caps
     ],
 )
 def test_what_another_sweeper_raises_is_named_as_its_own(monkeypatch, error, said):
-    def run_main(*_: Any) -> None:
+    def run_main(*_):
         raise error
 
     monkeypatch.setattr(plugins, "run_main", run_main)

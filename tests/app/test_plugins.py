@@ -3,9 +3,7 @@
 import logging
 import os
 import pickle
-from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from hydra.core.utils import JobReturn, JobStatus
@@ -15,7 +13,6 @@ from omegaconf import OmegaConf
 from gsbench.app import plugins, sweep
 from gsbench.app.plugins import Objective, TrialTask, metric_of
 from gsbench.app.sweep import Ended
-from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
 from tests.app.stand_ins import done, trial
@@ -25,7 +22,7 @@ from tests.finished import write_results
 
 
 @pytest.mark.parametrize(
-    ("primary", "found"),
+    "primary, found",
     [
         (None, ("psnr", 1)),
         ("ssim", ("ssim", 1)),
@@ -62,11 +59,11 @@ def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_
 
 
 @pytest.fixture
-def job(tmp_path, monkeypatch) -> SimpleNamespace:
+def job(tmp_path, monkeypatch):
     """A job of Hydra's that makes a trial for each list of words."""
     state = SimpleNamespace(mode=RunMode.RUN, log={}, did=[])
 
-    def instance() -> Any:
+    def instance():
         overrides = OmegaConf.create({"hydra": ["hydra.mode=RUN", "hydra.x=1"], "task": ["a=1"]})
         node = {
             "job_logging": state.log,
@@ -76,11 +73,11 @@ def job(tmp_path, monkeypatch) -> SimpleNamespace:
         }
         return SimpleNamespace(cfg=SimpleNamespace(hydra=SimpleNamespace(**node)))
 
-    def resolve(config: Any, allowed: Sequence[str], words: Sequence[str]) -> Trial:
+    def resolve(config, allowed, words):
         state.did.append(("composed", allowed))
         return trial(tmp_path / "runs", config.seed, words)
 
-    def note(name: str) -> Any:
+    def note(name):
         return lambda *given: state.did.append((name, *given[-2:]))
 
     monkeypatch.setattr(plugins.HydraConfig, "instance", instance)
@@ -121,14 +118,14 @@ def test_a_job_of_a_sweep_raises_its_failure_and_returns_its_value(job, tmp_path
     assert task.ended == Ended()  # whoever launched it collects them
     for bad_input, kind in ((True, InputError), (False, GsbenchError)):
 
-        def failing(trials: Sequence[Trial], bad_input: bool = bad_input) -> list[Outcome]:
+        def failing(trials, bad_input=bad_input):
             return [Outcome(one.folder, "failed", "no luck", bad_input) for one in trials]
 
         with pytest.raises(GsbenchError, match="no luck") as error:
             TrialTask(failing, folder=job.folder)(job.config)
         assert type(error.value) is kind
 
-    def measured(trials: Sequence[Trial]) -> list[Outcome]:
+    def measured(trials):
         for one in trials:
             write_results(one.folder, one.values, metrics={"psnr": 20.0 + one.values["seed"]})
         return done(trials)
@@ -143,8 +140,8 @@ def test_a_job_of_a_sweep_raises_its_failure_and_returns_its_value(job, tmp_path
 
 
 def test_a_task_is_pickled_without_what_it_collected(tmp_path):
-    given: Any = (done, ("a",), "/f", Objective(1, ("seed=1",)))
-    task = TrialTask(*given, sweep=object(), ended=Ended([trial(tmp_path)]))  # type: ignore[arg-type]
+    given = (done, ("a",), "/f", Objective(1, ("seed=1",)))
+    task = TrialTask(*given, sweep=object(), ended=Ended([trial(tmp_path)]))
     assert pickle.loads(pickle.dumps(task)) == TrialTask(*given)
 
 
@@ -152,24 +149,22 @@ def test_a_task_is_pickled_without_what_it_collected(tmp_path):
 
 
 @pytest.fixture
-def begun(monkeypatch) -> list[Any]:
-    begun: list[Any] = []
+def begun(monkeypatch):
+    begun = []
     monkeypatch.setattr(plugins, "begin_for_another_launcher", begun.append)
     return begun
 
 
-def run_by(
-    monkeypatch: pytest.MonkeyPatch, trials: Sequence[Trial], name: str, launch: Any = None
-) -> Ended:
+def run_by(monkeypatch, trials, name, launch=None):
     """Run ``trials`` twice as gsbench's sweeper does by the launcher ``name``."""
     hydra = {"runtime": {"choices": {"hydra/launcher": name}}, "verbose": False}
     config = OmegaConf.create({"hydra": hydra})
-    own: Any = SimpleNamespace(composer=SimpleNamespace(keep_times=lambda config: None))
+    own = SimpleNamespace(composer=SimpleNamespace(keep_times=lambda config: None))
     task = TrialTask(done, sweep=own)
     hydras = SimpleNamespace(instantiate_launcher=lambda **_: SimpleNamespace(launch=launch))
     monkeypatch.setattr(plugins.Plugins, "instance", lambda: hydras)
     monkeypatch.setattr(plugins, "run_sweep", lambda sweep, run: [run(trials), run(trials)])
-    task.run_sweep(None, config)  # type: ignore[arg-type]
+    task.run_sweep(None, config)
     return task.ended
 
 
@@ -177,9 +172,9 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, monkeypatch, begun):
     trials = [trial(tmp_path, seed, ["hydra.x=1", f"seed={seed}"]) for seed in (0, 1)]
     assert run_by(monkeypatch, trials, "gsbench") == Ended(trials * 2, done(trials * 2))
     assert begun == []
-    asked: list[Any] = []
+    asked = []
 
-    def launch(jobs: Any, initial_job_idx: int) -> list[JobReturn]:
+    def launch(jobs, initial_job_idx):
         asked.append((jobs, initial_job_idx))
         good, bad = JobReturn(), JobReturn()
         good._return_value, bad._return_value = 1.0, InputError("no photos")
@@ -197,7 +192,7 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, monkeypatch, begun):
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (GsbenchError("ours"), "^ours$"),
         (ValueError("a\n b"), "^hydra/launcher=joblib: a b .gsbench status tells"),
@@ -205,7 +200,7 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, monkeypatch, begun):
     ],
 )
 def test_any_error_of_another_launcher_is_one_line(tmp_path, monkeypatch, begun, error, said):
-    def launch(jobs: Any, initial_job_idx: int) -> None:
+    def launch(jobs, initial_job_idx):
         raise error
 
     with pytest.raises(GsbenchError, match=said):
@@ -213,9 +208,9 @@ def test_any_error_of_another_launcher_is_one_line(tmp_path, monkeypatch, begun,
 
 
 def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
-    composed: list[Any] = []
+    composed = []
 
-    def compose_jobs(jobs: Any) -> list[Trial]:
+    def compose_jobs(jobs):
         composed.extend(jobs)
         seeds = [int(dict(word.split("=") for word in job).get("seed", "7")) for job in jobs]
         name = lambda job: {"name": job[0].replace("=", "")}  # noqa: E731
@@ -224,15 +219,15 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
             for seed, job in zip(seeds, jobs, strict=True)
         ]
 
-    own: Any = SimpleNamespace(composer=SimpleNamespace(trials=compose_jobs))
+    own = SimpleNamespace(composer=SimpleNamespace(trials=compose_jobs))
 
-    def run(trials: Sequence[Trial]) -> list[Outcome]:
+    def run(trials):
         outcomes = []
         for one in trials:
             name = one.values["scene"]["name"]
             value = 20.0 + one.values["seed"] + 10 * (name == "a2")
             write_results(one.folder, one.values, metrics={"psnr": value})
-            status: Any = "failed" if name == "a3" else "done"
+            status = "failed" if name == "a3" else "done"
             outcomes.append(Outcome(one.folder, status, "no luck", bad_input=True))
         return outcomes[::-1]
 

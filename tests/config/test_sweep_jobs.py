@@ -42,9 +42,9 @@ SWEEPS = {  # words, and how often Hydra composes for them
 
 
 @pytest.fixture
-def compositions(monkeypatch) -> list[list[str]]:
+def compositions(monkeypatch):
     """The words of each of Hydra's compositions."""
-    asked: list[list[str]] = []
+    asked = []
     real = ConfigLoaderImpl.load_configuration
 
     def counted(self, config_name, overrides, **settings):
@@ -76,7 +76,7 @@ def test_a_bad_value_is_refused_in_a_shared_composition(words):
 
 
 @pytest.mark.parametrize(
-    ("words", "others", "seed"),
+    "words, others, seed",
     [
         (["a.b=1", "seed=2"], ("a.b=1",), 2),
         (["a.b=1"], ("a.b=1",), None),
@@ -91,7 +91,7 @@ def test_only_a_plain_seed_is_set_apart(words, others, seed):
 
 
 @pytest.mark.parametrize(
-    ("word", "found"),
+    "word, found",
     [
         ("a.b=2", {"a": {"b": 2, "c": [1]}}),
         ("+a.d=2", {"a": {"b": 1, "c": [1], "d": 2}}),

@@ -7,8 +7,6 @@ the class's own defaults. A file that is built on another of the same class stat
 
 import dataclasses
 import importlib
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 import yaml
@@ -21,12 +19,12 @@ from gsbench.system.install import conf_dir
 NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")
 
 
-def read(path: str) -> dict[str, Any]:
+def read(path):
     content = yaml.safe_load((conf_dir() / f"{path}.yaml").read_text(encoding="utf-8"))
     return content if isinstance(content, dict) else {}
 
 
-def bases(path: str) -> Iterator[str]:
+def bases(path):
     """The files of the same group that a file is built on, nearest first."""
     group = path.partition("/")[0]
     for entry in read(path).get("defaults", []):
@@ -41,7 +39,7 @@ def bases(path: str) -> Iterator[str]:
             yield from bases(base)
 
 
-def class_of(path: str) -> type | None:
+def class_of(path):
     """The dataclass whose options a file states."""
     targets = [
         values["_target_"] for values in map(read, (path, *bases(path))) if "_target_" in values
@@ -62,9 +60,9 @@ FILES = [
 ]
 
 
-def stated(*paths: str) -> dict[str, Any]:
+def stated(*paths):
     """The values that files state, except names and references to other settings."""
-    values: dict[str, Any] = {}
+    values = {}
     for file in paths:
         values |= read(file)
     given = {
@@ -73,7 +71,7 @@ def stated(*paths: str) -> dict[str, Any]:
     return {key: value for key, value in given.items() if not str(value).startswith(("${", "???"))}
 
 
-def plain(value: Any) -> Any:
+def plain(value):
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -3,13 +3,9 @@
 Then read registers, spills and loops from the machine code.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
-import subprocess
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,44 +17,45 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, make_backend
 from triton.runtime.jit import JITFunction, create_function_from_signature
 
+from tests.processes import completed
+
 TARGETS = (80, 86, 89, 90, 120)  # A100, RTX 30, RTX 40, H100/H200, RTX 50
 BINARIES = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
 
 
 @dataclass(frozen=True)
 class Launch:
-    """One launch of a kernel: its positional arguments, and the named ones, constants and options."""
+    """One launch of a kernel with its arguments, constants and options."""
 
     kernel: JITFunction
-    arguments: tuple[Any, ...]
     named: dict[str, Any]
 
     @property
-    def name(self) -> str:
+    def name(self):
         return str(self.kernel.fn.__name__)
 
 
 @contextmanager
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
+def recorded(monkeypatch):
     """Within this context, kernels do not run; their launches are appended to the list."""
-    launches: list[Launch] = []
+    launches = []
 
-    def run(kernel: JITFunction, *arguments: Any, grid: Any, warmup: bool, **named: Any) -> None:
-        launches.append(Launch(kernel, arguments, named))
+    def run(kernel, *, grid, warmup, **named):
+        launches.append(Launch(kernel, named))
 
     with monkeypatch.context() as patch:
         patch.setattr(JITFunction, "run", run)
         yield launches
 
 
-def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, ...]:
+def specialization(launch, compute_capability=90):
     """The properties for which Triton compiles a kernel separately.
 
     These are types, constants, and which arguments are divisible by 16.
     """
     backend = make_backend(GPUTarget("cuda", compute_capability, 32))
     binder = create_function_from_signature(launch.kernel.signature, launch.kernel.params, backend)
-    _, kinds, _ = binder(*launch.arguments, **launch.named)
+    _, kinds, _ = binder(**launch.named)
     return tuple(kinds)
 
 
@@ -73,17 +70,17 @@ class Compiled:
     text: str  # SASS
 
     @property
-    def inner_loop(self) -> int:
+    def inner_loop(self):
         """Instructions of the longest innermost loop; 0 without one."""
         return max(self.loops.values(), default=0)
 
 
-def compile_for(launch: Launch, compute_capability: int) -> Compiled:
+def compile_for(launch, compute_capability):
     target = GPUTarget("cuda", compute_capability, 32)
     backend = make_backend(target)
     kernel = launch.kernel
     binder = create_function_from_signature(kernel.signature, kernel.params, backend)
-    bound, kinds, options = binder(*launch.arguments, **launch.named)
+    bound, kinds, options = binder(**launch.named)
     options, signature, constants, attributes = kernel._pack_args(
         backend, launch.named, bound, kinds, options
     )
@@ -100,10 +97,10 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
     )
 
 
-def innermost_loops(text: str) -> dict[str, int]:
+def innermost_loops(text):
     """For each innermost loop, the number of instructions from its label to the branch back."""
-    labels: dict[str, int] = {}
-    loops: dict[str, tuple[int, int]] = {}
+    labels = {}
+    loops = {}
     place = 0
     for line in text.splitlines():
         if label := re.match(r"\s*(\.L_\w+):", line):
@@ -122,11 +119,9 @@ def innermost_loops(text: str) -> dict[str, int]:
     return {label: loops[label][1] - loops[label][0] for label in sorted(inner)}
 
 
-def _run(tool: str, *arguments: str) -> str:
+def _run(tool, *arguments):
     path = BINARIES / tool
     command = str(path) if path.exists() else shutil.which(tool)
     if command is None:
         pytest.skip(f"this Triton has no {tool}")
-    return subprocess.run(
-        [command, *arguments], capture_output=True, text=True, check=True, timeout=120
-    ).stdout
+    return completed([command, *arguments]).stdout

@@ -1,12 +1,7 @@
 """The records of an experiment: its folder, the search for settings, and declarations."""
 
-import json
-from pathlib import Path
-from typing import Any
-
 import pytest
 
-from gsbench.errors import InputError
 from gsbench.parsing import DamagedError, read_typed
 from gsbench.runs.experiments import (
     Declaration,
@@ -23,6 +18,7 @@ from gsbench.runs.experiments import (
     trial_folders,
 )
 from gsbench.runs.trial_record import Declared
+from tests.helpers import refusal, write
 
 POINTS = [{"settings": {"x": 0.5}, "value": 2.0}, {"settings": {"x": 1}, "value": 4.0}]
 TUNING = {
@@ -48,7 +44,7 @@ def test_experiments_are_folders_that_are_not_hidden(tmp_path):
     assert list_experiments(tmp_path) == ["a", "b"]
     assert list(trial_folders(tmp_path / "a")) == [str(tmp_path / "a" / "scene" / "arm" / "trial")]
     assert experiment_home(tmp_path, "b") == tmp_path / "b"
-    with pytest.raises(InputError, match=r"no experiment 'c' in .*; there: a, b"):
+    with refusal(r"no experiment 'c' in .*; there: a, b"):
         experiment_home(tmp_path, "c")
 
 
@@ -57,12 +53,12 @@ def test_the_folder_of_an_experiment_is_made_unless_it_is_a_link(tmp_path):
     make_home(tmp_path / "runs" / "x")
     assert (tmp_path / "runs" / "x").is_dir()
     (tmp_path / "runs" / "link").symlink_to(tmp_path / "runs" / "x")
-    with pytest.raises(InputError, match="follows no links"):
+    with refusal("follows no links"):
         make_home(tmp_path / "runs" / "link")
 
 
-def tuning(tmp_path: Path, **changes: Any) -> Any:
-    (tmp_path / "tuning.json").write_text(json.dumps(TUNING | changes))
+def tuning(tmp_path, **changes):
+    write(tmp_path / "tuning.json", TUNING | changes)
     return read_typed(tmp_path / "tuning.json", TuningRecord)
 
 
@@ -79,7 +75,7 @@ def test_the_best_point_is_the_one_with_the_best_value(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("points", "fault"),
+    "points, fault",
     [
         ([*POINTS, {"settings": {"y": 1.0}, "value": 1.0}], "different settings"),
         ([{"settings": {"x": 0.0}, "value": 1.0}], "not above 0"),
@@ -93,7 +89,7 @@ def test_a_record_of_an_impossible_search_is_damaged(tmp_path, points, fault):
         assert tuning(tmp_path, points=points, log=[]).points
 
 
-def declared(hour: int, *metrics: str, **values: Any) -> Declaration:
+def declared(hour, *metrics, **values):
     questions = tuple(open_question(metric) for metric in metrics)
     return Declaration(time=f"1970-01-01T{hour:02d}:00:00Z", questions=questions, **values)
 

@@ -1,11 +1,8 @@
 """A runs folder of a stranger: none of its links is followed, and nothing in it blocks a reader."""
 
 import os
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -22,13 +19,14 @@ from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import describe_holder, hold, is_held
 from tests.finished import write_results
+from tests.helpers import refusal
 from tests.runs.toy import TOY, build, toy_inputs
 
 SECRET = "what nobody else may read or change"
 
 
 @pytest.fixture
-def outside(tmp_path) -> Path:
+def outside(tmp_path):
     """A private folder beside the runs folder."""
     folder = tmp_path / "outside"
     folder.mkdir()
@@ -37,7 +35,7 @@ def outside(tmp_path) -> Path:
 
 
 @pytest.fixture
-def trial(tmp_path) -> Path:
+def trial(tmp_path):
     """A finished trial in the runs folder, with results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
     named = {
@@ -47,29 +45,29 @@ def trial(tmp_path) -> Path:
     return folder
 
 
-def _log(folder: Path) -> None:
+def _log(folder):
     with log_to(folder / "log.txt"):
         pass
 
 
-def _hold(folder: Path) -> None:
+def _hold(folder):
     with hold(folder / ".lock", "work"):
         pass
 
 
-def _forget(folder: Path) -> None:
+def _forget(folder):
     forget(folder.parents[2], [])
 
 
-def _declare(folder: Path) -> None:
-    trial: Any = SimpleNamespace(
+def _declare(folder):
+    trial = SimpleNamespace(
         files=TrialFolder(folder), values={"seed": 0, "eval": {"primary": "psnr"}}
     )
     declare([trial])
 
 
 # The file in a trial's folder that is a link, and the function that writes it.
-WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
+WRITERS = {
     "the log": ("log.txt", _log),
     "a lock": (".lock", _hold),
     "a lock's holder": (".lock.holder", _hold),
@@ -97,20 +95,20 @@ def test_trials_in_a_linked_folder_are_ignored(level, trial, outside):
     assert read_experiment(home).trials == () or level == 0  # a named folder may be a link
     assert states_of_experiment(home) == [] or level == 0
     assert (list_experiments(home.parent) == []) == (level == 0)
-    with pytest.raises(InputError, match="follows no links"):
+    with refusal("follows no links"):
         remove(home, [trial])
     assert trial.is_dir()
 
 
-def _link(path: Path, outside: Path) -> None:
+def _link(path, outside):
     path.symlink_to(outside / "private")
 
 
-def _folder_link(path: Path, outside: Path) -> None:
+def _folder_link(path, outside):
     path.symlink_to(outside)
 
 
-def _pipe(path: Path, outside: Path) -> None:
+def _pipe(path, outside):
     os.mkfifo(path)
 
 
@@ -125,7 +123,7 @@ def test_a_trial_with_a_link_or_a_pipe_is_left_out(name, make, trial, outside):
     found = read_experiment(trial.parents[2])
     assert not found.trials
     assert name in found.warnings[0]
-    with pytest.raises(InputError, match="not a regular file"):
+    with refusal("not a regular file"):
         require_no_links(trial.parents[3], trial, below=True)
 
 
@@ -147,7 +145,7 @@ def test_the_store_builds_nothing_in_a_linked_folder(tmp_path, outside):
     partial = store.partial(step.stage, step.key)
     partial.parent.mkdir(parents=True)
     partial.symlink_to(outside)
-    with pytest.raises(InputError, match="follows no links"):
+    with refusal("follows no links"):
         store.get(step)
     assert [path.name for path in outside.iterdir()] == ["private"]
     partial.unlink()

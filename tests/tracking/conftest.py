@@ -1,12 +1,10 @@
 """A runs folder with a database, and a PostgreSQL server for one test."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
+from shlex import split
 
 import pytest
 
@@ -15,7 +13,7 @@ from tests.tracking.helpers import free_port
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Path:
+def runs(tmp_path_factory):
     """A runs folder with a database; making one takes MLflow seconds."""
     folder = tmp_path_factory.mktemp("runs")
     ensure_experiment(connect(None, folder), "tracked", folder)
@@ -23,7 +21,7 @@ def runs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def postgresql(tmp_path) -> Iterator[str]:
+def postgresql(tmp_path):
     """The address of an empty database in a new PostgreSQL server; skips without PostgreSQL."""
     pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
     homes = (
@@ -44,7 +42,7 @@ def postgresql(tmp_path) -> Iterator[str]:
     if os.geteuid() == 0:  # the server refuses to run as root
         if shutil.which("runuser") is None:
             pytest.skip("PostgreSQL does not run as root, and there is no runuser")
-        prefix = ["runuser", "-u", "nobody", "--"]
+        prefix = split("runuser -u nobody --")
         shutil.chown(data, "nobody")
         # a worker of pytest-xdist has a folder of its own
         for folder in (tmp_path, *tmp_path.parents[:3]):

@@ -1,15 +1,13 @@
 """A complete trial ends with exit code 0 and at most one warning, whatever its tracker does."""
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
+from shlex import split
 from urllib.parse import urlsplit
 
 import psutil
@@ -19,7 +17,8 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import SETTINGS
 from tests.end_to_end.conftest import SMALL
-from tests.processes import heed_interrupts
+from tests.helpers import read_json
+from tests.processes import completed, heed_interrupts
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
@@ -50,11 +49,11 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Path:
+def runs(tmp_path_factory):
     return tmp_path_factory.mktemp("bad-trackers")
 
 
-def start(runs: Path, *words: str) -> subprocess.Popen[str]:
+def start(runs, *words):
     kept = {
         key: value
         for key, value in child_environment().items()
@@ -77,13 +76,13 @@ def start(runs: Path, *words: str) -> subprocess.Popen[str]:
     )
 
 
-def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
+def check_complete(runs, name, code, errors):
     assert code == 0, errors
     said = [line for line in errors.splitlines() if "tracking" in line or "MLflow" in line]
     assert len(said) == 1, errors
     assert "gsbench sync" in said[0]
     (results,) = (runs / name).glob("**/results.json")
-    assert json.loads(results.read_text())["status"] == "complete"
+    assert read_json(results)["status"] == "complete"
 
 
 @pytest.mark.parametrize(
@@ -153,11 +152,11 @@ def test_sync_can_be_stopped_while_the_tracker_hangs(runs):
     assert "Traceback" not in errors
 
 
-def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
+def mirrors_of(program):
     """The mirror processes of a program, once there are any."""
-    found: list[psutil.Process] = []
+    found = []
 
-    def look() -> bool:
+    def look():
         with suppress(psutil.NoSuchProcess):
             children = psutil.Process(program.pid).children(recursive=True)
             found[:] = [
@@ -171,7 +170,7 @@ def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
     return found
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition):
     deadline = time.monotonic() + SECONDS
     while not condition():
         assert time.monotonic() < deadline
@@ -179,7 +178,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(params=["http", "postgresql"])
-def tracker(request, tmp_path_factory) -> Iterator[tuple[Gate, str]]:
+def tracker(request, tmp_path_factory):
     """A gate before a working tracker, and the address of the tracker through the gate."""
     with ExitStack() as stack:
         if request.param == "http":
@@ -227,37 +226,25 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
         assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
 
 
-def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
+def mirror_a_trial(runs, uri, seed, patience):
     """Mirror a trial in a process of its own, which must succeed; returns its stderr."""
     words = mirror_command(runs, uri, seed, patience)
-    done = subprocess.run(
-        words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed(words, env=child_environment(), timeout=SECONDS)
     return done.stderr
 
 
 @contextmanager
-def mlflow_server(folder: Path) -> Iterator[int]:
+def mlflow_server(folder):
     port = free_port()
-    words = [
-        "server",
-        "--backend-store-uri",
-        f"sqlite:///{folder}/mlflow.db",
-        "--artifacts-destination",
-        str(folder),
-    ]
+    words = split(
+        f"server --backend-store-uri sqlite:///{folder}/mlflow.db --artifacts-destination {folder}"
+    )
     command = [
         sys.executable,
         "-m",
         "mlflow",
         *words,
-        "--host",
-        "127.0.0.1",
-        "--port",
-        str(port),
-        "--workers",
-        "1",
+        *split(f"--host 127.0.0.1 --port {port} --workers 1"),
     ]
     lean = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     server = subprocess.Popen(
@@ -268,7 +255,7 @@ def mlflow_server(folder: Path) -> Iterator[int]:
         stderr=subprocess.DEVNULL,
     )
 
-    def answers() -> bool:
+    def answers():
         with (
             suppress(OSError),
             urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer,

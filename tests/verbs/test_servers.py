@@ -1,7 +1,5 @@
 """Verbs that serve pages end all their processes and import no module of the current folder."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -11,8 +9,8 @@ import time
 import urllib.request
 from contextlib import suppress
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
-from typing import Any
 
 import psutil
 import pytest
@@ -21,6 +19,7 @@ import torch
 from gsbench.runs.experiments import make_home
 from gsbench.tracking import connect
 from gsbench.verbs import servers
+from tests.helpers import write
 
 SECONDS = 120
 
@@ -37,7 +36,7 @@ def test_all_processes_of_the_dashboard_end_and_none_imports_from_the_current_fo
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     environment = os.environ | {"GSBENCH_RUNS": str(tmp_path / "runs")}
-    command = [sys.executable, "-P", "-m", "gsbench.cli", "ui", "--port", str(port)]
+    command = [sys.executable, *split(f"-P -m gsbench.cli ui --port {port}")]
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
     ) as process:
@@ -67,16 +66,16 @@ def test_ui_needs_a_database(runs, refused):
     assert "no MLflow database" in refused("ui")
 
 
-def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    commands: list[list[str]] = []
+def test_ui_serves_on_this_machine_only(monkeypatch):
+    commands = []
 
     class Server:
-        def __init__(self, command: list[str], cwd: Any, env: dict[str, str]) -> None:
+        def __init__(self, command, cwd, env):
             commands.append(command)
             assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
             assert not list(Path(cwd).iterdir())
 
-        def wait(self) -> int:
+        def wait(self):
             return 0
 
     monkeypatch.setattr(subprocess, "Popen", Server)
@@ -86,21 +85,20 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.fixture
-def served(runs, monkeypatch) -> list[Any]:
+def served(runs, monkeypatch):
     """The servers that ``ui`` would start, and the pages that it would open."""
-    served: list[Any] = []
+    served = []
 
     class Thread:
-        def __init__(self, target: Any, args: Any, daemon: bool) -> None:
+        def __init__(self, target, args, daemon):
             self.args, self.daemon = args, daemon
 
-        def start(self) -> None:  # the server answers at once
+        def start(self):  # the server answers at once
             server, lines, page = self.args
             print(lines)
             served.extend([(server, page, self.daemon)] * bool(page))
 
-    runs.mkdir()
-    (runs / "mlflow.db").touch()
+    write(runs / "mlflow.db", b"")
     monkeypatch.setattr(servers, "publish", lambda home, uri: f"{len(home.name)}")
     monkeypatch.setattr(servers, "version", lambda package: "3.17.0")
     monkeypatch.setattr(servers, "serve", lambda uri, port: served.append((uri, port)) or 0)
@@ -122,10 +120,10 @@ def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
     assert served == [(LOCAL, LOCAL, True), (uri, 5000)]
     for name in ("ab", "cde"):
         make_home(runs / name)
-        words = said("ui", "--port", "81").split()
+        words = said("ui --port 81").split()
     assert words == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
     served.clear()
-    pages = said("ui", "cde", "--no-browser").split()
+    pages = said("ui cde --no-browser").split()
     assert pages[0] == "arms"
     assert pages[1].startswith(f"{LOCAL}/#/experiments/3/")
     assert pages[2] == "table"
@@ -135,16 +133,16 @@ def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
 def test_no_second_server_is_started(runs, served, said, monkeypatch):
     make_home(runs / "ab")
     address = "https://tracker.example"
-    page = said("ui", "--uri", address).split()[1]
+    page = said("ui --uri", address).split()[1]
     assert served == [(address, page, False)]
     served.clear()
     monkeypatch.setattr(servers, "_serves", lambda server, name, page: name == "ab")
-    said("ui", "--no-browser")
+    said("ui --no-browser")
     assert served == []
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--uri", "file"], "--uri file is not an address"),
         (["none"], "no experiment 'none'"),
@@ -154,7 +152,7 @@ def test_no_second_server_is_started(runs, served, said, monkeypatch):
 def test_what_the_dashboard_cannot_show_is_refused(
     runs, served, refused, monkeypatch, words, message
 ):
-    def full(*_: Any) -> str:
+    def full(*_):
         raise OSError("full")
 
     make_home(runs / "ab")
@@ -165,10 +163,10 @@ def test_what_the_dashboard_cannot_show_is_refused(
 
 def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
     page = f"{LOCAL}/#/experiments/12/runs"
-    answers: list[Any] = [{"experiment": {"experiment_id": "12"}}, {"experiment": {}}, [], None]
+    answers = [{"experiment": {"experiment_id": "12"}}, {"experiment": {}}, [], None]
     answers += [{"experiment": {"experiment_id": "1"}}]
 
-    def get(place: str, params: dict[str, str], timeout: float) -> Any:
+    def get(place, params, timeout):
         assert place == f"{LOCAL}/api/2.0/mlflow/experiments/get-by-name"
         assert params == {"experiment_name": "x"}
         assert timeout == servers.SECONDS_TO_ANSWER
@@ -180,11 +178,11 @@ def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
 
 
 def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, capsys):
-    waits: list[str] = []
-    opened: list[str] = []
+    waits = []
+    opened = []
     failures = [True, True, False, False]
 
-    def get(server: str, timeout: float) -> None:
+    def get(server, timeout):
         assert server == LOCAL
         if failures.pop(0):
             raise servers.requests.ConnectionError
@@ -202,7 +200,7 @@ def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, c
 
 
 @pytest.mark.parametrize(
-    ("platform", "variables", "found"),
+    "platform, variables, found",
     [
         ("linux", {}, False),
         ("linux", {"DISPLAY": ":0"}, True),
@@ -223,22 +221,22 @@ def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch, platform,
 
 
 def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, capsys, refused):
-    made: list[Any] = []
+    made = []
 
     class Viewer:
         url = "http://127.0.0.1:8080"
 
-        def __init__(self, painters: Any, port: int) -> None:
+        def __init__(self, painters, port):
             made.append((painters, port))
 
-        def stop(self) -> None:
+        def stop(self):
             made.append("stopped")
 
     class Event:
-        def wait(self) -> None:
+        def wait(self):
             raise KeyboardInterrupt
 
-    def check_port(port: int) -> None:
+    def check_port(port):
         made.append(port)
 
     monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: object())
@@ -251,7 +249,7 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
     proven = SimpleNamespace(rasterizer="rasterizer")
     monkeypatch.setattr("gsbench.train.proof.create_proven", lambda name, device: proven)
     monkeypatch.setattr(servers.threading, "Event", Event)
-    assert servers.view(["a", "b", "--device", "cpu", "--port", "0"], runs) == 0
+    assert servers.view(split("a b --device cpu --port 0"), runs) == 0
     cpu = torch.device("cpu")
     painters = [(("a", cpu), "rasterizer"), (("b", cpu), "rasterizer")]
     assert made == [0, (painters, 0), "stopped"]
@@ -259,6 +257,6 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
         "http://127.0.0.1:8080  (Ctrl+C ends it)",
         "stopped",
     ]
-    assert "one or two trials can be viewed, not 3" in refused("view", "a", "b", "c")
+    assert "one or two trials can be viewed, not 3" in refused("view a b c")
     monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: None)
-    assert "the viewer needs viser: " in refused("view", "a")
+    assert "the viewer needs viser: " in refused("view a")

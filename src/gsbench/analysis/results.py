@@ -5,22 +5,29 @@ A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<
 tables over thousands of trials start quickly.
 """
 
-import json
 import math
+import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from gsbench.analysis.trial_settings import (
+    Configurations,
+    canonical,
+    load_flat_config,
+    settings_text,
+)
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.keys import SHOWN, flatten, is_hashed, present_digest
+from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
+from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
 from gsbench.system.machine import kind_of_machine
@@ -29,68 +36,8 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
-CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
-# settings in which repetitions of a trial may differ
-UNCOUNTED = ("eval.primary", "eval.controls", "densify.switches", "scene.path", "hydra.")
-GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
-ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
+FOREIGN = "foreign"  # first word about a folder that is no trial of the experiment
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
-
-
-class Configurations:
-    """The settings that determine results, of all trials of an experiment.
-
-    Each file is read once for all seeds. ``trial`` is the key that the seeds of a trial share
-    (`TrialResult.key`). ``known`` has, by this key, the settings of trials that have not run
-    and thus have no file.
-    """
-
-    def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-        self._known: dict[str, Mapping[str, Any]] = dict(known or {})
-
-    def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
-        """A trial's settings, read from ``folder`` or from an earlier seed; {} if unreadable."""
-        if trial not in self._known:
-            self.read(trial, [folder])
-        return self._known[trial]
-
-    def read(self, trial: str, folders: Iterable[Path]) -> str:
-        """Read a trial's settings from its first readable folder; return "", or the last fault."""
-        fault = ""
-        for folder in folders:
-            try:
-                config = load_flat_config(folder)
-            except FileNotFoundError:
-                fault = f"{CONFIG} is not there"
-            except DamagedError as error:
-                fault = f"{error.path.name} {error.reason}"
-            else:
-                self._known[trial] = {key: value for key, value in config.items() if is_hashed(key)}
-                return ""
-        self._known.setdefault(trial, {})
-        return fault
-
-
-def load_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys.
-
-    Raises FileNotFoundError and DamagedError.
-    """
-    values = TrialFolder(folder).settings()
-    if not isinstance(values, dict) or not all(
-        isinstance(values.get(group), dict) for group in GROUPS
-    ):
-        raise DamagedError(
-            folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}"
-        )
-    return flatten(values)
-
-
-def canonical(value: object) -> str:
-    """JSON text that is equal for equal values."""
-    if type(value) is int or (type(value) is float and math.isfinite(value)):
-        return repr(value)  # the same text as JSON's, but faster: most settings are numbers
-    return ENCODER.encode(value)
 
 
 @dataclass(frozen=True)
@@ -179,31 +126,21 @@ class TrialResult:
         return TrialFolder(self.path)
 
     @cached_property
-    def code(self) -> dict[str, str]:
-        """The versions of the code that made the trial; empty if another program made it.
+    def code(self) -> dict[Part, str]:
+        """The versions of the code that made the trial; empty if another program made it."""
+        return code_of(self.record.code)
 
-        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of a stage
-        of gsbench.
-        """
-        code = self.record.code
-        return {f"{CODE}{module}": digest for module, digest in code.sources.items()} | {
-            f"stage {name}": str(version) for name, version in code.stages.items()
-        }
+    @property
+    def code_texts(self) -> list[str]:
+        """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
+        shown = [part for part in self.code if part.kind != "package"]
+        return [f"{part} {self.code[part]:.{SHOWN}}" for part in shown]
 
-    @cached_property
-    def edited(self) -> tuple[str, ...]:
-        """The user's modules that were edited since; those that are not found are left out."""
-        present = {name: present_digest(name) for name in self.record.code.sources}
-        return tuple(
-            name
-            for name, digest in self.record.code.sources.items()
-            if present[name] not in (None, digest)
-        )
-
-    @cached_property
-    def rooms(self) -> dict[str, str]:
-        """The rooms (parts of gsbench) that made the trial, with their states then."""
-        return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
+    @property
+    def edits(self) -> list[Change]:
+        """The user's modules that were edited since, as far as they are found from here."""
+        modules = {part: made for part, made in self.code.items() if part.kind == "module"}
+        return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
 
     @property
     def finished(self) -> float:
@@ -223,7 +160,7 @@ class TrialResult:
         """The hash of the initial model's files (cameras, poses, points); "" if unrecorded."""
         return self.record.hashes.get("cloud", "")
 
-    @property
+    @cached_property
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of the file."""
         moment = unix_time(self.record.measured)
@@ -304,7 +241,8 @@ TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one o
 class Experiment:
     """The usable trials of an experiment, and a line for each trial folder that cannot be used.
 
-    ``older`` are trials of earlier code that `newest_code` left out.
+    ``older`` are trials of earlier code that `newest_code` left out. ``lacking`` are the folders of
+    trials without a usable result: they failed, were stopped, or are damaged.
     """
 
     name: str
@@ -312,6 +250,7 @@ class Experiment:
     trials: tuple[TrialResult, ...]
     warnings: tuple[str, ...]
     older: tuple[TrialResult, ...] = ()
+    lacking: tuple[Path, ...] = ()
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -326,7 +265,7 @@ def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
-def seeds_words(trials: Iterable[TrialResult]) -> str:
+def seeds_text(trials: Iterable[TrialResult]) -> str:
     """``seed 0`` or ``seeds 0, 1``"""
     seeds = sorted(trial.seed for trial in trials)
     return f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
@@ -373,7 +312,12 @@ def read_experiment(folder: Path) -> Experiment:
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
-    return Experiment(folder.name, folder, tuple(usable), tuple(warnings))
+    lacking = tuple(
+        path
+        for path, fault in sorted(faults.items())
+        if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
+    )
+    return Experiment(folder.name, folder, tuple(usable), tuple(warnings), lacking=lacking)
 
 
 def newest_code(experiment: Experiment) -> Experiment:
@@ -384,20 +328,20 @@ def newest_code(experiment: Experiment) -> Experiment:
     """
     older: list[TrialResult] = []
     lines: list[str] = []
-    for own in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
-        if len({canonical(trial.code | trial.rooms) for trial in own}) < 2:
+    for of_arm in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
+        if len({frozenset(trial.code.items()) for trial in of_arm}) < 2:
             continue
         # eval.primary, switches and the place of the photographs do not tell trials apart
-        for same in group_by(own, lambda trial: settings_text(trial.config)).values():
-            versions = group_by(same, lambda trial: canonical(trial.code | trial.rooms))
+        for same in group_by(of_arm, lambda trial: settings_text(trial.config)).values():
+            versions = group_by(same, lambda trial: frozenset(trial.code.items()))
             newest = max(
                 versions.values(),
-                key=lambda made: (not made[0].edited, max(trial.finished for trial in made)),
+                key=lambda made: (not made[0].edits, max(trial.finished for trial in made)),
             )
             for made in versions.values():
                 if made is not newest:
                     older += made
-                    lines.append(_left_out_words(made, newest[0]))
+                    lines.append(_left_out_line(made, newest[0]))
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
@@ -407,27 +351,14 @@ def newest_code(experiment: Experiment) -> Experiment:
     )
 
 
-def settings_text(config: Mapping[str, Any]) -> str:
-    """The settings that determine a result, as text that is equal for equal settings."""
-    # A missing key counts as unset: trials from before a setting existed equal later ones.
-    return canonical(
-        {
-            key: value
-            for key, value in config.items()
-            if value is not None and is_hashed(key) and not key.startswith(UNCOUNTED)
-        }
-    )
-
-
-def _left_out_words(made: Sequence[TrialResult], newest: TrialResult) -> str:
+def _left_out_line(made: Sequence[TrialResult], newest: TrialResult) -> str:
     """``sw/garden/sfm-mine seeds 0, 1: left out, made by an earlier mine (3fa9c1d2, now …)``"""
-    one, now = made[0].code | made[0].rooms, newest.code | newest.rooms
-    part = next(part for part in {**now, **one} if one.get(part) != now.get(part))
-    versions = [version.get(part, "none")[:SHOWN] for version in (one, now)]
+    parts = dict.fromkeys([*newest.code, *made[0].code], "none")
+    change = next(code_changes(parts | made[0].code, (parts | newest.code).get))
     cell = f"{made[0].experiment}/{made[0].scene}/{made[0].init}-{made[0].densify}"
     return (
-        f"{cell} {seeds_words(made)}: left out, made by an earlier "
-        f"{part.removeprefix(CODE)} ({versions[0]}; the trials that count have {versions[1]})"
+        f"{cell} {seeds_text(made)}: left out, made by an earlier {change.name} "
+        f"({change.made:.{SHOWN}}; the trials that count have {change.now:.{SHOWN}})"
     )
 
 
@@ -438,8 +369,8 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
     ones. Other trials' files are not opened here, which saves time.
     """
     faults: dict[str, str] = {}
-    for own in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
-        by_key = group_by(own, lambda trial: trial.key)
+    for of_arm in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
+        by_key = group_by(of_arm, lambda trial: trial.key)
         if len(by_key) > 1:
             faults |= {
                 key: settings.read(key, [trial.path for trial in same])
@@ -498,7 +429,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         raise _UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
-        raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
+        raise _UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
     recorded = {
         "experiment": record.experiment,
         "scene": record.scene,
@@ -508,11 +439,13 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     names = (*path.relative_to(runs_dir).parts[-4:-1], match["seed"])
     for (key, value), name in zip(recorded.items(), names, strict=True):
         if value != name:
-            raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
+            raise _UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
 
 
 def _why_unfinished(path: Path) -> str:
     if (path / FAILED).exists():
         return f"failed, {TrialFolder(path).failure().reason}"
-    return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
+    return (
+        f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else f"{FOREIGN}, not a trial"
+    )

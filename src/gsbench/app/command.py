@@ -8,7 +8,7 @@ Hydra's (`gsbench.app.plugins`).
 import logging
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
@@ -21,7 +21,7 @@ from gsbench.app.plugins import (
 )
 from gsbench.app.sweep import HYDRA_ERRORS, Ended, Sweep
 from gsbench.claims.stopping import log_verdicts
-from gsbench.config.command_words import key_of, parse
+from gsbench.config.command_words import parse
 from gsbench.config.compose import Trial
 from gsbench.config.explain import explained
 from gsbench.errors import GsbenchError, InputError
@@ -30,9 +30,6 @@ from gsbench.launch.batch import check_parts, missing_folders, need_no_check, ru
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
-from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
-
-TRACKER = "tracking.uri"
 
 log = logging.getLogger(__name__)
 
@@ -53,15 +50,20 @@ def launch(argv: list[str]) -> int:
     return summarize(ended.outcomes, ended.trials)
 
 
-def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
-    """The trials that a command line would run."""
-    sweep = _read(words, multirun)
+def compose_trials(
+    words: Sequence[str], multirun: bool = False, typed: Sequence[str] | None = None
+) -> list[Trial]:
+    """The trials that a command line would run.
+
+    Only the words ``typed`` by the user (default: all ``words``) give permissions.
+    """
+    sweep = _read(words, multirun, typed)
     with explained(words, HYDRA_ERRORS):
         return trials_of(sweep)[0]
 
 
-def _read(words: Sequence[str], multirun: bool) -> Sweep:
-    sweep = Sweep.read(words, multirun)
+def _read(words: Sequence[str], multirun: bool, typed: Sequence[str] | None = None) -> Sweep:
+    sweep = Sweep.read(words, multirun, typed)
     set_up_logging(sweep.config.hydra.verbose)
     return sweep
 
@@ -73,7 +75,7 @@ def trials_of(sweep: Sweep) -> tuple[list[Trial], bool]:
     """
     if sweep.other_sweeper:
         words, is_grid = words_without_sweeper(sweep)
-        trials, are_known = trials_of(Sweep.read(words, is_grid))
+        trials, are_known = trials_of(Sweep.read(words, is_grid, sweep.composer.typed))
         return trials, are_known and is_grid
     if sweep.multirun:
         return planned_trials(sweep, None)
@@ -108,21 +110,6 @@ def own_sweep(sweep: Sweep) -> Ended:
     else:
         run(trials_of(sweep)[0])
     return ended
-
-
-def check_trackers(trials: Iterable[Trial], typed: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send results to an address that only a file names.
-
-    The runs folder may be somebody else's, and the address theirs. ``typed`` are the user's words.
-    """
-    typed_uri = next((word.partition("=")[2] for word in typed if key_of(word) == TRACKER), None)
-    for trial in trials:
-        if address := untyped_address(trial.values["tracking"], typed_uri):
-            raise InputError(
-                f"{trial.files.label} would send its results to {address}, an address from a file: "
-                f"to allow it, type {TRACKER}={address} (for a trial in no plan: set "
-                f"{VARIABLE}={address}); tracking=none sends nothing"
-            )
 
 
 def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:

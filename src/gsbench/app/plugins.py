@@ -51,7 +51,7 @@ from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.jobs import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import targets_in
+from gsbench.runs.nested import targets_in
 from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
 

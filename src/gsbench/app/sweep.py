@@ -48,10 +48,13 @@ class Sweep:
     composer: Composer
 
     @classmethod
-    def read(cls, words: Sequence[str], multirun: bool) -> Self:
-        """Check and compose ``words``. Raises InputError with one line for wrong ones."""
+    def read(cls, words: Sequence[str], multirun: bool, typed: Sequence[str] | None = None) -> Self:
+        """Check and compose ``words``; only those ``typed`` (default: all) give permissions.
+
+        Raises InputError with one line for wrong ones.
+        """
         check_words(words)
-        composer = Composer(words)
+        composer = Composer(words, typed)
         config = composer.config
         # without -m, a file may say that it is a sweep
         multirun = multirun or config.hydra.mode == RunMode.MULTIRUN

@@ -16,7 +16,7 @@ from gsbench.config.groups import GROUPS, options
 from gsbench.config.schema import COMPONENTS
 from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
-from gsbench.runs.keys import DECLARED, NOT_HASHED, WITHOUT_EFFECT
+from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.words import did_you_mean
 
 # not in the configuration's hash, but in the path of the trial's folder

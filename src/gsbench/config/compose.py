@@ -89,14 +89,21 @@ class Composer:
     """Composes the configurations and the trials of one command.
 
     ``config`` is the whole configuration of the words that list no values, with Hydra's node.
-    From here on Python finds the modules that the words allow in the folder ``modules`` (default:
-    the current one). Raises InputError with one line.
+    Only the words ``typed`` by the user (default: all ``words``) give permissions. From here on
+    Python finds the modules that are allowed in the folder ``modules`` (default: the current one).
+    Raises InputError with one line.
     """
 
-    def __init__(self, words: Sequence[str], modules: str | None = None) -> None:
+    def __init__(
+        self,
+        words: Sequence[str],
+        typed: Sequence[str] | None = None,
+        modules: str | None = None,
+    ) -> None:
         # The order matters: Hydra imports packages of the search path while it composes, so they
         # are checked first.
-        self.allowed = command_words.typed_permissions(words)
+        self.typed = words if typed is None else typed
+        self.allowed = command_words.typed_permissions(self.typed)
         packages = command_words.check_search_path(words, self.allowed)
         allow_modules(self.allowed, os.getcwd() if modules is None else modules)
         check_places(command_words.searched_folders(words), packages)
@@ -110,6 +117,11 @@ class Composer:
         listed = set(map(key_of, words)) - set(map(key_of, single))
         values = [word for word in own if key_of(word).partition(".")[0] not in listed]
         self.config = self.settings(values)
+        with explained(words):
+            is_sent = self.config.tracking.get("uri")
+        if is_sent:
+            self.allowed += typed_address(self.typed)
+            self.config[PERMISSIONS] = list(self.allowed)
         with open_dict(self.config):
             self.config.hydra = self._choose(values).hydra
 
@@ -222,6 +234,8 @@ class Composer:
                 CONFIG_NAME, [*self.hydra_words, *choices], return_hydra_config=True
             )
         if self.hydra_words:  # without them, all files are gsbench's own
+            # for the check, which tells what is typed from what a file sets
+            config.hydra.overrides.task = list(map(key_of, words))
             check_permitted(config, self.allowed)
         return config
 
@@ -349,13 +363,21 @@ def installed_nodes(choices: tuple[str, ...]) -> Mapping[str, Any]:
     return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 
-def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
-    """The single trial that ``overrides`` describe.
-
-    The folder ``modules`` (default: the current one) is where the user's modules are looked for.
-    """
+def compose_one(
+    overrides: Sequence[str], typed: Sequence[str] | None = None, modules: str | None = None
+) -> Trial:
+    """The single trial that ``overrides`` describe; `Composer` says what the others mean."""
     command_words.check_single(overrides, "choose one")
-    return Composer(overrides, modules).trial(overrides)
+    return Composer(overrides, typed, modules).trial(overrides)
+
+
+def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
+    """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
+    own = ("tracking", "hydra.searchpath")
+    words = [word for word in typed if key_of(word).startswith(own)]
+    with hydra_ready(), explained(words):
+        config = hydra.compose(CONFIG_NAME, words)
+        return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
 
 
 def trial_of_job(config: DictConfig, allowed: Sequence[str], overrides: Sequence[str]) -> Trial:

@@ -30,16 +30,10 @@ from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
-from gsbench.raster.executors import AUTO, offers, resolve
+from gsbench.raster.executors import AUTO, lacks, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import (
-    OWN,
-    UserCode,
-    module_digest,
-    targets_in,
-    unnamed_modules,
-    user_modules,
-)
+from gsbench.runs.nested import GSBENCH, targets_in
+from gsbench.runs.user_code import UserCode, module_digest, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, unknown_setting
 from gsbench.system.device import select_device
@@ -50,18 +44,6 @@ from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
-# Features of a render that not every rasterizer has: the densifier's attribute that asks for it ->
-# (the rasterizer's attribute that offers it, the error's words).
-OPTIONAL_FEATURES = {
-    "needs_footprint": (
-        "has_footprint",
-        "needs the pixels that a Gaussian covers, and raster={} does not give them",
-    ),
-    "needs_splitting_matrix": (
-        "has_splitting_matrix",
-        "needs splitting matrices, and raster={} does not give them",
-    ),
-}
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 REQUIRED_METHODS = {  # of a user's class, by the group that names it
     "init": ("needs_reference", "content", "run"),
@@ -101,7 +83,7 @@ class Parts:
     def initializer(self) -> Initializer:
         values = self.values["init"]
         # else COLMAP would take all cores
-        if values.get("threads") == "auto" and values["_target_"].startswith(OWN):
+        if values.get("threads") == "auto" and values["_target_"].startswith(GSBENCH):
             values = values | {"threads": self.threads}
         initializer: Initializer = build("init", values, self._allowed)
         return initializer
@@ -145,7 +127,7 @@ class Parts:
         """The rasterizer for ``device``, with its proof. A user's own has none."""
         chosen = None if self.own_rasterizer is None else Proven(self.own_rasterizer)
         chosen = chosen or create_proven(self.values["raster"]["name"], self.device, self.threads)
-        self._check_features(chosen.rasterizer.name)
+        self._check_outputs(chosen.rasterizer.name)
         return chosen
 
     @property
@@ -179,24 +161,19 @@ class Parts:
         if on_this_machine and self.program is not None:
             self.program.executable()
         if own is not None or name != AUTO:
-            self._check_features(name if own is None else own.name)
+            self._check_outputs(name if own is None else own.name)
         if on_this_machine:
             device = self.device
             if own is None and name != AUTO:
                 resolve(name, device.type)
 
-    def _check_features(self, raster: str) -> None:
-        """Raise InputError if the densifier needs a feature that raster=``raster`` lacks."""
-        for need, (offer, words) in OPTIONAL_FEATURES.items():
-            if getattr(self.trainer, need, False) and not offers(
-                raster, offer, self.own_rasterizer
-            ):
-                able = " or ".join(
-                    f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer)
-                )
-                raise InputError(
-                    f"densify={self.values['densify']['name']} {words.format(raster)}; take {able}"
-                )
+    def _check_outputs(self, raster: str) -> None:
+        """Raise InputError if the densifier needs an output that ``raster`` does not give."""
+        # Another program has no needs, and a user's class may not extend ``Densifier``.
+        footprint = getattr(self.trainer, "needs_footprint", False)
+        extra = getattr(self.trainer, "needs_extra", None)
+        if lack := lacks(raster, self.own_rasterizer, footprint, extra):
+            raise InputError(f"densify={self.values['densify']['name']} {lack}")
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
@@ -214,7 +191,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         check_program(values, allow_targets)
     cls = External if external else locate(target, group, allow_targets)
     options = {key: value for key, value in values.items() if key not in RESERVED}
-    own = target.startswith(OWN)
+    own = target.startswith(GSBENCH)
     _check_names(cls, target, options, group)
     if dataclasses.is_dataclass(cls) and not own:
         options = check_values(cls, options, group)
@@ -281,7 +258,7 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
     ):
         return
     key = f"{group}.{unknown}"
-    if target.startswith(OWN):
+    if target.startswith(GSBENCH):
         raise InputError(unknown_setting(key, unknown, parameters))
     raise InputError(
         f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
@@ -303,7 +280,7 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if not isinstance(cls, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
-    if target.startswith(OWN):
+    if target.startswith(GSBENCH):
         return cls
     module, permitted = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
     # The first call keeps the digest of the files. It must come right after the import: later they

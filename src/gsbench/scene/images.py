@@ -13,6 +13,8 @@ a result.
 import logging
 import os
 import shutil
+import sys
+import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -25,7 +27,7 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.errors import InputError
 from gsbench.files import MAX_NAME_BYTES, require_regular
 from gsbench.scene.options import Backdrop
-from gsbench.words import counted, some_of
+from gsbench.words import counted, is_utf8, some_of
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +62,8 @@ WHOLE = 0  # all parts of a path
 def list_images(folder: Path) -> list[str]:
     """The sorted image files below a folder, relative, with "/" as separator, without hidden files.
 
-    Links to folders are followed, and no folder is read twice.
+    Links to folders are followed, and no folder is read twice. Raises InputError for a name that is
+    not UTF-8, since no file of results could have it.
     """
     names: list[str] = []
     unread = 0
@@ -85,6 +88,11 @@ def list_images(folder: Path) -> list[str]:
     if unread:
         files = f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
         log.warning("%s: %s not read: save as JPEG", folder, files)
+    if strange := sorted(name for name in names if not is_utf8(name)):
+        advice = "rename them"
+        if sys.getfilesystemencoding() != "utf-8":
+            advice += f", or set PYTHONUTF8=1: Python reads names as {sys.getfilesystemencoding()}"
+        raise InputError(f"{folder}: names that are not UTF-8: {some_of(strange)}: {advice}")
     return sorted(names)
 
 
@@ -103,10 +111,10 @@ def match_names(
 
     A file of the same name comes first, then the only file whose path differs in the extension
     alone (``a.png`` for ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG``
-    for ``img_1.jpg``). With ``other_folders``, if no file fits any name, names and files are
-    compared by the last parts of their paths, as many as give a match (``b/a.jpg`` for
-    ``C:\\data\\b\\a.jpg``). Raises `InputError` if several such files fit a name, or if several
-    names fit such a file.
+    for ``img_1.jpg``). Names that Unicode counts as equal are equal. With ``other_folders``, if no
+    file fits any name, names and files are compared by the last parts of their paths, as many as
+    give a match (``b/a.jpg`` for ``C:\\data\\b\\a.jpg``). Raises `InputError` if several such files
+    fit a name, or if several names fit such a file.
     """
     names, found = list(dict.fromkeys(wanted)), set(files)
     matches = _matched(names, found, WHOLE)
@@ -125,6 +133,8 @@ def _matched(wanted: Iterable[str], files: Iterable[str], count: int) -> dict[st
     """`match_names` by the last ``count`` parts of each path."""
 
     def tail(path: str) -> str:
+        # macOS writes é as two characters (NFD) where most programs write one (NFC)
+        path = unicodedata.normalize("NFC", path)
         return path if count == WHOLE else "/".join(_parts(path)[-count:])
 
     unmatched, free = dict.fromkeys(wanted), set(files)
@@ -163,6 +173,7 @@ def _matched(wanted: Iterable[str], files: Iterable[str], count: int) -> dict[st
 
 def same_folder(one: str, other: str) -> bool:
     """Return whether two names have the same folder, up to capitals."""
+    one, other = (unicodedata.normalize("NFC", name) for name in (one, other))
     return _parts(one)[:-1] == _parts(other)[:-1] or one.casefold() == other.casefold()
 
 

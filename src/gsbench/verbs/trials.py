@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import key_of, makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
@@ -26,7 +26,6 @@ from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
-from gsbench.runs.keys import module_digest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
@@ -127,17 +126,13 @@ def _cell(counts: dict[str, int]) -> str:
 def progress_with_superseded(home: Path) -> list[TrialState]:
     """The state of every trial in ``home``; those that older code made are ``superseded``."""
     states = states_of_experiment(home)
-    folders = {one.folder: one.planned.cwd for one in states if one.planned is not None}
-
+    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
     # The user's modules are read in the folder where the trial's command was given: another may
     # have a namesake.
-    def present_digest(module: str, trial: TrialResult) -> str | None:
-        return module_digest(module, folders[trial.path]) if trial.path in folders else None
-
-    reasons = find_superseded(read_experiment(home).trials, present_digest)
+    reasons = find_superseded(read_experiment(home).trials, folders)
     for place, trial in enumerate(states):
         if trial.state == "done" and trial.folder in reasons:
-            states[place] = replace(trial, state="superseded", note=reasons[trial.folder])
+            states[place] = replace(trial, state="superseded", note=str(reasons[trial.folder]))
     return states
 
 
@@ -178,7 +173,7 @@ def _age(trial: TrialState) -> str:
 
 def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
-    from gsbench.app.command import check_trackers, run_trials
+    from gsbench.app.command import run_trials
 
     parser = ArgumentParser("retry")
     parser.add_argument("experiment")
@@ -208,7 +203,6 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         recompose(folder, planned.get(folder), runs, options.changes, modules)
         for folder in unfinished
     ]
-    check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -242,7 +236,7 @@ def recompose(
             kept = [word for word in kept if not word.startswith("launch.")]
         # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
         # theirs.
-        trial = compose_one([*kept, *changes], modules=modules)
+        trial = compose_one([*kept, *changes], typed=changes, modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):
