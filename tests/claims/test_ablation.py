@@ -15,8 +15,8 @@ from gsbench.claims.ablation import (
     off_settings,
     runs_to_train,
 )
-from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
+from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build

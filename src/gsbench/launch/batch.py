@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.config.command_words import options
 from gsbench.config.compose import Trial
+from gsbench.config.groups import options
 from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
