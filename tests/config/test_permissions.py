@@ -10,11 +10,11 @@ import yaml
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
+from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
-from gsbench.pipeline.parts import build
 from gsbench.runs.trial_folder import TrialFolder
 from tests.strange import no_trial
 from tests.strange import place as place

@@ -13,11 +13,11 @@ import pytest
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
+from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variables, load_class
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build
 from gsbench.runs.keys import module_digest
 from gsbench.system.own_modules import allow_modules
 from tests.strange import BOMB, ask, experiment

@@ -13,7 +13,7 @@ from gsbench.settings import option_fields
 from gsbench.system.install import conf_dir
 
 # keys that tell the files of a group apart
-NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")
+NAMES = ("name", "kind", "protocol", "path", "_target_", "enabled")
 # group/file: the keys whose values differ from the class's own; a file that is built on another has
 # the other's too
 DELIBERATE = {

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsbench.config.build import locate
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors
 from gsbench.raster.base import Footprint, RenderOutput
 from gsbench.raster.contract import CASES, departures

@@ -6,7 +6,7 @@ import json
 import os
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from gsbench.tracking.mirror import mirror_ended
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
+STATE = "mlflow.json"  # in the trial's folder
 
 
 def options(uri: str | None = None, patience: float = 30.0) -> dict[str, Any]:
@@ -61,9 +62,11 @@ def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
         yield
 
 
-def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any]) -> bool:
+def mirror_trial(
+    settings: dict[str, Any], folder: Path, values: dict[str, Any], allowed: Sequence[str] = ()
+) -> bool:
     """Mirror an ended trial; False if nothing was missing. Raises any error of the tracker."""
-    return mirror_ended(TrialFolder(folder), settings, values)
+    return mirror_ended(TrialFolder(folder), settings, values, allowed)
 
 
 def write_trial(
