@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from PIL import Image
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect
 from gsbench.tracking.mirror import TrackerRun, make_sink
+from tests.conftest import ROOT
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
@@ -29,27 +31,8 @@ from tests.tracking.helpers import (
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 METHODS = ("open", "params", "tags", "metrics", "artifacts", "close")
-OWN = """
-class Kept:
-    runs, made = {}, 0
-    def open(self, trial, run):
-        if run.replaces: self.runs.pop(run.replaces, None)
-        if run.token not in self.runs:
-            Kept.made += 1
-            new = {"params": {}, "tags": {}, "metrics": {}, "files": set(), "pictures": set()}
-            self.runs[run.token] = new | {"name": f"run {Kept.made}"}
-        self.run = self.runs[run.token]
-        if not run.complete: self.run["status"] = ("RUNNING", None)
-        return self.run["name"]
-    def params(self, values): self.run["params"].update(values)
-    def tags(self, values): self.run["tags"].update(values)
-    def metrics(self, scalars):
-        self.run["metrics"].update({(one.key, one.step): one.value for one in scalars})
-    def artifacts(self, files, pictures):
-        self.run["files"].update(files)
-        self.run["pictures"].update(one.key for one in pictures)
-    def close(self, status, reason): self.run["status"] = (status, reason)
-"""
+# the class of the document
+(OWN,) = re.findall(r"^# kept.py\n.*?^```$", (ROOT / "docs/hydra.md").read_text(), re.S | re.M)
 
 
 class FakeRun:
@@ -77,7 +60,7 @@ class FakeRun:
 
 
 class Shown:
-    """What a tracker shows of its runs, in one form: the runs, each a mapping as in `OWN`."""
+    """What a tracker shows of its runs, in one form."""
 
     def __init__(self, kind: str, runs: Path, monkeypatch: Any) -> None:
         self.kind, self.runs = kind, runs
@@ -90,11 +73,10 @@ class Shown:
             wandb.init = lambda **how: self.fakes.setdefault(how["id"], FakeRun(how["name"]))
             monkeypatch.setitem(sys.modules, "wandb", wandb)
         if kind == "own":
-            module: Any = ModuleType("kept")
-            exec(OWN, vars(module))
-            module.Kept.__module__ = "kept"
+            module = ModuleType("kept")
             monkeypatch.setitem(sys.modules, "kept", module)
-            self.settings["_target_"] = "kept.Kept"
+            exec(OWN.removesuffix("```"), vars(module))
+            self.settings |= {"_target_": "kept.Kept", "folder": str(runs / "kept")}
 
     def mirror(self, folder: Path, values: dict[str, Any]) -> bool:
         return mirror_trial(self.settings, folder, values, ["kept"])
@@ -109,7 +91,21 @@ class Shown:
         return shown[-1]
 
     def _own(self) -> list[dict[str, Any]]:
-        return list(sys.modules["kept"].Kept.runs.values())
+        shown = [json.loads(file.read_text()) for file in (self.runs / "kept").glob("*.json")]
+        return [
+            {
+                "params": one["params"],
+                "tags": one["tags"],
+                "metrics": {
+                    (key.split()[0], int(key.split()[1])): value
+                    for key, value in one.get("metrics", {}).items()
+                },
+                "files": set(one.get("files", ())),
+                "pictures": set(one.get("pictures", ())),
+                "status": tuple(one.get("end", {"status": "RUNNING", "reason": None}).values()),
+            }
+            for one in shown
+        ]
 
     def _mlflow(self) -> list[dict[str, Any]]:
         client = connect(None, self.runs)
@@ -350,6 +346,6 @@ def test_a_run_that_was_deleted_there_is_made_again(shown):
     elif shown.kind == "TensorBoard":
         shutil.rmtree(shown.runs / "tensorboard")
     else:
-        sys.modules["kept"].Kept.runs.clear()  # type: ignore[attr-defined]
+        shutil.rmtree(shown.runs / "kept")
     assert shown.mirror(folder, values)
     check_whole(shown.one())

@@ -223,6 +223,8 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
             given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})
+    if values["scene"].get("_target_") is None:  # as in configurations before it was a setting
+        values["scene"].pop("_target_", None)
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     values |= check_values(Config, root, "")
     for group in COMPONENTS:

@@ -1,6 +1,7 @@
 """The parts of a trial: the objects that its configuration describes. Errors name its keys."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -22,8 +23,9 @@ from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import OWN, UserCode, targets_in, user_modules
+from gsbench.runs.keys import OWN, TARGET, UserCode, targets_in, user_modules
 from gsbench.scene.options import SceneConfig
+from gsbench.scene.own_reader import SceneReader
 from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
 from gsbench.train.options import TrainConfig
@@ -59,7 +61,15 @@ class Parts:
 
     @cached_property
     def scene(self) -> SceneConfig:
-        return SceneConfig(**self.values["scene"])
+        values, known = self.values["scene"], {one.name for one in fields(SceneConfig)}
+        return SceneConfig(**{key: value for key, value in values.items() if key in known})
+
+    @cached_property
+    def reader(self) -> SceneReader | None:
+        """The user's own reader of the capture; None for gsbench's own readers."""
+        known = {one.name for one in fields(SceneConfig)} - {TARGET}
+        values = {key: value for key, value in self.values["scene"].items() if key not in known}
+        return build("scene", values, self._allowed) if values.get(TARGET) else None
 
     @cached_property
     def train(self) -> TrainConfig:
@@ -146,7 +156,7 @@ class Parts:
         With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
         checked too.
         """
-        _ = self.initializer, self.trainer, self.metrics
+        _ = self.reader, self.initializer, self.trainer, self.metrics
         name, own = self.values["raster"]["name"], self.own_rasterizer
         if on_this_machine and self.program is not None:
             self.program.executable()

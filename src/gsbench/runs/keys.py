@@ -367,13 +367,17 @@ _digests_at_import: dict[str, tuple[ModuleSpec, str | None]] = {}
 def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
     """``{module: sha256}`` of the user's code behind a configuration; {} if there is none.
 
-    These are the modules of its classes, and the modules in ``allow_targets``, which the classes
-    may import. An installed module is included only if a class comes from it.
+    These are the modules of its classes, without trackers, and the modules in ``allow_targets``,
+    which the classes may import. An installed module is included only if a class comes from it.
     """
-    of_classes = {name.split(".")[0] for _, name in targets_in(values) if not name.startswith(OWN)}
+    named = [(place[0], name.split(".")[0]) for place, name in targets_in(values) if place]
+    named = [(group, module) for group, module in named if f"{module}." != OWN]
+    of_classes = {module for group, module in named if is_hashed(group)}
     if not of_classes:
         return {}
-    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - of_classes
+    # A tracker changes no result.
+    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()}
+    helpers -= {module for _, module in named}
     helpers = {
         name
         for name in helpers
