@@ -26,6 +26,14 @@ STRANGE_TRIALS: dict[str, tuple[dict[str, Any], str]] = {
         {"eval": {"extra": {"x": {"_target_": "bomb.Bomb"}}}},
         "add allow_targets=[bomb] to the command",
     ),
+    "a tracker": (
+        {"tracking": {"_target_": "bomb.Bomb"}},
+        "add allow_targets=[bomb] to the command",
+    ),
+    "a reader": (
+        {"scene": {"kind": "reader", "_target_": "bomb.Bomb"}},
+        "add allow_targets=[bomb] to the command",
+    ),
     "a program": (
         {
             "densify": {
@@ -86,7 +94,10 @@ def test_retry_runs_nothing_of_a_strangers_folder_without_permission(
     assert not Path("exploded").exists()
 
 
-@pytest.mark.parametrize("case", ["a class", "a metric", "a program", "a program by another path"])
+@pytest.mark.parametrize(
+    "case",
+    ["a class", "a metric", "a tracker", "a reader", "a program", "a program by another path"],
+)
 def test_verbs_that_only_read_run_nothing_of_a_strangers_folder(case):
     strange_runs(STRANGE_TRIALS[case][0])
     for words in (
@@ -95,9 +106,23 @@ def test_verbs_that_only_read_run_nothing_of_a_strangers_folder(case):
         ["status", "x", "--json"],
         ["tables", "x"],
         ["report", "x"],
+        ["sync", "x"],
     ):
         cli.run(words)
     assert not Path("exploded").exists()
+
+
+def test_sync_shows_trials_by_a_class_that_its_command_allows(capfd):
+    folder = strange_runs(STRANGE_TRIALS["a tracker"][0])
+    assert cli.run(["sync", "x"]) == 0
+    assert "add allow_targets=[bomb] to the command; no file can" in capfd.readouterr().out
+    values = yaml.safe_load((folder / "config.yaml").read_text())
+    values["tracking"]["_target_"] = "mine.Mine"
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    assert cli.run(["sync", "allow_targets=[mine]"]) == 0  # it was imported
+    assert "mine.Mine is not a class for tracking: it has no open, " in capfd.readouterr().out
+    assert cli.run(["sync", "x", "name=y"]) == 2
+    assert "sync reads only allow_targets, not name=y" in capfd.readouterr().err
 
 
 def test_permissions_in_a_trials_configuration_are_dropped():

@@ -170,6 +170,8 @@ STRANGE: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a densifier": ({"densify": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a package": ({"densify": {"_target_": "bombs.Bomb"}}, "allow_targets=[bombs]"),
+    "a tracker": ({"tracking": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
+    "a reader": ({"scene": {"kind": "reader", "_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a module of a package": ({"densify": {"_target_": "bombs.one.Bomb"}}, "allow_targets=[bombs]"),
     "a densifier that allows itself": (
         {"allow_targets": ["bomb"], "densify": {"_target_": "bomb.Bomb"}},

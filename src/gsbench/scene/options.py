@@ -134,7 +134,7 @@ MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 # Kinds of scenes, and the settings that only they read.
 READ_BY = {
     ("colmap", "photos", "transforms"): ("images",),
-    ("colmap", "photos", "transforms", "own"): ("masks",),
+    ("colmap", "photos", "transforms", "reader"): ("masks",),
     ("colmap",): ("sparse",),
     ("courtyard",): ("views", "width", "height", "seed"),
 }
@@ -149,8 +149,8 @@ def folder_name(path: str | None) -> str:
 @dataclass
 class SceneConfig:
     name: FolderName | None = MISSING  # null: the name of the folder `path`
-    kind: Literal["colmap", "photos", "transforms", "courtyard", "own"] = MISSING
-    # scene=own: a class of your own that reads the capture; its options are further keys
+    kind: Literal["colmap", "photos", "transforms", "courtyard", "reader"] = MISSING
+    # scene=reader: a class of your own that reads the capture; its options are further keys
     _target_: TargetName | None = None
     path: PathName | None = None  # folder of the capture
     # image folder below path; null: images, or what transforms.json names
@@ -195,10 +195,10 @@ class SceneConfig:
                 f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos "
                 "(bare photographs), scene=colmap or scene=transforms"
             )
-        if (self.kind == "own") != (self._target_ is not None):
+        if (self.kind == "reader") != (self._target_ is not None):
             raise InputError(
                 f"scene.kind={self.kind} with scene._target_={self._target_}: a reader of your own "
-                "is scene=own scene._target_=mine.MyReader"
+                "is scene=reader scene._target_=mine.MyReader"
             )
         self._check_that_all_is_read()
         self.split_rule.check()

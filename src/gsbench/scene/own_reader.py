@@ -1,4 +1,4 @@
-"""The contract of a user's own reader of captures (``scene=own``), and a check of what it reads."""
+"""The contract of a user's own reader of captures (``scene=reader``), and a check of what it reads."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def read_posed_images(reader: SceneReader, folder: Path) -> PosedImages:
     for image, camera in posed.images.items():
         try:
             images[str(image)] = _checked(folder, image, *camera)
-        except (TypeError, ValueError, InputError) as error:
+        except (AttributeError, TypeError, ValueError, InputError) as error:
             raise InputError(f"{name}: {image}: {error}") from error
     points = None
     if posed.points is not None:
@@ -83,11 +83,13 @@ def _checked(
     folder: Path, image: str, camera: CameraModel, rotation: object, translation: object
 ) -> PosedCamera:
     """A photograph's camera and pose; raises InputError or ValueError for unusable ones."""
-    from gsbench.scene.colmap import new_camera  # loads pycolmap
+    from gsbench.scene.colmap import is_model, new_camera  # loads pycolmap
 
     place = PurePath(image)
     if place.is_absolute() or ".." in place.parts or not (folder / place).is_file():
         raise InputError(f"no such file in {folder}")
+    if not is_model(camera.name):
+        raise InputError(f"{camera.name!r} is no camera model of COLMAP, such as PINHOLE")
     params = tuple(map(float, camera.params))
     if not np.isfinite(params).all():
         raise InputError("the camera's parameters must be finite")

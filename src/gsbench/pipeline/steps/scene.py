@@ -104,7 +104,7 @@ class CaptureSource:
             capture = read_transforms(
                 self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection
             )
-        elif options.kind == "own":
+        elif options.kind == "reader":
             assert made is not None
             capture = read_posed(
                 self.name, self._folder, self._posed, made / SPARSE_FOLDERS[0], **selection
