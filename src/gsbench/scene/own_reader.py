@@ -1,4 +1,4 @@
-"""The contract of a user's own reader of captures (``scene=reader``), and a check of what it reads."""
+"""The contract of a user's reader of captures (``scene=reader``), and a check of what it reads."""
 
 from __future__ import annotations
 
