@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +15,7 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import CaptureSource
-from gsbench.runs.keys import UserCode
+from gsbench.runs.user_code import UserCode
 from gsbench.scene.colmap import read_model
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.own_reader import PosedImages, read_posed_images
@@ -27,14 +26,14 @@ POINTS = (np.arange(6.0).reshape(2, 3), np.zeros((2, 3), np.uint8))
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     for number in range(4):
         pixels = np.full((24, 32, 3), 50 * number, np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{number}.png")
     return tmp_path
 
 
-def posed(count: int = 4) -> PosedImages:
+def posed(count=4):
     """Cameras on a line."""
     return PosedImages(
         {f"{n}.png": (CAMERA, np.eye(3), np.array([0.1 * n, 0, 0])) for n in range(count)}, POINTS
@@ -46,30 +45,30 @@ class Reader:
     result: Any = None
     scale: float = 1.0
 
-    def read(self, folder: Path) -> PosedImages:
+    def read(self, folder):
         if isinstance(self.result, BaseException):
             raise self.result
         return posed() if self.result is None else self.result
 
 
-def one(**changes: Any) -> PosedImages:
+def one(**changes):
     """One image whose camera, rotation or translation is changed."""
     values = {"camera": CAMERA, "rotation": np.eye(3), "translation": np.zeros(3)} | changes
     return PosedImages({"0.png": tuple(values.values())})
 
 
-def camera(*params: float, name: str = "PINHOLE") -> PosedImages:
+def camera(*params, name="PINHOLE"):
     return one(camera=CameraModel(name, 32, 24, params))
 
 
-FAULTS: dict[str, tuple[Any, str]] = {
+FAULTS = {
     "nothing": ({}, "read() must return gsbench.scene.own_reader.PosedImages, got dict"),
     "an error": (KeyError("w"), "Reader cannot read {folder} (KeyError: 'w')"),
     "an end": (SystemExit(3), "Reader cannot read {folder} (SystemExit: 3)"),
     "a missing file": (PosedImages({"9.png": posed().images["0.png"]}), "9.png: no such file in"),
     "a file above": (PosedImages({"../0.png": posed().images["0.png"]}), "../0.png: no such file"),
     "an absolute path": (PosedImages({"/etc/passwd": posed().images["0.png"]}), "no such file in"),
-    "no camera": (PosedImages({"0.png": None}), "0.png: "),  # type: ignore[dict-item]
+    "no camera": (PosedImages({"0.png": None}), "0.png: "),
     "no model": (camera(30, 31, 16, 12, name="pinhole"), "'pinhole' is no camera model of"),
     "no camera model": (one(camera="PINHOLE"), "0.png: "),
     "too few parameters": (camera(30, 16, 12), "is not a camera of COLMAP: it has fx, fy, cx, cy"),
@@ -94,7 +93,7 @@ def test_a_fault_of_the_reader_is_named(fault, folder):
     assert "\n" not in str(error.value)
 
 
-def source(folder: Path, reader: Reader, code: str = "a", **settings: Any) -> CaptureSource:
+def source(folder, reader, code="a", **settings):
     options = SceneConfig("own", "reader", _target_="mine.Reader", path=str(folder), **settings)
     return CaptureSource(options, reader, UserCode({"mine": code}, {"scene": "mine.Reader"}))
 
@@ -116,7 +115,7 @@ def test_cameras_points_and_the_readers_own_split_reach_the_capture(folder, tmp_
 
 
 def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_reads(folder):
-    def key(reader: Reader, code: str = "a") -> str:
+    def key(reader, code="a"):
         step = source(folder, reader, code).step
         assert step is not None
         return step.key
@@ -132,7 +131,7 @@ def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_read
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    "settings, said",
     [
         ({"kind": "reader"}, "a reader of your own is scene=reader scene._target_=mine.MyReader"),
         ({"kind": "colmap", "_target_": "mine.Reader"}, "a reader of your own is scene=reader"),

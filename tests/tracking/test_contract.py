@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -38,36 +37,36 @@ METHODS = ("open", "params", "tags", "metrics", "artifacts", "close")
 class FakeRun:
     """Stands in for a run of W&B's client."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name):
         self.name, self.notes, self.code = name, "", None
         self.config, self.summary = dict[str, Any](), dict[str, Any]()
         self.rows, self.files = list[dict[str, Any]](), set[str]()
-        self.config = SimpleNamespace(  # type: ignore[assignment]
+        self.config = SimpleNamespace(
             values={}, update=lambda new, **how: self.config.values.update(new)
         )
 
-    def define_metric(self, name: str, step_metric: str) -> None:
+    def define_metric(self, name, step_metric):
         assert (name, step_metric) == ("*", "iteration")
 
-    def log(self, row: dict[str, Any]) -> None:
+    def log(self, row):
         self.rows.append(row)
 
-    def save(self, path: str, base_path: str, policy: str) -> None:
+    def save(self, path, base_path, policy):
         self.files.add(Path(path).relative_to(base_path).as_posix())
 
-    def finish(self, code: int) -> None:
+    def finish(self, code):
         self.code = code
 
 
 class Shown:
     """What a tracker shows of its runs, in one form."""
 
-    def __init__(self, kind: str, runs: Path, monkeypatch: Any) -> None:
+    def __init__(self, kind, runs, monkeypatch):
         self.kind, self.runs = kind, runs
         self.settings = options() | {"_target_": f"gsbench.tracking.{kind}"}
         if kind == "WandB":
-            self.fakes: dict[str, FakeRun] = {}
-            wandb: Any = ModuleType("wandb")
+            self.fakes = {}
+            wandb = ModuleType("wandb")
             wandb.__spec__ = SimpleNamespace()
             wandb.Settings, wandb.Image = dict, lambda pixels: pixels
             wandb.init = lambda **how: self.fakes.setdefault(how["id"], FakeRun(how["name"]))
@@ -78,19 +77,19 @@ class Shown:
             exec(OWN.removesuffix("```"), vars(module))
             self.settings |= {"_target_": "kept.Kept", "folder": str(runs / "kept")}
 
-    def mirror(self, folder: Path, values: dict[str, Any]) -> bool:
+    def mirror(self, folder, values):
         return mirror_trial(self.settings, folder, values, ["kept"])
 
-    def __call__(self) -> list[dict[str, Any]]:
+    def __call__(self):
         return getattr(self, f"_{self.kind.lower()}")()
 
-    def one(self) -> dict[str, Any]:
+    def one(self):
         """The newest run; only W&B keeps those with earlier results."""
         shown = self()
         assert len(shown) == 1 or self.kind == "WandB"
         return shown[-1]
 
-    def _own(self) -> list[dict[str, Any]]:
+    def _own(self):
         shown = [json.loads(file.read_text()) for file in (self.runs / "kept").glob("*.json")]
         return [
             {
@@ -107,7 +106,7 @@ class Shown:
             for one in shown
         ]
 
-    def _mlflow(self) -> list[dict[str, Any]]:
+    def _mlflow(self):
         client = connect(None, self.runs)
         return [
             {
@@ -128,7 +127,7 @@ class Shown:
             for run in found_runs(client, "tracked")
         ]
 
-    def _wandb(self) -> list[dict[str, Any]]:
+    def _wandb(self):
         status = {None: "RUNNING", 0: "FINISHED", 1: "FAILED"}
         return [
             {
@@ -152,7 +151,7 @@ class Shown:
             for run in self.fakes.values()
         ]
 
-    def _tensorboard(self) -> list[dict[str, Any]]:
+    def _tensorboard(self):
         from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
         from tensorboard.util import tensor_util
 
@@ -162,12 +161,12 @@ class Shown:
         events = EventAccumulator(str(folder), size_guidance=sizes).Reload()
         names = events.Tags()
 
-        def texts(name: str) -> list[str]:
+        def texts(name):
             key = f"{name}/text_summary"
             found = events.Tensors(key) if key in names["tensors"] else []
             return [tensor_util.make_ndarray(one.tensor_proto)[0].decode() for one in found]
 
-        def table(name: str) -> dict[str, str]:
+        def table(name):
             rows = [
                 line.strip("| ").split(" | ") for text in texts(name) for line in text.split("\n")
             ]
@@ -191,7 +190,7 @@ class Shown:
         ]
 
 
-def _once(history: Any) -> Any:
+def _once(history):
     """The history of a number, which no step may have twice."""
     steps = [one.step for one in history]
     assert len(steps) == len(set(steps))
@@ -199,7 +198,7 @@ def _once(history: Any) -> Any:
 
 
 @pytest.fixture(params=["MLflow", "TensorBoard", "WandB", "own"])
-def shown(request, runs, tmp_path, monkeypatch) -> Shown:
+def shown(request, runs, tmp_path, monkeypatch):
     """A tracker for a new runs folder; MLflow's database is copied, since making it takes long."""
     if request.param == "TensorBoard":
         pytest.importorskip("tensorboard", reason="needs tensorboard")
@@ -211,7 +210,7 @@ def shown(request, runs, tmp_path, monkeypatch) -> Shown:
     return Shown(request.param, folder, monkeypatch)
 
 
-def finished(runs: Path, psnr: float = 20.0) -> tuple[Path, dict[str, Any]]:
+def finished(runs, psnr=20.0):
     """A finished trial with a picture, which was also measured at iteration 50."""
     values = trial_values(runs, 1)
     folder = begin_trial(values)
@@ -224,7 +223,7 @@ def finished(runs: Path, psnr: float = 20.0) -> tuple[Path, dict[str, Any]]:
     return folder, values
 
 
-def check_whole(run: dict[str, Any], psnr: float = 20.0) -> None:
+def check_whole(run, psnr=20.0):
     """The run shows the trial of `finished`, all of it."""
     losses = {("train/loss", i): 1 / i for i in range(1, RECORDS + 1)}
     cloned = {("train/densify/cloned", i): i for i in (50, 100)}
@@ -267,7 +266,7 @@ def test_what_was_sent_before_a_crash_is_not_shown_twice(shown):
 @pytest.mark.parametrize("method", METHODS)
 def test_after_an_error_anywhere_the_next_time_completes_the_run(shown, method, monkeypatch):
     folder, values = finished(shown.runs)
-    cls: Any = type(make_sink(shown.settings, ["kept"]))
+    cls = type(make_sink(shown.settings, ["kept"]))
     with monkeypatch.context() as patch:
         for done in (False, True):  # before the tracker did it, and after: its answer is lost
             whole = getattr(cls, method)
@@ -280,8 +279,8 @@ def test_after_an_error_anywhere_the_next_time_completes_the_run(shown, method, 
     assert len(shown()) == 1
 
 
-def _failing(whole: Callable[..., Any], done: bool) -> Callable[..., Any]:
-    def method(*given: Any) -> None:
+def _failing(whole, done):
+    def method(*given):
         if done:
             whole(*given)
         raise ConnectionError

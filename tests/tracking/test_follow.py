@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +18,6 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking import Mirror, mirror
 from gsbench.tracking.mirror import MirrorError, TrackerRun, mirror_ended, refusal, sync
-from gsbench.tracking.sinks import Run
 from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
 
 # ---- the sweep's side
@@ -30,35 +28,35 @@ class Process:
 
     code, takes, errors = 0, 0.0, b""
 
-    def __init__(self, made: list["Process"], command: list[str], stderr: Any, **how: Any) -> None:
+    def __init__(self, made, command, stderr, **how):
         made.append(self)
         self.command, self.stderr, self.how = command, stderr, how
         self.stdin, self.did = io.BytesIO(), list[Any]()
-        self.returncode: int | None = None
+        self.returncode = None
 
-    def __enter__(self) -> "Process":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         self.did.append("closed")
 
-    def poll(self) -> int | None:
+    def poll(self):
         return self.returncode
 
-    def communicate(self, timeout: float) -> None:
+    def communicate(self, timeout):
         self.did.append(timeout)
         if self.takes > timeout:
             raise subprocess.TimeoutExpired("mirror", timeout)
         self.stderr.write(self.errors)
         self.returncode = self.code
 
-    def kill(self) -> None:
+    def kill(self):
         self.did.append("killed")
 
 
 @pytest.fixture
-def processes(monkeypatch, caplog) -> list[Process]:
-    made: list[Process] = []
+def processes(monkeypatch, caplog):
+    made = []
     monkeypatch.setattr(subprocess, "Popen", lambda command, **how: Process(made, command, **how))
     return made
 
@@ -82,14 +80,14 @@ def test_one_process_gets_the_folders_of_all_trials(processes, tmp_path, caplog)
 
 
 @pytest.mark.parametrize(
-    ("error", "seconds"), [(None, 7.0), (ValueError(), 7.0), (KeyboardInterrupt(), 3.0)]
+    "error, seconds", [(None, 7.0), (ValueError(), 7.0), (KeyboardInterrupt(), 3.0)]
 )
 def test_a_stopped_sweep_waits_less_for_a_slow_tracker(
     processes, tmp_path, caplog, monkeypatch, error, seconds
 ):
     monkeypatch.setattr(Process, "takes", 7.5)
 
-    def sweep() -> None:
+    def sweep():
         with Mirror() as one:
             one.follow(tmp_path, options(patience=7.0) | {"_target_": "gsbench.tracking.WandB"})
             if error is not None:
@@ -109,7 +107,7 @@ REST = "; the files are complete, `gsbench sync` mirrors them later"
 
 
 @pytest.mark.parametrize(
-    ("code", "errors", "said"),
+    "code, errors, said",
     [
         (3, b"Traceback\n  File\nMLflow does not take x\n", "MLflow does not take x"),
         (
@@ -140,7 +138,7 @@ def test_a_failed_mirror_is_reported_once_and_the_next_trial_gets_another(
 
 
 def test_a_mirror_that_cannot_start_harms_nothing(tmp_path, caplog, monkeypatch):
-    def fail(*words: Any, **how: Any) -> None:
+    def fail(*words, **how):
         raise OSError("no memory")
 
     monkeypatch.setattr(subprocess, "Popen", fail)
@@ -158,38 +156,38 @@ class Tracker:
     told: list[Any]
     refuses: BaseException | None = None
 
-    def open(self, trial: Any, run: Run) -> str:
+    def open(self, trial, run):
         self.told.append(("open", run.complete))
         return f"run {run.token}"
 
-    def params(self, values: Any) -> None:
+    def params(self, values):
         pass
 
-    def tags(self, values: Any) -> None:
+    def tags(self, values):
         if "note" in values:
             self.told.append(("note", values["note"]))
 
-    def metrics(self, scalars: Any) -> None:
+    def metrics(self, scalars):
         if self.refuses:
             raise self.refuses
         self.told.append(("log", {one.key.split("/")[1] for one in scalars}, len(scalars)))
 
-    def artifacts(self, files: Any, pictures: Any) -> None:
+    def artifacts(self, files, pictures):
         self.told.append(("files", list(files)))
 
-    def close(self, status: str, reason: str | None) -> None:
+    def close(self, status, reason):
         self.told.append((status, reason))
 
 
 @pytest.fixture
-def told(monkeypatch) -> list[Any]:
+def told(monkeypatch):
     monkeypatch.setattr(Tracker, "told", [], raising=False)
     monkeypatch.setattr(mirror, "make_sink", lambda settings, allowed: Tracker())
     monkeypatch.setattr(mirror, "publish", lambda home, uri: None)
     return Tracker.told
 
 
-def words(told: list[Any]) -> list[str]:
+def words(told):
     return [word for word, *_ in told]
 
 
@@ -285,10 +283,10 @@ def test_sync_mirrors_ended_trials_and_counts_them(told, tmp_path, monkeypatch):
 
 
 def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypatch):
-    published: list[Any] = []
+    published = []
     monkeypatch.setattr(mirror, "publish", lambda home, uri: published.append((home, uri)))
     folder = TrialFolder.of(trial_values(tmp_path))
-    pages: Any = {
+    pages = {
         (folder.home, "u"): (folder, options("u")),
         (folder.home, "w"): (folder, options("w") | {"_target_": "gsbench.tracking.WandB"}),
     }
@@ -296,7 +294,7 @@ def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypa
     assert published == [(folder.home, "u")]
     assert pages == {}
 
-    def refuse(home: Path, uri: str) -> None:
+    def refuse(home, uri):
         raise KeyError("no page")
 
     monkeypatch.setattr(mirror, "publish", refuse)
@@ -313,12 +311,12 @@ class Followed:
     made: list["Followed"]
     error: BaseException | None = None
 
-    def __init__(self, folder: TrialFolder) -> None:
+    def __init__(self, folder):
         self.folder, self.options, self.has_ended = folder, options("u"), False
-        self.calls: list[bool] = []
+        self.calls = []
         self.made.append(self)
 
-    def catch_up(self, last: bool) -> None:
+    def catch_up(self, last):
         self.calls.append(last)
         if self.error:
             raise self.error
@@ -326,7 +324,7 @@ class Followed:
 
 
 @pytest.fixture
-def followed(monkeypatch) -> list[Followed]:
+def followed(monkeypatch):
     monkeypatch.setattr(Followed, "made", [], raising=False)
     monkeypatch.setattr(mirror, "_FollowedTrial", Followed)
     return Followed.made
@@ -335,26 +333,26 @@ def followed(monkeypatch) -> list[Followed]:
 class Lines:
     """The lines of stdin: between two lists of lines nothing comes for a while."""
 
-    def __init__(self, *parts: list[str | None]) -> None:
+    def __init__(self, *parts):
         self.parts, self.queue, self.pauses = list(parts), Queue[str | None](), list[float]()
 
-    def get(self, timeout: float) -> str | None:
+    def get(self, timeout):
         self.pauses.append(timeout)
         for line in self.parts.pop(0):
             self.queue.put(line)
         return self.queue.get_nowait()
 
-    def get_nowait(self) -> str | None:
+    def get_nowait(self):
         return self.queue.get_nowait()
 
 
 def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
-    renewed: list[Any] = []
+    renewed = []
     now = iter([100.0, 100.0, 159.0, 160.5, 160.5, 170.0, 170.0])
     monkeypatch.setattr(mirror, "_renew", lambda pages: renewed.append(sorted(map(str, pages))))
     monkeypatch.setattr(time, "monotonic", lambda: next(now))
     lines = Lines(["a/b/c/d", "a/b/c/e"], [], ["a/b/c/f"], [None])
-    mirror._follow(lines, 0.5)  # type: ignore[arg-type]
+    mirror._follow(lines, 0.5)
     assert [str(one.folder.path) for one in followed] == ["a/b/c/d", "a/b/c/e", "a/b/c/f"]
     # the first two ended at the second reading; the last one is read once more at the end
     assert [one.calls for one in followed] == [[False, False], [False, False], [False, True]]
@@ -370,10 +368,10 @@ def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
     monkeypatch.setattr(mirror, "_renew", lambda pages: None)
     lines = Lines(["a/b/c/d"], [], [None])
     if isinstance(error, BusyError):
-        mirror._follow(lines, 0)  # type: ignore[arg-type]
+        mirror._follow(lines, 0)
     else:
         with pytest.raises(MirrorError, match=r"could not be sent to MLflow \(\w+: down\)"):
-            mirror._follow(lines, 0)  # type: ignore[arg-type]
+            mirror._follow(lines, 0)
     assert followed[0].calls == [False, False, True]
 
 
@@ -421,10 +419,10 @@ def test_a_trial_that_ended_before_it_was_seen_is_mirrored(told, tmp_path, name)
 
 @pytest.mark.parametrize("error", [None, ValueError("tracker\n down")])
 def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, capsys, error):
-    ended: list[int] = []
-    given: list[Any] = []
+    ended = []
+    given = []
 
-    def follow(lines: Any, pause: float) -> None:
+    def follow(lines, pause):
         given.append(pause)
         if error:
             raise error
@@ -433,7 +431,7 @@ def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, 
     monkeypatch.setattr(mirror, "_follow", follow)
     monkeypatch.setattr(mirror, "_read_input", lambda lines, patience: given.append(patience))
     monkeypatch.setattr(os, "_exit", ended.append)
-    signals: list[Any] = []
+    signals = []
     monkeypatch.setattr(signal, "signal", lambda *what: signals.append(what))
     mirror.follow()
     assert sorted(given) == [0.5, 30.0]
@@ -444,10 +442,10 @@ def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, 
 
 
 def test_a_process_whose_parent_is_gone_ends_after_some_patience(monkeypatch):
-    did: list[Any] = []
+    did = []
     monkeypatch.setattr(sys, "stdin", io.StringIO("a\nb\n"))
     monkeypatch.setattr(time, "sleep", did.append)
     monkeypatch.setattr(os, "_exit", lambda code: did.append(f"exit {code}"))
-    lines: Any = SimpleNamespace(put=did.append)
+    lines = SimpleNamespace(put=did.append)
     mirror._read_input(lines, 30.0)
     assert did == ["a", "b", None, 40.0, "exit 1"]

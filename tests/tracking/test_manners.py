@@ -4,8 +4,6 @@ import getpass
 import shutil
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,7 +24,7 @@ from tests.tracking.helpers import (
 pytestmark = pytest.mark.slow
 
 
-def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
+def mirrored(runs, seed, **more):
     """A client, and the run of a finished trial."""
     values = trial_values(runs, seed)
     folder = TrialFolder.of(values).path
@@ -38,7 +36,7 @@ def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
     return client, run
 
 
-def artifacts(client: Any, run: Any) -> set[str]:
+def artifacts(client, run):
     return {item.path for item in client.list_artifacts(run.info.run_id)}
 
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -32,7 +31,7 @@ from tests.tracking.servers import Listener
 SECONDS = 240  # a limit for what never comes; a slow machine needs less
 
 
-def wait_for_run(folder: Path) -> None:
+def wait_for_run(folder):
     """Wait until the trial's folder records its run."""
     deadline = time.monotonic() + SECONDS
     while "token" not in (

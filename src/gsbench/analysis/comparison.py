@@ -11,7 +11,14 @@ from typing import Any
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
-from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of, uncompared
+from gsbench.analysis.pairing import (
+    BASELINE,
+    baseline_settings,
+    choose_pairs,
+    controls_of,
+    pair_trials,
+    uncompared,
+)
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs, sentence
 from gsbench.runs.layout import LEDGER, TUNING
@@ -39,7 +46,14 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
         return Pairing(trials, (), ())
     by_arm = group_by(trials, lambda trial: trial.arm)
     arms, settings = sorted(by_arm), {arm: own[0].config for arm, own in by_arm.items()}
-    pairs = choose_pairs(arms, baseline, controls_of(trials), settings)
+    ages = {arm: min(trial.measured for trial in own) for arm, own in by_arm.items()}
+    pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
+    pairs += [
+        pair
+        for pair in baseline_settings(arms, ages, baseline)
+        # settings under which no two trials can be paired, such as budgets, give no verdict
+        if pair not in pairs and pair_trials(trials, *pair)
+    ]
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
 
 
@@ -82,7 +96,7 @@ class Comparison:
             answers = [one for one in self.answers if arm in (one.first, one.second)]
             # Where an arm has no verdict at all, its sentence says why.
             if left_out and any(one.verdicts for one in answers):
-                notes = [note.partition(": ")[2] for one in answers for note in one.notes]
+                notes = [note for one in answers for own in one.verdicts for note in own.notes]
                 reasons = some_of(list(dict.fromkeys(notes))) or NOT_PLANNED
                 yield f"In no verdict: {some_of(left_out)} ({reasons})."
 

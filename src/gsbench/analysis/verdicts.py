@@ -147,7 +147,11 @@ def _judge_families(
         standing = standings.get(pair)
         if standing is None or not standing.beforehand:
             return pair
-        return standing.declaration.time, standing.declaration.hash, bool(question.seeds)
+        # The baseline's own settings are a family of their own: questions about ideas pay nothing
+        # for them.
+        is_setting = pair[0].densify == pair[1].densify
+        named = standing.declaration
+        return named.time, named.hash, bool(question.seeds), is_setting
 
     verdicts: dict[int, Verdict] = {}
     for own in group_by(enumerate(asked), family).values():
@@ -238,7 +242,7 @@ def sentence(judged: PairVerdicts) -> str:
     first = verdicts[0]
     if judged.role(first) == DECLARED:
         if first.interval is None:
-            return f"{against}: no verdict yet, {first.untestable or TOO_FEW.format(where)}."
+            return f"{against}: no verdict yet, {first.untestable or _too_few(judged, first)}."
         waits = "" if first.final else "not decided yet, "
         seeds = ""
         if planned := first.question.seeds:
@@ -254,6 +258,16 @@ def sentence(judged: PairVerdicts) -> str:
 
 
 TOO_FEW = "one trial of each on {}; run more seeds"
+BEFORE_LOOKS = (
+    "not all of the first {} seeds are there in both arms; give the sweep's command again"
+)
+
+
+def _too_few(judged: PairVerdicts, verdict: Verdict) -> str:
+    standing = judged.standing
+    if verdict.question.seeds and standing is not None and standing.declaration.looks:
+        return BEFORE_LOOKS.format(standing.declaration.looks[0])
+    return TOO_FEW.format(_scope(verdict))
 
 
 def no_pairs(judged: PairVerdicts) -> str:

@@ -18,7 +18,7 @@ from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_words
+from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_text
 from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, plan_looks
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import cloud_notes, machine_notes
@@ -436,7 +436,7 @@ def _chart(one: ClaimVerdict) -> str:
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each scene and arm."""
     groups = group_by(trials, lambda trial: trial.label.rpartition(SEED)[0])
-    return tuple((folder, seeds_words(own)) for folder, own in groups.items())
+    return tuple((folder, seeds_text(own)) for folder, own in groups.items())
 
 
 def _number(value: float) -> str:

@@ -21,8 +21,8 @@ from gsbench.config.trust import is_external
 from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.raster.executors import RasterConfig
-from gsbench.runs.keys import OWN, entries_of
 from gsbench.runs.layout import IN_RUNS
+from gsbench.runs.nested import GSBENCH, entries_of
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (
     MAX_INTEGER,
@@ -218,7 +218,8 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
             )
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
-        if not str(given.get("_target_") or OWN).startswith(OWN):  # other keys are its options
+        target = given.get("_target_") or GSBENCH
+        if not str(target).startswith(GSBENCH):  # keys that are no settings are its options
             known = {one.name for one in dataclasses.fields(schema)}
             given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))

@@ -23,7 +23,8 @@ from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import OWN, TARGET, UserCode, targets_in, user_modules
+from gsbench.runs.nested import GSBENCH, TARGET, targets_in
+from gsbench.runs.user_code import UserCode, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.own_reader import SceneReader
 from gsbench.system.device import select_device
@@ -83,7 +84,7 @@ class Parts:
     def initializer(self) -> Initializer:
         values = self.values["init"]
         # else COLMAP would take all cores
-        if values.get("threads") == "auto" and values["_target_"].startswith(OWN):
+        if values.get("threads") == "auto" and values["_target_"].startswith(GSBENCH):
             values = values | {"threads": self.threads}
         initializer: Initializer = build("init", values, self._allowed)
         return initializer

@@ -14,7 +14,8 @@ from PIL import Image
 from gsbench.eval.facts import find_metric
 from gsbench.parsing import Record, read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.keys import TRAIN, flatten, sha256_of
+from gsbench.runs.keys import TRAIN
+from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
