@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.locks import BusyError
 from gsbench.tracking import connect
 from gsbench.tracking.mirror import TrackerRun, make_sink
 from tests.conftest import ROOT
@@ -318,6 +319,8 @@ def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
     files = TrialFolder(folder)
     (folder / "results.json").unlink()
     run = TrackerRun(files, shown.settings, values, ["kept"])
+    with pytest.raises(BusyError):  # one process at a time
+        TrackerRun(files, shown.settings, values, ["kept"])
     run.add_curves()
     assert ("train/loss", 1) not in shown.one()["metrics"]
     training = {"stage": "train", "folder": str(tmp_path / "building")}

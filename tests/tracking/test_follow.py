@@ -1,7 +1,6 @@
 """The mirror and its process, with stand-ins for the process and for the tracker."""
 
 import io
-import json
 import logging
 import os
 import signal
@@ -17,7 +16,7 @@ import pytest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking import Mirror, mirror
-from gsbench.tracking.mirror import MirrorError, TrackerRun, mirror_ended, refusal, sync
+from gsbench.tracking.mirror import MirrorError, mirror_ended, refusal, sync
 from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
 
 # ---- the sweep's side
@@ -192,48 +191,6 @@ def words(told):
 
 
 ENDED = ["log", "note", "files", "FINISHED"]
-
-
-def test_a_run_gets_each_record_once_and_its_end(told, tmp_path):
-    values = trial_values(tmp_path)
-    folder = begin_trial(values)
-    files = TrialFolder(folder)
-    run = TrackerRun(files, options(), values)
-    assert told == [("open", None)]
-    state = json.loads((folder / "mlflow.json").read_text())
-    assert state["id"] == f"run {state['token']}"
-    with pytest.raises(BusyError):
-        TrackerRun(files, options(), values)
-    run.end()
-    assert told[1:] == [("KILLED", None)]
-    (folder / "failed.json").write_text(json.dumps({"message": "no luck\nat all"}))
-    run.end()
-    assert told[2:] == [("files", ["config.yaml", "failed.json"]), ("FAILED", "no luck")]
-    write_trial(folder, values)
-    (folder / "failed.json").unlink()
-    run.add_curves()  # these are of an earlier training, as long as the trial runs
-    assert len(told) == 4
-    run.add_curves(live=False)
-    assert words(told[4:]) == ["log", "log"]
-    logged = json.loads((folder / "mlflow.json").read_text())["logged"]
-    assert logged == {"metrics.jsonl": 150, "events.jsonl": 100}
-    assert not run.is_complete
-    run.end()
-    assert words(told[6:]) == ENDED  # no curve is logged again
-    assert run.is_complete
-    run.end()
-    run.add_curves()
-    assert len(told) == 10
-    run.close()
-    assert not mirror_ended(files, options(), values)
-    first = json.loads((folder / "mlflow.json").read_text())
-    write_trial(folder, values, psnr=33.0)  # new results replace the run
-    del told[:]
-    assert mirror_ended(files, options(), values)
-    assert words(told) == ["open", "log", "log", *ENDED]
-    again = json.loads((folder / "mlflow.json").read_text())
-    assert again["token"] != first["token"]
-    assert again["complete"] != first["complete"]
 
 
 def test_a_tracker_that_fails_frees_the_trial(told, tmp_path, monkeypatch):

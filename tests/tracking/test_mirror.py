@@ -20,7 +20,6 @@ from tests.tracking.helpers import (
     following,
     found_runs,
     free_port,
-    history,
     options,
     run_of,
     trial_values,
@@ -59,27 +58,6 @@ def test_runs_of_failed_and_stopped_trials_say_so_and_are_continued(runs):
         write_trial(folder, values)
     run = run_of(client, 4)
     assert run.info.status == "FINISHED"
-
-
-@pytest.mark.slow
-def test_curves_of_a_training_in_progress_are_followed(runs, tmp_path):
-    values = trial_values(runs, seed=5)
-    folder = begin_trial(values)
-    client = connect(None, runs)
-    seen = 0
-    with following(options(), folder):
-        (folder / "building.json").write_text(
-            json.dumps({"stage": "train", "folder": str(tmp_path)})
-        )
-        (tmp_path / "metrics.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
-        wait_for_run(folder)
-        deadline = time.monotonic() + SECONDS
-        while not seen and time.monotonic() < deadline:
-            time.sleep(0.1)
-            # The token is noted before the run is created, so the run may still be missing.
-            found = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == "5"]
-            seen = sum(len(history(client, run.info.run_id, "train/loss")) for run in found)
-    assert seen == 1
 
 
 @pytest.mark.parametrize("uri", ["down", "not a database", "no such place", "nonsense"])

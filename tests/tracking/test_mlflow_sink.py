@@ -72,17 +72,6 @@ def test_an_experiment_that_another_machine_created_meanwhile_is_used(tmp_path):
         ensure_experiment(client, "x", tmp_path)
 
 
-def test_a_deleted_experiment_is_restored_and_a_foreign_one_gets_the_missing_tags(tmp_path):
-    client = Client(get_experiment_by_name=experiment("deleted", **KIND))
-    ensure_experiment(client, "x", tmp_path)
-    assert client.called("restore_experiment") == [(7,)]
-    assert client.called("set_experiment_tag") == []
-    client = Client(get_experiment_by_name=experiment())
-    ensure_experiment(client, "x", tmp_path)
-    assert client.called("restore_experiment") == []
-    assert client.called("set_experiment_tag") == [(7, *item) for item in KIND.items()]
-
-
 def test_artifacts_of_the_own_database_stay_in_the_runs_folder(tmp_path):
     own, other = Client(default_uri(tmp_path)), Client("http://there")
     inside = tmp_path / "mlartifacts" / "x" / "run"
