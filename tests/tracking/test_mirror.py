@@ -33,7 +33,7 @@ SECONDS = 240  # a limit for what never comes; a slow machine needs less
 def wait_for_run(folder):
     """Wait until the trial's folder records its run."""
     deadline = time.monotonic() + SECONDS
-    while "token" not in (
+    while "described" not in (
         json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}
     ):
         assert time.monotonic() < deadline

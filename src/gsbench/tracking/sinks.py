@@ -32,10 +32,6 @@ class Run(Record):
     logged: dict[str, Count] = field(default_factory=dict)  # newest iteration sent, by file
     complete: str | None = None  # hash of the results that were sent
 
-    def time_of(self, seconds: float) -> float:
-        """The time, in seconds since 1970, ``seconds`` of training after the start."""
-        return self.started / 1000 + seconds
-
 
 class Sink(Protocol):
     """One trial in a tracker; a new object is made for each.
@@ -101,7 +97,8 @@ class TensorBoard:
 
     def metrics(self, scalars: Sequence[Scalar]) -> None:
         for one in scalars:
-            self._writer.add_scalar(one.key, one.value, one.step, self._run.time_of(one.seconds))
+            time = self._run.started / 1000 + one.seconds
+            self._writer.add_scalar(one.key, one.value, one.step, time)
         self._writer.flush()
 
     def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
