@@ -132,7 +132,7 @@ def test_the_initialiser_of_its_document_runs(folder, capsys):
 def test_the_tracker_of_its_document_gets_every_trial(folder, capsys):
     found = run_blocks(ROOT / "docs" / "hydra.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
-    shown = {one["tags"]["seed"]: one for one in map(_json, Path("shown").iterdir())}
+    shown = {one["tags"]["seed"]: one for one in map(_json, Path("runs/told/shown").iterdir())}
     results = {one["seed"]: one for one in map(_json, Path("runs/told").rglob("results.json"))}
     assert set(shown) == {"0", "1"}
     for seed, one in results.items():

@@ -4,7 +4,6 @@ The notes below a table say who trained, what was declared, and how else the com
 """
 
 import itertools
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -25,27 +24,15 @@ from gsbench.analysis.differences import (
     differing_code,
     differing_conditions,
 )
-from gsbench.analysis.fairness import caveats
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
+from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.analysis.table_notes import LEARNT_NOTHING, trials_notes
 from gsbench.eval.facts import find_metric
-from gsbench.events import FEWEST_ROUNDS, few_rounds
-from gsbench.runs.layout import EVENTS
-from gsbench.runs.nested import SHOWN
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted, some_of
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
-
-# trained here by another program (or elsewhere), what was measured, and its description
-ORIGINS = (
-    (True, FROM_MODEL, "Trained here by another program, its model rendered by gsbench"),
-    (True, FROM_RENDERS, "Trained here by another program, its own renders measured as they are"),
-    (False, FROM_MODEL, "A model that another program trained, rendered here"),
-    (False, FROM_RENDERS, "Renders of another program, measured as they are"),
-)
 
 Labels = tuple[str, ...]
 # of a cell: the labels of its row, those of its column, and the quantity's key
@@ -92,10 +79,10 @@ def build_table(
     scenes = sorted({trial.scene for trial in trials})
     scene_index = fields.index("scene") if "scene" in fields else None
     cells: dict[Position, Cell] = {}
-    for row, one, column in itertools.product(row_labels, quantities, column_labels):
+    for row, quantity, column in itertools.product(row_labels, quantities, column_labels):
         own_scenes = scenes if scene_index is None else [(*row, *column)[scene_index]]
-        cells[row, column, one.key] = make_cell(
-            groups.get((*row, *column), []), one, own_scenes, expected
+        cells[row, column, quantity.key] = make_cell(
+            groups.get((*row, *column), []), quantity, own_scenes, expected
         )
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
@@ -108,11 +95,11 @@ def build_table(
         best = set() if notes else _best(means, quantities, None)[0]
         shown += _rows(means, best, quantities, ruled=True)
     headings = []
-    for one, column in itertools.product(quantities, column_labels):
-        above, text = "", one.heading
+    for quantity, column in itertools.product(quantities, column_labels):
+        above, text = "", quantity.heading
         if columns:
             above, text = text, " + ".join(names.get(value, value) for value in column)
-        headings.append(Column(above, text, (one.key, "+".join(column))))
+        headings.append(Column(above, text, (quantity.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
     notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
@@ -120,9 +107,6 @@ def build_table(
         notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")
     heading = title or f"Experiment {experiment.name}"
     return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(notes))
-
-
-LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
 
 
 def format_cell(cell: Cell, quantity: Quantity) -> str:
@@ -147,7 +131,7 @@ def _rows(
 
     A cell over fewer scenes than the others says how many.
     """
-    quantity_of = {one.key: one for one in quantities}
+    quantity_of = {quantity.key: quantity for quantity in quantities}
     most_scenes = max((cell.scenes for cell in cells.values()), default=0)
     rows: list[Row] = []
     for labels, positions in group_by(cells, lambda position: position[0]).items():
@@ -183,8 +167,8 @@ def _best(
             (position for position in cells if position[2] == quantity.key), scene_and_split
         )
         for (scene, _), positions in rivals.items():
-            own = {position: cells[position] for position in positions}
-            shown = itertools.chain(*(cell.trials for cell in own.values()))
+            compared = {position: cells[position] for position in positions}
+            shown = itertools.chain(*(cell.trials for cell in compared.values()))
             by_scene = group_by(shown, lambda trial: trial.scene).values()
             differing = sorted(set().union(*map(differing_conditions, by_scene)))
             if differing:
@@ -193,7 +177,7 @@ def _best(
                     f"{place}: not compared, no best marked: {', '.join(differing)} differ."
                 )
             else:
-                bold |= best_cells(own, quantity)
+                bold |= best_cells(compared, quantity)
     return bold, list(dict.fromkeys(notes))
 
 
@@ -228,17 +212,17 @@ def _means(
                     left.remove(scene)
         return left
 
-    shared_scenes = {one.key: shared(one) for one in quantities}
+    shared_scenes = {quantity.key: shared(quantity) for quantity in quantities}
     most_scenes = max(map(len, shared_scenes.values()))
     if most_scenes == 0:
         return {}
     label = f"mean of {counted(most_scenes, 'scene')}"
     cells: dict[Position, Cell] = {}
-    for row, one, column in itertools.product(mean_rows, quantities, column_labels):
-        own_scenes = shared_scenes[one.key]
-        own = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
+    for row, quantity, column in itertools.product(mean_rows, quantities, column_labels):
+        own_scenes = shared_scenes[quantity.key]
+        averaged = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
         labels = (*row[:scene_index], label, *row[scene_index:])
-        cells[labels, column, one.key] = make_cell(own, one, own_scenes, expected)
+        cells[labels, column, quantity.key] = make_cell(averaged, quantity, own_scenes, expected)
     return cells
 
 
@@ -248,7 +232,7 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
     ``trials`` have their variants.
     """
     by_arm = group_by(trials, lambda trial: trial.arm).values()
-    return any(conditions_between_scenes(own) or differing_code(own) for own in by_arm)
+    return any(conditions_between_scenes(of_arm) or differing_code(of_arm) for of_arm in by_arm)
 
 
 def _reading_notes(
@@ -266,10 +250,10 @@ def _reading_notes(
     trials = itertools.chain(*(cell.trials for cell in cells.values()))
     protocols = {trial.record.protocol for trial in trials}
     notes.append(f"Protocol {', '.join(sorted(protocols))}.")
-    for one in quantities:
-        own = [cell for position, cell in cells.items() if position[2] == one.key]
-        reasons = {cell.reason for cell in own if cell.trials and cell.reason}
-        notes += [f"{one.name}: n/a, {reason}." for reason in sorted(reasons)]
+    for quantity in quantities:
+        shown = [cell for position, cell in cells.items() if position[2] == quantity.key]
+        reasons = {cell.reason for cell in shown if cell.trials and cell.reason}
+        notes += [f"{quantity.name}: n/a, {reason}." for reason in sorted(reasons)]
     return notes
 
 
@@ -282,131 +266,6 @@ def _natural(key: Labels) -> tuple[tuple[int, float, str], ...]:
         except ValueError:
             parts.append((1, 0.0, text))
     return tuple(parts)
-
-
-def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[str]:
-    """All notes on ``trials`` of an experiment and on its comparisons."""
-    return [
-        *doubt_notes(trials),
-        *origin_notes(trials),
-        *edited_notes(trials),
-        *comparison_notes(experiment),
-        *held_out_notes(trials),
-        *points_notes(trials),
-        *machine_notes(trials),
-        *cloud_notes(trials),
-    ]
-
-
-def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on results that are worth little or may surprise.
-
-    They are about renders not better than one colour, executors that failed their proof, pictures
-    made by different filters, twins, and doubts about initial points.
-    """
-    notes = []
-    for trial in trials:
-        if line := trial.record.learnt_nothing:
-            notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
-        notes += [f"{line}." for line in trial.record.raster_passed_over]
-    known = [trial.config for trial in trials if trial.config]
-    folders = {config.get("scene.images") for config in known}
-    downscales = {config.get("scene.downscale") for config in known}
-    if len(folders) > 1 and len(downscales) > 1:
-        notes.append(
-            "Pictures of scene.images and of scene.downscale were made by different filters: "
-            "results on them differ by about 0.3 to 0.45 dB."
-        )
-    for trial in trials:
-        twins = trial.record.twins or TwinViews()
-        if twins.near:
-            count = f"{len(twins.near)} of {trial.record.test_views} test views have"
-            notes.append(
-                f"{trial.scene}: {count} a near twin in training, so they measure memory too."
-            )
-        if twins.left_out:
-            left_out = counted(len(twins.left_out), "photograph")
-            notes.append(
-                f"{trial.scene}: {left_out} left out, since another one has its name or content."
-            )
-    notes += [line for own in group_by(trials, arm_of).values() if (line := rounds_note(own[0]))]
-    for trial in trials:
-        cloud = trial.record.initial_cloud
-        lines = [] if cloud is None else cloud.warnings
-        notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
-    return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
-
-
-def arm_of(trial: TrialResult) -> str:
-    """The arm's folder with its settings' hash: trials that share it have one schedule."""
-    return trial.key.partition("/")[2]
-
-
-def rounds_note(trial: TrialResult) -> str:
-    """A line if a trial's densifier had too few rounds to be judged by them; else ""."""
-    if trial.program or trial.made_elsewhere or not (trial.path / EVENTS).is_file():
-        return ""
-    rounds = len(trial.folder.curves(EVENTS))
-    if rounds >= FEWEST_ROUNDS or not trial.config.get("densify.interval"):
-        return ""
-    return few_rounds(f"{trial.init}-{trial.densify}", rounds, trial.record.iterations)
-
-
-def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on arms that gsbench did not train: who did, and what was measured."""
-    notes = []
-    not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
-    for trained_here, measured, what in ORIGINS:
-        own = [
-            t
-            for t in not_ours
-            if bool(t.program) == trained_here and t.record.evaluated_from == measured
-        ]
-        versions = sorted(
-            {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own}
-        )
-        arms = ", ".join(
-            f"{arm} (version {version})" if trained_here else arm for arm, version in versions
-        )
-        limits = (
-            "its time is that of the whole program, and it sets its own budget"
-            if trained_here
-            else "its conditions are not known"
-        )
-        notes += [f"{what} ({limits}): {arms}."] if own else []
-    return notes
-
-
-def edited_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each of the user's modules that was edited after it made some of the trials."""
-    of_module: dict[str, list[TrialResult]] = {}
-    for trial in trials:
-        for edit in trial.edits:
-            of_module.setdefault(edit.name, []).append(trial)
-    return [
-        f"{module} was edited since: {counted(len(own), 'trial')} of "
-        f"{some_of(sorted({f'{one.init}-{one.densify}' for one in own}))} are of the old code. "
-        "Give the command again to run the new one."
-        for module, own in of_module.items()
-    ]
-
-
-def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: the verdicts, what no verdict uses, and caveats.
-
-    They are about the whole experiment, so choosing the trials that a table shows cannot change a
-    verdict.
-    """
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import compare
-
-    comparison = compare(experiment)
-    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
-    sentences = (
-        caveats([*by_arm[first], *by_arm[second]], first, second)
-        for first, second in comparison.pairs
-    )
-    return [*comparison.lines(), *filter(None, sentences)]
 
 
 # Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA
@@ -438,85 +297,3 @@ def with_agreement(tables: Sequence[Table]) -> list[Table]:
         f"{', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench vote asks people."
     )
     return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]
-
-
-def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line that names the kinds of machine if trials ran on several."""
-    kinds = Counter(trial.machine for trial in trials)
-    unknown = kinds.pop(None, 0)
-    if len(kinds) < 2:
-        return []
-    listed = "; ".join(f"{kind}: {counted(count, 'trial')}" for kind, count in kinds.most_common())
-    rest = f"; not recorded: {unknown}" if unknown else ""
-    return [
-        f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings "
-        "give other last digits and, after thousands of iterations, other results."
-    ]
-
-
-def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each scene and initialiser with equal settings but several clouds."""
-    notes = []
-    groups = group_by(
-        trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init"))
-    )
-    for (scene, init, _), group in groups.items():
-        clouds = group_by([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
-        if len(clouds) > 1:
-            listed = "; ".join(f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items())
-            notes.append(
-                f"{scene}: trials of init {init} started from {len(clouds)} different clouds "
-                f"({listed})."
-            )
-    return notes
-
-
-def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each way of holding views out, with its scenes if there are several ways."""
-    notes = []
-    recorded = [trial for trial in trials if trial.record.held_out]
-    splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
-    for (question, words), group in sorted(
-        splits.items(), key=lambda item: (-len(item[1]), item[0])
-    ):
-        scenes = sorted({trial.scene for trial in group})
-        counts = sorted(
-            {(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group}
-        )
-        views = " and ".join(f"{test} of {test + train} views" for test, train in counts)
-        where = (
-            f", {', '.join(scenes)}"
-            if len(splits) > 1 and len({trial.scene for trial in recorded}) > 1
-            else ""
-        )
-        notes.append(f"Held out{f' ({question})' if question else ''}{where}: {words}; {views}.")
-    return notes
-
-
-def points_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each initialiser on the views that made its points, if photographs did."""
-    notes = []
-    for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
-        if choice == "all":
-            notes.append(
-                f"Initial points of {init}: from all views, test views included "
-                "(init.points_from=all)."
-            )
-        elif choice:
-            notes.append(
-                f"Initial points of {init}: from training views alone (init.points_from={choice})."
-            )
-    return notes
-
-
-def _points_from(trial: TrialResult) -> str:
-    """The views that made the trial's initial points: all or train; "" if no views did."""
-    if "init.points_from" in trial.config:
-        return str(trial.config["init.points_from"])
-    return "all" if trial.record.init_report.get("mean_track_length") is not None else ""
-
-
-def _arms(trials: Sequence[TrialResult]) -> str:
-    """``adc seeds 0, 1; volumetric seed 0``"""
-    groups = group_by(trials, lambda trial: trial.densify)
-    return "; ".join(f"{densify} {seeds_text(own)}" for densify, own in groups.items())

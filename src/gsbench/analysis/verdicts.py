@@ -13,9 +13,11 @@ Holm (1979). So a further arm never changes the verdict on another one.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration, Standing
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import (
     NO_DIRECTION,
@@ -24,14 +26,8 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import (
-    ALPHA,
-    TOO_SMALL,
-    UNDECIDED,
-    Outcome,
-    exact_for,
-    seeds_needed,
-)
+from gsbench.analysis.statistics import ALPHA, TOO_SMALL, UNDECIDED, Outcome, exact_for
+from gsbench.analysis.unfinished import lacking_words
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 from gsbench.words import some_of
 
@@ -88,10 +84,11 @@ def judge_pairs(
     trials: Sequence[TrialResult],
     pairs: Sequence[ArmPair],
     declared: ActiveDeclaration | None = None,
+    lacking: Sequence[Path] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
-    ``declared`` defines the families of tests.
+    ``declared`` defines the families of tests; ``lacking`` are folders of trials without a result.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primary = None if declared is None else asked_quantity(declared.metric, trials)
@@ -108,7 +105,8 @@ def judge_pairs(
             if metric.direction:
                 question = _question(by_arm, pair, metric, declared, standings.get(pair))
                 asked.append((pair, metric, question))
-    verdicts = _judge_families(trials, [(pair, own) for pair, _, own in asked], standings)
+    questions = [(pair, own) for pair, _, own in asked]
+    verdicts = _judge_families(trials, questions, standings, lacking)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0][0])
     judged = []
     for pair in pairs:
@@ -139,6 +137,7 @@ def _judge_families(
     trials: Sequence[TrialResult],
     asked: Sequence[tuple[ArmPair, Question]],
     standings: Mapping[ArmPair, Standing],
+    lacking: Sequence[Path],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair."""
 
@@ -171,7 +170,7 @@ def _judge_families(
                 looks=looks,
             )
         places = [place for place, _ in own]
-        verdicts |= dict(zip(places, judge(trials, declaration), strict=False))
+        verdicts |= dict(zip(places, judge(trials, declaration, lacking), strict=False))
     return [verdicts[place] for place in range(len(asked))]
 
 
@@ -248,12 +247,14 @@ def sentence(judged: PairVerdicts) -> str:
         if planned := first.question.seeds:
             seeds = f", with {first.pairs.seeds} of at most {len(planned)} seeds"
         return f"{against}: {waits}{in_words(first)}{seeds}. The metric was declared beforehand."
+    in_doubt = [one for one in verdicts if one.favours_lacking][:1]
     if all(one.interval is None for one in verdicts):
         return f"{against}: no verdict, {TOO_FEW.format(where)}."
     return (
         f"{against}, on {where}: {_by_word(verdicts, with_numbers=True)}. Exploratory: "
         f"{_why_exploratory(judged)}, so all metrics count, adjusted for their number "
         f"({max(one.family for one in verdicts)})."
+        + "".join(f" Undecided: {lacking_words(one.lacking)}." for one in in_doubt)
     )
 
 
@@ -446,17 +447,18 @@ def like_these_words(verdict: Verdict, words: Mapping[Outcome, str], what: str) 
 
 
 def outlying_words(verdict: Verdict) -> str:
-    """The outlying trials of a verdict in words; "" if there are none.
+    """The outlying trials, and the missing ones that make it undecided, in words; "" for none.
 
     For example ``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``.
     """
-    if not verdict.outlying:
-        return ""
-    labels, word = (
-        some_of([trial.label for trial in verdict.outlying]),
-        WORDS[verdict.outcome_without or "undecided"],
-    )
-    return f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
+    parts = [lacking_words(verdict.lacking)] if verdict.favours_lacking else []
+    if verdict.outlying:
+        labels = some_of([trial.label for trial in verdict.outlying])
+        word = WORDS[verdict.outcome_without or "undecided"]
+        parts.append(
+            f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
+        )
+    return "; ".join(parts)
 
 
 def p_text(p: float) -> str:

@@ -15,13 +15,14 @@ from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, read_experiment, seeds_text
-from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.analysis.statistics import SUPPORTED, TOO_SMALL
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import cloud_notes, machine_notes
+from gsbench.analysis.table_notes import cloud_notes, machine_notes
 from gsbench.analysis.verdicts import like_these_words, outlying_words
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.file import Claim, ClaimsFile
@@ -89,6 +90,8 @@ class ClaimVerdict:
         if not verdict.final:
             failed = f"; failed: {some_of(list(self.failed))}" if self.failed else ""
             return f"trials are missing: the next look waits for them{failed}"
+        if verdict.favours_lacking:
+            return "trials of one arm alone failed"
         if verdict.rests_on_outlying:
             return "it depends on trials far outside the others"
         seeds = verdict.pairs.seeds
@@ -129,7 +132,8 @@ class Check:
 
     def judged(self) -> list[Verdict]:
         """The verdicts on the declared questions from the trials that are done."""
-        return judge(read_experiment(self.home).trials, self.declaration)
+        experiment = read_experiment(self.home)
+        return judge(experiment.trials, self.declaration, experiment.lacking)
 
     def verdicts(self, judged: Sequence[Verdict]) -> list[ClaimVerdict]:
         """All claims in the order of the file, with the reasons why trials failed."""
@@ -171,7 +175,7 @@ def prepare(
                 words = (*own, f"name={file.name}", "seed=0", *permissions)
                 if words not in composed:
                     where = f"claim {claim.id}, scene {scene}, arm {arm}"
-                    composed[words] = _compose(words, runs, where)
+                    composed[words] = _compose(words, permissions, runs, where)
                 trials.append(composed[words])
             if lacking := [*find_missing(trials[:1]), *find_missing(trials[1:])]:
                 reasons.setdefault(lacking[0], []).append(scene)
@@ -261,9 +265,9 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
         raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
 
 
-def _compose(words: Sequence[str], runs: Path, where: str) -> Trial:
+def _compose(words: Sequence[str], typed: Sequence[str], runs: Path, where: str) -> Trial:
     try:
-        trial = compose_one(words)
+        trial = compose_one(words, typed)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return Trial(trial.values | {"runs": str(runs.resolve())}, trial.overrides)

@@ -10,20 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from gsbench.analysis.designs import POWER, Design, power_of_mean
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import FIRST_LOOK, look_levels, plan_looks
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import (
-    FIRST_LOOK,
-    POWER,
-    REFUTED,
-    SUPPORTED,
-    TOO_SMALL,
-    Design,
-    look_levels,
-    plan_looks,
-    power_of_mean,
-)
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.claims.file import LeastEffect, read_least
 from gsbench.claims.stopping import facts_for
 from gsbench.errors import InputError
@@ -214,7 +206,9 @@ def _not_worse(verdict: Verdict) -> bool:
 
 
 def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult]:
-    return [replace(trial, config_hash=version) for trial in trials]
+    return [
+        one if one.config_hash == version else replace(one, config_hash=version) for one in trials
+    ]
 
 
 # ---- bisection: the search for the commit that made a trainer worse

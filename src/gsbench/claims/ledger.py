@@ -13,9 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.ledger import (

@@ -21,7 +21,7 @@ from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
-from gsbench.raster.executors import AUTO, offers, resolve
+from gsbench.raster.executors import AUTO, lacks, resolve
 from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.nested import GSBENCH, TARGET, targets_in
 from gsbench.runs.user_code import UserCode, user_modules
@@ -31,19 +31,6 @@ from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
 from gsbench.train.options import TrainConfig
 from gsbench.train.proof import Proven, create_proven
-
-# Features of a render that not every rasterizer has: the densifier's attribute that asks for it ->
-# (the rasterizer's attribute that offers it, the error's words).
-OPTIONAL_FEATURES = {
-    "needs_footprint": (
-        "has_footprint",
-        "needs the pixels that a Gaussian covers, and raster={} does not give them",
-    ),
-    "needs_splitting_matrix": (
-        "has_splitting_matrix",
-        "needs splitting matrices, and raster={} does not give them",
-    ),
-}
 
 
 class Parts:
@@ -128,7 +115,7 @@ class Parts:
         """The rasterizer for ``device``, with its proof. A user's own has none."""
         chosen = None if self.own_rasterizer is None else Proven(self.own_rasterizer)
         chosen = chosen or create_proven(self.values["raster"]["name"], self.device, self.threads)
-        self._check_features(chosen.rasterizer.name)
+        self._check_outputs(chosen.rasterizer.name)
         return chosen
 
     @property
@@ -162,24 +149,19 @@ class Parts:
         if on_this_machine and self.program is not None:
             self.program.executable()
         if own is not None or name != AUTO:
-            self._check_features(name if own is None else own.name)
+            self._check_outputs(name if own is None else own.name)
         if on_this_machine:
             device = self.device
             if own is None and name != AUTO:
                 resolve(name, device.type)
 
-    def _check_features(self, raster: str) -> None:
-        """Raise InputError if the densifier needs a feature that raster=``raster`` lacks."""
-        for need, (offer, words) in OPTIONAL_FEATURES.items():
-            if getattr(self.trainer, need, False) and not offers(
-                raster, offer, self.own_rasterizer
-            ):
-                able = " or ".join(
-                    f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer)
-                )
-                raise InputError(
-                    f"densify={self.values['densify']['name']} {words.format(raster)}; take {able}"
-                )
+    def _check_outputs(self, raster: str) -> None:
+        """Raise InputError if the densifier needs an output that ``raster`` does not give."""
+        # Another program has no needs, and a user's class may not extend ``Densifier``.
+        footprint = getattr(self.trainer, "needs_footprint", False)
+        extra = getattr(self.trainer, "needs_extra", None)
+        if lack := lacks(raster, self.own_rasterizer, footprint, extra):
+            raise InputError(f"densify={self.values['densify']['name']} {lack}")
 
 
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:

@@ -5,13 +5,14 @@ hanging thread cannot be ended, and a thread that is inside a C library when the
 crashes the process, after a trial that was complete. A process can be killed.
 
 `Mirror` starts the process, and at the end waits for it a bounded time. `follow` is the main
-function of the process. It gets the folders to follow on stdin, and reads everything else from
+function of the process. It gets folders and settings on stdin, and reads everything else from
 files. Its exit code says how it ended, and the last line on its stderr says why. `sync` mirrors,
 once, the trials that have ended.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
@@ -23,7 +24,7 @@ import time
 import traceback
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, chdir, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Queue
@@ -35,11 +36,13 @@ from gsbench.files import write_json
 from gsbench.parsing import read_if_sound
 from gsbench.runs.layout import CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.settings import foreign_address
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
 from gsbench.system.own_modules import allowed_modules
+from gsbench.system.programs import own_folder, safe_environment
 from gsbench.tracking.comparison import publish
-from gsbench.tracking.mlflow_sink import untyped_address
+from gsbench.tracking.mlflow_sink import VARIABLE, absolute_address
 from gsbench.tracking.sinks import Run, Sink
 from gsbench.tracking.trial import TrackedTrial
 from gsbench.words import counted
@@ -83,6 +86,14 @@ def make_sink(options: Mapping[str, Any], allowed: Sequence[str]) -> Sink:
 ERRORS = (Exception, SystemExit)
 
 
+def with_absolute_address(options: dict[str, Any]) -> dict[str, Any]:
+    """The settings ``tracking`` for a process in another folder than the command's."""
+    uri = options.get("uri")
+    if not uri and class_of(options) == MLFLOW:
+        uri = os.environ.get(VARIABLE)
+    return options | {"uri": absolute_address(uri)} if uri else options
+
+
 class MirrorError(Exception):
     """The error of a mirror that could not be written. Its text is the reason, in one line."""
 
@@ -106,14 +117,14 @@ class Mirror:
         """Mirror the trial in ``folder`` with the settings ``tracking`` from start to end."""
         if self._idle or not options["enabled"]:
             return
-        self._options = options
+        self._options = options = with_absolute_address(options)
         try:
             if self._process is not None and self._process.poll() is not None:
                 self._finish(self._process, 0)
             if self._process is None:
                 self._process = self._start()
             assert self._process.stdin is not None
-            self._process.stdin.write(f"{folder}\n".encode())
+            self._process.stdin.write(f"{json.dumps([str(folder), options])}\n".encode())
             self._process.stdin.flush()
         except OSError as error:
             self._warn(error)
@@ -131,13 +142,19 @@ class Mirror:
 
         Raises OSError where it cannot start.
         """
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process runs
+        # Trackers' clients read settings in the current folder: W&B would take its server's address
+        # from a stranger's ``wandb/settings``.
+        self._held = ExitStack()  # as long as the process runs
+        folder = self._held.enter_context(own_folder())
+        self._errors = self._held.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
             python_command(__name__, "follow", *words),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,  # what MLflow prints
             stderr=self._errors,
+            cwd=folder,
+            env=safe_environment(),
             # Ctrl-C must reach only the trials' process, which then ends this one
             start_new_session=True,
         )
@@ -145,7 +162,7 @@ class Mirror:
     def _finish(self, process: subprocess.Popen[bytes], seconds: float) -> None:
         """Close the process's input, wait for its end ``seconds`` at most, then kill it."""
         self._process = None
-        with self._errors, process:
+        with self._held, process:
             try:
                 process.communicate(timeout=seconds)
             except subprocess.TimeoutExpired:
@@ -301,19 +318,22 @@ def sync(
         options = values["tracking"] | ({"uri": uri} if uri else {})
         # The runs folder may be a stranger's. It must not make gsbench send files or passwords to
         # the stranger's address.
-        if address := untyped_address(options, uri):
+        if address := foreign_address(options, [uri] if uri else []):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "
                 f"--uri {address} was not typed"
             )
             continue
+        options = with_absolute_address(options)
         try:  # a class of a user's is run only with permission
             make_sink(options, allowed)
         except InputError as error:
             yield f"left out: {folder.label}: {error}"
             continue
         try:
-            is_new = mirror_ended(folder, options, values, allowed)
+            # for the same reason as in `Mirror`
+            with own_folder() as place, chdir(place):
+                is_new = mirror_ended(folder, options, values, allowed)
             pages[folder.home, options["uri"]] = folder, options
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
@@ -372,7 +392,9 @@ Lines = Queue[str | None]  # of stdin; None is the end
 
 
 def follow() -> NoReturn:
-    """Mirror the trials whose folders come on stdin, until it and the trials have ended.
+    """Mirror the trials that come on stdin, until it and the trials have ended.
+
+    Each line is JSON: a trial's folder, and its settings ``tracking``.
 
     Arguments of the process: the time between two readings of the files, and how long the parent
     waits for this process at the end; both in seconds.
@@ -398,10 +420,11 @@ def _follow(lines: Lines, pause: float) -> None:
     last = False
     while not last:
         with suppress(Empty):
-            path = lines.get(timeout=pause)
-            while path is not None:
-                trials.append(_FollowedTrial(TrialFolder(Path(path))))
-                path = lines.get_nowait()
+            line = lines.get(timeout=pause)
+            while line is not None:
+                folder, options = json.loads(line)
+                trials.append(_FollowedTrial(TrialFolder(Path(folder)), options))
+                line = lines.get_nowait()
             last = True
         for trial in trials:
             try:
@@ -421,14 +444,15 @@ def _follow(lines: Lines, pause: float) -> None:
 
 
 class _FollowedTrial:
-    """A trial to mirror.
+    """A trial to mirror with the settings ``options`` of tracking.
 
     Its run is opened once the trial runs or has ended, or when the sweep ends.
     """
 
-    def __init__(self, folder: TrialFolder) -> None:
-        self.folder, self.has_ended = folder, False
-        self.options: dict[str, Any] = {}
+    def __init__(self, folder: TrialFolder, options: dict[str, Any]) -> None:
+        # These are the settings that were checked: a trial that has not begun may have a stranger's
+        # `config.yaml`, with the stranger's address.
+        self.folder, self.options, self.has_ended = folder, options, False
         self._added_at = time.time()
         self._run: TrackerRun | None = None
 
@@ -445,7 +469,6 @@ class _FollowedTrial:
             return
         if self._run is None:
             values = self.folder.configuration()
-            self.options = values["tracking"]
             # the permissions that this process's parent got on its command line
             self._run = TrackerRun(self.folder, self.options, values, tuple(allowed_modules()))
         self._run.add_curves()

@@ -306,7 +306,7 @@ def explain_cell(address: str, runs: Path) -> str:
 
 def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
     """The trials of a scene and of the one arm that ``word`` names (`Arm.answers_to`)."""
-    of_scene = [one for one in with_variants(experiment.trials) if one.scene == scene]
+    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
         raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
