@@ -47,7 +47,7 @@ def in_looks(
     """The ledger's rule, restated for many nights at once; without ``lond`` Bonferroni's levels."""
     count = len(differences)
     level = 2 * RATE / IDEAS * ((kept + 1) if lond else np.ones(count))  # both sides
-    level = level / (RETRIES if differences.shape[1] == 1 else 1.0)
+    level = level / RETRIES
     undecided, keep = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
     seeds = np.full(count, LOOKS[-1])
     for number, look in enumerate(LOOKS):

@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
 
@@ -89,9 +90,12 @@ def is_path(value: str) -> bool:
         return False
 
 
-def is_utf8(text: str) -> bool:
-    """Return whether a name is UTF-8: Python reads other bytes of a file's name as surrogates."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+def is_one_line(name: str) -> bool:
+    """Return whether a name is UTF-8 without control characters and line breaks.
+
+    Python reads bytes of a file's name that are not UTF-8 as surrogates.
+    """
+    return not any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name)
 
 
 def printable(text: str) -> str:

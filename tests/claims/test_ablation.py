@@ -16,8 +16,8 @@ from gsbench.claims.ablation import (
     runs_to_train,
 )
 from gsbench.config.build import build
-from gsbench.config.command_words import options
 from gsbench.config.compose import compose_one
+from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import config_hash

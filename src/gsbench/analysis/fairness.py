@@ -164,11 +164,13 @@ def budget_words(trial: TrialResult) -> str | None:
 
 
 def _code(trial: TrialResult) -> str | None:
-    parts = sorted(text.removeprefix("code of ") for text in trial.code_texts)
     release = trial.record.versions.get("gsbench")
     program = f"{trial.program} {trial.trainer_version}".strip()
     return (
-        ", ".join(filter(None, [program, f"gsbench {release}" if release else "", *parts])) or None
+        ", ".join(
+            filter(None, [program, f"gsbench {release}" if release else "", *trial.code_texts])
+        )
+        or None
     )
 
 

@@ -51,9 +51,9 @@ def look_levels(
     """
     # Equally noisy scenes alone would not do: the test is cautious there, so each look would get
     # all that may be spent.
-    simulated = [_simulate_looks(1, looks, draws, seed=seed)]
+    simulated = [simulate_looks(1, looks, draws, seed=seed)]
     if scenes > 1:
-        simulated += [_simulate_looks(scenes, looks, draws, noise, seed) for noise in NOISY]
+        simulated += [simulate_looks(scenes, looks, draws, noise, seed) for noise in NOISY]
     # The test itself keeps the level of the first look.
     levels = [alpha * (looks[0] / looks[-1]) ** SPENDING_POWER]
     free = [np.ones(draws, dtype=bool) for _ in simulated]
@@ -78,7 +78,7 @@ def look_levels(
 
 
 @dataclass(frozen=True, eq=False)
-class _Sequences:
+class Sequences:
     """Simulated sequences of trainings without an effect, with ``weights`` [D] that sum to 1.
 
     ``sizes`` [L, D] are means in standard errors at each look; ``even`` [L, D] say how evenly the
@@ -101,7 +101,7 @@ class _Sequences:
 
 
 def _rates(
-    simulated: Sequence[_Sequences], look: int, errors: Sequence[NDArray[np.int64]], level: float
+    simulated: Sequence[Sequences], look: int, errors: Sequence[NDArray[np.int64]], level: float
 ) -> Array:
     """The rate of each kind of sequences at a look with this level."""
     pairs = zip(simulated, errors, strict=True)
@@ -138,9 +138,9 @@ def _parts(scenes: int, looks: tuple[int, ...]) -> list[_Part]:
 
 
 @cache
-def _simulate_looks(
+def simulate_looks(
     scenes: int, looks: tuple[int, ...], draws: int, noise: float = 1.0, seed: int = 0
-) -> _Sequences:
+) -> Sequences:
     """Sequences in which the first of ``scenes`` is ``noise`` times as noisy as the others.
 
     Errors are frequent in parts of them, and weights undo that (importance sampling). The drift of
@@ -166,7 +166,7 @@ def _simulate_looks(
         weights += np.exp(logs)
     variances = squares * deviations**2 / (seeds - 1)[..., None]
     sizes = np.abs(sums) / np.sqrt(variances.sum(axis=2))
-    return _Sequences(scenes, looks, sizes, evenness(variances), len(parts) / weights / draws)
+    return Sequences(scenes, looks, sizes, evenness(variances), len(parts) / weights / draws)
 
 
 def _draw(

@@ -37,27 +37,24 @@ UNSURE = 0.8  # of pilots have the real deviation within the stated range
 class Purpose:
     """The purpose of the trials.
 
-    ``rate`` is the error rate of one question, divided by ``alone`` on a single scene. ``looks``
-    says whether it is judged in looks, and ``give_up`` is the chance at each look that an idea with
-    just the difference is given up.
+    ``rate`` is the error rate of one question. ``looks`` says whether it is judged in looks, and
+    ``give_up`` is the chance at each look that an idea with just the difference is given up.
     """
 
     rate: float = ALPHA
     looks: bool = False
     give_up: float = 0.0
-    alone: float = 1.0
 
     def power(self, design: Design, difference: float, deviation: float) -> float:
         """The chance that the command shows ``difference``; pairs differ by ``deviation``."""
         if deviation == 0:
             return 1.0 if difference else 0.0
-        rate = self.rate / (self.alone if design.scenes == 1 else 1.0)
         if not self.looks:
-            return power_of_mean(deviation, design, difference, rate)
+            return power_of_mean(deviation, design, difference, self.rate)
         shown = np.zeros(DESIGN_DRAWS, dtype=bool)
         open_ = ~shown
         size = abs(difference) / deviation
-        for mean, error, region, level in _looks(design, rate):
+        for mean, error, region, level in _looks(design, self.rate):
             reach = region.limits(level) * error
             better = open_ & (size + mean > reach)
             shown |= better

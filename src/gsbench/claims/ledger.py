@@ -2,7 +2,7 @@
 
 The levels are LOND's (Javanmard and Montanari 2015, arXiv 1502.06197, eq. 3) with equal weights:
 with ``ideas`` planned tests and a false discovery rate ``rate``, the next test has the level
-``rate * (kept + 1) / ideas``, on one capture divided by `RETRIES`. LOND controls the false
+``rate * (kept + 1) / ideas``, divided by `RETRIES`. LOND controls the false
 discovery rate for p values with positive dependence (Zrnic, Ramdas and Jordan 2021, theorem 4),
 such as those of ideas that share the trainings of one baseline. Tests that run side by side count
 the ideas that were kept before they began, as the same paper does. `scripts/ledger_rates.py`
@@ -40,7 +40,8 @@ IDEAS, RATE = 40, 0.1  # the defaults of a ledger
 # It costs power and cannot make a false discovery.
 GIVE_UP = 0.05
 # Tries of what looked best share its noise, so they are kept by chance more often than their level
-# says. On several captures the test is careful enough for that; on one it has exactly its level.
+# says. With equally noisy captures the test is careful enough for that, but nobody knows
+# beforehand that one of them has not all of the noise.
 RETRIES = 3.0
 
 
@@ -52,8 +53,7 @@ def next_level(ledger: Ledger) -> float:
             f"all {opened.ideas} planned ideas were tried, so the error rate is spent: begin "
             "another ledger, with another baseline or other captures"
         )
-    retries = RETRIES if len(opened.keys) == 1 else 1.0
-    return opened.rate * (len(ledger.kept) + 1) / opened.ideas / retries
+    return opened.rate * (len(ledger.kept) + 1) / opened.ideas / RETRIES
 
 
 def declaration_of(ledger: Ledger, idea: str) -> Declaration:

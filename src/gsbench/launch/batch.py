@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.config.command_words import options
 from gsbench.config.compose import Trial
+from gsbench.config.groups import options
 from gsbench.config.schema import COMPONENTS
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
@@ -149,7 +149,7 @@ def check_trackers(trials: Sequence[Trial]) -> None:
     """Raise InputError for a tracker that cannot be made, or needs a package that is missing."""
     for trial in trials:
         if (options := trial.values["tracking"])["enabled"]:
-            make_sink(options, trial.values[PERMISSIONS])
+            make_sink(options, trial.values.get(PERMISSIONS) or ())
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:

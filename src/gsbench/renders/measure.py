@@ -19,8 +19,9 @@ from PIL import Image
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import TrialResult, read_experiment, read_views
-from gsbench.config.command_words import options, typed_permissions
+from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
+from gsbench.config.groups import options
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize

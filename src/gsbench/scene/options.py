@@ -176,9 +176,11 @@ class SceneConfig:
     validation: bool = False  # drop the test views, and measure on views held out of the rest
     # centred: moved to the image centre, as 3DGS assumes
     principal_point: Literal["used", "centred"] = "used"
-    views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
-    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
-    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
+    # courtyard only, as are the next three: in steps of 7.5 degrees; 48 close the ring
+    views: Annotated[int, Interval(ge=3, le=9999)] = 48
+    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400  # px
+    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300  # px
+    # of the small variations: every seed has the same plan
     seed: Annotated[int, Interval(ge=0, le=2**31 - 1)] = 0
 
     def __post_init__(self) -> None:

@@ -234,8 +234,8 @@ def plan(argv: Sequence[str], runs: Path) -> int:
 def _purpose(command: str, questions: int | None) -> Purpose:
     """The purpose of a command's trials; ideas share a rate of which each takes one side."""
     if command == "ledger":
-        rate = 2 * RATE / (questions or IDEAS)
-        return Purpose(rate, looks=True, give_up=GIVE_UP, alone=RETRIES)
+        rate = 2 * RATE / RETRIES / (questions or IDEAS)
+        return Purpose(rate, looks=True, give_up=GIVE_UP)
     return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
 
 
