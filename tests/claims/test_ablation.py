@@ -15,11 +15,11 @@ from gsbench.claims.ablation import (
     off_settings,
     runs_to_train,
 )
+from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.analysis.synthetic import Plan, trial_data, write_trial

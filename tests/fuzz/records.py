@@ -39,7 +39,8 @@ from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking.sinks import MirrorState, TrackedTrial
+from gsbench.tracking.sinks import Run
+from gsbench.tracking.trial import TrackedTrial
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
 from tests.finished import record_of
@@ -317,10 +318,10 @@ def look(runs, places):
     attempt(lambda: read_declarations(home))
     attempt(lambda: search_summary(home))
     for folder in {path.parent for path in places.values()} - {home}:
-        attempt(lambda folder=folder: TrialFolder(folder).configuration())
-        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())
-        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", MirrorState))
-        attempt(lambda folder=folder: _mirror(folder))
+        attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]
+        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())  # type: ignore[misc]
+        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", Run))  # type: ignore[misc]
+        attempt(lambda folder=folder: _mirror(folder))  # type: ignore[misc]
     attempt(lambda: TrialFolder.of(v := values_of(runs, "adc", 0, 0.03)).why_not_done(v))
     return refused
 
