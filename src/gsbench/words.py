@@ -23,6 +23,18 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def split_outside_brackets(text: str, mark: str) -> list[str]:
+    """The parts of ``text`` between ``mark``; a value in brackets may have the mark itself."""
+    parts, depth = [""], 0
+    for letter in text:
+        depth += (letter in "[{(") - (letter in "]})")
+        if letter == mark and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
 def readable_time(seconds: float) -> str:
     """Seconds in a readable unit."""
     if seconds < 90:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsbench.analysis.addresses import fitting
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import budget_words
@@ -233,15 +234,11 @@ def _group_into_studies(
 def _arm_pairs(
     trials: Sequence[TrialResult], question: PooledQuestion, path: Path
 ) -> list[tuple[Arm, Arm]]:
-    """The pair (baseline, arm) of each initialiser that has both.
-
-    A name of an arm is its densifier, its densifier with its variant, or its full name.
-    """
+    """The pair (baseline, arm) of each initialiser that has both."""
     arms = sorted({trial.arm for trial in trials})
 
     def named(init: str, names: Sequence[str]) -> list[Arm]:
-        own = [arm for arm in arms if arm.init == init]
-        return [arm for arm in own if any(map(arm.answers_to, names))]
+        return sorted(fitting([trial for trial in trials if trial.init == init], names))
 
     pairs = []
     for init in sorted({arm.init for arm in arms}):

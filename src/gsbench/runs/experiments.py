@@ -162,10 +162,6 @@ class Arm:
         values = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)
         return f"{self.densify}[{values}]" if values else self.densify
 
-    def answers_to(self, word: str) -> bool:
-        """Return whether ``word`` names this arm, with or without initialiser and settings."""
-        return word in (str(self), self.short, f"{self.init}-{self.densify}", self.densify)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):
