@@ -18,7 +18,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import GRIDS, run_sweep
-from gsbench.app.other_sweepers import other_sweeper, prepare_other_sweeper, words_without_sweeper
+from gsbench.app.other_sweepers import (
+    GRID_SWEEPER,
+    best_line,
+    other_sweeper,
+    prepare_other_sweeper,
+    words_without_sweeper,
+)
 from gsbench.app.sweep import OWN, Sweep, TrialTask
 from gsbench.claims.stopping import log_verdicts
 from gsbench.config import compose
@@ -162,6 +168,9 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
             name,
             name,
         )
+    elif other not in ("", GRID_SWEEPER) and task.objective:
+        if line := best_line(task.trials, task.objective):
+            log.info("hydra/sweeper=%s: %s", other, line)
 
 
 def _checked_config(words: Sequence[str], multirun: bool) -> tuple[DictConfig, bool]:

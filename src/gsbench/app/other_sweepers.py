@@ -1,15 +1,20 @@
 """Another sweeper than gsbench's own: Hydra's, or one of an installed package."""
 
 import logging
+import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import product
 
 from omegaconf import DictConfig, OmegaConf
 
+from gsbench.analysis.results import group_by
 from gsbench.app.sweep import OWN, Objective, TrialTask, metric_of
 from gsbench.config import compose
 from gsbench.config.command_words import bare_key, grid_points, is_sweep, key_of, parse_word
-from gsbench.errors import InputError
+from gsbench.config.compose import Trial
+from gsbench.errors import GsbenchError, InputError
+from gsbench.words import counted
 
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
@@ -87,6 +92,40 @@ def prepare_other_sweeper(
     )
     kept = [word for word in words if key_of(word) != "seed" or not is_sweep(word)]
     return kept + ["~hydra.sweeper.params.seed"] * ("seed" in params)
+
+
+def best_line(trials: Sequence[Trial], objective: Objective) -> str:
+    """The best values that a sweeper proposed, with the command that repeats them.
+
+    It is "" if no job has all of its values.
+    """
+    by_job = group_by(trials, lambda trial: _job_words(trial, without="seed"))
+    values: dict[tuple[str, ...], float] = {}
+    for words, own in by_job.items():
+        with suppress(GsbenchError):  # a job that failed has no value
+            values[words] = objective.value(own)
+    if not values:
+        return ""
+    best = max(values, key=lambda words: objective.sign * values[words])
+    metric, direction = metric_of(trials[0].values)
+    swept = [word for word in best if not all(word in words for words in by_job)]
+    seeds = dict.fromkeys(str(trial.values["seed"]) for trial in by_job[best])
+    command = [*best, f"seed={','.join(seeds)}"]
+    return (
+        f"best: {' '.join(swept) or 'the only job'}, {metric} "
+        f"{values[best] * direction * objective.sign:.4g} of test views "
+        f"({counted(len(seeds), 'seed')}); again: gsbench "
+        f"{'-m ' * (len(seeds) > 1)}{shlex.join(command)}"
+    )
+
+
+def _job_words(trial: Trial, without: str) -> tuple[str, ...]:
+    """The words of a trial's job without Hydra's own and without one key."""
+    return tuple(
+        word
+        for word in trial.overrides
+        if key_of(word) != without and not parse_word(word).is_hydra_override()
+    )
 
 
 def _maximizes(sweeper: DictConfig) -> bool:
