@@ -125,10 +125,11 @@ def _is_new(record: logging.LogRecord) -> bool:
     """Return whether a warning about a scene has not been shown by this command."""
     if record.levelno < logging.WARNING or not f"{record.name}.".startswith(OF_SCENES):
         return True
-    if not hasattr(record, "is_new"):  # several handlers ask about one record
-        record.is_new = record.getMessage() not in _shown_of_scenes
+    known = vars(record)
+    if "is_new" not in known:  # several handlers ask about one record
+        known["is_new"] = record.getMessage() not in _shown_of_scenes
         _shown_of_scenes.add(record.getMessage())
-    return bool(record.is_new)
+    return bool(known["is_new"])
 
 
 def _make_printable(record: logging.LogRecord) -> bool:

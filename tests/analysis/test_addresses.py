@@ -19,7 +19,12 @@ from tests.analysis.synthetic import write_arms
 
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
 VALUES = st.one_of(
-    st.floats(allow_nan=False), st.integers(), st.booleans(), st.none(), NAMES, st.lists(st.integers()),
+    st.floats(allow_nan=False),
+    st.integers(),
+    st.booleans(),
+    st.none(),
+    NAMES,
+    st.lists(st.integers()),
     st.just("mine.a:b"),
 )
 

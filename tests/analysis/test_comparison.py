@@ -20,11 +20,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsbench.analysis.comparison import Comparison, compare
+from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import t_test
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import sentence
+from gsbench.analysis.verdict_words import sentence
 from gsbench.claims.archive import write_archive
 from gsbench.claims.site import write_site
 from gsbench.runs.experiments import Declaration, open_question, record_text
@@ -149,7 +150,7 @@ def test_every_arm_is_compared_by_the_settings_that_both_have(
         write(tmp_path, grid(densify, **options))
     found = answer(tmp_path)
     assert against(found) == pairs
-    assert named in "\n".join(found.unused)
+    assert named in "\n".join(texts(found.unused))
 
 
 def test_an_arm_without_a_baseline_is_named_everywhere(
@@ -159,7 +160,7 @@ def test_an_arm_without_a_baseline_is_named_everywhere(
     write(tmp_path, [*grid("adc"), *grid("mine"), *alone])
     reason = "random-mine is not compared: there is no random-adc."
     experiment = load_experiment(tmp_path, "exp")
-    assert answer(tmp_path).unused == [reason]
+    assert texts(answer(tmp_path).unused) == [reason]
     plan(["exp"], tmp_path)
     tables(["exp", "--format", "json"], tmp_path)
     said = capsys.readouterr().out
@@ -339,7 +340,7 @@ def check_all_is_named(comparison: Comparison) -> None:
     }
     without = {str(one.second) for one in comparison.answers if not one.verdicts}
     without |= {str(one.first) for one in comparison.answers if not one.verdicts}
-    named = "\n".join(comparison.unused)
+    named = "\n".join(texts(comparison.unused))
     for trial in comparison.trials:
         label = f"{trial.experiment}/{trial.scene}/{trial.init}-{trial.densify}"
         known = trial.path in used or str(trial.arm) in without
@@ -365,7 +366,7 @@ def test_all_surfaces_state_the_same(made: tuple[list[Made], list[Made]]) -> Non
             assert f"Verdict, {sentence}" in notes
             assert f"<strong>{sentence}" in page
             assert sentence in told or len(told) > 4000  # cut to what a tag may hold
-        for line in comparison.unused:
+        for line in texts(comparison.unused):
             assert line in notes
             assert line in page
     finally:

@@ -14,11 +14,13 @@ import pytest
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.declaration import Standing, active_declaration
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import PairVerdicts, families, in_words, p_text
+from gsbench.analysis.verdict_words import families, in_words, p_text
+from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.runs.experiments import (
     STAMP,
     Arm,
@@ -206,7 +208,7 @@ def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
     assert {one.role(verdict) for verdict in one.verdicts} == {"secondary"}
-    assert one.notes == ("LPIPS Alex: weights file alexnet.pth not found",)
+    assert texts(one.notes) == ["LPIPS Alex: weights file alexnet.pth not found"]
     assert families([one]) == [
         "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 4 "
         "tests."

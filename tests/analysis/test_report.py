@@ -35,7 +35,8 @@ from gsbench.analysis.report.build import (
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
 from gsbench.analysis.results import Experiment, load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.analysis.verdicts import by_scene_lines, judge_pairs, sentence
+from gsbench.analysis.verdict_words import by_scene_lines, sentence
+from gsbench.analysis.verdicts import judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import Histogram

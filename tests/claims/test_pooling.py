@@ -96,7 +96,7 @@ def test_studies_are_rows_of_a_table():
         pool([Study("a", 1.0, Interval(0.9, 1.25), "paper-1"), Study("b", -0.5)])
     )
     assert first == "| a | +1 | +0.9 to +1.25 | paper-1 |"
-    assert second == "| b | -0.5 | unknown |  |"
+    assert second == "| b | -0.5 | – |  |"
 
 
 def archive(

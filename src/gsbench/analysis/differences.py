@@ -15,9 +15,11 @@ from typing import Any
 
 import yaml
 
+from gsbench.analysis.notes import Note
 from gsbench.analysis.results import (
     CODE,
     Arm,
+    Configured,
     TrialPair,
     TrialResult,
     canonical,
@@ -119,7 +121,7 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
     return {key: sorted(values) for key, values in values_by_condition.items() if len(values) > 1}
 
 
-def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
+def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
     """The settings in which trials differ, with their values, without `IGNORED_SETTINGS`.
 
     A missing key counts as unset (null): trials from before a setting existed equal later ones that
@@ -182,8 +184,8 @@ def _between_scenes(
     return differing
 
 
-def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[str]:
-    """Lines on arms that have other settings, conditions or code on other scenes.
+def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
+    """Notes on arms that have other settings, conditions or code on other scenes.
 
     A mean over the scenes hides these: an arm may have been tuned for each scene. ``sides`` are
     trials with their variants; arms of one name on two sides are two arms.
@@ -200,7 +202,7 @@ def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[str]:
             if texts:
                 arms_by_text.setdefault(some_of(texts), []).append(str(arm))
     return [
-        f"Scenes of {listed(list(dict.fromkeys(arms)))} differ in more than the scene: {text}."
+        Note.of("scenes differ", arms=list(dict.fromkeys(arms)), differences=text)
         for text, arms in arms_by_text.items()
     ]
 

@@ -96,7 +96,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
         shown = [_shown_in(side, key) for side in sides]
         rows.append(_row(key, shown, rule_above=index == 0))
     notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
-    notes += between_scenes_notes(*groups)
+    notes += map(str, between_scenes_notes(*groups))
     notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
     notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
     columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), DIFFERS))

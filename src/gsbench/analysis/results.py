@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
@@ -91,6 +91,25 @@ def canonical(value: object) -> str:
     if type(value) is int or (type(value) is float and math.isfinite(value)):
         return repr(value)  # the same text as JSON's, but faster: most settings are numbers
     return ENCODER.encode(value)
+
+
+class Configured(Protocol):
+    """A trial with its place and its settings, finished or only planned."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def scene(self) -> str: ...
+    @property
+    def init(self) -> str: ...
+    @property
+    def densify(self) -> str: ...
+    @property
+    def config_hash(self) -> str: ...
+    @property
+    def config(self) -> Mapping[str, Any]: ...
+    @property
+    def key(self) -> str: ...
 
 
 @dataclass(frozen=True)

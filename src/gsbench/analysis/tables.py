@@ -114,7 +114,7 @@ def build_table(
             above, text = text, " + ".join(names.get(value, value) for value in column)
         headings.append(Column(above, text, (one.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
-    notes += between_scenes_notes(varied)
+    notes += map(str, between_scenes_notes(varied))
     notes += trials_notes(experiment, trials)
     if left_out := experiment.warnings:
         notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")

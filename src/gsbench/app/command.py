@@ -168,9 +168,8 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
             name,
             name,
         )
-    elif other not in ("", GRID_SWEEPER) and task.objective:
-        if line := best_line(task.trials, task.objective):
-            log.info("hydra/sweeper=%s: %s", other, line)
+    elif other not in ("", GRID_SWEEPER) and (best := best_line(task.trials, task.objective)):
+        log.info("hydra/sweeper=%s: %s", other, best)
 
 
 def _checked_config(words: Sequence[str], multirun: bool) -> tuple[DictConfig, bool]:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import Sweep
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep, run_looks
+from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep
 from gsbench.config.command_words import (
     GROUPS,
     bare_key,
@@ -97,7 +97,7 @@ def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
         if batch:
             sweep.launch(batch)
 
-    run_looks(stopping.declaration, stopping.judged, run)
+    stopping.asked.answer(run)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [

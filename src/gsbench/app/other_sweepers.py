@@ -94,11 +94,13 @@ def prepare_other_sweeper(
     return kept + ["~hydra.sweeper.params.seed"] * ("seed" in params)
 
 
-def best_line(trials: Sequence[Trial], objective: Objective) -> str:
+def best_line(trials: Sequence[Trial], objective: Objective | None) -> str:
     """The best values that a sweeper proposed, with the command that repeats them.
 
     It is "" if no job has all of its values.
     """
+    if objective is None:
+        return ""
     by_job = group_by(trials, lambda trial: _job_words(trial, without="seed"))
     values: dict[tuple[str, ...], float] = {}
     for words, own in by_job.items():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair
 from gsbench.analysis.planning import COMMANDS, UNSURE, Purpose, deviation_range
 from gsbench.analysis.quantities import Quantity, quantity
@@ -23,10 +24,11 @@ from gsbench.analysis.statistics import (
 )
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
-from gsbench.claims.check import Check, make_page, prepare, recheck, to_html, to_text
+from gsbench.claims.check import Check, prepare, recheck
+from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, RETRIES
-from gsbench.claims.stopping import KeyAndSeed, run_looks
+from gsbench.claims.stopping import KeyAndSeed
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
 from gsbench.config.trust import PERMISSIONS
@@ -35,7 +37,7 @@ from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import declare_questions
-from gsbench.runs.experiments import ERROR_RATE, Question, read_declarations
+from gsbench.runs.experiments import ERROR_RATE, Question
 from gsbench.runs.layout import SEED
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
 from gsbench.words import counted
@@ -102,7 +104,7 @@ def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> None:
     if out is not None and out.suffix != ".html":
         raise InputError(f"--out {out}: a page ends in .html")
     with tempfile.TemporaryDirectory() as folder:
-        page = make_page(file, *recheck(file, archive, Path(folder)))
+        page = make_page(recheck(file, archive, Path(folder)))
         print(to_text(page), end="")
         if out is None:
             print("The whole page says what each verdict rests on: --out PAGE.html")
@@ -165,11 +167,12 @@ def _run(check: Check) -> None:
         if unfinished:
             run_batch(unfinished)
 
-    verdicts = check.verdicts(run_looks(check.declaration, check.judged, run))
-    page = make_page(check.file, verdicts, check.declaration, read_declarations(check.home))
-    write_text(check.home / HTML, to_html(page))
-    for verdict in verdicts:
-        print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.reason}")
+    checked = check.checked(check.asked.answer(run))
+    write_text(check.home / HTML, to_html(make_page(checked)))
+    for one in checked.verdicts:
+        print(f"{one.word:<19}  {one.claim.id}: {one.sentence}")
+    for note in texts(checked.unused):
+        print(note)
     print(check.home / HTML)
 
 
@@ -219,11 +222,11 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    print("\n".join([*comparison.sentences, *comparison.unused, *experiment.warnings]))
+    print("\n".join([*comparison.sentences, *texts(comparison.unused), *experiment.warnings]))
     for baseline, arm in comparison.pairs:
         paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
-            reason = next(iter(paired.left_out), "they share no scene and seed")
+            reason = next(map(str, paired.left_out), "they share no scene and seed")
             fault = f"no trials of {baseline} and {arm} can be paired in {metric.name}: {reason}"
             if len(comparison.pairs) == 1:
                 raise InputError(fault)

@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
+from gsbench.analysis.comparison import unused_trials
+from gsbench.analysis.notes import texts
 from gsbench.analysis.results import TrialResult, group_by, read_experiment
+from gsbench.analysis.verdict_words import reason, with_notes
 from gsbench.app.command import one_trial_per_scene, run_trials
 from gsbench.claims import gate as gates
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
+from gsbench.claims.stopping import KeyAndSeed, finished_trials
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.external.program import run_program
@@ -70,11 +73,11 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         }
         make_runs_folder(checked_runs_folder(str(home.parent)))
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
-        gate = gates.Gate(
-            declare_questions(home, declaration),
-            lambda: old,
-            lambda: finished_trials(home, trials.values()),
-        )
+
+        def new() -> list[TrialResult]:
+            return finished_trials(home, trials.values())
+
+        asked = gates.ask_gate(declare_questions(home, declaration), lambda: old, new)
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
             if code := run_trials([trials[key] for key in planned if key in trials]):
@@ -82,11 +85,12 @@ def gate(argv: Sequence[str], runs: Path) -> int:
                     "the new version's trials fail: nothing is compared"
                 )
 
-        (verdict,) = run_looks(gate.declaration, gate.judged, run)
+        (verdict,) = asked.answer(run)
         if verdict.answer is None and not verdict.equal:
-            reasons = filter(None, (verdict.untestable, *verdict.notes, "trials are missing"))
-            raise InputError(f"the versions cannot be compared: {next(reasons)}")
-        print("\n".join([gates.describe(verdict), *gates.deviations(old, list(gate.new()))]))
+            why = with_notes(reason(verdict), verdict)
+            raise InputError(f"the versions cannot be compared: {why}")
+        left_out = texts(unused_trials([*asked.read()], [verdict]))
+        print("\n".join([gates.describe(verdict), *left_out, *gates.deviations(old, new())]))
     return EXIT_CODES[gates.result_of(verdict)]
 
 
@@ -182,10 +186,10 @@ class CommitSearch:
             for version, k in places.items()
         }
         good, bad, new = (lambda home=home: _trials(home) for home in homes.values())
-        asked: gates.Gate | gates.Step = (
-            gates.Gate(self.declaration, good, new)
+        asked = (
+            gates.ask_gate(self.declaration, good, new)
             if number == last
-            else gates.Step(self.declaration, self.share, good, bad, new)
+            else gates.ask_step(self.declaration, self.share, good, bad, new)
         )
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
@@ -194,7 +198,7 @@ class CommitSearch:
                 self._train(place, homes[version], seeds)
 
         try:
-            verdicts = run_looks(asked.declaration, asked.judged, run)
+            verdicts = asked.answer(run)
         except TrainingError as error:
             if number == last or not good():
                 raise
