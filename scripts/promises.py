@@ -520,9 +520,8 @@ def table(share: float, word: str = "") -> str:
         limit = f"{'≥' if promise.at_least else '≤'} {100 * promise.limit:g} %"
         draws = max(20, round(share * promise.draws))
         lines.append(
-            f"| {promise.name} | {promise.where} | {limit} "
-            f"| {100 * mean:.1f} ± {100 * error:.1f} % "
-            f"| {draws} | {'yes' if promise.holds(mean, error) else '**no**'} |"
+            f"| {promise.name} | {promise.where} | {limit} | {100 * mean:.1f} ± {100 * error:.1f} "
+            f"% | {draws} | {'yes' if promise.holds(mean, error) else '**no**'} |"
         )
         print(lines[-1], file=sys.stderr, flush=True)
     return "\n".join(lines) + "\n"

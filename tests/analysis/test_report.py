@@ -686,8 +686,8 @@ def test_a_search_is_summed_up_in_a_line_and_a_chart(tmp_path):
     )
     assert "each point from 27.5 at 1 to 27.9 at 3." in chart
     assert summary(27.5)[0].endswith(
-        "(point 1). 1 of 2 points, each 1 seed. Judged by "
-        "validation views; no test view was looked at."
+        "(point 1). 1 of 2 points, each 1 seed. Judged by validation views; no test view was "
+        "looked at."
     )
     assert summary(None) == ("1 of 2 points, each 1 seed; 1 failed; none has a result yet.", "")
 

@@ -35,7 +35,7 @@ from tests.claims.test_file import GOOD, changed, without
 from tests.launch.test_declare import TINY
 
 SENTENCE = (
-    "volumetric against adc: better in PSNR (dB) on this scene: +1.000 (interval +0.998 to +1.002), "
+    "volumetric against adc: better in PSNR (dB) on this scene: +1.000 (interval +0.996 to +1.004), "
     "with 2 of at most 4 seeds"
 )
 EFFECT = 1.0  # dB, of "volumetric" in the made-up trials

@@ -269,7 +269,9 @@ def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
     adc, other = Arm("sfm", "adc"), Arm("dim", "adc")
 
     def pairs(*arms: Arm, arm: str = "volumetric", baseline: str = "adc") -> list[tuple[Arm, Arm]]:
-        trials: Any = [SimpleNamespace(arm=one) for one in arms]
+        trials: Any = [
+            SimpleNamespace(arm=one, init=one.init, config={}, variant=one.variant) for one in arms
+        ]
         return _arm_pairs(trials, replace(WANTED, arm=(arm,), baseline=(baseline,)), Path("a.zip"))
 
     assert pairs(adc, other, plain) == [(adc, plain)]

@@ -434,8 +434,8 @@ def with_agreement(tables: Sequence[Table]) -> list[Table]:
         return list(tables)
     note = (
         "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
-        "3DGS models was "
-        f"{', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench vote asks people."
+        f"3DGS models was {', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench "
+        "vote asks people."
     )
     return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]
 

@@ -66,8 +66,8 @@ def choose_switches(
     if not declared:
         raise InputError(
             f"densify={densify} declares no switch that is on: name one by "
-            "+densify.switches.NAME.off.KEY=VALUE, where "
-            "the setting turns a part off (docs/claims.md)"
+            "+densify.switches.NAME.off.KEY=VALUE, where the setting turns a part off "
+            "(docs/claims.md)"
         )
     chosen = {name: declared[name] for name in names or declared}
     if len(chosen) > MAX_SWITCHES:

@@ -153,10 +153,9 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
     kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
     if kinds[0] != kinds[1]:
         lines.append(
-            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than "
-            "the new trials "
-            f"({listed(kinds[1])}); this alone changes last digits and, after long training, "
-            "results"
+            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than the "
+            f"new trials ({listed(kinds[1])}); this alone changes last digits and, after long "
+            "training, results"
         )
     libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {
         "gsbench"
@@ -169,8 +168,7 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
         if versions[0] != versions[1]:
             lines.append(
                 f"deviation: the baseline was made with {name} {listed(versions[0])}, the new "
-                "trials with "
-                f"{listed(versions[1])}"
+                f"trials with {listed(versions[1])}"
             )
     return lines
 

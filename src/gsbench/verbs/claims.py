@@ -256,8 +256,8 @@ def _lines(
         between = f", between scenes by {components.between:{digits}}"
     lines = [
         f"  differences in {metric.name} vary between seeds by "
-        f"{components.within:{digits}}{between} "
-        f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
+        f"{components.within:{digits}}{between} (from {counted(components.trials, 'pair')} on "
+        f"{counted(components.scenes, 'scene')})"
     ]
     groups = {"these scenes": False, f"scenes like these (from {MIN_SCENES} scenes on)": True}
     for group, like_these in groups.items():

@@ -174,8 +174,8 @@ def check_form(out: Path) -> None:
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
             f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and "
-            "trainer reads, or in "
-            ".html, a page for browsers (docs/other_models.md says what makes other forms)"
+            "trainer reads, or in .html, a page for browsers (docs/other_models.md says what makes "
+            "other forms)"
         )
 
 

@@ -42,10 +42,9 @@ def gate(argv: Sequence[str], runs: Path) -> int:
     """
     parser = ArgumentParser(
         "gate",
-        "It trains this version on scenes and seeds of an archive (gsbench export --results), "
-        "seed by seed until it "
-        "is decided. Exit code 0: not worse by --least; 1: worse, or a trial failed; 3: undecided; "
-        "2: bad input (docs/gate.md).",
+        "It trains this version on scenes and seeds of an archive (gsbench export --results), seed "
+        "by seed until it is decided. Exit code 0: not worse by --least; 1: worse, or a trial "
+        "failed; 3: undecided; 2: bad input (docs/gate.md).",
     )
     parser.add_argument("archive", type=path, help="the results of the version that you trust")
     add_question(parser)
@@ -136,11 +135,9 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(
         "bisect",
         "It searches the git repository of this folder: one with a densifier of your own, or "
-        "gsbench's checkout. Each "
-        "step trains one commit in a work tree of its own and compares it with GOOD and BAD; all "
-        "steps share an error rate of 5 %. The same command goes on after a kill. Exit code 0: "
-        "found, 3: not found "
-        "(docs/gate.md).",
+        "gsbench's checkout. Each step trains one commit in a work tree of its own and compares it "
+        "with GOOD and BAD; all steps share an error rate of 5 %. The same command goes on after a "
+        "kill. Exit code 0: found, 3: not found (docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
     parser.add_argument("bad", help="a later one whose results are worse")
