@@ -3,27 +3,28 @@
 import ast
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 
 import pytest
 
+from gsbench.words import split_outside_brackets
 from tests.conftest import ROOT
 
 WIDTH, SPARE = 100, 10
 PART = re.compile(r'^ *(f?)"((?:[^"\\]|\\.)*)"$')  # a line that is one part of a text
+BREAK = re.compile(r"[a-z,] ?\n[a-z]")
 ENDS = tuple(".,:;)")  # a line may be short after one of these
 
 
 def first_word(text: str) -> str:
-    """The first word of a part with its blank; a replacement field is not broken."""
-    match = re.match(r"(?:\{[^{}]*(?:\{[^{}]*\}[^{}]*)*\}|[^ {])*[ ]?", text)
-    assert match is not None
-    return match.group()
+    """The first word of a part; a replacement field is not broken."""
+    return split_outside_brackets(text, " ")[0]
 
 
 def ragged_lines(source: str) -> Iterator[int]:
     """The numbers of the lines that break a sentence early: the next word has ample room."""
     lines = source.split("\n")
-    for number, (line, after) in enumerate(zip(lines, lines[1:], strict=False), 1):
+    for number, (line, after) in enumerate(pairwise(lines), 1):
         one, other = PART.match(line), PART.match(after.rstrip(",)"))
         if one is None or other is None or one[2].rstrip().endswith(ENDS) or "\\n" in one[2]:
             continue
@@ -36,9 +37,9 @@ def broken_texts(source: str) -> Iterator[str]:
     tree = ast.parse(source)
     statements = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and id(node) not in statements:
-            if isinstance(node.value, str) and re.search(r"[a-z,] ?\n[a-z]", node.value):
-                yield node.value
+        text = getattr(node, "value", None)
+        if id(node) not in statements and isinstance(text, str) and BREAK.search(text):
+            yield text
 
 
 FILES = sorted((ROOT / "src").rglob("*.py"))

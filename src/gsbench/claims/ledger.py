@@ -11,7 +11,9 @@ simulates it (docs/night.md).
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.comparison import unused_trials
+from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, plan_looks
@@ -167,6 +169,14 @@ def difference_of(verdict: Verdict) -> Difference | None:
     if verdict.mean is None or verdict.interval is None:
         return None
     return Difference(mean=verdict.mean, low=verdict.interval.low, high=verdict.interval.high)
+
+
+def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
+    """A note with the reason for the trials that are in no verdict on an idea."""
+    declarations = [declaration_of(ledger, idea) for idea in ledger.started]
+    declarations += [confirmation_of(ledger.opened, asked) for asked, _ in ledger.confirmations]
+    verdicts = [verdict for one in declarations for verdict in judge(trials, one)]
+    return unused_trials(trials, verdicts)
 
 
 def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
+from gsbench.analysis.notes import texts
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
@@ -300,7 +301,9 @@ def show(options: argparse.Namespace, home: Path) -> int:
         values = {"opened": book.opened.to_json(), "ideas": ideas, "confirmations": confirmations}
         print(json.dumps(values | _left(book), indent=1))
         return 0
-    print("\n".join([*describe_ledger(book), "", *map(to_markdown, ledger_tables(book))]))
+    left_out = texts(rules.unused(book, trials))
+    tables = map(to_markdown, ledger_tables(book))
+    print("\n".join([*describe_ledger(book), "", *tables, *left_out]))
     return 0
 
 
