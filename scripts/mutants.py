@@ -61,7 +61,6 @@ FURTHER_TESTS = {
     "init": YAML,
     "train": YAML,
 }
-TESTS = {"bench": "benchmarks"}  # where the folder has another name
 LEFT_OUT = "triton"  # files with this in their path
 # Swapped arguments change nothing in calls of these.
 SYMMETRIC = {"maximum", "minimum", "min", "max", "add", "ssim_map", "similarity", "fma", "dot"}
@@ -327,7 +326,7 @@ def tests_of_room(room: str, place: Path) -> list[str]:
     """The folder of a room's tests; for the ground floor, the files beside the folders."""
     if room == GROUND:
         return [path.relative_to(place).as_posix() for path in (place / "tests").glob("test_*.py")]
-    return [f"tests/{TESTS.get(room, room)}"]
+    return [f"tests/{room}"]
 
 
 def is_caught(fault: Fault, place: Path, reached: Reached) -> bool:

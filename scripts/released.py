@@ -1,15 +1,18 @@
-"""Write ``src/gsbench/released.json``, the digests of this release's rooms (docs/releasing.md).
+"""Write ``src/gsbench/released.json``, the digests of this release's packages (docs/releasing.md).
 
 python scripts/released.py
 """
 
+import itertools
+
 from gsbench.files import write_json
-from gsbench.runs import keys
+from gsbench.runs.keys import CODE_OF_STAGE
+from gsbench.runs.package_code import PACKAGE, RELEASED, digests_at_release
 
 
 def main() -> None:
-    rooms = sorted({room for rooms in keys.ROOMS.values() for room in rooms})
-    write_json(keys.PACKAGE / keys.RELEASED, {room: keys.room_digests(room) for room in rooms})
+    packages = sorted({*itertools.chain(*CODE_OF_STAGE.values())})
+    write_json(PACKAGE / RELEASED, {name: digests_at_release(name) for name in packages})
 
 
 if __name__ == "__main__":

@@ -1,23 +1,19 @@
 """Trials that are composed only once: Hydra takes a tenth of a second for each."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
 from gsbench.app.command import compose_trials
-from gsbench.config.compose import Trial
 
 
 @cache
-def _composed(words: tuple[str, ...], multirun: bool) -> list[Trial]:
+def _composed(words, multirun):
     return compose_trials(words, multirun)
 
 
-def composed(words: Sequence[str], multirun: bool = True) -> list[Trial]:
+def composed(words, multirun=True):
     """The trials of a command, in this test's runs folder. Equal words are composed once."""
     runs = {"runs": os.environ["GSBENCH_RUNS"]}
     return [

@@ -1,13 +1,9 @@
 """Fixtures that all tests share."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 # before torch is imported, as the program itself does
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -15,6 +11,9 @@ os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.helpers import words_of
+from tests.processes import completed
 
 # The same examples on every machine and however loaded it is: `pytest --hypothesis-profile=explore`
 # tries new ones.
@@ -27,7 +26,7 @@ settings.load_profile("gsbench")
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def script(name: str) -> Any:
+def script(name):
     """Load a file of scripts/ as a module."""
     specification = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     assert specification is not None
@@ -39,7 +38,7 @@ def script(name: str) -> Any:
 
 
 @pytest.fixture(scope="session")
-def shared() -> Path:
+def shared():
     """The folder with development data beside the checkout; skips if it is absent."""
     folder = ROOT.parent / "shared"
     if not (folder / "data").is_dir():
@@ -48,7 +47,7 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def shared_weights(shared: Path) -> Path:
+def shared_weights(shared):
     """The folder with small network weights; skips if it is absent."""
     if not (shared / "weights").is_dir():
         pytest.skip(f"needs the weights in {shared / 'weights'}")
@@ -56,14 +55,14 @@ def shared_weights(shared: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _own_search_path(monkeypatch: pytest.MonkeyPatch) -> None:
+def _own_search_path(monkeypatch):
     """Restore PYTHONSAFEPATH after each test: the program sets it for its children."""
     monkeypatch.setenv("PYTHONSAFEPATH", "")  # so that monkeypatch knows it, and restores it
     monkeypatch.delenv("PYTHONSAFEPATH")
 
 
 @pytest.fixture
-def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
+def caplog(caplog):
     """Catch gsbench's log lines, too: its logger does not propagate them once a command has run."""
     from gsbench.logs import LOGGER, set_up_logging
 
@@ -76,7 +75,27 @@ def caplog(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixtur
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def small_disk(tmp_path):
+    """A file system of three MiB; skips the test if this user may not mount one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", disk]
+    if completed(mount, code=None).returncode != 0:
+        pytest.skip("needs the right to mount a small tmpfs (root)")
+    yield disk
+    completed(["umount", "-l", disk])
+
+
+@pytest.fixture
+def plain_git(tmp_path, monkeypatch):
+    """Let git read no settings of the user's or the machine's."""
+    monkeypatch.setenv("GIT_CONFIG_GLOBAL", "/dev/null")
+    monkeypatch.setenv("GIT_CONFIG_NOSYSTEM", "1")
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
     """The runs folder of a test that works in its own folder; it is not made yet."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
@@ -88,9 +107,9 @@ def said(capsys):
     """A function that runs a command line, which must succeed, and returns what it prints."""
     from gsbench.cli import run
 
-    def call(*words: object) -> str:
+    def call(*command):
         capsys.readouterr()
-        assert run([*map(str, words)]) == 0
+        assert run(words_of(*command)) == 0
         return capsys.readouterr().out
 
     return call
@@ -101,9 +120,9 @@ def refused(capsys):
     """A function that runs a command line, which must be refused, and returns the error's line."""
     from gsbench.cli import run
 
-    def call(*words: object) -> str:
+    def call(*command):
         capsys.readouterr()
-        assert run([*map(str, words)]) == 2
+        assert run(words_of(*command)) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("gsbench: ")
         return line

@@ -1,15 +1,11 @@
 """The records of a finished trial and of a search, for tests that need one."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 from gsbench.runs.trial_record import TrialRecord
 
 
-def record_of(values: dict[str, Any], **changes: Any) -> TrialRecord:
+def record_of(values, **changes):
     """The record of a finished trial with the configuration ``values``; ``changes`` are fields."""
     fields = {
         "status": "complete",
@@ -31,7 +27,7 @@ def record_of(values: dict[str, Any], **changes: Any) -> TrialRecord:
     return TrialRecord(**(fields | changes))
 
 
-def write_results(folder: Path, values: dict[str, Any], **changes: Any) -> TrialRecord:
+def write_results(folder, values, **changes):
     """Write ``results.json`` without a record of the trial's inputs (``made_of``)."""
     record = record_of(values, **changes)
     folder.mkdir(parents=True, exist_ok=True)
@@ -39,7 +35,7 @@ def write_results(folder: Path, values: dict[str, Any], **changes: Any) -> Trial
     return record
 
 
-def search_record(points: list[dict[str, Any]]) -> dict[str, Any]:
+def search_record(points):
     """The content of ``tuning.json`` for a search with these points, for the arm ``volumetric``."""
     return {
         "sweep": "vth",

@@ -1,20 +1,29 @@
 """Child processes of tests: their signals, whether they run, and the files that they write."""
 
-from __future__ import annotations
-
 import signal
+import subprocess
 from contextlib import suppress
-from pathlib import Path
 
 import psutil
 
 
-def heed_interrupts() -> None:
+def completed(command, code=0, **options):
+    """Run a command to its end and return it with its output as text.
+
+    Its exit code must be ``code``, unless that is None.
+    """
+    options = {"capture_output": True, "text": True, "timeout": 600} | options
+    done = subprocess.run([*map(str, command)], check=False, **options)
+    assert code in (None, done.returncode), done.stderr
+    return done
+
+
+def heed_interrupts():
     """Restore SIGINT in a child (``preexec_fn``): tests in the background of a shell ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def is_running(pid: int) -> bool:
+def is_running(pid):
     """Return whether a process exists and has not ended; a zombie has ended."""
     try:
         return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
@@ -22,7 +31,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def bytes_written(folder: Path, pattern: str) -> int:
+def bytes_written(folder, pattern):
     """Count the bytes in files of ``folder`` that match ``pattern``; files may vanish meanwhile."""
     total = 0
     for path in folder.glob(pattern):

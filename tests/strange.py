@@ -1,11 +1,7 @@
 """A working folder with a stranger's files: modules that leave a mark when they are imported."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -32,7 +28,7 @@ class Calls(Callback):
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def place(tmp_path, monkeypatch):
     """The working folder of a command, with modules that were never allowed, and ``mine``."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
@@ -50,14 +46,12 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     allowed_modules().clear()
 
 
-def no_trial(trials: Any) -> Any:
+def no_trial(trials):
     """Stand in for a function that runs trials."""
     raise InputError("the trials began")
 
 
-def ask(
-    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> str:
+def ask(words, capsys, monkeypatch):
     """The one line with which a command is refused."""
     monkeypatch.setattr("gsbench.app.command.run_batch", no_trial)
     monkeypatch.setattr("gsbench.app.command.list_trials", no_trial)
@@ -66,7 +60,7 @@ def ask(
     return line
 
 
-def experiment(settings: dict[str, Any]) -> list[str]:
+def experiment(settings):
     """The words that run an experiment from a stranger's file."""
     folder = Path("conf/experiment")
     folder.mkdir(parents=True, exist_ok=True)

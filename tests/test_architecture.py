@@ -1,11 +1,8 @@
 """The rules of docs/architecture.md on imports between modules, also on those inside functions."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import re
-from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -55,11 +52,10 @@ ONLY = {
     ("config", "external"): {"gsbench.external.settings"},
 }
 
-Graph = Mapping[str, set[str]]
 TYPES_ONLY = "if TYPE_CHECKING:\n    {}\nelse:\n    pass"
 
 
-def modules() -> dict[str, Path]:
+def modules():
     """The file of every module of gsbench, by its dotted name; ``__init__`` by its package's."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -68,12 +64,12 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports_of(path: Path, inside_functions: bool = True, for_types: bool = False) -> Iterator[str]:
+def imports_of(path, inside_functions=True, for_types=False):
     """The dotted names that a file imports: modules, or names in them.
 
     ``for_types`` includes the imports that only type checkers run.
     """
-    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    pending = [ast.parse(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()
         types_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
@@ -91,10 +87,10 @@ def imports_of(path: Path, inside_functions: bool = True, for_types: bool = Fals
 
 
 @functools.cache
-def arrows(inside_functions: bool = True, for_types: bool = False) -> dict[str, set[str]]:
+def arrows(inside_functions=True, for_types=False):
     """For each module of gsbench, its imports: modules of gsbench, and names of other packages."""
     known = modules()
-    graph: dict[str, set[str]] = {}
+    graph = {}
     for name, path in known.items():
         graph[name] = set()
         for target in imports_of(path, inside_functions, for_types):
@@ -107,7 +103,7 @@ def arrows(inside_functions: bool = True, for_types: bool = False) -> dict[str, 
     return graph
 
 
-def reached(start: str) -> set[str]:
+def reached(start):
     """The module ``start`` and all modules of gsbench that it imports, also through others."""
     found, waiting = set[str](), [start]
     while waiting:
@@ -118,15 +114,15 @@ def reached(start: str) -> set[str]:
     return found
 
 
-def room(module: str) -> str:
+def room(module):
     """The room of a module: its folder below ``gsbench``, or itself if it is in none."""
     parts = module.split(".")
     return parts[1] if parts[0] == "gsbench" and len(parts) > 1 else ""
 
 
-def by_room(graph: Graph) -> dict[str, set[str]]:
+def by_room(graph):
     """The arrows between rooms."""
-    rooms: dict[str, set[str]] = {room(module): set() for module in graph if room(module)}
+    rooms = {room(module): set() for module in graph if room(module)}
     for module, targets in graph.items():
         if room(module):
             rooms[room(module)] |= {room(target) for target in targets if room(target)} - {
@@ -135,11 +131,11 @@ def by_room(graph: Graph) -> dict[str, set[str]]:
     return rooms
 
 
-def circle(graph: Graph) -> list[str]:
+def circle(graph):
     """The members of a circle of arrows in order, with the first again at the end; [] if none."""
-    done: set[str] = set()
+    done = set()
 
-    def visit(name: str, way: list[str]) -> list[str]:
+    def visit(name, way):
         if name in way:
             return [*way[way.index(name) :], name]
         if name in done or name not in graph:
@@ -153,7 +149,7 @@ def circle(graph: Graph) -> list[str]:
     return next((found for name in sorted(graph) if (found := visit(name, []))), [])
 
 
-def upward(graph: Graph) -> list[str]:
+def upward(graph):
     """Each arrow between rooms that does not run down, in words."""
     level = {name: number for number, names in enumerate(reversed(FLOORS), 1) for name in names}
     level |= dict.fromkeys(GROUND_FLOOR, 0)
@@ -166,7 +162,7 @@ def upward(graph: Graph) -> list[str]:
     return found
 
 
-def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
+def way_to(graph, start, goals):
     """A shortest chain of imports from a module to one of ``goals``; [] if none.
 
     Importing a module also runs the packages that contain it.
@@ -186,7 +182,7 @@ def way_to(graph: Graph, start: str, goals: Iterable[str]) -> list[str]:
     return []
 
 
-def test_no_circle_of_files() -> None:
+def test_no_circle_of_files():
     """Imports for type checkers count, since readers follow them, too."""
     found = circle(arrows(for_types=True))
     assert not found, f"{' imports '.join(found)}: the last of these imports closes a circle"
@@ -195,9 +191,7 @@ def test_no_circle_of_files() -> None:
 @pytest.mark.parametrize(
     "back", ["{}", "def later():\n    {}", "class A:\n    def later(self):\n        {}", TYPES_ONLY]
 )
-def test_a_planted_circle_of_files_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, back: str
-) -> None:
+def test_a_planted_circle_of_files_is_found(tmp_path, monkeypatch, back):
     (tmp_path / "init").mkdir()
     for name, text in {
         "__init__": "",
@@ -211,23 +205,23 @@ def test_a_planted_circle_of_files_is_found(
     assert found == ["gsbench.init.report", "gsbench.init.sfm", "gsbench.init.report"]
 
 
-def test_no_circle_of_folders() -> None:
+def test_no_circle_of_folders():
     found = circle(by_room(arrows()))
     assert not found, f"{' knows '.join(found)}: the last of these closes a circle"
 
 
-def test_every_room_has_a_floor_and_arrows_run_down() -> None:
+def test_every_room_has_a_floor_and_arrows_run_down():
     assert set(by_room(arrows())) <= set().union(*FLOORS) | GROUND_FLOOR
     assert not upward(arrows())
 
 
-def test_the_ground_floor_is_small() -> None:
+def test_the_ground_floor_is_small():
     loose = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
     assert loose == GROUND_FLOOR | {"cli", "__main__"}
 
 
-@pytest.mark.parametrize(("above", "below"), sorted(ONLY))
-def test_some_rooms_import_only_parts_of_others(above: str, below: str) -> None:
+@pytest.mark.parametrize("above, below", sorted(ONLY))
+def test_some_rooms_import_only_parts_of_others(above, below):
     for module, targets in arrows().items():
         if room(module) == above:
             seen = {target for target in targets if room(target) == below}
@@ -235,7 +229,7 @@ def test_some_rooms_import_only_parts_of_others(above: str, below: str) -> None:
 
 
 @pytest.mark.parametrize("name", LIBRARY)
-def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name: str) -> None:
+def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name):
     program = {
         module
         for module in arrows()
@@ -248,7 +242,7 @@ def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name: str
 
 
 @pytest.mark.parametrize("name", WITHOUT_TORCH)
-def test_rooms_of_quick_commands_load_no_torch(name: str) -> None:
+def test_rooms_of_quick_commands_load_no_torch(name):
     graph = arrows(inside_functions=False)
     for module in graph:
         if room(module) == name and not module.startswith(MAY_LOAD_TORCH):
@@ -260,7 +254,7 @@ def test_rooms_of_quick_commands_load_no_torch(name: str) -> None:
 MAY_LOAD_TORCH = ("gsbench.system.resources", "gsbench.system.device")
 
 
-def test_only_two_rooms_import_hydra() -> None:
+def test_only_two_rooms_import_hydra():
     for module, targets in arrows().items():
         assert not targets & HYDRA or room(module) in KNOW_HYDRA, (
             f"{module} imports {targets & HYDRA}"
@@ -268,13 +262,13 @@ def test_only_two_rooms_import_hydra() -> None:
 
 
 @pytest.mark.parametrize("library", sorted(HYDRA))
-def test_private_modules_of_hydra_are_not_imported(library: str) -> None:
+def test_private_modules_of_hydra_are_not_imported(library):
     internal = re.compile(rf"{library}\._")
     known = {name for name, path in modules().items() if any(map(internal.match, imports_of(path)))}
     assert not known
 
 
-def test_verbs_do_not_import_each_other() -> None:
+def test_verbs_do_not_import_each_other():
     # the arguments of all verbs, and the list of verbs
     shared = {"gsbench.verbs.arguments", "gsbench.verbs"}
     for module, targets in arrows().items():
@@ -283,7 +277,25 @@ def test_verbs_do_not_import_each_other() -> None:
             assert not others, f"{module} imports {others}"
 
 
-def test_the_checks_can_fail() -> None:
+def annotated(text):
+    """The functions of a file that have annotations. Triton's constants of a kernel need theirs."""
+    return [
+        node.name
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (node.returns or any(getattr(each, "annotation", None) for each in ast.walk(node.args)))
+        and "constexpr" not in ast.unparse(node.args)
+    ]
+
+
+def test_functions_of_tests_have_no_annotations():
+    assert annotated("def f(a, *b: int): ...\ndef g() -> None: ...") == ["f", "g"]
+    for path in Path(__file__).parent.rglob("*.py"):
+        found = annotated(path.read_text(encoding="utf-8"))
+        assert not found, f"{path}: {found}"
+
+
+def test_the_checks_can_fail():
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
     assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
     modules_apart = {"gsbench.train.x": {"gsbench.eval.x"}, "gsbench.eval.y": {"gsbench.train.y"}}

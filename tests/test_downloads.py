@@ -1,14 +1,9 @@
 """Downloads try again after failures that may pass, and say in one line why they gave up."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import time
-from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import requests
@@ -23,17 +18,17 @@ URL = "http://a.org/b"
 
 
 @pytest.fixture
-def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def pauses(monkeypatch):
     """The pauses, which take no time."""
-    pauses: list[float] = []
+    pauses = []
     monkeypatch.setattr(time, "sleep", pauses.append)
     return pauses
 
 
-def failing(errors: list[Exception]) -> Callable[[], str]:
+def failing(errors):
     """An action that raises the errors one after the other, and then succeeds."""
 
-    def action() -> str:
+    def action():
         if errors:
             raise errors.pop(0)
         return "done"
@@ -41,12 +36,12 @@ def failing(errors: list[Exception]) -> Callable[[], str]:
     return action
 
 
-def refusal(status: int) -> failures.HTTPError:
-    answer: Any = SimpleNamespace(status_code=status, reason="No")
+def refusal(status):
+    answer = SimpleNamespace(status_code=status, reason="No")
     return failures.HTTPError(f"{status} error", response=answer)
 
 
-def test_pauses_double_up_to_a_limit(pauses: list[float], caplog: pytest.LogCaptureFixture) -> None:
+def test_pauses_double_up_to_a_limit(pauses, caplog):
     caplog.set_level(logging.INFO, "gsbench")
     lost = [failures.ConnectionError("lost") for _ in range(7)]
     assert with_retries(failing(lost), URL, RetryPolicy(tries=8)) == "done"
@@ -54,15 +49,15 @@ def test_pauses_double_up_to_a_limit(pauses: list[float], caplog: pytest.LogCapt
     assert caplog.messages[:2] == ["lost: trying again in 1 s", "lost: trying again in 2 s"]
 
 
-def test_the_last_try_ends_with_an_error_without_a_pause(pauses: list[float]) -> None:
-    lost: list[Exception] = [urllib3.exceptions.HTTPError("lost") for _ in range(5)]
+def test_the_last_try_ends_with_an_error_without_a_pause(pauses):
+    lost = [urllib3.exceptions.HTTPError("lost") for _ in range(5)]
     with pytest.raises(FetchError, match=rf"^{URL}: 5 failures in a row \(lost\): to continue, "):
         with_retries(failing(lost), URL, RetryPolicy(pause=0.5))
     assert pauses == [0.5, 1, 2, 4]
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (failures.SSLError("old"), r"the certificate is not trusted here \(old\)"),
         (failures.InvalidURL("no host"), r"no address that can be fetched \(no host\)"),
@@ -70,25 +65,23 @@ def test_the_last_try_ends_with_an_error_without_a_pause(pauses: list[float]) ->
         *((refusal(status), f"the server says {status} No: give another") for status in (403, 404)),
     ],
 )
-def test_a_permanent_failure_is_not_tried_again(
-    error: Exception, said: str, pauses: list[float]
-) -> None:
+def test_a_permanent_failure_is_not_tried_again(error, said, pauses):
     with pytest.raises(InputError, match=said):
         with_retries(failing([error]), URL, RetryPolicy())
     assert pauses == []
 
 
 @pytest.mark.parametrize("status", [408, 425, 429, 500, 502, 503, 504])
-def test_a_busy_server_is_asked_again(status: int, pauses: list[float]) -> None:
+def test_a_busy_server_is_asked_again(status, pauses):
     assert with_retries(failing([refusal(status)]), URL, RetryPolicy()) == "done"
     assert pauses == [1]
 
 
 @pytest.mark.parametrize(
-    ("error", "reason"),
+    "error, reason",
     [
         (failures.ReadTimeout("x"), "no answer in time"),
-        (urllib3.exceptions.ReadTimeoutError(None, "", "x"), "no answer in time"),  # type: ignore[arg-type]
+        (urllib3.exceptions.ReadTimeoutError(None, "", "x"), "no answer in time"),
         (failures.ConnectionError("HTTPPool: Read timed out."), "no answer in time"),
         (failures.ChunkedEncodingError("x"), "the connection was cut"),
         (urllib3.exceptions.ProtocolError("x"), "the connection was cut"),
@@ -97,43 +90,39 @@ def test_a_busy_server_is_asked_again(status: int, pauses: list[float]) -> None:
         (failures.ConnectionError(), "ConnectionError"),
     ],
 )
-def test_a_failure_is_named_by_its_cause(error: Exception, reason: str) -> None:
+def test_a_failure_is_named_by_its_cause(error, reason):
     with pytest.raises(FetchError) as raised:
         with_retries(failing([error]), URL, RetryPolicy(tries=1))
     assert f"1 failures in a row ({reason})" in str(raised.value)
 
 
-@pytest.mark.parametrize(("length", "total"), [("5", 5), (None, None), ("many", None)])
+@pytest.mark.parametrize("length, total", [("5", 5), (None, None), ("many", None)])
 def test_every_try_starts_from_the_beginning_and_reports_its_bytes(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    pauses: list[float],
-    length: str | None,
-    total: int | None,
-) -> None:
+    tmp_path, monkeypatch, pauses, length, total
+):
     bodies = [[b"xy", failures.ChunkedEncodingError()], [b"abc", b"de"]]
-    asked: list[Any] = []
+    asked = []
 
     class Answer:
         headers = {} if length is None else {"Content-Length": length}
 
-        def __enter__(self) -> Answer:
+        def __enter__(self):
             return self
 
-        def __exit__(self, *error: object) -> None:
+        def __exit__(self, *error):
             pass
 
-        def raise_for_status(self) -> None:
+        def raise_for_status(self):
             pass
 
-        def iter_content(self, size: int) -> Any:
+        def iter_content(self, size):
             for piece in bodies.pop(0):
                 if isinstance(piece, Exception):
                     raise piece
                 yield piece
 
     monkeypatch.setattr(requests, "get", lambda url, **how: asked.append((url, how)) or Answer())
-    seen: list[tuple[int, int | None]] = []
+    seen = []
     digest = download(
         URL, tmp_path / "a", RetryPolicy(timeout=7), lambda done, whole: seen.append((done, whole))
     )

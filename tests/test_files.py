@@ -1,20 +1,16 @@
 """Writing and checking files: nothing is left half written, followed through a link, or waited for."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os
 import socket
 from collections import namedtuple
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from gsbench import files
-from gsbench.errors import GsbenchError, InputError, TrainingError
+from gsbench.errors import InputError, TrainingError
 from gsbench.files import (
     DiskFullError,
     atomic,
@@ -38,10 +34,8 @@ from gsbench.files import (
 Usage = namedtuple("Usage", "total used free")
 
 
-def test_a_file_appears_whole_or_stays_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    synced: list[int] = []
+def test_a_file_appears_whole_or_stays_as_it_was(tmp_path, monkeypatch):
+    synced = []
     monkeypatch.setattr(os, "fsync", synced.append)
     path = tmp_path / "a.json"
     left = tmp_path / f".a.json.tmp-{os.getpid()}"
@@ -64,9 +58,7 @@ def test_a_file_appears_whole_or_stays_as_it_was(
     assert len(synced) == 1
 
 
-def test_a_link_replaces_its_target_and_where_links_fail_a_copy_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_link_replaces_its_target_and_where_links_fail_a_copy_does(tmp_path, monkeypatch):
     source, target = tmp_path / "source", tmp_path / "target"
     source.write_text("new")
     target.write_text("old")
@@ -80,16 +72,14 @@ def test_a_link_replaces_its_target_and_where_links_fail_a_copy_does(
     assert sorted(tmp_path.iterdir()) == [source, target]
 
 
-def _refuse(number: int) -> Any:
-    def refuse(*arguments: Any, **named: Any) -> None:
+def _refuse(number):
+    def refuse(*arguments, **named):
         raise OSError(number, os.strerror(number))
 
     return refuse
 
 
-def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_written(
-    tmp_path: Path,
-) -> None:
+def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_written(tmp_path):
     out = tmp_path / "new" / "below" / "page.html"
     with writable_output(out):
         out.write_text("a")
@@ -102,7 +92,7 @@ def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_writ
 
 
 @pytest.fixture
-def special(tmp_path: Path) -> dict[str, Path]:
+def special(tmp_path):
     """A runs folder with a file, a folder, and below it what may not be there."""
     place = tmp_path / "runs" / "x"
     place.mkdir(parents=True)
@@ -120,7 +110,7 @@ def special(tmp_path: Path) -> dict[str, Path]:
 SPECIAL = ("pipe", "link", "linked", "dangling")
 
 
-def test_only_regular_files_are_opened(special: dict[str, Path]) -> None:
+def test_only_regular_files_are_opened(special):
     with os.fdopen(open_plain(special["file"])) as stream:
         assert stream.read() == "a"
     for name in (*SPECIAL, "folder"):
@@ -137,7 +127,7 @@ def test_only_regular_files_are_opened(special: dict[str, Path]) -> None:
         open_plain(made, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
 
 
-def test_links_are_found_on_the_way_and_only_if_asked_below(special: dict[str, Path]) -> None:
+def test_links_are_found_on_the_way_and_only_if_asked_below(special):
     runs = special["file"].parents[1]
     for place in (runs / "x", runs / "x" / "none" / "a", runs / "x" / "file" / "a"):
         require_no_links(runs, place)
@@ -160,7 +150,7 @@ def test_links_are_found_on_the_way_and_only_if_asked_below(special: dict[str, P
     require_no_links(runs, runs / "x", below=True)
 
 
-def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special: dict[str, Path]) -> None:
+def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special):
     for name in ("file", "folder", "link", "linked", "dangling"):
         require_regular(special[name])
     with socket.socket(socket.AF_UNIX) as server:
@@ -171,7 +161,7 @@ def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special: dict[str, 
                 require_regular(path)
 
 
-def test_the_remains_of_killed_writers_are_removed_and_no_other_files(tmp_path: Path) -> None:
+def test_the_remains_of_killed_writers_are_removed_and_no_other_files(tmp_path):
     kept = [".a.tmp-", ".a.tmp-1x", "a.tmp-1", ".tmp", ".hidden", "a"]
     for name in (".a.json.tmp-17", ".a.tmp", *kept):
         (tmp_path / name).touch()
@@ -182,10 +172,8 @@ def test_the_remains_of_killed_writers_are_removed_and_no_other_files(tmp_path: 
     assert {path.name for path in tmp_path.rglob("*")} == {"below", ".c.tmp-1", *kept}
 
 
-def test_syncing_reaches_the_disk_and_is_left_out_where_it_is_not_supported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    synced: list[int] = []
+def test_syncing_reaches_the_disk_and_is_left_out_where_it_is_not_supported(tmp_path, monkeypatch):
+    synced = []
     monkeypatch.setattr(os, "fsync", synced.append)
     before = len(os.listdir("/dev/fd"))
     sync_to_disk(tmp_path)
@@ -196,7 +184,7 @@ def test_syncing_reaches_the_disk_and_is_left_out_where_it_is_not_supported(
     assert len(os.listdir("/dev/fd")) == before
 
 
-def test_the_digest_of_a_file_is_its_sha256(tmp_path: Path) -> None:
+def test_the_digest_of_a_file_is_its_sha256(tmp_path):
     (tmp_path / "a").write_bytes(b"abc" * 10**6)
     assert file_sha256(tmp_path / "a") == hashlib.sha256(b"abc" * 10**6).hexdigest()
 
@@ -204,9 +192,7 @@ def test_the_digest_of_a_file_is_its_sha256(tmp_path: Path) -> None:
 # ---- the runs folder
 
 
-def test_the_runs_folder_is_absolute_and_can_be_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_runs_folder_is_absolute_and_can_be_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert checked_runs_folder("a/../b/c") == tmp_path / "b" / "c"
@@ -223,7 +209,7 @@ def test_the_runs_folder_is_absolute_and_can_be_made(
             checked_runs_folder(name)
 
 
-def test_a_runs_folder_is_made_and_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_runs_folder_is_made_and_tried(tmp_path, monkeypatch):
     folder = tmp_path / "a" / "runs"
     for _ in range(2):
         make_runs_folder(folder)
@@ -238,7 +224,7 @@ def test_a_runs_folder_is_made_and_tried(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("error", "kind", "words"),
+    "error, kind, words",
     [
         (OSError(errno.ENOSPC, "x"), DiskFullError, "is full"),
         (OSError(errno.EDQUOT, "x"), DiskFullError, "is full"),
@@ -255,9 +241,7 @@ def test_a_runs_folder_is_made_and_tried(tmp_path: Path, monkeypatch: pytest.Mon
         (FileNotFoundError(errno.ENOENT, "x"), None, ""),
     ],
 )
-def test_storage_errors_are_recognised(
-    tmp_path: Path, error: Exception, kind: type[GsbenchError] | None, words: str
-) -> None:
+def test_storage_errors_are_recognised(tmp_path, error, kind, words):
     found = explain_storage(error, tmp_path)
     assert type(found) is (kind or type(None))
     assert kind is None or (words in str(found) and str(error) not in str(found))
@@ -266,10 +250,8 @@ def test_storage_errors_are_recognised(
     assert raised.value is error or raised.value.__cause__ is error
 
 
-def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Path] = []
+def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(tmp_path, monkeypatch):
+    asked = []
     usage = Usage(10**9, 0, 65_535)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda path: asked.append(path) or usage)
     error, missing = RuntimeError("a library's text"), tmp_path / "not" / "there"
@@ -288,6 +270,6 @@ def test_on_a_disk_without_free_space_any_failed_write_counts_as_a_full_disk(
             raise own
 
 
-def test_a_text_with_a_name_that_is_not_utf_8_is_written(tmp_path: Path) -> None:
+def test_a_text_with_a_name_that_is_not_utf_8_is_written(tmp_path):
     write_text(tmp_path / "a.txt", "a \udcff b")
     assert (tmp_path / "a.txt").read_text() == "a \\udcff b"

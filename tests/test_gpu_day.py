@@ -1,7 +1,5 @@
 """scripts/gpu_day.sh without a GPU: every line is tried before the short time on a GPU."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -12,7 +10,6 @@ import tarfile
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -75,7 +72,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash, /pr
 class Day:
     """The script with its folders below ``folder``, and the stand-in for Python."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.out, self.state = folder / "out", folder / "state"
         stand_in = folder / "python"
         stand_in.write_text(STAND_IN.format(python=sys.executable))
@@ -94,16 +91,14 @@ class Day:
             "FAULTS": "{}",
         }
 
-    def bring(self) -> None:
+    def bring(self):
         """Make an archive like that of the verb ``wheels``."""
         brought = Path(self.environment["GPU_DAY_BROUGHT"])
         (brought / "site").mkdir(parents=True)
         with tarfile.open(brought / "brought.tar.xz", "w:xz") as archive:
             archive.add(brought / "site", "site")
 
-    def start(
-        self, *words: str, faults: dict[str, tuple[str, str]] | None = None, **more: str
-    ) -> subprocess.Popen[str]:
+    def start(self, *words, faults=None, **more):
         environment = self.environment | {"FAULTS": json.dumps(faults or {})} | more
         return subprocess.Popen(
             ["bash", str(SCRIPT), *words],
@@ -113,14 +108,12 @@ class Day:
             stderr=subprocess.STDOUT,
         )
 
-    def run(
-        self, *words: str, faults: dict[str, tuple[str, str]] | None = None, **more: str
-    ) -> tuple[int, str]:
+    def run(self, *words, faults=None, **more):
         with self.start(*words, faults=faults, **more) as process:
             said, _ = process.communicate(timeout=1700)
         return process.returncode, said
 
-    def results(self, verb: str) -> dict[str, Any]:
+    def results(self, verb):
         """The end of each part in the archive in $OUT; "files" has the names of the files in it."""
         with tarfile.open(self.out / f"gpu_day-{verb}.tar.gz") as archive:
             file = archive.extractfile(f"results/parts-{verb}.jsonl")
@@ -132,14 +125,14 @@ class Day:
 
 
 @pytest.fixture
-def day(tmp_path: Path) -> Day:
+def day(tmp_path):
     made = Day(tmp_path)
     made.bring()
     return made
 
 
 @pytest.mark.slow
-def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day: Day) -> None:
+def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
     faults = {
         "proof-triton": ("doctor --json --prove --raster triton", "hang"),
         "contract": ("test_contract.py -k triton", "kill"),
@@ -193,7 +186,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day: Day) ->
     }
 
 
-def test_a_killed_command_leaves_the_results_so_far_and_no_process(day: Day) -> None:
+def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
     process = day.start("all", "300", faults={"train-adc-0": ("densify=adc ", "hang")})
     marker = day.state / "results" / "train-adc-0.out"
     until = time.monotonic() + 60
@@ -214,14 +207,14 @@ def test_a_killed_command_leaves_the_results_so_far_and_no_process(day: Day) -> 
     assert (rest["train-adc-0"], rest["memcheck"]) == (0, 0)
 
 
-def test_named_parts_run_and_an_unknown_name_is_refused(day: Day) -> None:
+def test_named_parts_run_and_an_unknown_name_is_refused(day):
     code, said = day.run("rest", "60", "bits", "train-adc-3")
     assert code == 0, said
     assert day.results("rest").keys() == {"install", "bits", "train-adc-3", "files"}
     assert day.run("rest", "60", "bites")[1].endswith("there is no part bites\n")
 
 
-def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
+def test_without_a_compiled_gsplat_its_parts_are_not_tried(day):
     code, _ = day.run("all", "45", faults={"compilation": ("-c 0", "fail")})
     ends = day.results("all")
     assert (code, ends["compilation"]) == (1, 1)
@@ -232,7 +225,7 @@ def test_without_a_compiled_gsplat_its_parts_are_not_tried(day: Day) -> None:
     }
 
 
-def test_the_archive_has_packages_scene_and_weights(tmp_path: Path, shared: Path) -> None:
+def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
     """The scene has no tracks, but gives a training the same points."""
     from gsbench.scene.colmap import model_points, read_reference
     from gsbench.scene.readers import read_colmap
@@ -265,7 +258,7 @@ def test_the_archive_has_packages_scene_and_weights(tmp_path: Path, shared: Path
     assert len(list((there / "weights").iterdir())) == 2
 
 
-def test_a_table_of_two_commands(day: Day) -> None:
+def test_a_table_of_two_commands(day):
     assert day.run("all", "45", faults={"bits": ("test_same_bits.py", "fail")})[0] == 1
     assert day.run("rest", "60", "bits")[0] == 0
     code, said = day.run("table", str(day.out))
@@ -283,7 +276,7 @@ def test_a_table_of_two_commands(day: Day) -> None:
     assert "| train-volumetric_once-0 | 30000 | 12345 | 99.5 | - | 31.543 | - | - | - |" in said
 
 
-def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day: Day) -> None:
+def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day):
     (day.out.parent / "compute-sanitizer").write_text(
         "#!/bin/sh\necho '= Error: Device not supported'; exit 1\n"
     )
@@ -291,7 +284,7 @@ def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day
     assert "- memcheck: not tried, since" in day.run("table", str(day.out))[1]
 
 
-def test_an_unknown_verb_prints_the_usage(tmp_path: Path) -> None:
+def test_an_unknown_verb_prints_the_usage(tmp_path):
     code, said = Day(tmp_path).run("everything")
     assert code == 2
     assert "scripts/gpu_day.sh wheels" in said
@@ -299,7 +292,7 @@ def test_an_unknown_verb_prints_the_usage(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_whole_day_in_the_interpreter(day: Day) -> None:
+def test_the_whole_day_in_the_interpreter(day):
     triton = pytest.importorskip("triton")
     if fault := interpreter_fault(triton.__version__, version("numpy")):
         pytest.skip(fault)

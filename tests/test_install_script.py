@@ -1,10 +1,6 @@
 """`scripts/install.py` installs by uv with the indexes of pip's settings, else by pip."""
 
-from __future__ import annotations
-
 import subprocess
-from types import ModuleType
-from typing import Any
 
 import pytest
 
@@ -12,13 +8,11 @@ from tests.conftest import script
 
 
 @pytest.fixture
-def install() -> ModuleType:
+def install():
     return script("install")
 
 
-def test_indexes_of_pips_settings_are_passed_to_uv(
-    install: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_indexes_of_pips_settings_are_passed_to_uv(install, monkeypatch):
     listed = "global.index-url='https://a.org/simple'\nglobal.timeout='9'\n:env:.extra-index-url='https://b.org'\n"
     monkeypatch.setattr(
         install.subprocess,
@@ -31,15 +25,11 @@ def test_indexes_of_pips_settings_are_passed_to_uv(
     }
 
 
-@pytest.mark.parametrize(
-    ("uv", "code", "last"), [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")]
-)
-def test_pip_installs_if_uv_is_missing_or_fails(
-    install: ModuleType, monkeypatch: pytest.MonkeyPatch, uv: str | None, code: int, last: str
-) -> None:
-    ran: list[list[str]] = []
+@pytest.mark.parametrize("uv, code, last", [("uv", 0, "uv"), ("uv", 1, "pip"), (None, 0, "pip")])
+def test_pip_installs_if_uv_is_missing_or_fails(install, monkeypatch, uv, code, last):
+    ran = []
 
-    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+    def run(command, **_):
         ran.append(command)
         return subprocess.CompletedProcess(command, code if command[0] == "uv" else 0, stdout="")
 

@@ -1,12 +1,9 @@
 """Printed and logged text has no characters that control a terminal, whoever wrote it."""
 
-from __future__ import annotations
-
 import io
 import logging
 import sys
 import unicodedata
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -43,14 +40,14 @@ TURNING = set("LRE RLE LRO RLO PDF LRI RLI FSI PDI".split())  # noqa: SIM905
 
 
 @pytest.mark.parametrize("text", CONTROL_CHARACTERS)
-def test_control_characters_are_escaped(text: str) -> None:
+def test_control_characters_are_escaped(text):
     shown = printable(f"a {text} b")
     assert shown.isprintable()
     assert shown.encode("ascii").decode("unicode_escape") == f"a {text} b"
 
 
 @given(st.text(st.characters(exclude_categories=[])))
-def test_all_characters_that_control_a_terminal_are_escaped_and_no_others(text: str) -> None:
+def test_all_characters_that_control_a_terminal_are_escaped_and_no_others(text):
     shown = printable(text)
     assert not [
         c for c in shown if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in "\n\t"
@@ -64,16 +61,16 @@ def test_all_characters_that_control_a_terminal_are_escaped_and_no_others(text: 
     shown.encode()  # fails for surrogates, which names of files may have
 
 
-def test_text_in_any_language_is_unchanged() -> None:
+def test_text_in_any_language_is_unchanged():
     for text in ("größe 大きさ حجم 🏔️👩‍🔬", "a\tb\nc"):
         assert printable(text) == text
 
 
 @pytest.mark.parametrize("text", CONTROL_CHARACTERS)
 def test_control_characters_in_prints_logs_and_errors_are_escaped(
-    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(argv: list[str]) -> int:
+    text, tmp_path, monkeypatch, capsys
+):
+    def fail(argv):
         LOGGER.info("said: %s", text)
         print("printed:", text)
         with log_to(tmp_path / "log.txt"):
@@ -98,7 +95,7 @@ def test_control_characters_in_prints_logs_and_errors_are_escaped(
         LOGGER.removeHandler(handler)
 
 
-def test_streams_are_restored_and_keep_their_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_are_restored_and_keep_their_methods(monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", stream)
     with printable_output():
@@ -109,11 +106,11 @@ def test_streams_are_restored_and_keep_their_methods(monkeypatch: pytest.MonkeyP
         raise KeyError
     stream.flush()
     assert sys.stdout is stream
-    assert stream.buffer.getvalue() == b"\\x1b[31m\na\\x07b"  # type: ignore[attr-defined]
+    assert stream.buffer.getvalue() == b"\\x1b[31m\na\\x07b"
     assert logging.getLogger("gsbench") is LOGGER
 
 
-def test_log_lines_go_to_the_present_stderr(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_lines_go_to_the_present_stderr(monkeypatch):
     monkeypatch.setattr(LOGGER, "handlers", [])
     set_up_logging()
     closed, now = io.StringIO(), io.StringIO()
@@ -126,7 +123,7 @@ def test_log_lines_go_to_the_present_stderr(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.fixture
-def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+def said(monkeypatch, capsys):
     """What has come to stderr since the last call; the handlers of all loggers are restored."""
     monkeypatch.setattr(LOGGER, "handlers", [])
     monkeypatch.setattr(LOGGER, "propagate", True)
@@ -136,7 +133,7 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.mark.parametrize(
-    ("verbose", "shown"),
+    "verbose, shown",
     [
         (False, "INFO"),
         (True, "gsbench gsbench.eval gsbench.evaluate INFO"),
@@ -145,9 +142,7 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
         ("other", "INFO other"),
     ],
 )
-def test_debug_lines_are_those_asked_for(
-    verbose: bool | str | list[str], shown: str, said: Callable[[], str]
-) -> None:
+def test_debug_lines_are_those_asked_for(verbose, shown, said):
     set_up_logging()
     set_up_logging(verbose)  # replaces its own handlers
     assert len(LOGGER.handlers) == 1
@@ -160,21 +155,19 @@ def test_debug_lines_are_those_asked_for(
     assert said().split() == shown.split()
 
 
-def test_lines_go_through_the_handlers_of_another_library_and_come_once(
-    said: Callable[[], str], tmp_path: Path
-) -> None:
+def test_lines_go_through_the_handlers_of_another_library_and_come_once(said, tmp_path):
     class Kept(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
+        def emit(self, record):
             kept.append(record.getMessage())
 
-    kept: list[str] = []
+    kept = []
     root = logging.getLogger()
     root.addHandler(Kept())
     set_up_logging(through_root=True)  # no console there: gsbench writes, too
     LOGGER.info("one")
     assert (kept, said()) == (["one"], "one\n")
     raw = io.StringIO()
-    console = logging.StreamHandler(PrintableStream(raw))  # type: ignore[arg-type]
+    console = logging.StreamHandler(PrintableStream(raw))
     console.setFormatter(logging.Formatter("\x1b[32m%(message)s\x1b[0m"))
     root.addHandler(console)
     set_up_logging("gsbench.eval", through_root=True)
@@ -186,15 +179,13 @@ def test_lines_go_through_the_handlers_of_another_library_and_come_once(
     assert not LOGGER.propagate
 
 
-def test_a_trials_log_is_continued_with_all_lines_and_closed(
-    said: Callable[[], str], tmp_path: Path
-) -> None:
+def test_a_trials_log_is_continued_with_all_lines_and_closed(said, tmp_path):
     set_up_logging()
     for text in ("one", "two"):
         with log_to(tmp_path / "log.txt"):
             LOGGER.debug(text)
             (handler,) = set(LOGGER.handlers[1:])
-        assert handler.stream.closed  # type: ignore[attr-defined]
+        assert handler.stream.closed
     LOGGER.info("after")
     lines = (tmp_path / "log.txt").read_text().splitlines()
     assert [line.partition(" DEBUG ")[2] for line in lines] == ["gsbench: one", "gsbench: two"]
@@ -204,7 +195,7 @@ def test_a_trials_log_is_continued_with_all_lines_and_closed(
         pass
 
 
-def test_a_log_on_a_full_disk_stops_nothing(said: Callable[[], str]) -> None:
+def test_a_log_on_a_full_disk_stops_nothing(said):
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     with open("/dev/full", "w") as full:
@@ -217,12 +208,12 @@ def test_a_log_on_a_full_disk_stops_nothing(said: Callable[[], str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("encoding", "shown"), [("latin-1", b"\\u2191 \xe9"), ("ascii", b"\\u2191 \\xe9")]
+    "encoding, shown", [("latin-1", b"\\u2191 \xe9"), ("ascii", b"\\u2191 \\xe9")]
 )
-def test_what_an_encoding_lacks_is_escaped(encoding: str, shown: bytes) -> None:
+def test_what_an_encoding_lacks_is_escaped(encoding, shown):
     raw = io.BytesIO()
     stream = PrintableStream(io.TextIOWrapper(raw, encoding=encoding))
-    print("\u2191 \xe9", end="", file=stream, flush=True)  # type: ignore[call-overload]
+    print("\u2191 \xe9", end="", file=stream, flush=True)
     assert raw.getvalue() == shown
 
 

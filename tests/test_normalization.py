@@ -1,7 +1,5 @@
 """The frame of a training: models as COLMAP leaves them keep theirs, all others get COLMAP's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 import pytest
@@ -14,7 +12,7 @@ from gsbench.normalization import COLMAP_SIZE, IDENTITY, Normalization, find_nor
 SEEDS = st.integers(0, 10**6)
 
 
-def cameras(seed: int, count: int) -> np.ndarray:
+def cameras(seed, count):
     """Centres [V, 3] on a ring, on a plane, or in a box, of size about 1."""
     rng = np.random.default_rng(seed)
     if seed % 3 == 0:
@@ -23,7 +21,7 @@ def cameras(seed: int, count: int) -> np.ndarray:
     return rng.uniform(-1, 1, (count, 3)) * ([1, 1, 0.05] if seed % 3 == 1 else [1, 1, 1])
 
 
-def as_colmap_leaves(centers: np.ndarray) -> np.ndarray:
+def as_colmap_leaves(centers):
     """The centres after COLMAP's own normalisation of a model."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
@@ -39,19 +37,19 @@ def as_colmap_leaves(centers: np.ndarray) -> np.ndarray:
 
 
 @given(SEEDS, st.integers(8, 200))
-def test_models_that_colmap_normalized_keep_their_coordinates(seed: int, count: int) -> None:
+def test_models_that_colmap_normalized_keep_their_coordinates(seed, count):
     assert find_normalization(as_colmap_leaves(cameras(seed, count))) is IDENTITY
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 11, 12, 13, 14])
-def test_other_units_get_the_size_that_colmap_gives(count: int) -> None:
+def test_other_units_get_the_size_that_colmap_gives(count):
     for seed in range(6):
         normalization = find_normalization(100 * as_colmap_leaves(cameras(seed, count)))
         assert normalization.scale == pytest.approx(0.01, rel=1e-6), seed
 
 
 @pytest.mark.parametrize("count", [5, 6])
-def test_one_camera_far_away_decides_the_size_only_among_fewer_than_six(count: int) -> None:
+def test_one_camera_far_away_decides_the_size_only_among_fewer_than_six(count):
     centers = 100 * cameras(1, count)
     centers[0] *= 1e4
     size = COLMAP_SIZE / find_normalization(centers).scale
@@ -59,9 +57,7 @@ def test_one_camera_far_away_decides_the_size_only_among_fewer_than_six(count: i
 
 
 @given(SEEDS, st.integers(3, 60), st.floats(-4, 4), st.floats(0, 7))
-def test_normalized_cameras_do_not_depend_on_a_similarity(
-    seed: int, count: int, log_scale: float, log_shift: float
-) -> None:
+def test_normalized_cameras_do_not_depend_on_a_similarity(seed, count, log_scale, log_shift):
     centers = cameras(seed, count)
     normalization = find_normalization(centers)  # a size of about 1 is not ordinary
     assert not normalization.is_identity
@@ -78,9 +74,7 @@ def test_normalized_cameras_do_not_depend_on_a_similarity(
 
 
 @given(SEEDS, st.integers(8, 40), st.floats(3, 12))
-def test_one_camera_far_away_hardly_changes_the_scale(
-    seed: int, count: int, log_distance: float
-) -> None:
+def test_one_camera_far_away_hardly_changes_the_scale(seed, count, log_distance):
     centers = as_colmap_leaves(cameras(seed, count))
     before = find_normalization(centers)
     centers[seed % count] += 10**log_distance * np.array([0.2, -0.9, 0.4])
@@ -88,7 +82,7 @@ def test_one_camera_far_away_hardly_changes_the_scale(
     assert 0.2 < after.scale / before.scale < 5
 
 
-def test_a_rotation_changes_the_scale_by_less_than_two() -> None:
+def test_a_rotation_changes_the_scale_by_less_than_two():
     centers = cameras(3, 30)
     scales = [
         find_normalization(Rotation.random(random_state=k).apply(centers)).scale for k in range(20)
@@ -97,27 +91,25 @@ def test_a_rotation_changes_the_scale_by_less_than_two() -> None:
 
 
 @pytest.mark.parametrize("centers", [np.zeros((0, 3)), np.ones((5, 3)), np.full((3, 3), 5.4e6)])
-def test_cameras_at_one_place_are_not_normalized(centers: np.ndarray) -> None:
+def test_cameras_at_one_place_are_not_normalized(centers):
     assert find_normalization(centers) is IDENTITY
 
 
 @pytest.mark.parametrize(
-    ("center", "scale"), [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)]
+    "center, scale", [((0, 0, 0), 0), ((0, 0, 0), -1), ((0, float("nan"), 0), 1)]
 )
-def test_a_normalization_needs_finite_numbers_and_a_positive_scale(
-    center: tuple, scale: float
-) -> None:
+def test_a_normalization_needs_finite_numbers_and_a_positive_scale(center, scale):
     with pytest.raises(ValueError, match="positive scale"):
         Normalization(center, scale)
 
 
-def box(size: float, center: float = 0.0) -> np.ndarray:
+def box(size, center=0.0):
     """Two cameras at the ends of a diagonal of this length along x, around ``center``."""
     return np.array([[center - size / 2, 0, 0], [center + size / 2, 0, 0]])
 
 
 @pytest.mark.parametrize(
-    ("size", "center", "scale", "moved"),
+    "size, center, scale, moved",
     [
         (30.0, 0.0, 1.0, False),  # three times COLMAP's size
         (30.01, 0.0, 10 / 30.01, True),
@@ -130,9 +122,7 @@ def box(size: float, center: float = 0.0) -> np.ndarray:
         (5e-7, 1e5, 1.0, False),  # below what float64 can tell apart
     ],
 )
-def test_a_model_is_normalized_beyond_the_limits(
-    size: float, center: float, scale: float, moved: bool
-) -> None:
+def test_a_model_is_normalized_beyond_the_limits(size, center, scale, moved):
     found = find_normalization(box(size, center))
     assert found.is_identity != moved
     assert found.scale == pytest.approx(scale, rel=1e-4)
@@ -142,7 +132,7 @@ def test_a_model_is_normalized_beyond_the_limits(
         assert found.undo([0, 0, 2]).tolist() == pytest.approx([center, 0, 2 / scale])
 
 
-def test_a_scene_is_far_beyond_ten_sizes_after_scaling() -> None:
+def test_a_scene_is_far_beyond_ten_sizes_after_scaling():
     assert not Normalization((0.0, -100.0, 0.0), 1.0).is_far
     assert Normalization((0.0, -100.1, 0.0), 1.0).is_far
     assert not Normalization((0.0, -1000.0, 0.0), 0.1).is_far

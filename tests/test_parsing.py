@@ -6,7 +6,6 @@ import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -40,13 +39,13 @@ from gsbench.parsing import (
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="needs /proc")
-def test_a_file_that_reports_no_size_is_read_whole() -> None:
+def test_a_file_that_reports_no_size_is_read_whole():
     path = Path("/proc/version")
     assert path.stat().st_size == 0
     assert read_bytes(path) == path.read_bytes()
 
 
-def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path: Path) -> None:
+def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path):
     file = tmp_path / "a"
     file.write_bytes(b"x" * 10)
     assert read_bytes(file, most=10) == b"x" * 10
@@ -55,19 +54,17 @@ def test_a_file_is_read_up_to_its_limit_and_refused_beyond(tmp_path: Path) -> No
     assert [read_tail(file, count) for count in (3, 10, 11)] == [b"xxx", b"x" * 10, b"x" * 10]
 
 
-def test_a_file_that_grows_while_it_is_read_is_read_up_to_the_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_grows_while_it_is_read_is_read_up_to_the_limit(tmp_path, monkeypatch):
     """As from files in ``/proc`` that report no size, the pieces come one by one."""
     pieces = iter([b"ab", b"cd", b"ef", b""])
-    asked: list[int] = []
+    asked = []
     monkeypatch.setattr(os, "read", lambda _, most: asked.append(most) or next(pieces))
     (tmp_path / "a").write_text("x" * 4)
     assert read_bytes(tmp_path / "a", most=6) == b"abcdef"
     assert asked == [5, 5, 3, 1]
 
 
-def test_only_regular_files_are_read(tmp_path: Path) -> None:
+def test_only_regular_files_are_read(tmp_path):
     (tmp_path / "file").write_text("1")
     (tmp_path / "link").symlink_to(tmp_path / "file")
     os.mkfifo(tmp_path / "pipe")
@@ -84,7 +81,7 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     assert len(os.listdir("/dev/fd")) == before
 
 
-def test_a_byte_order_mark_is_removed_and_other_encodings_are_refused() -> None:
+def test_a_byte_order_mark_is_removed_and_other_encodings_are_refused():
     assert without_byte_order_mark("\ufeffä".encode()) == "ä".encode()
     assert without_byte_order_mark("ä\ufeff".encode()) == "ä\ufeff".encode()
     for encoding in ("utf-16-le", "utf-16-be", "utf-32-be", "utf-32-le"):
@@ -92,7 +89,7 @@ def test_a_byte_order_mark_is_removed_and_other_encodings_are_refused() -> None:
             without_byte_order_mark("\ufeffä".encode(encoding))
 
 
-def test_a_message_about_a_file_is_one_short_line() -> None:
+def test_a_message_about_a_file_is_one_short_line():
     assert one_line(" a\n\tb  c ") == "a b c"
     assert one_line("x" * MAX_MESSAGE) == "x" * MAX_MESSAGE
     assert one_line("x" * (MAX_MESSAGE + 1)) == "x" * MAX_MESSAGE + "…"
@@ -100,7 +97,7 @@ def test_a_message_about_a_file_is_one_short_line() -> None:
     assert (str(error), error.path, error.reason) == ("a/b is wrong", Path("a/b"), "is wrong")
 
 
-def nested(levels: int, innermost: Any = 1) -> Any:
+def nested(levels, innermost=1):
     """A value within so many lists."""
     for _ in range(levels):
         innermost = [innermost]
@@ -108,7 +105,7 @@ def nested(levels: int, innermost: Any = 1) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("value", "fault"),
+    "value, fault",
     [
         ({"a": [1, 2.5, "b", True, None]}, ""),
         (3, ""),
@@ -133,11 +130,11 @@ def nested(levels: int, innermost: Any = 1) -> Any:
     ],
     ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
 )
-def test_values_that_are_not_plain_are_named_by_their_place(value: Any, fault: str) -> None:
+def test_values_that_are_not_plain_are_named_by_their_place(value, fault):
     assert fault_of(value) == fault
 
 
-def test_values_are_counted_and_may_be_infinite_where_allowed() -> None:
+def test_values_are_counted_and_may_be_infinite_where_allowed():
     shared = [1, 2, 3]
     assert fault_of([shared, shared], most=9) == ""  # 1 + 2 + 2 * 3
     assert fault_of([shared, shared], most=8) == "it has more than 8 values"
@@ -146,7 +143,7 @@ def test_values_are_counted_and_may_be_infinite_where_allowed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    "text, fault",
     [
         ("a: !!python/object:os.system x", "is damaged: it has the tag tag:yaml.org,2002:python"),
         ("a: {b: 1, b: 2}", "is not YAML ('b' is in it twice (line 1))"),
@@ -161,14 +158,14 @@ def test_values_are_counted_and_may_be_infinite_where_allowed() -> None:
     ],
     ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
 )
-def test_dangers_in_yaml_are_named(tmp_path: Path, text: str, fault: str) -> None:
+def test_dangers_in_yaml_are_named(tmp_path, text, fault):
     (tmp_path / "a.yaml").write_text(text, errors="surrogateescape")
     with pytest.raises(DamagedError) as error:
         read_yaml(tmp_path / "a.yaml")
     assert error.value.reason.startswith(fault)
 
 
-def test_yaml_up_to_the_limits_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yaml_up_to_the_limits_is_read(tmp_path, monkeypatch):
     file = tmp_path / "a.yaml"
     shallow = (
         "[" + ",".join(["[]"] * (MAX_DEPTH + 5)) + "]"
@@ -197,7 +194,7 @@ def test_yaml_up_to_the_limits_is_read(tmp_path: Path, monkeypatch: pytest.Monke
         read_yaml(file)
 
 
-def test_json_is_read_if_it_is_plain(tmp_path: Path) -> None:
+def test_json_is_read_if_it_is_plain(tmp_path):
     file = tmp_path / "a.json"
     for text, said in (
         ("{", r"is not JSON \("),
@@ -219,13 +216,13 @@ class Row(Record):
     whole: Whole = 0
     number: Number = 0.0
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         if self.name == "wrong":
             raise ValueError("Name is wrong")
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
+    "content, reason",
     [
         ("{", "is not JSON (EOF while parsing an object at line 1 column 1)"),
         ("{}", "is damaged: it lacks 'amount'"),
@@ -244,13 +241,13 @@ class Row(Record):
         ('{"amount": true}', "is damaged: amount is True"),
     ],
 )
-def test_a_record_that_does_not_fit_is_described(content: str, reason: str) -> None:
+def test_a_record_that_does_not_fit_is_described(content, reason):
     with pytest.raises(DamagedError) as error:
         parse_typed(content.encode(), Row, Path("a.json"))
     assert error.value.reason.startswith(reason)
 
 
-def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_path: Path) -> None:
+def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_path):
     row = Row(amount=0, counts={"b": 2**63 - 1}, whole=1 - 2**63)
     assert row.to_json() == {"amount": 0, "counts": {"b": 2**63 - 1}, "whole": 1 - 2**63}
     assert Row(amount=0, name="b").to_json() == {"amount": 0, "name": "b"}
@@ -263,7 +260,7 @@ def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_
 
 
 @pytest.mark.parametrize(
-    ("content", "amounts", "warned"),
+    "content, amounts, warned",
     [
         ('{"amount": 1}\n{"amount": 2}\n', [1, 2], ""),
         ('{"amount": 1}\r\n{"amount": 2}', [1, 2], ""),
@@ -275,9 +272,7 @@ def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_
         ('{"amount": 1}, {"amount": 2}\n', [], "from line 1 on, which is not JSON"),
     ],
 )
-def test_rows_are_read_up_to_the_first_damaged_one(
-    content: str, amounts: list[int], warned: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_rows_are_read_up_to_the_first_damaged_one(content, amounts, warned, caplog):
     rows = list(iterate_rows(content.encode(), Row, Path("a.jsonl")))
     assert [row.amount for _, row in rows] == amounts
     assert [json.loads(line)["amount"] for line, _ in rows] == amounts

@@ -1,19 +1,13 @@
 """Progress in a log: some lines, and always the last one."""
 
-from __future__ import annotations
-
 import io
 import logging
 import sys
 
-import pytest
-
 from gsbench.logs import SECONDS_BETWEEN_LINES, no_progress, progress
 
 
-def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_log_gets_the_first_line_of_a_phase_and_the_last(caplog):
     caplog.set_level(logging.INFO, "gsbench")
     with progress("train") as report:
         for done in range(1, 5):
@@ -27,9 +21,7 @@ def test_a_log_gets_the_first_line_of_a_phase_and_the_last(
     ]
 
 
-def test_a_log_gets_a_line_from_time_to_time(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_gets_a_line_from_time_to_time(caplog, monkeypatch):
     caplog.set_level(logging.INFO, "gsbench")
     now = 1000.0
     monkeypatch.setattr("time.monotonic", lambda: now)
@@ -49,11 +41,9 @@ def test_a_log_gets_a_line_from_time_to_time(
     no_progress("a", 1, 2)
 
 
-def test_a_terminal_gets_a_bar_without_control_characters_of_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_terminal_gets_a_bar_without_control_characters_of_others(monkeypatch):
     class Terminal(io.StringIO):
-        def isatty(self) -> bool:
+        def isatty(self):
             return True
 
     monkeypatch.setenv("TERM", "xterm")
@@ -63,7 +53,7 @@ def test_a_terminal_gets_a_bar_without_control_characters_of_others(
     with progress("fetch") as report:
         report("a", 1, 2)
         report("b", 1, 2, "[red]\x07 of 5")
-    shown = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    shown = sys.stderr.getvalue()
     assert "fetch: b" in shown
     assert "[red]\\x07 of 5" in shown
     assert "\x07" not in shown

@@ -1,11 +1,7 @@
 """Files in the root of the project agree on facts that several of them state."""
 
-from __future__ import annotations
-
 import re
 import tomllib
-from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -18,25 +14,25 @@ PUBLIC = {"pypi.org", "files.pythonhosted.org"}
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 
-def normal(name: str) -> str:
+def normal(name):
     """A distribution's name as the package index compares it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def constraints() -> dict[str, str]:
+def constraints():
     lines = (ROOT / "constraints.txt").read_text().split()
     return {normal(name): version for name, version in (line.split("==") for line in lines)}
 
 
-def locked() -> list[dict[str, Any]]:
+def locked():
     return tomllib.loads((ROOT / "uv.lock").read_text())["package"]
 
 
-def names(requirements: list[str]) -> set[str]:
-    return {normal(re.match(r"[\w.-]+", line).group()) for line in requirements}  # type: ignore[union-attr]
+def names(requirements):
+    return {normal(re.match(r"[\w.-]+", line).group()) for line in requirements}
 
 
-def steps(workflow: Path) -> list[dict[str, Any]]:
+def steps(workflow):
     return [
         step
         for job in yaml.safe_load(workflow.read_text())["jobs"].values()
@@ -44,7 +40,7 @@ def steps(workflow: Path) -> list[dict[str, Any]]:
     ]
 
 
-def test_the_lock_has_the_versions_of_the_constraints() -> None:
+def test_the_lock_has_the_versions_of_the_constraints():
     pinned = constraints()
     different = {
         package["name"]: (package["version"], pinned[package["name"]])
@@ -54,11 +50,11 @@ def test_the_lock_has_the_versions_of_the_constraints() -> None:
     assert different == {}, "make lock"
 
 
-def test_every_constraint_is_of_a_locked_package() -> None:
+def test_every_constraint_is_of_a_locked_package():
     assert set(constraints()) - {normal(package["name"]) for package in locked()} == set()
 
 
-def test_the_lock_has_the_requirements_of_the_project_file() -> None:
+def test_the_lock_has_the_requirements_of_the_project_file():
     (own,) = (package for package in locked() if "editable" in package["source"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
@@ -80,7 +76,7 @@ def test_the_lock_has_the_requirements_of_the_project_file() -> None:
     ), "make lock"
 
 
-def test_the_lock_names_public_addresses_only() -> None:
+def test_the_lock_names_public_addresses_only():
     text = (ROOT / "uv.lock").read_text()
     assert {
         urlsplit(address).hostname for address in re.findall(r'"([a-z+]+://[^"]*)"', text)
@@ -90,7 +86,7 @@ def test_the_lock_names_public_addresses_only() -> None:
     assert [source["editable"] for source in sources if "editable" in source] == ["."]
 
 
-def test_all_files_state_the_same_version() -> None:
+def test_all_files_state_the_same_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == gsbench.__version__
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
@@ -98,14 +94,14 @@ def test_all_files_state_the_same_version() -> None:
     assert newest.group(1) == gsbench.__version__.removesuffix(".dev0")
 
 
-def test_the_pre_commit_hook_uses_the_pinned_ruff() -> None:
+def test_the_pre_commit_hook_uses_the_pinned_ruff():
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
     (ruff,) = (entry for entry in hooks if entry["repo"].endswith("/ruff-pre-commit"))
     assert ruff["rev"] == f"v{constraints()['ruff']}"
 
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
-def test_workflows_call_existing_targets_and_files(workflow: Path) -> None:
+def test_workflows_call_existing_targets_and_files(workflow):
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     called = {
         name
@@ -118,7 +114,7 @@ def test_workflows_call_existing_targets_and_files(workflow: Path) -> None:
             assert (ROOT / name).exists()
 
 
-def test_the_scripts_that_make_calls_exist() -> None:
+def test_the_scripts_that_make_calls_exist():
     assert [
         name
         for name in re.findall(r"scripts/\S+", (ROOT / "Makefile").read_text())
@@ -126,7 +122,7 @@ def test_the_scripts_that_make_calls_exist() -> None:
     ] == []
 
 
-def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
+def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci():
     makefile = (ROOT / "Makefile").read_text()
     wanted = {
         name
@@ -140,7 +136,7 @@ def test_every_target_for_tests_is_called_by_a_workflow_and_by_ci() -> None:
     assert wanted <= set(" ".join(calls).split())
 
 
-def test_linux_is_tested_from_the_oldest_supported_python() -> None:
+def test_linux_is_tested_from_the_oldest_supported_python():
     (tests,) = (path for path in WORKFLOWS if path.stem == "tests")
     tested = yaml.safe_load(tests.read_text())["jobs"]["linux"]["strategy"]["matrix"]["python"]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -148,12 +144,12 @@ def test_linux_is_tested_from_the_oldest_supported_python() -> None:
     assert tested == sorted(tested, key=lambda version: int(version.split(".")[1]))
 
 
-def test_the_core_tests_exist() -> None:
+def test_the_core_tests_exist():
     for name in (ROOT / "tests" / "core.txt").read_text().split():
         assert (ROOT / name).exists(), name
 
 
-def test_the_site_has_every_document() -> None:
+def test_the_site_has_every_document():
     """This test is quick and does not build the site; `make docs` finds broken links."""
 
     class Loader(yaml.SafeLoader):
@@ -176,7 +172,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
 
 
 @pytest.mark.parametrize(
-    ("link", "folder", "repository", "wanted"),
+    "link, folder, repository, wanted",
     [
         ("[a](search.md#here)", "docs", None, "[a](search.md#here)"),
         ("[a](#here)", "docs", None, "[a](#here)"),
@@ -210,14 +206,12 @@ REPOSITORY = "https://example.org/owner/gsbench/"
         ("```\n[a](../conf/densify/)\n```", "docs", None, "```\n[a](../conf/densify/)\n```"),
     ],
 )
-def test_links_are_rewritten_for_the_site(
-    link: str, folder: str, repository: str | None, wanted: str
-) -> None:
+def test_links_are_rewritten_for_the_site(link, folder, repository, wanted):
     assert script("build_site").with_site_links(link, ROOT / folder, repository) == wanted
 
 
 @pytest.mark.parametrize(
-    ("link", "wanted"),
+    "link, wanted",
     [
         ("[a](docs/gpu.md#x)", f"[a]({REPOSITORY}blob/main/docs/gpu.md#x)"),
         ("![a](docs/demo.jpg)", f"![a]({REPOSITORY}raw/main/docs/demo.jpg)"),
@@ -225,6 +219,6 @@ def test_links_are_rewritten_for_the_site(
         ("```\n[a](b.md)\n```", "```\n[a](b.md)\n```"),
     ],
 )
-def test_the_readme_of_the_package_has_absolute_links(link: str, wanted: str) -> None:
+def test_the_readme_of_the_package_has_absolute_links(link, wanted):
     pytest.importorskip("hatchling", reason="needs hatchling (group dev)")
     assert script("hatch_readme").absolute_links(link, REPOSITORY) == wanted

@@ -1,7 +1,5 @@
 """A sample of the simulations behind docs/promises.md; ``make promises`` repeats all of them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -16,19 +14,19 @@ SHARE = 0.02
 
 @pytest.mark.slow
 @pytest.mark.parametrize("promise", ALL, ids=lambda one: one.name)
-def test_a_promise_holds_in_a_sample(promise: object) -> None:
-    mean, error = promise.measure(SHARE)  # type: ignore[attr-defined]
-    assert promise.holds(mean, error), (mean, error)  # type: ignore[attr-defined]
+def test_a_promise_holds_in_a_sample(promise):
+    mean, error = promise.measure(SHARE)
+    assert promise.holds(mean, error), (mean, error)
 
 
-def test_each_promise_of_the_page_has_a_figure() -> None:
+def test_each_promise_of_the_page_has_a_figure():
     page = promises.PAGE.read_text(encoding="utf-8")
     rows = re.findall(r"^\| (.+?) \| .+ \| ([\d.]+) ± ([\d.]+) % \| \d+ \| (\S+) \|$", page, re.M)
     assert [name for name, *_ in rows] == [one.name for one in ALL]
     assert {holds for *_, holds in rows} == {"yes"}
 
 
-def test_a_broken_promise_is_noticed() -> None:
+def test_a_broken_promise_is_noticed():
     """Bisecting by comparisons with the first commit alone would name wrong ones."""
     promise = promises.Promise("always", "", 0.05, 1000, lambda rng: float(rng.random() < 0.2))
     assert not promise.holds(*promise.measure(1.0))
@@ -37,7 +35,7 @@ def test_a_broken_promise_is_noticed() -> None:
     assert promise.holds(*promises.Promise("fair", "", 0.5, 50, lambda _: 0.0).measure(1.0))
 
 
-def test_draws_of_a_sweep_have_the_stated_noise_and_correlation() -> None:
+def test_draws_of_a_sweep_have_the_stated_noise_and_correlation():
     rng = np.random.default_rng(0)
     made = promises.arms(rng, promises.noise_of(3, 4.0), 4000, [0.3], correlation=0.5)
     values = np.array([one.metrics["psnr"] for one in made]).reshape(2, 3, 4000)
@@ -47,7 +45,7 @@ def test_draws_of_a_sweep_have_the_stated_noise_and_correlation() -> None:
     assert differences.std(axis=1) == pytest.approx(np.array([0.4, 0.1, 0.1]) / 2**0.5, rel=0.05)
 
 
-def test_statements_about_scenes_like_these_share_the_rate_of_named_trials() -> None:
+def test_statements_about_scenes_like_these_share_the_rate_of_named_trials():
     """So do those of a ledger's confirmation and of an ablation, which name their trials."""
     made = promises.arms(np.random.default_rng(0), promises.noise_of(8, 1.0), 3, [0.0] * 4)
     asked = tuple(promises.question(f"arm{k}", 8, 3) for k in range(4))

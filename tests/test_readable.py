@@ -1,7 +1,5 @@
 """Text for people: times, sizes, names in sentences, suggestions."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsbench.events import Cause, RefineEvent, sum_events
@@ -19,7 +17,7 @@ from gsbench.words import (
 
 
 @pytest.mark.parametrize(
-    ("seconds", "text"),
+    "seconds, text",
     [
         (0.4, "0 s"),
         (89, "89 s"),
@@ -30,12 +28,12 @@ from gsbench.words import (
         (36 * 3600, "1.5 days"),
     ],
 )
-def test_times_are_shown_in_a_readable_unit(seconds: float, text: str) -> None:
+def test_times_are_shown_in_a_readable_unit(seconds, text):
     assert readable_time(seconds) == text
 
 
 @pytest.mark.parametrize(
-    ("count", "text"),
+    "count, text",
     [
         (None, "unknown size"),
         (0, "0 bytes"),
@@ -47,11 +45,11 @@ def test_times_are_shown_in_a_readable_unit(seconds: float, text: str) -> None:
         (10**9, "1 GB"),
     ],
 )
-def test_sizes_are_shown_in_a_readable_unit(count: int | None, text: str) -> None:
+def test_sizes_are_shown_in_a_readable_unit(count, text):
     assert readable_bytes(count) == text
 
 
-def test_numbers_and_names_are_put_into_sentences() -> None:
+def test_numbers_and_names_are_put_into_sentences():
     assert [counted(n, "trial") for n in (0, 1, 2)] == ["0 trials", "1 trial", "2 trials"]
     assert [least_text(0.005, relative) for relative in (False, True)] == ["0.005", "0.5 %"]
     assert [signed(0.5, ".2f"), signed(-0.03, ".1%")] == ["+0.50", "−3.0%"]
@@ -62,7 +60,7 @@ def test_numbers_and_names_are_put_into_sentences() -> None:
     ]
 
 
-def test_a_similar_word_is_suggested_whatever_its_case() -> None:
+def test_a_similar_word_is_suggested_whatever_its_case():
     words = (word for word in ("status", "tables"))
     assert did_you_mean("statsu", words) == "; did you mean status?"
     assert did_you_mean("TABLES", ["status", "tables"]) == "; did you mean tables?"
@@ -71,12 +69,12 @@ def test_a_similar_word_is_suggested_whatever_its_case() -> None:
 
 
 @pytest.mark.parametrize("text", ["", " ", "a\tb", "~nosuchuser/x"])
-def test_some_texts_can_be_no_path(text: str) -> None:
+def test_some_texts_can_be_no_path(text):
     assert not is_path(text)
     assert is_path("~/a b")
 
 
-def test_the_counts_of_a_refinement_explain_the_number_after_it() -> None:
+def test_the_counts_of_a_refinement_explain_the_number_after_it():
     grown = {"cloned": 1, "split_gradient": 2, "split_volume": 4, "added": 8}
     event = RefineEvent(step=7, before=100, after=67, pruned_opacity=16, pruned_size=32, **grown)
     assert event.balances()
@@ -98,7 +96,7 @@ def test_the_counts_of_a_refinement_explain_the_number_after_it() -> None:
     assert not {"step", "before", "after", "target", "volume_threshold"} & set(counts)
 
 
-def test_causes_have_fixed_numbers_and_colours_apart() -> None:
+def test_causes_have_fixed_numbers_and_colours_apart():
     assert {cause.key: int(cause) for cause in Cause} == {
         **{"initial": 0, "clone": 1, "split_gradient": 2},
         **{"split_volume": 3, "relocated": 4, "added": 5},

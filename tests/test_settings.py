@@ -54,7 +54,7 @@ class Options:
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "words"),
+    "name, given, words",
     [
         ("count", 0, "options.count must be a whole number above 0, got 0"),
         ("count", 1.5, "options.count must be a whole number above 0, got 1.5"),
@@ -85,13 +85,13 @@ class Options:
         ("folder", 3.5, "options.folder must be of type Path, got 3.5"),
     ],
 )
-def test_errors_state_the_key_the_rule_and_the_value(name: str, given: Any, words: str) -> None:
+def test_errors_state_the_key_the_rule_and_the_value(name, given, words):
     with pytest.raises(InputError) as error:
         check_values(Options, {name: given}, "options")
     assert str(error.value) == words
 
 
-def test_values_are_converted_to_their_type() -> None:
+def test_values_are_converted_to_their_type():
     given = {"count": 1e3, "rate": 2, "color": [0, 1, 2], "label": 7, "flag": "yes", "folder": "a"}
     result = check_values(Options, given, "options")
     assert result == {
@@ -105,24 +105,24 @@ def test_values_are_converted_to_their_type() -> None:
     assert [type(result[name]) for name in ("count", "rate", "label")] == [int, float, str]
 
 
-def test_the_fields_of_an_object_are_converted_also_if_it_is_frozen() -> None:
+def test_the_fields_of_an_object_are_converted_also_if_it_is_frozen():
     @dataclass(frozen=True)
     class Frozen:
         count: PositiveInt = 1
         label: str = ""
 
-    options: Any = Frozen(count=1e3, label=7)  # type: ignore[arg-type]
+    options = Frozen(count=1e3, label=7)
     check_settings(options, "options")
     assert (repr(options.count), options.label) == ("1000", "7")
 
 
-def test_a_default_of_the_class_may_break_its_own_rule() -> None:
+def test_a_default_of_the_class_may_break_its_own_rule():
     assert check_values(Options, {"farthest": math.inf}, "options") == {"farthest": math.inf}
     with pytest.raises(InputError, match="farthest must be a number, got -inf"):
         check_values(Options, {"farthest": -math.inf}, "options")
 
 
-def test_unknown_keys_name_the_nearest() -> None:
+def test_unknown_keys_name_the_nearest():
     with pytest.raises(
         InputError,
         match=r"^options\.cuont is not a setting; did you mean count\? \(there are: count, ",
@@ -133,24 +133,24 @@ def test_unknown_keys_name_the_nearest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "key"),
+    "make, key",
     [
         (lambda: ADC(start=-1), "densify.start"),
         (lambda: ADC(stop=500), "densify.stop"),
         (lambda: ADC(prune_opacity=math.nan), "densify.prune_opacity"),
-        (lambda: ADC(gradient="both"), "densify.gradient"),  # type: ignore[arg-type]
+        (lambda: ADC(gradient="both"), "densify.gradient"),
         (lambda: ADC(cap="curve", max_gaussians=None), "densify.max_gaussians"),
         (lambda: Volumetric(volume_interval=150), "densify.volume_interval"),
         (lambda: Volumetric(split_size=0), "densify.split_size"),
         (lambda: MCMC(growth=-0.1), "densify.growth"),
         (lambda: Sfm(peak_threshold=-1), "init.peak_threshold"),
         (lambda: Sfm(seed=2**31), "init.seed"),
-        (lambda: Dim(extractor="sift"), "init.extractor"),  # type: ignore[arg-type]
+        (lambda: Dim(extractor="sift"), "init.extractor"),
         (lambda: Dim(extractor="aliked", aliked_model="t16"), "init.aliked_model"),
         (lambda: Random(count=0), "init.count"),
     ],
 )
-def test_library_callers_get_the_same_errors(make: Any, key: str) -> None:
+def test_library_callers_get_the_same_errors(make, key):
     with pytest.raises(InputError, match=key):
         make()
 
@@ -162,11 +162,11 @@ class Own(ADC):
     patience: int = 5
 
 
-def test_a_users_own_fields_are_checked_by_their_type() -> None:
+def test_a_users_own_fields_are_checked_by_their_type():
     assert Own(patience=7).patience == 7
     for wrong in ({"patience": "long"}, {"interval": 0}):
         with pytest.raises(InputError, match=f"densify.{next(iter(wrong))}"):
-            Own(**wrong)  # type: ignore[arg-type]
+            Own(**wrong)
 
 
 ANYTHING = st.recursive(
@@ -179,7 +179,7 @@ ANYTHING = st.recursive(
 
 
 @given(st.sampled_from([one.name for one in dataclasses.fields(Options) if one.init]), ANYTHING)
-def test_any_value_is_accepted_or_refused_in_one_line(name: str, value: Any) -> None:
+def test_any_value_is_accepted_or_refused_in_one_line(name, value):
     options = dataclasses.replace(Options(), **{name: value})
     refusal = ""
     try:
@@ -198,7 +198,7 @@ def test_any_value_is_accepted_or_refused_in_one_line(name: str, value: Any) -> 
 
 
 @pytest.mark.parametrize(
-    ("value", "good"),
+    "value, good",
     [
         ("a b", True),
         ("größe", True),
@@ -209,12 +209,12 @@ def test_any_value_is_accepted_or_refused_in_one_line(name: str, value: Any) -> 
         ("a.-b", True),
     ],
 )
-def test_a_name_must_fit_into_a_path_on_every_system(value: str, good: bool) -> None:
+def test_a_name_must_fit_into_a_path_on_every_system(value, good):
     assert is_folder_name(value) == good
 
 
 @pytest.mark.parametrize(
-    ("value", "good"),
+    "value, good",
     [
         ("http://a:1", True),
         ("sqlite:///x", True),
@@ -222,11 +222,11 @@ def test_a_name_must_fit_into_a_path_on_every_system(value: str, good: bool) -> 
         *((text, False) for text in ("http:/a", "://a", "1a://b", "http://a b", "http://a\x07")),
     ],
 )
-def test_an_address_names_its_kind(value: str, good: bool) -> None:
+def test_an_address_names_its_kind(value, good):
     assert is_address(value) == good
 
 
-def test_whole_numbers_have_at_most_64_bits_at_any_depth() -> None:
+def test_whole_numbers_have_at_most_64_bits_at_any_depth():
     @dataclass
     class Large:
         number: int = 0
@@ -252,7 +252,7 @@ def test_whole_numbers_have_at_most_64_bits_at_any_depth() -> None:
         raise InputError(unknown_setting("x", "x", []))
 
 
-def test_annotations_are_described_in_words() -> None:
+def test_annotations_are_described_in_words():
     assert describe(Annotated[int, Interval(gt=0, le=4)]) == "a whole number in (0, 4]"
     assert describe(OpenFraction) == "a number in (0, 1)"
     assert describe(Threads) == "a whole number in [1, 4096]"

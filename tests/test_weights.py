@@ -1,7 +1,5 @@
 """Weights files: search, download, and refusal of wrong files."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging
@@ -9,9 +7,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -27,28 +23,24 @@ from gsbench.weights import (
     hub_cache,
     load_state,
 )
-from tests.datasets.server import Manners, Server, serve
+from tests.datasets.server import Manners, serve
 
 STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
 
-def spec(
-    content: bytes | None = None, url: str | None = None, digits: int = 64, name: str = "net.pth"
-) -> WeightsFile:
+def spec(content=None, url=None, digits=64, name="net.pth"):
     sha256 = None if content is None else hashlib.sha256(content).hexdigest()[:digits]
     return WeightsFile((name, f"other/{name}"), url, sha256, "example.org")
 
 
 @pytest.fixture(autouse=True)
-def empty_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def empty_caches(tmp_path, monkeypatch):
     monkeypatch.delenv("GSBENCH_WEIGHTS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     return tmp_path / "torch" / "hub" / "checkpoints"
 
 
-def test_search_order_is_argument_environment_cache(
-    tmp_path: Path, empty_caches: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_search_order_is_argument_environment_cache(tmp_path, empty_caches, monkeypatch):
     places = [
         tmp_path / "argument" / "deep" / "below",
         tmp_path / "environment" / "other",
@@ -64,7 +56,7 @@ def test_search_order_is_argument_environment_cache(
     assert find_weights(spec(b"x")) == places[2] / "net.pth"
 
 
-def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path: Path):
+def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path):
     for name, content in (("b/net.pth", b"2"), ("a/net.pth", b"1"), ("other/net.pth", b"3")):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_bytes(content)
@@ -80,7 +72,7 @@ def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path: Path):
     ]
 
 
-def test_only_the_cache_is_not_searched_below(empty_caches: Path, monkeypatch: pytest.MonkeyPatch):
+def test_only_the_cache_is_not_searched_below(empty_caches, monkeypatch):
     (empty_caches / "deep").mkdir(parents=True)
     (empty_caches / "deep" / "net.pth").write_bytes(b"x")
     with pytest.raises(MissingWeightsError, match="it has no address to download from"):
@@ -95,10 +87,10 @@ def test_only_the_cache_is_not_searched_below(empty_caches: Path, monkeypatch: p
     assert hub_cache() == Path("/home/me/.cache/torch/hub/checkpoints")
 
 
-def test_after_a_failed_download_no_other_is_tried(monkeypatch: pytest.MonkeyPatch):
-    asked: list[tuple[str, downloads.RetryPolicy]] = []
+def test_after_a_failed_download_no_other_is_tried(monkeypatch):
+    asked = []
 
-    def download(url: str, target: Path, policy: downloads.RetryPolicy, advance: Any) -> str:
+    def download(url, target, policy, advance):
         asked.append((url, policy))
         raise OSError("no network")
 
@@ -111,9 +103,7 @@ def test_after_a_failed_download_no_other_is_tried(monkeypatch: pytest.MonkeyPat
     assert asked == [("http://a", downloads.RetryPolicy(timeout=10.0, tries=1))]
 
 
-def test_users_files_without_a_published_checksum_are_known_by_their_digest(
-    tmp_path: Path, empty_caches: Path
-):
+def test_users_files_without_a_published_checksum_are_known_by_their_digest(tmp_path, empty_caches):
     """Such a file may be any, so that it belongs into the keys of results; a download may not."""
     empty_caches.mkdir(parents=True)
     (empty_caches / "net.pth").write_bytes(b"downloaded")
@@ -125,7 +115,7 @@ def test_users_files_without_a_published_checksum_are_known_by_their_digest(
 
 @pytest.mark.parametrize("digits", [16, 64])
 def test_a_file_with_a_wrong_checksum_is_refused_unless_a_right_copy_is_found(
-    tmp_path: Path, empty_caches: Path, digits: int
+    tmp_path, empty_caches, digits
 ):
     folder = tmp_path / "mine"
     folder.mkdir()
@@ -139,7 +129,7 @@ def test_a_file_with_a_wrong_checksum_is_refused_unless_a_right_copy_is_found(
     assert find_weights(spec(b"truncated", digits=digits), folder).parent == empty_caches
 
 
-def test_missing_files_are_named_together_with_places_and_sources(tmp_path: Path):
+def test_missing_files_are_named_together_with_places_and_sources(tmp_path):
     with pytest.raises(MissingWeightsError) as caught:
         find_all_weights([spec(), spec(name="second.pth")], tmp_path, download=False)
     message = str(caught.value)
@@ -157,18 +147,18 @@ def test_missing_files_are_named_together_with_places_and_sources(tmp_path: Path
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path):
     (tmp_path / "served").mkdir()
     with serve(tmp_path / "served") as running:
         yield running
 
 
-def served(server: Server, content: bytes) -> str:
+def served(server, content):
     (server.folder / "served.bin").write_bytes(content)
     return f"{server.url}/served.bin"
 
 
-def test_download_is_checked_and_kept(server: Server, empty_caches: Path):
+def test_download_is_checked_and_kept(server, empty_caches):
     url = served(server, b"good")
     found = find_weights(spec(b"good", url))
     assert found == empty_caches / "net.pth"
@@ -177,9 +167,7 @@ def test_download_is_checked_and_kept(server: Server, empty_caches: Path):
     assert len(server.requests) == 1
 
 
-def test_a_download_logs_its_progress(
-    server: Server, empty_caches: Path, caplog: pytest.LogCaptureFixture
-):
+def test_a_download_logs_its_progress(server, empty_caches, caplog):
     caplog.set_level(logging.INFO, "gsbench")
     url = served(server, b"g" * 2_500_000)
     find_weights(spec(b"g" * 2_500_000, url))
@@ -191,7 +179,7 @@ def test_a_download_logs_its_progress(
     ]
 
 
-def test_download_shows_a_bar_on_a_terminal(server: Server):
+def test_download_shows_a_bar_on_a_terminal(server):
     pty = pytest.importorskip("pty", reason="needs terminals as Unix has them")
     code = (
         "from gsbench.weights import WeightsFile, find_weights\n"
@@ -213,7 +201,7 @@ def test_download_shows_a_bar_on_a_terminal(server: Server):
 
 
 @pytest.mark.parametrize(
-    ("content", "manners", "said"),
+    "content, manners, said",
     [
         (
             b"x" * 100_000,
@@ -224,7 +212,7 @@ def test_download_shows_a_bar_on_a_terminal(server: Server):
     ],
 )
 def test_download_that_ends_early_or_is_damaged_leaves_nothing(
-    server: Server, empty_caches: Path, content: bytes, manners: Manners, said: str
+    server, empty_caches, content, manners, said
 ):
     server.manners = manners
     with pytest.raises(MissingWeightsError, match=said):
@@ -240,7 +228,7 @@ def test_without_a_network_there_is_one_attempt():
 
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors", "net-pth"])
-def test_tensors_are_read_from_both_formats(tmp_path: Path, name: str):
+def test_tensors_are_read_from_both_formats(tmp_path, name):
     path = tmp_path / name
     if name.endswith("safetensors"):
         pytest.importorskip("safetensors.torch").save_file(STATE, path)
@@ -251,7 +239,7 @@ def test_tensors_are_read_from_both_formats(tmp_path: Path, name: str):
     torch.testing.assert_close(state["a.weight"], STATE["a.weight"])
 
 
-def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path: Path):
+def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path):
     torch.save({"epoch": 3, "extractor": STATE}, tmp_path / "net.pth")
     assert load_state(tmp_path / "net.pth", entry="extractor").keys() == STATE.keys()
     with pytest.raises(MissingWeightsError, match="no entry 'model'"):
@@ -268,7 +256,7 @@ def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path: Path):
 class Malicious:
     """Pickles to a call that would create a file."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
 
     def __reduce__(self):
@@ -276,7 +264,7 @@ class Malicious:
 
 
 @pytest.mark.parametrize("how", ["torch", "pickle"])
-def test_code_in_a_file_is_not_run(tmp_path: Path, how: str):
+def test_code_in_a_file_is_not_run(tmp_path, how):
     trace = tmp_path / "was_here"
     if how == "torch":
         torch.save({"a": Malicious(trace)}, tmp_path / "net.pth")
@@ -289,7 +277,7 @@ def test_code_in_a_file_is_not_run(tmp_path: Path, how: str):
 
 @pytest.mark.parametrize("name", ["net.pth", "net.safetensors"])
 @pytest.mark.parametrize("content", [b"", b"<html>404</html>", "half"])
-def test_truncated_and_foreign_files_are_refused(tmp_path: Path, name: str, content: bytes | str):
+def test_truncated_and_foreign_files_are_refused(tmp_path, name, content):
     path = tmp_path / name
     if content == "half":
         if name.endswith("safetensors"):

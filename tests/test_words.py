@@ -1,13 +1,10 @@
 """Every word on the command line is understood, or refused before any work in one line."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -17,7 +14,7 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.schema import GROUP_SCHEMAS
 from gsbench.errors import InputError
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.settings import check_values, option_fields
 
 REFUSED = {  # command line: a part of the line that refuses it
@@ -173,7 +170,7 @@ class Raises(ADC):
 
 
 @pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(tmp_path, monkeypatch):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -199,9 +196,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("command", REFUSED)
-def test_a_wrong_command_is_refused_in_one_line(
-    command: str, place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_command_is_refused_in_one_line(command, place, capsys):
     assert cli.run(shlex.split(command)) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("gsbench: ")
@@ -210,9 +205,7 @@ def test_a_wrong_command_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("command", ["", "-m", "--multirun"])
-def test_a_command_without_settings_prints_the_usage(
-    command: str, place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_without_settings_prints_the_usage(command, place, capsys):
     assert cli.run(shlex.split(command)) == 0
     assert "gsbench --help" in capsys.readouterr().out
     assert not (place / "runs").exists()
@@ -221,22 +214,14 @@ def test_a_command_without_settings_prints_the_usage(
 @pytest.mark.parametrize(
     "command", ["check {} --dry-run allow_targets=[x]", "check --dry-run allow_targets=[x] {}"]
 )
-def test_a_permission_may_stand_anywhere_in_a_command(
-    command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_permission_may_stand_anywhere_in_a_command(command, capsys):
     assert cli.run(shlex.split(command.format("nosuch.yaml"))) == 2
     assert "nosuch.yaml cannot be read" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["seed=1", "status", "tables x"])
 @pytest.mark.parametrize("runs", ["file", "file/below", "~nosuchuser/x", ""])
-def test_a_name_that_cannot_be_a_runs_folder_is_refused(
-    runs: str,
-    command: str,
-    place: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_name_that_cannot_be_a_runs_folder_is_refused(runs, command, place, monkeypatch, capsys):
     (place / "file").touch()
     monkeypatch.setenv("GSBENCH_RUNS", runs)
     assert cli.run(shlex.split(command)) == 2
@@ -245,14 +230,14 @@ def test_a_name_that_cannot_be_a_runs_folder_is_refused(
     assert "full" not in line
 
 
-def test_a_runs_folder_that_cannot_be_made_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_runs_folder_that_cannot_be_made_is_refused(capsys):
     if not Path("/proc/self").exists():
         pytest.skip("needs /proc, where nobody can make a folder")
     assert cli.run(["runs=/proc/nowhere", "tracking=none"]) == 2
     assert "/proc/nowhere cannot be the runs folder" in capsys.readouterr().err
 
 
-def test_errors_of_a_separate_process_are_one_line(place: Path) -> None:
+def test_errors_of_a_separate_process_are_one_line(place):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     for command in ("+extra=1", "-m seed=range(0,0)", "=3"):
         argv = [sys.executable, "-m", "gsbench.cli", *shlex.split(command)]
@@ -273,19 +258,19 @@ def test_errors_of_a_separate_process_are_one_line(place: Path) -> None:
         ["~densify.cap"],
     ],
 )
-def test_unusual_but_right_words_are_accepted(words: list[str]) -> None:
+def test_unusual_but_right_words_are_accepted(words):
     (trial,) = compose_trials(words)
     assert trial.values["launch"]["sbatch"] == (
         {"constraint": "a100"} if words[0] == "launch=slurm" else {}
     )
 
 
-def test_glob_lists_the_options_of_a_group() -> None:
+def test_glob_lists_the_options_of_a_group():
     trials = compose_trials(["densify=glob(a*)"], multirun=True)
     assert [trial.values["densify"]["name"] for trial in trials] == ["absgrad", "absgs", "adc"]
 
 
-def test_report_writes_into_a_folder_as_tables_does(place: Path) -> None:
+def test_report_writes_into_a_folder_as_tables_does(place):
     from gsbench.verbs.results import file_at
 
     (place / "folder.html").mkdir()
@@ -301,7 +286,7 @@ SCHEMA_KEYS = [
     for group, schema in GROUP_SCHEMAS.items()
     for entry in option_fields(schema)
 ]
-VALUES: st.SearchStrategy[Any] = st.recursive(
+VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text("aB1./~é \n", max_size=6),
     lambda inner: (
         st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from("abc"), inner, max_size=2)
@@ -312,9 +297,7 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(key=st.sampled_from(SCHEMA_KEYS), value=VALUES)
-def test_any_value_of_any_setting_is_kept_or_refused_in_one_line(
-    key: tuple[str, str], value: Any
-) -> None:
+def test_any_value_of_any_setting_is_kept_or_refused_in_one_line(key, value):
     group, name = key
     try:
         once = check_values(GROUP_SCHEMAS[group], {name: value}, group)
@@ -367,6 +350,6 @@ HASHES = {
 
 
 @pytest.mark.parametrize("words", HASHES)
-def test_hashes_of_valid_configurations_stay(words: tuple[str, ...]) -> None:
+def test_hashes_of_valid_configurations_stay(words):
     (trial,) = compose_trials(words)
     assert config_hash(trial.values) == HASHES[words]

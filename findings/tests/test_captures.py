@@ -1,7 +1,5 @@
 """``scripts/captures.py`` on made-up captures: kept points, commands, and files that stay."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -22,7 +20,7 @@ CAMERA = CameraModel("PINHOLE", 8, 6, (5.0, 5.0, 4.0, 3.0))
 COUNT = 6300  # above the most that are kept
 
 
-def write_capture(folder: Path, points: int = COUNT, model: bool = True) -> np.ndarray:
+def write_capture(folder, points=COUNT, model=True):
     """Write a capture with a photograph and a model of random points [P, 3]; return the points."""
     positions = np.random.default_rng(1).normal(size=(points, 3))
     (folder / "images").mkdir(parents=True)
@@ -32,20 +30,18 @@ def write_capture(folder: Path, points: int = COUNT, model: bool = True) -> np.n
     return positions
 
 
-def write_model(folder: Path, positions: np.ndarray) -> None:
+def write_model(folder, positions):
     frames = {f"{k}.png": (CAMERA, np.eye(3), np.array([k, 0.0, 1.0])) for k in range(3)}
     write_frames(folder, frames, cloud=(positions, np.full(positions.shape, 7, dtype=np.uint8)))
 
 
-def points_of(capture: Path) -> np.ndarray:
+def points_of(capture):
     """The positions [P, 3] of a capture's points, sorted."""
     model = pycolmap.Reconstruction(capture / "sparse" / "0")
     return np.unique([point.xyz for point in model.points3D.values()], axis=0)
 
 
-def test_a_prepared_capture_has_fewer_points_and_the_same_cameras_and_photographs(
-    tmp_path: Path,
-) -> None:
+def test_a_prepared_capture_has_fewer_points_and_the_same_cameras_and_photographs(tmp_path):
     given = write_capture(tmp_path / "data" / "fox")
     few = write_capture(tmp_path / "data" / "bonsai", points=10)
     for name in ("out", "again"):
@@ -62,9 +58,7 @@ def test_a_prepared_capture_has_fewer_points_and_the_same_cameras_and_photograph
     assert len(points_of(tmp_path / "data" / "fox")) == COUNT, "the capture itself stays as it is"
 
 
-def test_prepared_captures_are_kept_and_missing_ones_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prepared_captures_are_kept_and_missing_ones_are_named(tmp_path, capsys):
     write_capture(tmp_path / "data" / "fox", points=20)
     captures.prepare(tmp_path / "data", tmp_path / "out")
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*")}
@@ -77,11 +71,11 @@ def test_prepared_captures_are_kept_and_missing_ones_are_named(
     assert len(lines) == len(captures.CAPTURES)
 
 
-def test_a_killed_run_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_run_is_continued(tmp_path, monkeypatch):
     """A capture counts as ready only if it is complete; the linked photographs never change."""
     write_capture(tmp_path / "data" / "fox", points=20)
 
-    def killed(self: pycolmap.Reconstruction, folder: Path) -> None:
+    def killed(self, folder):
         (Path(folder) / "cameras.bin").touch()
         raise KeyboardInterrupt
 
@@ -96,17 +90,15 @@ def test_a_killed_run_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (tmp_path / "data" / "fox" / "images" / "0.png").is_file()
 
 
-def test_a_capture_without_a_model_gets_the_estimated_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_capture_without_a_model_gets_the_estimated_one(tmp_path, monkeypatch):
     """gsbench understands both commands.
 
     The second one exports the trial that the first one ran.
     """
     write_capture(tmp_path / "data" / "monstree", model=False)
-    asked: list[str] = []
+    asked = []
 
-    def answer(command: list[str], check: bool) -> None:
+    def answer(command, check):
         assert check
         assert Path(command[0]).name == "gsbench"
         asked.append(command[1])

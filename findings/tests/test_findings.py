@@ -1,7 +1,5 @@
 """The findings agree with the archives, and the files that they name exist."""
 
-from __future__ import annotations
-
 import re
 import sys
 import zipfile
@@ -40,13 +38,13 @@ SETTINGS = {
 PAGE = tables.README.read_text(encoding="utf-8")
 
 
-def test_the_tables_follow_from_the_archives() -> None:
+def test_the_tables_follow_from_the_archives():
     assert tables.TABLES.read_text(encoding="utf-8") == tables.all_tables()
     assert tables.with_answers(PAGE) == PAGE
     assert "nan" not in tables.all_tables()
 
 
-def test_every_figure_of_the_page_is_in_a_table() -> None:
+def test_every_figure_of_the_page_is_in_a_table():
     known = set(FIGURE.findall(tables.TABLES.read_text(encoding="utf-8")))
     known |= {figure.lstrip("+−") for figure in known} | SETTINGS
     prose = re.sub(r"<!-- verdicts -->.*?<!-- end -->", "", PAGE, flags=re.DOTALL)
@@ -56,10 +54,8 @@ def test_every_figure_of_the_page_is_in_a_table() -> None:
     assert [figure for figure in FIGURE.findall(prose) if figure not in known] == []
 
 
-def test_the_pages_statements_on_seeds_are_true() -> None:
-    def of(
-        name: str, arm: str, scene: str, split: str = "interpolation", **kept: object
-    ) -> tuple[float, float]:
+def test_the_pages_statements_on_seeds_are_true():
+    def of(name, arm, scene, split="interpolation", **kept):
         frame = tables.read_trials(name)
         for key, value in kept.items():
             frame = frame[frame[key] == value]
@@ -81,7 +77,7 @@ def test_the_pages_statements_on_seeds_are_true() -> None:
     assert not any(one.verdict.seen for one in tables.verdicts("volume").values())
 
 
-def test_files_that_the_page_names_exist() -> None:
+def test_files_that_the_page_names_exist():
     for name in re.findall(r"\]\(((?!http)[^)#]+)\)", PAGE):
         assert (FINDINGS / name).exists(), name
     for name in re.findall(r"findings/(?:claims|archives|scripts)/\w+\.\w+", PAGE):
@@ -91,14 +87,14 @@ def test_files_that_the_page_names_exist() -> None:
 
 
 @pytest.mark.parametrize("file", sorted(FINDINGS.glob("claims/*.yaml")), ids=lambda file: file.stem)
-def test_claims_can_be_read(file: Path) -> None:
+def test_claims_can_be_read(file):
     assert read_claims(file).claims
 
 
 @pytest.mark.parametrize(
     "file", sorted(FINDINGS.glob("experiment/*.yaml")), ids=lambda file: file.stem
 )
-def test_experiments_are_composed(file: Path) -> None:
+def test_experiments_are_composed(file):
     path = ["init.path=/somewhere"] if "override /init: points" in file.read_text() else []
     trials = compose_trials(
         [f"hydra.searchpath=['file://{FINDINGS}']", f"+experiment={file.stem}", *path]
@@ -109,7 +105,7 @@ def test_experiments_are_composed(file: Path) -> None:
 @pytest.mark.parametrize(
     "file", sorted(FINDINGS.glob("archives/*.zip")), ids=lambda file: file.stem
 )
-def test_archives_are_small_and_name_no_folder_of_a_machine(file: Path) -> None:
+def test_archives_are_small_and_name_no_folder_of_a_machine(file):
     assert file.stat().st_size < 300_000
     with zipfile.ZipFile(file) as archive:
         for member in archive.namelist():

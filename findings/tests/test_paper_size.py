@@ -9,7 +9,7 @@ FINDINGS = Path(__file__).parents[1]
 PAGE = (FINDINGS / "paper_size.md").read_text(encoding="utf-8")
 
 
-def test_the_rows_of_30000_iterations_and_of_the_authors_are_those_of_the_archives() -> None:
+def test_the_rows_of_30000_iterations_and_of_the_authors_are_those_of_the_archives():
     found = set()
     for archive in FINDINGS.glob("archives/bonsai_gpu_*.zip"):
         for line in zipfile.ZipFile(archive).read("results.jsonl").decode().splitlines():
@@ -25,7 +25,7 @@ def test_the_rows_of_30000_iterations_and_of_the_authors_are_those_of_the_archiv
     assert [row for row in found if row not in PAGE] == []
 
 
-def test_the_archives_that_the_page_names_exist() -> None:
+def test_the_archives_that_the_page_names_exist():
     names = re.findall(r"\((archives/\w+\.zip)\)", PAGE)
     assert len(names) == 2
     assert all((FINDINGS / name).is_file() for name in names)

@@ -39,6 +39,7 @@ MAX_DEPTH = 40
 MAX_WORD = 4000  # characters of an unquoted YAML word, which could be a number
 MAX_VALUES = 100_000  # in a YAML file, whose aliases let a few lines stand for billions of values
 MAX_MESSAGE = 300  # characters of a message about a file
+AROUND = 20  # bytes on each side of one that is not UTF-8 that a message shows
 LARGEST_INT = 2**64  # larger than the seeds of torch and times in ns
 SURROGATE = re.compile("[\ud800-\udfff]")  # half a character, which no file can hold
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -88,6 +89,19 @@ def without_byte_order_mark(content: bytes) -> bytes:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
         raise InputError("it is UTF-16 or UTF-32: save it as UTF-8")
     return content.removeprefix(codecs.BOM_UTF8)
+
+
+def text_of(content: bytes) -> str:
+    """The text of a user's file; raises InputError with the line and the mend if not UTF-8."""
+    content = without_byte_order_mark(content)
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        before, after = content[: error.start], content[error.start :]
+        near = before.rpartition(b"\n")[2][-AROUND:] + after.partition(b"\n")[0][:AROUND]
+        shown = one_line(near.decode("ascii", "backslashreplace"))
+        number = before.count(b"\n") + 1
+        raise InputError(f"line {number} is not UTF-8 ({shown}): save it as UTF-8") from error
 
 
 def resolved(path: Path) -> Path:

@@ -1,17 +1,13 @@
 """Fixtures of the evaluation tests."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 
-from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.results import load_experiment
 from tests.analysis.synthetic import Plan, write_runs
 
 
 @pytest.fixture
-def make_experiment(tmp_path) -> Callable[..., Experiment]:
+def make_experiment(tmp_path):
     """Write the trials of a plan below ``tmp_path`` and load them."""
 
     def make(**plan):

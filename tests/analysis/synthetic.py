@@ -8,8 +8,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -50,7 +48,7 @@ class Plan:
     pictures: bool = False  # also renders, ground truth and point clouds
 
 
-def write_runs(runs: Path, plan: Plan) -> list[Path]:
+def write_runs(runs, plan):
     """Write every trial of the plan; returns their folders."""
     rng = np.random.default_rng(plan.random_seed)
     paths = []
@@ -80,9 +78,7 @@ def write_runs(runs: Path, plan: Plan) -> list[Path]:
     return paths
 
 
-def trial_data(
-    plan: Plan, scene: str, init: str, densify: str, seed: int, views: dict[str, np.ndarray]
-) -> dict[str, Any]:
+def trial_data(plan, scene, init, densify, seed, views):
     """A ``results.json`` as a finished trial writes it."""
     gaussians = plan.gaussians.get(densify, 20_000)
     return {
@@ -122,18 +118,12 @@ def trial_data(
     }
 
 
-def trial_folder(runs: Path, data: dict[str, Any], config_hash: str = "c0ffee00") -> Path:
+def trial_folder(runs, data, config_hash="c0ffee00"):
     arm = f"{data['init']}-{data['densify']}"
     return runs / data["experiment"] / data["scene"] / arm / f"{config_hash}-seed{data['seed']}"
 
 
-def write_trial(
-    runs: Path,
-    data: dict[str, Any],
-    views: dict[str, np.ndarray],
-    config_hash: str = "c0ffee00",
-    **settings: Any,
-) -> Path:
+def write_trial(runs, data, views, config_hash="c0ffee00", **settings):
     """Write a trial's folder: results, per-view metrics, events, curves, and a configuration.
 
     ``settings`` (``group__key=value``) are added to the configuration.
@@ -164,14 +154,7 @@ def write_trial(
     return path
 
 
-def write_arms(
-    runs: Path,
-    arms: dict[str, dict[str, Any]],
-    seeds: Sequence[int] = (0, 1, 2),
-    scenes: Sequence[str] = ("courtyard",),
-    experiment: str = "exp",
-    **settings: Any,
-) -> list[Path]:
+def write_arms(runs, arms, seeds=(0, 1, 2), scenes=("courtyard",), experiment="exp", **settings):
     """Write trials of arms whose results are noise.
 
     ``arms`` has the densifier's settings of each arm; ``settings`` (``group__key=value``) are
@@ -198,7 +181,7 @@ PICTURE_SIZE = (120, 160)  # rows, columns
 TEXTURED = slice(80, 160)  # columns of the ground truth that hold grass; the others are smooth
 
 
-def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
+def write_pictures(path, data, views):
     """Write ground truth that is smooth on the left and grassy on the right, and renders.
 
     "adc" blurs the grass more than "volumetric". In the upper left corner "volumetric" is off
@@ -223,7 +206,7 @@ def write_pictures(path: Path, data: dict[str, Any], views: int) -> None:
             Image.fromarray(pixels).save(path / folder / f"view{view:03d}.png")
 
 
-def write_point_cloud(path: Path, data: dict[str, Any]) -> None:
+def write_point_cloud(path, data):
     """Write a PLY with log-normal scales, smaller for "volumetric", and logged histograms."""
     rng = np.random.default_rng(data["seed"])
     fields = ["x", "y", "z", "opacity", *(f"scale_{k}" for k in range(3))]
@@ -241,14 +224,14 @@ def write_point_cloud(path: Path, data: dict[str, Any]) -> None:
     _write_lines(path / "volume_histograms.jsonl", histograms)
 
 
-def events(data: dict[str, Any]) -> list[dict[str, int]]:
+def events(data):
     """Refinements every 100 iterations; only "volumetric" splits by volume."""
     volume = 4 if data["densify"] == "volumetric" else 0
     counts = {"cloned": 20, "split_gradient": 12, "split_volume": volume, "pruned_opacity": 7}
     return [{"step": step, **counts} for step in range(600, data["iterations"] + 1, 100)]
 
 
-def curves(data: dict[str, Any]) -> list[dict[str, float]]:
+def curves(data):
     """A growing scene and a rising PSNR."""
     final, rows = data["num_gaussians"], []
     for step in range(100, data["iterations"] + 1, 100):
@@ -265,5 +248,5 @@ def curves(data: dict[str, Any]) -> list[dict[str, float]]:
     return rows
 
 
-def _write_lines(path: Path, rows: list[dict[str, Any]]) -> None:
+def _write_lines(path, rows):
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))

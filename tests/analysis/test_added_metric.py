@@ -1,7 +1,5 @@
 """A user's own metric that is added later: for older trials its setting counts as unset."""
 
-from pathlib import Path
-
 import pytest
 
 from gsbench.analysis.cells import select_trials
@@ -16,7 +14,7 @@ OWN = {"eval__extra": {"mae": {"_target_": "mine.Mae"}}}
 
 
 @pytest.fixture
-def runs(tmp_path) -> Path:
+def runs(tmp_path):
     for seed in (0, 1):
         for densify in ("adc", "volumetric"):
             one_trial(tmp_path, seed, "aaaaaaaa", _densify=densify, psnr=27.0 + seed)

@@ -64,7 +64,7 @@ ARMS = {
 }
 
 
-@pytest.mark.parametrize(("word", "count"), ARMS.items())
+@pytest.mark.parametrize("word, count", ARMS.items())
 def test_all_verbs_read_an_arm_alike(runs, word, count):
     trials = with_variants(load_experiment(runs, "exp").trials)
     readers = {

@@ -1,13 +1,9 @@
 """The differences between two arms are named wherever the arms are compared."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import yaml
@@ -26,10 +22,10 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
-from gsbench.runs.keys import config_hash
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
 
@@ -41,7 +37,7 @@ SCHEDULE |= {
 }
 
 
-def config(name: str, **changes: Any) -> dict[str, Any]:
+def config(name, **changes):
     """The settings of a shipped densifier as a trial records them, with ``changes``."""
     own = {
         f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v)
@@ -50,7 +46,7 @@ def config(name: str, **changes: Any) -> dict[str, Any]:
     return SCHEDULE | own | {f"densify.{key}": v for key, v in changes.items()}
 
 
-def densifier(name: str, **changes: Any) -> dict[str, Any]:
+def densifier(name, **changes):
     """The same settings without the prefix ``densify.``."""
     prefix = "densify."
     return {
@@ -60,12 +56,12 @@ def densifier(name: str, **changes: Any) -> dict[str, Any]:
     }
 
 
-def trials_of(runs: Path, arms: dict[str, dict[str, Any]], **settings: Any) -> list[TrialResult]:
+def trials_of(runs, arms, **settings):
     write_arms(runs, arms, **settings)
     return with_variants(load_experiment(runs, "exp").trials)
 
 
-def sentence(trials: list[TrialResult], first: str, second: str) -> str:
+def sentence(trials, first, second):
     pair = Arm("sfm", first), Arm("sfm", second)
     found = ingredients_between(trials, *pair)
     return ingredients_sentence(found, *pair) if is_mixed(found) else ""
@@ -74,7 +70,7 @@ def sentence(trials: list[TrialResult], first: str, second: str) -> str:
 # --- ingredients
 
 
-def test_a_sentence_names_six_ingredients_and_counts_the_rest() -> None:
+def test_a_sentence_names_six_ingredients_and_counts_the_rest():
     first, second = Arm("sfm", "adc"), Arm("sfm", "mine")
     said = "sfm-mine differs from sfm-adc by 0, 1, 2, 3, 4"
     assert ingredients_sentence("012345", first, second) == f"{said} and 5."
@@ -82,7 +78,7 @@ def test_a_sentence_names_six_ingredients_and_counts_the_rest() -> None:
     assert ingredients_sentence("0", first, second) == "sfm-mine differs from sfm-adc by 0 alone."
 
 
-def test_settings_of_the_first_configuration_come_first() -> None:
+def test_settings_of_the_first_configuration_come_first():
     one, other = (
         {"densify._target_": "t", "densify.a": 1},
         {"densify._target_": "t", "densify.b": 2},
@@ -92,7 +88,7 @@ def test_settings_of_the_first_configuration_come_first() -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "expected"),
+    "first, second, expected",
     [
         ("adc", "longaxis", ("split", "gradient", "threshold")),
         ("absgrad", "longaxis", ("split",)),
@@ -101,17 +97,15 @@ def test_settings_of_the_first_configuration_come_first() -> None:
         ("adc", "adc", ()),
     ],
 )
-def test_shipped_arms_differ_in_the_ingredients_that_their_files_list(
-    first: str, second: str, expected: tuple[str, ...]
-) -> None:
+def test_shipped_arms_differ_in_the_ingredients_that_their_files_list(first, second, expected):
     assert ingredients(config(first), config(second)) == expected
 
 
-def test_every_shipped_class_lists_how_it_departs_from_adc() -> None:
+def test_every_shipped_class_lists_how_it_departs_from_adc():
     assert {settings["_target_"] for settings in shipped_arms().values()} == set(departures())
 
 
-def test_settings_that_only_name_or_place_a_trial_are_no_ingredients() -> None:
+def test_settings_that_only_name_or_place_a_trial_are_no_ingredients():
     other = config("adc") | {
         "densify.name": "adc-2",
         "eval.primary": "psnr",
@@ -126,12 +120,12 @@ def test_settings_that_only_name_or_place_a_trial_are_no_ingredients() -> None:
 @pytest.mark.parametrize(
     "key", ["densify.name_noise", "init.weights_power", "scene.path_length", "raster.named"]
 )
-def test_a_users_setting_that_begins_like_an_ignored_one_is_an_ingredient(key: str) -> None:
+def test_a_users_setting_that_begins_like_an_ignored_one_is_an_ingredient(key):
     other = config("adc") | {key: 2}
     assert ingredients(other | {key: 1}, other) == (key.removeprefix("densify."),)
 
 
-def test_changes_outside_the_densifier_are_ingredients() -> None:
+def test_changes_outside_the_densifier_are_ingredients():
     other = config("adc", stop=9000) | {
         "train.opacity": 0.05,
         "train.scale": 0.1,
@@ -155,7 +149,7 @@ def test_changes_outside_the_densifier_are_ingredients() -> None:
     assert set(ingredients(sfm, dim)) == {"initial cloud", "cameras"}
 
 
-def test_a_users_class_with_its_settings_is_one_ingredient() -> None:
+def test_a_users_class_with_its_settings_is_one_ingredient():
     """Between two versions of one such class, each setting is an ingredient."""
     own = config("adc") | {"densify._target_": "mine.Patient", "densify.patience": 3}
     assert ingredients(config("adc"), own) == ("rule mine.Patient",)
@@ -170,7 +164,7 @@ def test_a_users_class_with_its_settings_is_one_ingredient() -> None:
     assert ingredients(config("longaxis"), own)[0] == "rule mine.Patient"
 
 
-def test_a_comparison_of_several_ingredients_is_reported(tmp_path: Path) -> None:
+def test_a_comparison_of_several_ingredients_is_reported(tmp_path):
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     assert sentence(trials, "adc", "longaxis") == (
         "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
@@ -184,7 +178,7 @@ def test_a_comparison_of_several_ingredients_is_reported(tmp_path: Path) -> None
     assert sentence(trials, "adc", "longaxis") in notes
 
 
-def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path: Path) -> None:
+def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path):
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
     assert sentence(trials, "adc", "volumetric") == ""
     assert not any(
@@ -192,7 +186,7 @@ def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path: Path)
     )
 
 
-def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
+def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path):
     changes = {"gradient_threshold": 0.0016, "max_gaussians": 9, "cap": "governor", "stop": 77}
     arms = {name: densifier(name, **changes) for name in ("adc", "longaxis")}
     assert sentence(trials_of(tmp_path, arms), "adc", "longaxis") == (
@@ -200,7 +194,7 @@ def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path: Path) -> None:
     )
 
 
-def test_trials_without_recorded_settings_are_reported(tmp_path: Path) -> None:
+def test_trials_without_recorded_settings_are_reported(tmp_path):
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")}):
         if "longaxis" in path.parent.name:
             (path / "config.yaml").unlink()
@@ -209,7 +203,7 @@ def test_trials_without_recorded_settings_are_reported(tmp_path: Path) -> None:
     )
 
 
-def test_another_program_counts_as_many_ingredients(tmp_path: Path) -> None:
+def test_another_program_counts_as_many_ingredients(tmp_path):
     program = {"_target_": "gsbench.densify.External", "command": "train"}
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "3dgs": program, "brush": program})
     assert sentence(trials, "adc", "3dgs") == (
@@ -220,7 +214,7 @@ def test_another_program_counts_as_many_ingredients(tmp_path: Path) -> None:
     )
 
 
-def test_a_training_elsewhere_has_unknown_ingredients(tmp_path: Path) -> None:
+def test_a_training_elsewhere_has_unknown_ingredients(tmp_path):
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "theirs": densifier("adc")}):
         if path.parent.name == "sfm-theirs":
             data = json.loads((path / "results.json").read_text())
@@ -230,7 +224,7 @@ def test_a_training_elsewhere_has_unknown_ingredients(tmp_path: Path) -> None:
     assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."
 
 
-def test_points_of_a_search_are_not_compared(tmp_path: Path) -> None:
+def test_points_of_a_search_are_not_compared(tmp_path):
     trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     (tmp_path / "exp" / "tuning.json").write_text("{}")
     assert not any(
@@ -241,7 +235,7 @@ def test_points_of_a_search_are_not_compared(tmp_path: Path) -> None:
 # --- controls
 
 
-def test_arms_are_compared_with_their_controls(tmp_path: Path) -> None:
+def test_arms_are_compared_with_their_controls(tmp_path):
     arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
     trials = trials_of(
         tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"}
@@ -261,7 +255,7 @@ def test_arms_are_compared_with_their_controls(tmp_path: Path) -> None:
     ]
 
 
-def test_naming_a_control_does_not_change_the_configuration_hash() -> None:
+def test_naming_a_control_does_not_change_the_configuration_hash():
     with_control = {
         "eval": {"lpips": [], "controls": {"longaxis": "absgrad"}},
         "densify": {"name": "adc"},
@@ -271,7 +265,7 @@ def test_naming_a_control_does_not_change_the_configuration_hash() -> None:
     )
 
 
-def test_experiments_list_the_control_of_every_mixed_arm() -> None:
+def test_experiments_list_the_control_of_every_mixed_arm():
     """Where an experiment holds an arm that isolates an ingredient of another, it says so."""
     checked = 0
     folders = (ROOT / "conf" / "experiment", ROOT / "findings" / "experiment")
@@ -297,7 +291,7 @@ def test_experiments_list_the_control_of_every_mixed_arm() -> None:
     assert checked >= 2
 
 
-def test_representatives_share_scene_and_seed_if_possible() -> None:
+def test_representatives_share_scene_and_seed_if_possible():
     arms = Arm("sfm", "a"), Arm("sfm", "b")
     generator = random.Random(0)
     for _ in range(200):
@@ -312,8 +306,8 @@ def test_representatives_share_scene_and_seed_if_possible() -> None:
         expected = min(
             pairs, key=lambda pair: (pair[0].scene != pair[1].scene, pair[0].seed != pair[1].seed)
         )
-        found = representatives(trials, *arms)  # type: ignore[arg-type]
+        found = representatives(trials, *arms)
         assert found[0] is expected[0]
         assert found[1] is expected[1]
     with pytest.raises(KeyError, match="sfm"):
-        representatives(trials, arms[0], Arm("sfm", "c"))  # type: ignore[arg-type]
+        representatives(trials, arms[0], Arm("sfm", "c"))

@@ -1,17 +1,14 @@
 """Table cells never mix versions of the code, and superseded trials are named."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.runs.keys import present_digest
+from gsbench.runs import freshness
+from gsbench.runs.user_code import module_digest
 from gsbench.verbs.results import explain_cell
 from tests.analysis.test_tables import one_trial
 
@@ -20,24 +17,28 @@ STAGES = {"scene": 1, "init": 1, "train": 1, "evaluate": 1}
 MINE = {"densify___target_": "mine.Patient"}
 
 
-def code(digest: str | None = None, **stages: int) -> dict[str, Any]:
+def code(digest=None, **stages):
     return {
-        "sources": {} if digest is None else {"mine.Patient": digest},
+        "sources": {} if digest is None else {"mine": digest},
         "stages": STAGES | stages,
     }
 
 
-def finished_at(path: Path, seconds: float) -> Path:
+def of_gsbench(**packages):
+    return code() | {"rooms": packages}
+
+
+def finished_at(path, seconds):
     os.utime(path / "results.json", (seconds, seconds))
     return path
 
 
-def test_the_newest_code_counts_and_older_trials_are_named(tmp_path: Path) -> None:
+def test_the_newest_code_counts_and_older_trials_are_named(tmp_path):
     for seed in (0, 1):
         finished_at(one_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW)), 2000)
     words = (
-        "exp/garden/sfm-adc seeds 0, 1: left out, made by an earlier mine.Patient (11111111; the "
+        "exp/garden/sfm-adc seeds 0, 1: left out, made by an earlier mine (11111111; the "
         "trials that count have 22222222)"
     )
     experiment = load_experiment(tmp_path, "exp")
@@ -49,7 +50,7 @@ def test_the_newest_code_counts_and_older_trials_are_named(tmp_path: Path) -> No
     assert words in explain_cell("exp:garden:psnr:adc", tmp_path)
 
 
-def test_older_trials_with_other_settings_still_count(tmp_path: Path) -> None:
+def test_older_trials_with_other_settings_still_count(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify__views": 5}, psnr=27.0, _code=code(OLD))
     one_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify__views": 8}, psnr=28.0, _code=code(NEW))
     experiment = load_experiment(tmp_path, "exp")
@@ -57,7 +58,7 @@ def test_older_trials_with_other_settings_still_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "part"),
+    "old, new, part",
     [
         ({"_code": code()}, {"_code": code(train=2)}, "stage train"),
         (
@@ -67,9 +68,7 @@ def test_older_trials_with_other_settings_still_count(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_older_trials_of_gsbench_are_left_out(
-    tmp_path: Path, old: dict[str, Any], new: dict[str, Any], part: str
-) -> None:
+def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
     finished_at(one_trial(tmp_path, 0, psnr=27.0, **old), 1000)
     finished_at(one_trial(tmp_path, 1, psnr=27.0, **new), 2000)
     experiment = load_experiment(tmp_path, "exp")
@@ -77,12 +76,10 @@ def test_older_trials_of_gsbench_are_left_out(
     assert f"made by an earlier {part} (" in experiment.warnings[0]
 
 
-def test_the_code_that_is_here_now_counts_before_what_was_finished_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "patient.py").write_text("x = 1\n")
-    here = present_digest("patient")
+    here = module_digest("patient", str(tmp_path))
     made = {"sources": {"patient": here}, "stages": STAGES}
     finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=made), 1000)
     other = {"sources": {"patient": NEW}, "stages": STAGES}
@@ -101,22 +98,22 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(
     )
 
 
-def test_arms_that_share_a_class_in_two_versions_are_not_compared(tmp_path: Path) -> None:
+def test_arms_that_share_a_class_in_two_versions_are_not_compared(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify__views": 5}, psnr=27.0, _code=code(OLD))
     one_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify__views": 8}, psnr=28.0, _code=code(NEW))
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert not any(entry.bold for row in table.rows for entry in row.entries)
-    assert "garden: not compared, no best marked: code of mine.Patient differ." in table.notes
+    assert "garden: not compared, no best marked: code of mine differ." in table.notes
 
 
-def test_a_class_that_only_one_arm_has_is_no_difference(tmp_path: Path) -> None:
+def test_a_class_that_only_one_arm_has_is_no_difference(tmp_path):
     one_trial(tmp_path, 0, psnr=27.0, _code=code())
     one_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _densify="patient", _code=code(NEW))
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
 
 
-def test_a_scene_in_another_folder_is_no_other_version(tmp_path: Path) -> None:
+def test_a_scene_in_another_folder_is_no_other_version(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene__path": "/here"}, psnr=27.0, _code=code(NEW))
     one_trial(tmp_path, 1, "bbbbbbbb", MINE | {"scene__path": "/there"}, psnr=28.0, _code=code(NEW))
     assert (
@@ -125,11 +122,7 @@ def test_a_scene_in_another_folder_is_no_other_version(tmp_path: Path) -> None:
     )
 
 
-def of_gsbench(**rooms: str) -> dict[str, Any]:
-    return code() | {"rooms": rooms}
-
-
-def test_a_room_that_one_arm_alone_uses_is_no_difference(tmp_path: Path) -> None:
+def test_a_package_that_one_arm_alone_uses_is_no_difference(tmp_path):
     one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(train="a" * 16))
     theirs = of_gsbench(train="a" * 16, external="b" * 16)
     one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="brush", _code=theirs)
@@ -137,7 +130,7 @@ def test_a_room_that_one_arm_alone_uses_is_no_difference(tmp_path: Path) -> None
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
 
 
-def test_explain_names_the_commit_and_the_edited_rooms(tmp_path: Path) -> None:
+def test_explain_names_the_commit_and_the_edited_packages(tmp_path):
     made = of_gsbench(train="released", eval="a" * 16) | {"commit": "0123abcd", "edited": True}
     one_trial(tmp_path, 0, psnr=27.0, _code=made)
     said = explain_cell("exp:garden:psnr:adc", tmp_path)
@@ -150,43 +143,36 @@ def test_explain_names_the_commit_and_the_edited_rooms(tmp_path: Path) -> None:
     assert "since the last release" not in said
 
 
-def superseded(runs: Path, present: dict[str, str] | None = None) -> dict[str, str]:
-    """The reasons why trials are superseded, by their seeds."""
-    trials = read_experiment(runs / "exp").trials
-    found = find_superseded(trials, lambda target, trial: (present or {}).get(target))
-    return {path.name.partition("-")[2]: reason for path, reason in found.items()}
-
-
-def test_without_the_module_the_version_that_finished_last_is_the_present_one(
-    tmp_path: Path,
-) -> None:
-    finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
-    finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
-    assert superseded(tmp_path) == {
-        "seed0": "mine.Patient was 11111111, later trials have 22222222"
-    }
-
-
-def test_the_module_decides_which_version_is_the_present_one(tmp_path: Path) -> None:
-    finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=code(OLD)), 1000)
-    finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=code(NEW)), 2000)
-    assert superseded(tmp_path, {"mine.Patient": OLD}) == {
-        "seed1": "mine.Patient was 22222222, it is now 11111111"
-    }
-    assert superseded(tmp_path, {"mine.Patient": "3" * 64}).keys() == {"seed0", "seed1"}
-
-
-def test_stages_are_superseded_by_later_trials(tmp_path: Path) -> None:
-    finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=code()), 1000)
-    finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=code(train=2)), 2000)
-    # entered from elsewhere: no code of ours made it
-    finished_at(one_trial(tmp_path, 2, psnr=1.0), 500)
-    assert superseded(tmp_path) == {"seed0": "stage train was 1, later trials have 2"}
-
-
-def test_trials_of_an_edited_gsbench_are_superseded(tmp_path: Path) -> None:
-    finished_at(one_trial(tmp_path, 0, psnr=1.0, _code=of_gsbench(train="a" * 16)), 1000)
-    finished_at(one_trial(tmp_path, 1, psnr=1.0, _code=of_gsbench(train="b" * 16)), 2000)
-    assert superseded(tmp_path) == {
-        "seed0": "gsbench's train was aaaaaaaa, later trials have bbbbbbbb"
-    }
+@pytest.mark.parametrize(
+    "old, new, here, reasons",
+    [
+        (code(OLD), code(NEW), None, {"seed0": "mine was 11111111, later trials have 22222222"}),
+        (code(OLD), code(NEW), OLD, {"seed1": "mine was 22222222, it is now 11111111"}),
+        (
+            code(OLD),
+            code(NEW),
+            "3" * 64,
+            {
+                "seed0": "mine was 11111111, it is now 33333333",
+                "seed1": "mine was 22222222, it is now 33333333",
+            },
+        ),
+        (code(), code(train=2), None, {"seed0": "stage train was 1, later trials have 2"}),
+        (
+            of_gsbench(train="a" * 16),
+            of_gsbench(train="b" * 16),
+            None,
+            {"seed0": "gsbench's train was aaaaaaaa, later trials have bbbbbbbb"},
+        ),
+        ({}, code(), None, {}),  # entered from elsewhere: no code of ours made it
+    ],
+)
+def test_superseded_trials_are_named_with_the_reason(
+    tmp_path, monkeypatch, old, new, here, reasons
+):
+    first = finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=old), 1000)
+    second = finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=new), 2000)
+    monkeypatch.setattr(freshness, "module_digest", lambda name, folder: {"there": here}[folder])
+    folders = {first: "there", second: "there"} if here else {}
+    found = find_superseded(read_experiment(tmp_path / "exp").trials, folders)
+    assert {path.name.partition("-")[2]: str(one) for path, one in found.items()} == reasons

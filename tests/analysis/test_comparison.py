@@ -8,7 +8,6 @@ import os
 import random
 import shutil
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -19,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsbench.analysis.comparison import Comparison, compare
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
@@ -52,15 +51,15 @@ class Made:
     code: str = ""
 
     @property
-    def hash(self) -> str:
+    def hash(self):
         return sha256(repr((self.options, self.code)).encode()).hexdigest()[:8]
 
     @property
-    def key(self) -> str:
+    def key(self):
         return f"{self.scene}/{self.init}-{self.densify}/{self.hash}"
 
 
-def write(runs: Path, trials: Sequence[Made]) -> None:
+def write(runs, trials):
     for one in trials:
         rng = random.Random(repr(one))
         views = {m: np.array([20.0 + rng.gauss(0, 0.1)]) for m in METRICS[:2]}
@@ -76,7 +75,7 @@ def write(runs: Path, trials: Sequence[Made]) -> None:
         os.utime(path / "results.json", (moment, moment))
 
 
-def declare(runs: Path, *records: tuple[int, Sequence[Made]], metric: str = "psnr") -> None:
+def declare(runs, *records, metric="psnr"):
     """Write a declaration for each (day, trials of the command); each repeats those before."""
     entries, trials = [], dict[str, set[int]]()
     for day, made in records:
@@ -88,23 +87,23 @@ def declare(runs: Path, *records: tuple[int, Sequence[Made]], metric: str = "psn
     (runs / "exp" / "declared.jsonl").write_text(record_text(entries))
 
 
-def grid(densify: str, seeds: int = 3, day: int = 2, code: str = "", **options: Any) -> list[Made]:
+def grid(densify, seeds=3, day=2, code="", **options):
     named = tuple(options.items())
     return [Made(densify, named, seed=seed, day=day, code=code) for seed in range(seeds)]
 
 
-def answer(runs: Path) -> Comparison:
+def answer(runs):
     return compare(load_experiment(runs, "exp"))
 
 
-def against(comparison: Comparison) -> list[tuple[str, str]]:
+def against(comparison):
     return [(str(second), str(first)) for first, second in comparison.pairs]
 
 
 # ---- the ways in which people work
 
 
-def test_an_arm_stays_compared_when_another_is_added(tmp_path: Path) -> None:
+def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     write(tmp_path, [*grid("adc"), *grid("momentum", decay=0.9), *grid("momentum", decay=0.99)])
     before = answer(tmp_path)
     write(tmp_path, grid("absgs", day=3))
@@ -120,19 +119,31 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path: Path) -> None:
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
 
+BOTH_CAPS = ("sfm-adc[cap=2]", "sfm-adc[cap=1]")
+
+
+def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
+    write(tmp_path, [*grid("adc", cap=2), *grid("adc", day=3, cap=1)])
+    before = answer(tmp_path).sentences
+    write(tmp_path, [*grid("absgs", day=4), *grid("mine", day=4, cap=1)])
+    after = answer(tmp_path)
+    assert before[0].startswith("sfm-adc[cap=1] against sfm-adc[cap=2]")  # the older one
+    assert set(before) < set(after.sentences)
+
+
 @pytest.mark.parametrize(
-    ("arms", "pairs", "named"),
+    "arms, pairs, named",
     [
         # the settings that both have decide
         (
             [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 2, "lr": 3})],
-            [("sfm-mine", "sfm-adc[cap=2]")],
-            "sfm-adc[cap=1] is not compared: other arms have a baseline with settings nearer",
+            [("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
+            "",
         ),
         ([("adc", {"cap": 1}), ("mine", {"cap": 2})], [("sfm-mine", "sfm-adc")], ""),
         (
             [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 4})],
-            [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]")],
+            [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
             "",
         ),
         # without a baseline: an external trainer swept over an option, and no densification
@@ -143,9 +154,7 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_every_arm_is_compared_by_the_settings_that_both_have(
-    tmp_path: Path, arms: list[tuple[str, dict[str, int]]], pairs: list[tuple[str, str]], named: str
-) -> None:
+def test_every_arm_is_compared_by_the_settings_that_both_have(tmp_path, arms, pairs, named):
     for densify, options in arms:
         write(tmp_path, grid(densify, **options))
     found = answer(tmp_path)
@@ -153,9 +162,7 @@ def test_every_arm_is_compared_by_the_settings_that_both_have(
     assert named in "\n".join(texts(found.unused))
 
 
-def test_an_arm_without_a_baseline_is_named_everywhere(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
     alone = [replace(one, init="random") for one in grid("mine")]
     write(tmp_path, [*grid("adc"), *grid("mine"), *alone])
     reason = "random-mine is not compared: there is no random-adc."
@@ -173,7 +180,7 @@ def test_an_arm_without_a_baseline_is_named_everywhere(
 
 
 @pytest.mark.parametrize(
-    ("records", "trials", "doubt"),
+    "records, trials, doubt",
     [
         # an idea, the day after the baseline, each by its own command with eval.primary
         ([(1, "adc"), (5, "mine")], {"adc": 2, "mine": 6}, ""),
@@ -191,9 +198,9 @@ def test_an_arm_without_a_baseline_is_named_everywhere(
     ],
 )
 def test_a_question_is_declared_if_it_was_fixed_before_the_first_trial_of_its_arm(
-    tmp_path: Path, records: list[tuple[int, str]], trials: dict[str, int], doubt: str
-) -> None:
-    def made(name: str, day: int) -> list[Made]:
+    tmp_path, records, trials, doubt
+):
+    def made(name, day):
         own = grid(name.rstrip("+"), seeds=4, day=day)
         return own[3:] if name.endswith("+") else own[:3]
 
@@ -213,12 +220,8 @@ def test_a_question_is_declared_if_it_was_fixed_before_the_first_trial_of_its_ar
     assert sentence(found["mine"]).endswith("The metric was declared beforehand.") == (not doubt)
 
 
-def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path: Path) -> None:
-    adc, old, new = (
-        grid("adc"),
-        grid("mine", code=OLD, lr=1),
-        grid("mine", day=6, code=NEW, lr=1),
-    )
+def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
+    adc, old, new = (grid("adc"), grid("mine", code=OLD, lr=1), grid("mine", day=6, code=NEW, lr=1))
     write(tmp_path, [*adc, *old[:1], *new])
     declare(tmp_path, (1, [*adc, *old]), (5, new))
     found = answer(tmp_path)
@@ -231,7 +234,7 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path: Path)
     assert "missing" not in "\n".join(answer(tmp_path).declaration_lines)
 
 
-def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path: Path) -> None:
+def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
     write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
     declare(tmp_path, (5, [*grid("adc"), *grid("mine", code=NEW)]))
     assert not answer(tmp_path).answers[0].beforehand
@@ -249,7 +252,7 @@ ARMS = [
 
 
 @st.composite
-def experiments(draw: st.DrawFn) -> tuple[list[Made], list[Made]]:
+def experiments(draw):
     """Trials of a baseline and of arms on scenes and seeds, some missing; those declared."""
     places = draw(
         st.lists(
@@ -269,7 +272,7 @@ def experiments(draw: st.DrawFn) -> tuple[list[Made], list[Made]]:
     return trials, trials[: draw(st.sampled_from([0, len(trials), len(trials) - 1]))]
 
 
-def one_of(trials: Sequence[Made], densify: str) -> list[Made]:
+def one_of(trials, densify):
     return [one for one in trials if one.densify == densify]
 
 
@@ -291,7 +294,7 @@ ADDED = {
 }
 
 
-def outcomes(comparison: Comparison) -> dict[tuple[str, str], Any]:
+def outcomes(comparison):
     return {
         (str(one.second), str(one.first)): (
             one.beforehand,
@@ -302,12 +305,12 @@ def outcomes(comparison: Comparison) -> dict[tuple[str, str], Any]:
 
 
 @pytest.mark.parametrize("what", ADDED)
-def test_what_is_added_never_changes_another_verdict(what: str) -> None:
+def test_what_is_added_never_changes_another_verdict(what):
     examples = 500 if os.environ.get("GSBENCH_EXAMPLES") else 12
 
     @settings(max_examples=examples, deadline=None)
     @given(experiments())
-    def check(made: tuple[list[Made], list[Made]]) -> None:
+    def check(made):
         trials, declared = made
         runs = Path(tempfile.mkdtemp())
         try:
@@ -330,7 +333,7 @@ def test_what_is_added_never_changes_another_verdict(what: str) -> None:
     check()
 
 
-def check_all_is_named(comparison: Comparison) -> None:
+def check_all_is_named(comparison):
     """Each trial is in a verdict, or its arm is named in a sentence with the reason."""
     used = {
         trial.path
@@ -349,7 +352,7 @@ def check_all_is_named(comparison: Comparison) -> None:
 
 @settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
 @given(experiments())
-def test_all_surfaces_state_the_same(made: tuple[list[Made], list[Made]]) -> None:
+def test_all_surfaces_state_the_same(made):
     trials, declared = made
     runs = Path(tempfile.mkdtemp())
     try:
@@ -375,9 +378,7 @@ def test_all_surfaces_state_the_same(made: tuple[list[Made], list[Made]]) -> Non
 
 @settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 12, deadline=None)
 @given(experiments(), st.randoms(use_true_random=False))
-def test_the_order_of_commands_does_not_matter(
-    made: tuple[list[Made], list[Made]], shuffler: random.Random
-) -> None:
+def test_the_order_of_commands_does_not_matter(made, shuffler):
     trials, declared = made
     found = []
     for order in (trials, shuffler.sample(trials, len(trials))):
@@ -392,7 +393,7 @@ def test_the_order_of_commands_does_not_matter(
     assert found[0] == found[1]
 
 
-def test_the_simulation_of_a_shared_baseline_draws_what_it_says() -> None:
+def test_the_simulation_of_a_shared_baseline_draws_what_it_says():
     shared = script("shared_baseline")
     one, some = shared.rates(shared.seen(3, 3), 1, False, 20_000, 1)
     assert one == some == pytest.approx(0.05, abs=0.006)  # Student's test is exact on one scene

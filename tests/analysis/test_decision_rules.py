@@ -9,18 +9,18 @@ from gsbench.analysis import judgement
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.statistics import Outcome, look_levels, t_test
+from gsbench.analysis.statistics import look_levels, t_test
 from gsbench.runs.experiments import Question
 from tests.analysis.untruths import KINDS, rates, scene_pairs
 from tests.analysis.untruths import decision_rules as rules
 
-OUTCOMES: tuple[Outcome, ...] = ("undecided", "supported", "refuted", "too small to matter")
+OUTCOMES = ("undecided", "supported", "refuted", "too small to matter")
 RATE = 0.0125
 CHECKS = 100
 
 
 @pytest.mark.parametrize("row", range(9))
-def test_the_simulator_decides_as_the_judge_does(row: int) -> None:
+def test_the_simulator_decides_as_the_judge_does(row):
     name, draws = list(rules.rows(np.random.default_rng(7), CHECKS))[row]
     scenes, most = draws.arm.shape[1:]
     looks = (2, 3, 4)[: most - 1]
@@ -37,7 +37,7 @@ def test_the_simulator_decides_as_the_judge_does(row: int) -> None:
             assert found == (verdict.outcome, verdict.pairs.seeds), (name, effect, draw)
 
 
-def test_the_simulator_has_the_test_of_the_judge() -> None:
+def test_the_simulator_has_the_test_of_the_judge():
     draws = rules.normal(np.random.default_rng(8), np.ones((3, 2)), 4, 50)
     for seeds in (2, 3, 4):
         mean, error, shape = draws.test(rules.CHOSEN, seeds)
@@ -51,5 +51,5 @@ def test_the_simulator_has_the_test_of_the_judge() -> None:
 
 
 @pytest.mark.parametrize("kind", ["normal", "one scene in eight stands out"])
-def test_the_simulator_finds_the_error_rates_of_the_judge(kind: str) -> None:
+def test_the_simulator_finds_the_error_rates_of_the_judge(kind):
     assert rates(KINDS[kind], 1.0, 20, fast=True) == rates(KINDS[kind], 1.0, 20)

@@ -1,26 +1,22 @@
 """Declared metrics: which tests are adjusted together, and what is said of late declarations."""
 
-from __future__ import annotations
-
 import calendar
 import json
 import os
+import shutil
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.declaration import Standing, active_declaration
-from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import families, in_words, p_text
-from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.runs.experiments import (
     STAMP,
     Arm,
@@ -37,40 +33,40 @@ EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 CLEAR = {"lpips_vgg_raw": -0.05}
 
 
-def declare(runs: Path, *records: tuple[str, str], experiment: str = "exp") -> None:
+def declare(runs, *records, experiment="exp"):
     entries = [
         Declaration(time=moment, questions=(open_question(metric),)) for metric, moment in records
     ]
     (runs / experiment / "declared.jsonl").write_text(record_text(entries))
 
 
-def declared_experiment(runs: Path, *records: tuple[str, str], **plan: object) -> Experiment:
-    write_runs(runs, Plan(**plan))  # type: ignore[arg-type]
+def declared_experiment(runs, *records, **plan):
+    write_runs(runs, Plan(**plan))
     declare(runs, *records)
     return load_experiment(runs, "exp")
 
 
-def judged(experiment: Experiment) -> list[PairVerdicts]:
+def judged(experiment):
     return list(compare(experiment).answers)
 
 
-def standing(experiment: Experiment) -> Standing:
+def standing(experiment):
     """How the declaration stands to the question about the only compared arm."""
     (one,) = judged(experiment)
     assert one.standing is not None
     return one.standing
 
 
-def lines(experiment: Experiment) -> str:
+def lines(experiment):
     return "\n".join(compare(experiment).declaration_lines)
 
 
-def test_a_declaration_about_one_question_says_so(tmp_path: Path) -> None:
+def test_a_declaration_about_one_question_says_so(tmp_path):
     experiment = declared_experiment(tmp_path, ("psnr@extrapolation", EARLY))
     assert lines(experiment).startswith("PSNR (dB) at extrapolation was declared beforehand")
 
 
-def test_a_verdict_in_words_has_its_numbers(tmp_path: Path) -> None:
+def test_a_verdict_in_words_has_its_numbers(tmp_path):
     (one,) = judged(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR))
     first, second = one.verdicts[0], one.verdicts[1]
     for verdict, adjusted in ((first, ""), (second, ", adjusted for 3 tests")):
@@ -93,9 +89,7 @@ def test_a_verdict_in_words_has_its_numbers(tmp_path: Path) -> None:
 # --- families
 
 
-def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(
-    tmp_path: Path,
-) -> None:
+def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(tmp_path):
     (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
     assert [verdict.quantity.key for verdict in one.verdicts] == [
         "flip",
@@ -117,14 +111,14 @@ def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(
     assert ordered[0].outcome == "supported"  # a clear effect is found in a secondary metric, too
 
 
-def alone(verdict: Verdict) -> float:
+def alone(verdict):
     """The p of a verdict's test by itself."""
     assert verdict.answer is not None
     assert verdict.answer.test is not None
     return verdict.answer.test.p
 
 
-def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_path: Path) -> None:
+def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_path):
     arms = ("adc", "volumetric", "absgrad", "mcmc")
     found = judged(
         declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, densifiers=arms)
@@ -137,7 +131,7 @@ def test_with_several_arms_the_declared_metric_is_adjusted_for_their_number(tmp_
     assert all(one.family == 9 for arms in found for one in arms.verdicts[1:])
 
 
-def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family() -> None:
+def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family():
     rng = np.random.default_rng(3)
     noise = [rng.normal(0, 0.1, (1, 3)) for _ in range(9)]
     weak = np.array([[0.9, 1.0, 1.3]])
@@ -152,7 +146,7 @@ def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family() ->
 # --- what report and table say
 
 
-def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path) -> None:
+def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path):
     page = build_report(
         declared_experiment(
             tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1
@@ -166,9 +160,7 @@ def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path: Path)
     assert "no metric was declared" not in page
 
 
-def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(
-    tmp_path: Path,
-) -> None:
+def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(tmp_path):
     write_runs(tmp_path, Plan(effect=CLEAR, views=3))
     experiment = load_experiment(tmp_path, "exp")
     page = build_report(experiment)
@@ -186,9 +178,7 @@ def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so
     assert verdict.removeprefix("Verdict, ") in page
 
 
-def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(
-    tmp_path: Path,
-) -> None:
+def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR)
     whole = [note for note in build_table(experiment).notes if note.startswith("Verdict")]
     assert len(whole) == 1
@@ -201,9 +191,7 @@ def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_sh
     assert [note for note in part.notes if note.startswith("Verdict")] == whole
 
 
-def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_it(
-    tmp_path: Path,
-) -> None:
+def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_it(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_alex", EARLY), effect=CLEAR)
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
@@ -222,9 +210,7 @@ def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_
 # --- when it was declared
 
 
-def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
-    tmp_path: Path,
-) -> None:
+def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", LATE), effect=CLEAR, views=3)
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
@@ -237,7 +223,7 @@ def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
     assert "declared beforehand." not in page
 
 
-def test_a_repeated_declaration_counts_from_its_first_time() -> None:
+def test_a_repeated_declaration_counts_from_its_first_time():
     psnr, later, flip = (
         Declaration(time=time, questions=(Question(metric=metric, sign=0),))
         for metric, time in (("psnr", EARLY), ("psnr", LATE), ("flip", LATE))
@@ -248,7 +234,7 @@ def test_a_repeated_declaration_counts_from_its_first_time() -> None:
     assert latest_declaration([psnr, flip, later]) is later
 
 
-def test_a_replaced_declaration_is_reported(tmp_path: Path) -> None:
+def test_a_replaced_declaration_is_reported(tmp_path):
     experiment = declared_experiment(tmp_path, ("psnr", EARLY), ("flip", LATE))
     found = compare(experiment).declared
     assert found is not None
@@ -259,9 +245,7 @@ def test_a_replaced_declaration_is_reported(tmp_path: Path) -> None:
 OLDER = (0, 1, 3)  # two trials of the baseline, which do no harm, and one of the arm
 
 
-def test_the_time_of_measuring_counts_not_that_of_writing_results(
-    tmp_path: Path,
-) -> None:
+def test_the_time_of_measuring_counts_not_that_of_writing_results(tmp_path):
     """The store gives another experiment the same numbers at once, with their ``measured``."""
     paths = write_runs(tmp_path, Plan(scenes=("garden",)))
     declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
@@ -277,7 +261,7 @@ def test_the_time_of_measuring_counts_not_that_of_writing_results(
     assert not found.beforehand
 
 
-def test_a_declaration_is_read_from_trials_if_its_record_is_gone(tmp_path: Path) -> None:
+def test_a_declaration_is_read_from_trials_if_its_record_is_gone(tmp_path):
     path = write_runs(tmp_path, Plan())[0]
     data = json.loads((path / "results.json").read_text())
     (path / "results.json").write_text(
@@ -292,9 +276,7 @@ def test_a_declaration_is_read_from_trials_if_its_record_is_gone(tmp_path: Path)
 # --- which trials were declared with it
 
 
-def declare_trials(
-    runs: Path, *records: tuple[str, dict[str, list[int]]], metric: str = "lpips_vgg_raw"
-) -> None:
+def declare_trials(runs, *records, metric="lpips_vgg_raw"):
     asked = (open_question(metric),)
     entries = [
         Declaration(time=moment, questions=asked).to_json() | {"trials": trials}
@@ -305,15 +287,13 @@ def declare_trials(
     )
 
 
-def planned(
-    seeds: list[int], arms: tuple[str, ...] = ("adc", "volumetric")
-) -> dict[str, list[int]]:
+def planned(seeds, arms=("adc", "volumetric")):
     return {
         f"{scene}/sfm-{arm}/c0ffee00": seeds for scene in ("courtyard", "garden") for arm in arms
     }
 
 
-def test_a_metric_declared_with_all_trials_is_declared_beforehand(tmp_path: Path) -> None:
+def test_a_metric_declared_with_all_trials_is_declared_beforehand(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2])))
     assert standing(experiment).beforehand
@@ -328,27 +308,21 @@ WHOLE = planned([0, 1, 2])
 
 
 @pytest.mark.parametrize(
-    ("trials", "added"),  # the baseline's first trials were there before the arm's first result
+    "trials, added",  # the baseline's first trials were there before the arm's first result
     [
         (planned([0, 1]), 3),
         (planned([0]), 6),
         (planned([0, 1, 2], ("adc",)), 6),
-        (
-            {key: seeds for key, seeds in WHOLE.items() if "garden" not in key},
-            6,
-        ),
+        ({key: seeds for key, seeds in WHOLE.items() if "garden" not in key}, 6),
         (WHOLE | {"garden/sfm-adc/c0ffee00": [0, 1]}, 1),
-        (
-            {key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()},
-            9,
-        ),
+        ({key.replace("c0ff", "aaaa"): seeds for key, seeds in WHOLE.items()}, 9),
         ({}, 9),
     ],
 )
 @pytest.mark.parametrize("recorded", [True, False], ids=["by a command", "past the record"])
 def test_a_metric_whose_trials_were_added_after_results_is_adjusted_with_all_others(
-    tmp_path: Path, trials: dict[str, list[int]], added: int, recorded: bool
-) -> None:
+    tmp_path, trials, added, recorded
+):
     """A later command recorded the additions, or the trials came without a record."""
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
@@ -358,7 +332,7 @@ def test_a_metric_whose_trials_were_added_after_results_is_adjusted_with_all_oth
     assert any(words in note for note in build_table(experiment).notes)
 
 
-def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
+def test_the_report_says_that_trials_were_added(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, planned([0, 1])))
     page = build_report(experiment)
@@ -367,16 +341,14 @@ def test_the_report_says_that_trials_were_added(tmp_path: Path) -> None:
     assert "all metrics of a pair of arms are one family, 4 tests adjusted by Holm." in page
 
 
-def test_declared_trials_that_are_missing_are_counted(tmp_path: Path) -> None:
+def test_declared_trials_that_are_missing_are_counted(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
     assert standing(experiment).beforehand
     assert "4 of the 16 declared trials are still missing" in lines(experiment)
 
 
-def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(
-    tmp_path: Path,
-) -> None:
+def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(tmp_path):
     """Results repeat the declared metric and its time, but not the declared trials."""
     for path in write_runs(tmp_path, Plan(effect=CLEAR)):
         data = json.loads((path / "results.json").read_text())
@@ -391,16 +363,16 @@ def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(
     assert not found.beforehand
 
 
-def test_a_record_may_name_no_trials_and_a_damaged_record_declares_nothing(tmp_path: Path) -> None:
+def test_a_record_may_name_no_trials_and_a_damaged_record_declares_nothing(tmp_path):
     experiment = declared_experiment(tmp_path, ("psnr", EARLY))
     assert standing(experiment).beforehand
     for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3}, {"a/b/d": ["x"]}):
-        declare_trials(tmp_path, (EARLY, trials), metric="psnr")  # type: ignore[arg-type]
+        declare_trials(tmp_path, (EARLY, trials), metric="psnr")
         # a damaged line declares nothing
         assert active_declaration(experiment.folder, experiment.trials) is None
 
 
-def test_declarations_are_read_back_as_they_were_written(tmp_path: Path) -> None:
+def test_declarations_are_read_back_as_they_were_written(tmp_path):
     arms = Arm("sfm", "adc"), Arm("sfm", "volumetric", (("densify.max_gaussians", "30000"),))
     keys = ("garden/sfm-adc/3fa9c1d2", "garden/sfm-volumetric/aaaaaaaa")
     asked = Question(
@@ -422,7 +394,7 @@ def test_declarations_are_read_back_as_they_were_written(tmp_path: Path) -> None
     assert str(arms[1]) == "sfm-volumetric[max_gaussians=30000]"
 
 
-def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path: Path) -> None:
+def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     scenes = {
         scene: (f"{scene}/sfm-adc/c0ffee00", f"{scene}/sfm-volumetric/c0ffee00")
@@ -449,3 +421,12 @@ def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path: Path) ->
     assert page.count("better in LPIPS VGG raw") == 1
     seeds = one.verdicts[0].pairs.seeds
     assert f"with {seeds} of at most 3 seeds. The metric was declared beforehand." in page
+    # A look waits for the same seeds of both arms, and without pairs nothing is equal.
+    lost = next((tmp_path / "exp/garden/sfm-adc").glob("*-seed1"))
+    shutil.rmtree(lost)
+    answers = compare(load_experiment(tmp_path, "exp"))
+    assert (
+        "no verdict yet, not all of the first 2 seeds are there in both arms"
+        in (answers.sentences[0])
+    )
+    assert "since garden has no more" in str(answers.unused[0])

@@ -6,7 +6,6 @@ import shutil
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -15,7 +14,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import NOTHING, UNLIKE, _shown, fairness_table
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.table_formats import Table, to_latex
+from gsbench.analysis.table_formats import to_latex
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import tables
@@ -26,17 +25,17 @@ from tests.finished import search_record
 LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
 
-def sheet(runs: Path, second: str = "longaxis", first: str = "adc") -> Table:
+def sheet(runs, second="longaxis", first="adc"):
     return fairness_table(
         with_variants(load_experiment(runs, "exp").trials), Arm("sfm", first), Arm("sfm", second)
     )
 
 
-def shown(table: Table) -> dict[str, tuple[str, str, str]]:
+def shown(table):
     return {row.labels[0]: tuple(entry.text for entry in row.entries) for row in table.rows}
 
 
-def change(paths: list[Path], arm: str, **values: Any) -> None:
+def change(paths, arm, **values):
     for path in paths:
         if path.parent.name == f"sfm-{arm}":
             data = json.loads((path / "results.json").read_text())
@@ -44,7 +43,7 @@ def change(paths: list[Path], arm: str, **values: Any) -> None:
 
 
 @pytest.fixture
-def paths(tmp_path) -> list[Path]:
+def paths(tmp_path):
     return write_arms(tmp_path, {name: densifier(name) for name in ("adc", "longaxis")})
 
 
@@ -206,7 +205,7 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("searched", "said"),
+    "searched, said",
     [
         (("2026-01", "2026-02"), "before any of these trials"),
         # a trial of the same moment may not have guided the search

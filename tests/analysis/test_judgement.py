@@ -1,9 +1,6 @@
 """`pair` and `judge` on trials in files: pairs, trials that are left out, and outcomes."""
 
-from __future__ import annotations
-
 import statistics
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +10,6 @@ import pytest
 from gsbench.analysis.judgement import _contradicts, find_outlying, judge
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
-from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.statistics import answer_family, seeds_needed
 from gsbench.analysis.verdicts import judge_pairs, seeds_to_resolve
 from gsbench.runs.experiments import Arm, Declaration, Question
@@ -25,14 +21,14 @@ PSNR = Question(metric="psnr", least=0.1, baseline=ADC, arm=VOLUMETRIC)
 EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 
 
-def named(trials: tuple[TrialResult, ...], seeds: tuple[int, ...] = (0, 1, 2)) -> Question:
+def named(trials, seeds=(0, 1, 2)):
     """The question that names these trials by their folders."""
     keys = {(trial.scene, trial.densify): trial.key for trial in trials}
     scenes = {scene: (keys[scene, "adc"], keys[scene, "volumetric"]) for scene, _ in keys}
     return replace(PSNR, scenes=scenes, seeds=seeds, name="claim")
 
 
-def test_pairs_share_scene_and_seed(make_experiment: Callable[..., Experiment]) -> None:
+def test_pairs_share_scene_and_seed(make_experiment):
     trials = make_experiment(effect={"psnr": 0.7}, trial_noise=0.0, residual_noise=0.0).trials
     found = pair(trials, PSNR)
     assert found.scenes == ("courtyard", "garden")
@@ -41,9 +37,7 @@ def test_pairs_share_scene_and_seed(make_experiment: Callable[..., Experiment]) 
     assert pair(trials, named(trials)).differences.tolist() == found.differences.tolist()
 
 
-def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(make_experiment):
     trials = [
         t for t in make_experiment().trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)
     ]
@@ -56,17 +50,13 @@ def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(
     assert len(found.trials) == 8
 
 
-def test_planned_seeds_after_the_first_missing_one_do_not_count(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_planned_seeds_after_the_first_missing_one_do_not_count(make_experiment):
     trials = make_experiment().trials
     kept = [t for t in trials if (t.scene, t.densify, t.seed) != ("garden", "adc", 1)]
     assert pair(kept, named(trials)).seeds == 1
 
 
-def test_arms_under_different_conditions_are_not_compared(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_arms_under_different_conditions_are_not_compared(make_experiment):
     trials = make_experiment().trials
     for trial in trials:
         if trial.densify == "adc":
@@ -77,18 +67,14 @@ def test_arms_under_different_conditions_are_not_compared(
     assert texts(found.left_out) == [f"courtyard: {reason}", f"garden: {reason}"]
 
 
-def test_a_seed_that_an_arm_has_twice_is_not_compared(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_a_seed_that_an_arm_has_twice_is_not_compared(make_experiment):
     trials = make_experiment(scenes=("garden",)).trials
     found = pair([*trials, trials[0]], PSNR)
     assert not found.rows
     assert "scene=garden sfm-adc has seed 0 twice" in str(found.left_out[0])
 
 
-def test_budgets_may_differ_if_the_question_names_its_trials(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_budgets_may_differ_if_the_question_names_its_trials(make_experiment):
     trials = make_experiment().trials
     for trial in trials:
         if trial.densify == "adc":
@@ -97,9 +83,7 @@ def test_budgets_may_differ_if_the_question_names_its_trials(
     assert not pair(trials, PSNR).rows
 
 
-def test_relative_differences_are_means_of_logarithms(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_relative_differences_are_means_of_logarithms(make_experiment):
     trials = make_experiment().trials
     question = replace(named(trials), metric="gaussians", relative=True, least=0.1)
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(question,)))
@@ -114,9 +98,7 @@ def test_relative_differences_are_means_of_logarithms(
 
 
 @pytest.mark.parametrize("densify", ["adc", "volumetric"])
-def test_no_ratio_is_taken_of_a_value_of_zero(
-    make_experiment: Callable[..., Experiment], densify: str
-) -> None:
+def test_no_ratio_is_taken_of_a_value_of_zero(make_experiment, densify):
     trials = make_experiment(scenes=("garden",)).trials
     for trial in trials:
         if (trial.densify, trial.seed) == (densify, 1):
@@ -130,9 +112,7 @@ def test_no_ratio_is_taken_of_a_value_of_zero(
     )
 
 
-def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(make_experiment):
     trials = make_experiment(effect={"psnr": 3.0}).trials
     declared = Declaration(time=EARLY, questions=(named(trials),), looks=(2, 3))
     (whole,) = judge(trials, declared)
@@ -146,9 +126,7 @@ def test_a_look_waits_for_every_scene_and_the_first_that_decides_is_final(
     assert judge(later, declared)[0].interval == whole.interval
 
 
-def test_trials_measured_before_the_question_divide_its_error_rate(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_trials_measured_before_the_question_divide_its_error_rate(make_experiment):
     trials = make_experiment(effect={"psnr": 3.0}).trials
     one, late = (
         judge(trials, Declaration(time=t, questions=(named(trials),), looks=(3,)))[0]
@@ -162,9 +140,7 @@ def test_trials_measured_before_the_question_divide_its_error_rate(
 
 
 @pytest.mark.parametrize("seeds", [1, 2, 3])
-def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(
-    make_experiment: Callable[..., Experiment], seeds: int
-) -> None:
+def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(make_experiment, seeds):
     trials = make_experiment(seeds=range(seeds)).trials
     (verdict,) = judge(trials, Declaration(time=EARLY, questions=(PSNR,)))
     assert [scene.scene for scene in verdict.scenes] == ["courtyard", "garden"]
@@ -184,9 +160,7 @@ def test_a_scene_has_the_mean_and_the_deviation_of_its_differences(
         assert found.mean == pytest.approx(statistics.mean(own))
 
 
-def test_arms_that_never_differ_cannot_be_tested(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_arms_that_never_differ_cannot_be_tested(make_experiment):
     trials = make_experiment().trials
     for trial in trials:
         object.__setattr__(trial.record, "metrics", {"psnr": 20.0})
@@ -199,12 +173,12 @@ def test_arms_that_never_differ_cannot_be_tested(
 # --- trials far outside the others
 
 
-def rows(before: list[list[float]], after: list[list[float]]) -> Pairs:
+def rows(before, after):
     both = (np.array([b, a]) for b, a in zip(before, after, strict=True))
     return Pairs(tuple(scene_pairs(place, noise, 0.0) for place, noise in enumerate(both)))
 
 
-def test_an_outlying_training_is_found() -> None:
+def test_an_outlying_training_is_found():
     good = [[20.0, 20.1, 19.9, 20.05]] * 2
     found = find_outlying(rows(good, [[20.5, 20.6, 10.0, 20.4], [20.5, 20.4, 20.6, 20.5]]))
     assert [trial.path for trial in found] == [Path("0/b2")]
@@ -223,9 +197,7 @@ def test_an_outlying_training_is_found() -> None:
     assert find_outlying(rows([[20.0, 30.0]], [[20.0, 20.1]])) == []
 
 
-def test_a_verdict_that_depends_on_one_training_is_undecided(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_a_verdict_that_depends_on_one_training_is_undecided(make_experiment):
     """Without the training that failed the mean has the other sign."""
     trials = make_experiment(scenes=("a", "b", "c"), seeds=range(6)).trials
     values = {
@@ -244,7 +216,7 @@ def test_a_verdict_that_depends_on_one_training_is_undecided(
 
 
 @pytest.mark.parametrize(
-    ("rest", "outcome", "least", "expected"),
+    "rest, outcome, least, expected",
     [
         (0.1, "supported", None, False),
         (0.0, "supported", None, True),
@@ -254,15 +226,13 @@ def test_a_verdict_that_depends_on_one_training_is_undecided(
         (-0.5, "too small to matter", 0.5, True),
     ],
 )
-def test_a_mean_without_outlying_trials_may_contradict_the_outcome(
-    rest: float, outcome: str, least: float | None, expected: bool
-) -> None:
-    assert _contradicts(rest, 0.2, outcome, least) == expected  # type: ignore[arg-type]
+def test_a_mean_without_outlying_trials_may_contradict_the_outcome(rest, outcome, least, expected):
+    assert _contradicts(rest, 0.2, outcome, least) == expected
 
 
 def test_scenes_of_all_questions_are_one_family_and_a_single_scene_has_the_questions_answer(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+    make_experiment,
+):
     trials = make_experiment(scenes=("a", "b", "c"), effect={"psnr": 0.5}).trials
     questions = [
         named(tuple(t for t in trials if t.scene in scenes)) for scenes in (("a",), ("b", "c"))
@@ -278,7 +248,7 @@ def test_scenes_of_all_questions_are_one_family_and_a_single_scene_has_the_quest
 # --- which arms are compared
 
 
-def test_arms_are_compared_with_the_baseline_of_the_same_initialiser() -> None:
+def test_arms_are_compared_with_the_baseline_of_the_same_initialiser():
     arms = [Arm("dim", "adc"), Arm("dim", "volumetric"), ADC, VOLUMETRIC]
     assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[2], arms[3])]
     three = [Arm(init, "x") for init in "abc"]
@@ -287,7 +257,7 @@ def test_arms_are_compared_with_the_baseline_of_the_same_initialiser() -> None:
     assert choose_pairs([ADC]) == []
 
 
-def test_variants_are_compared_with_the_baseline_of_the_same_settings() -> None:
+def test_variants_are_compared_with_the_baseline_of_the_same_settings():
     arms = [
         Arm("sfm", name, (("cap", str(cap)),)) for name in ("adc", "volumetric") for cap in (1, 2)
     ]
@@ -296,9 +266,7 @@ def test_variants_are_compared_with_the_baseline_of_the_same_settings() -> None:
     assert choose_pairs(arms) == [(arms[0], arms[1]), (arms[0], arms[2])]
 
 
-def test_what_was_left_out_of_a_compared_pair_is_noted_for_each_metric(
-    make_experiment: Callable[..., Experiment],
-) -> None:
+def test_what_was_left_out_of_a_compared_pair_is_noted_for_each_metric(make_experiment):
     trials = make_experiment(scenes=("garden",)).trials
     kept = [trial for trial in trials if (trial.densify, trial.seed) != ("adc", 1)]
     (judged,) = judge_pairs(kept, [(ADC, VOLUMETRIC)])

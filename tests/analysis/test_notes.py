@@ -3,13 +3,12 @@
 import itertools
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from gsbench.analysis.fairness import counts_sentence
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import (
     build_table,
     doubt_notes,
@@ -33,17 +32,17 @@ COMPARED = (
 )
 
 
-def trials_of(tmp_path: Path, **plan: object) -> tuple[TrialResult, ...]:
+def trials_of(tmp_path, **plan):
     write_runs(tmp_path, Plan(**plan))
     return load_experiment(tmp_path, "exp").trials
 
 
-def with_record(trial: TrialResult, **values: object) -> TrialResult:
+def with_record(trial, **values):
     return replace(trial, record=replace(trial.record, **values))
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    "counts, said",
     [
         ({"garden": (100, 128)}, "28 % more"),
         ({"garden": (100, 60)}, "40 % fewer"),
@@ -76,7 +75,7 @@ DEMO, MINE = (
 
 
 @pytest.mark.parametrize(
-    ("baseline", "arm", "command"),
+    "baseline, arm, command",
     [
         (
             [*DEMO, "densify=adc"],
@@ -124,7 +123,7 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
     assert sentence.endswith("densify.cap=governor densify.max_gaussians=12300 name=exp_equal`.")
 
 
-@pytest.mark.parametrize(("rounds", "warns"), [(0, True), (1, True), (4, True), (5, False)])
+@pytest.mark.parametrize("rounds, warns", [(0, True), (1, True), (4, True), (5, False)])
 def test_a_table_warns_of_too_few_rounds(tmp_path, rounds, warns):
     (trial,) = trials_of(tmp_path, scenes=["garden"], densifiers=("adc",), seeds=(0,))
     config = json.loads((trial.path / "config.yaml").read_text())
@@ -187,7 +186,7 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("folders", "downscales", "noted"),
+    "folders, downscales, noted",
     [
         (("images", "images_4"), (4, 1), True),
         (("images", "images"), (4, 1), False),
@@ -229,9 +228,7 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
     assert doubt_notes(made) == []
 
 
-@pytest.mark.parametrize(
-    ("lost", "rest"), [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")]
-)
+@pytest.mark.parametrize("lost, rest", [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")])
 def test_up_to_three_left_out_trials_are_named_and_all_are_counted(tmp_path, lost, rest):
     paths = write_runs(tmp_path, Plan())
     for path in paths[:lost]:

@@ -1,7 +1,6 @@
 """Trials of several machines or initial clouds are averaged and compared, always with a note."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
@@ -23,11 +22,11 @@ RYZEN = XEON | {"cpu": "Ryzen", "kernels": "znver3", "torch": "AVX2"}
 A, B = "a" * 64, "b" * 64
 
 
-def notes_of(runs: Path) -> list[str]:
+def notes_of(runs):
     return list(build_table(load_experiment(runs, "exp"), metrics=["psnr"]).notes)
 
 
-def hashes(cloud: str | None, init: str = "init1") -> dict[str, str]:
+def hashes(cloud, init="init1"):
     return {"data": "d", "init": init} | ({} if cloud is None else {"cloud": cloud})
 
 

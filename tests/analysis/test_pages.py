@@ -1,12 +1,9 @@
 """Every page that gsbench writes, with hostile text in each of its fields."""
 
-from __future__ import annotations
-
 import random
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import pytest
 from markupsafe import Markup
@@ -36,28 +33,28 @@ LOOK = "[document.title === 'owned', document.scripts.length]"
 class Parsed(HTMLParser):
     """The elements of a page with their attributes, in order, and the texts of its scripts."""
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.scripts: list[str] = []
+        self.elements = []
+        self.scripts = []
         self.feed(page)
         self.close()
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
         if tag == "script":
             self.scripts.append("")
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self.cdata_elem == "script":
             self.scripts[-1] += data
 
     @property
-    def shape(self) -> list[tuple[str, tuple[str, ...]]]:
+    def shape(self):
         return [(tag, tuple(attributes)) for tag, attributes in self.elements]
 
 
-def pages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+def pages(folder, monkeypatch):
     """Each kind of page by its template, written by the verbs or what they call."""
     runs = folder / "runs"
     write_runs(runs, Plan(views=7, seeds=(0, 1), pictures=True, effect={"psnr": 1.0}))
@@ -79,16 +76,16 @@ def pages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, str], dict[str, str]]:
+def both(tmp_path_factory):
     """All pages, as they are and with `HOSTILE` in each field of each template."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         sound = pages(tmp_path_factory.mktemp("sound"), monkeypatch)
         plain = table_formats._environment.__wrapped__
 
-        def hostile(package: str) -> Any:
+        def hostile(package):
             environment = plain(package)
 
-            def finalize(value: Any) -> Any:
+            def finalize(value):
                 # Markup is what gsbench itself wrote: a script, its hash, a chart
                 return value if isinstance(value, Markup) else f"{value}{HOSTILE}"
 
@@ -99,7 +96,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, str], dict
         return sound, pages(tmp_path_factory.mktemp("hostile"), monkeypatch)
 
 
-def test_every_page_is_among_those_that_are_tried(both: Any) -> None:
+def test_every_page_is_among_those_that_are_tried(both):
     whole = {
         file.name
         for file in ROOT.rglob("*.j2")
@@ -110,7 +107,7 @@ def test_every_page_is_among_those_that_are_tried(both: Any) -> None:
     assert not written  # and `gsbench export --out page.html`, which is tried below
 
 
-def test_no_text_of_a_page_becomes_an_element_or_a_script(both: Any) -> None:
+def test_no_text_of_a_page_becomes_an_element_or_a_script(both):
     for name, sound in both[0].items():
         before, after = Parsed(sound), Parsed(both[1][name])
         assert after.shape == before.shape, name
@@ -123,7 +120,7 @@ def test_no_text_of_a_page_becomes_an_element_or_a_script(both: Any) -> None:
             assert re.match(r"#|data:|reports/|pictures/|https://", target), (name, target)
 
 
-def test_every_page_allows_its_own_script_alone(both: Any) -> None:
+def test_every_page_allows_its_own_script_alone(both):
     for name, text in both[0].items():
         parsed = Parsed(text)
         head = [tag for tag, _ in parsed.elements]
@@ -141,7 +138,7 @@ def test_every_page_allows_its_own_script_alone(both: Any) -> None:
 
 
 @pytest.mark.browser
-def test_no_hostile_text_runs_in_a_browser(both: Any, tmp_path: Path) -> None:
+def test_no_hostile_text_runs_in_a_browser(both, tmp_path):
     for name, text in both[1].items():
         file = tmp_path / f"{name}.html"
         file.write_text(text, encoding="utf-8")
@@ -150,7 +147,7 @@ def test_no_hostile_text_runs_in_a_browser(both: Any, tmp_path: Path) -> None:
             assert found["result"]["value"] == [False, len(Parsed(text).scripts)], name
 
 
-def test_the_name_of_a_photograph_stays_a_text_in_the_page_of_a_model() -> None:
+def test_the_name_of_a_photograph_stays_a_text_in_the_page_of_a_model():
     annotation = model_page._annotation(f"0{HOSTILE}.png", {"target": [0, 0, 0]})
     assert not set("<>&") & set(str(annotation))
     page = model_page.with_policy("<!DOCTYPE html><html><head lang='x'><title>t</title></head>")

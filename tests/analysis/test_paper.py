@@ -30,7 +30,7 @@ from tests.analysis.synthetic import Plan, write_runs
 from tests.analysis.test_tables import one_trial, texts
 
 
-def cell(mean: float, std: float | None = None, count: int = 3) -> Cell:
+def cell(mean, std=None, count=3):
     return Cell(mean, std, count, 3, 1, ())
 
 
@@ -116,7 +116,7 @@ def test_a_printed_number_has_the_range_that_rounds_to_it():
 
 
 @pytest.mark.parametrize(
-    ("measured", "expected"),
+    "measured, expected",
     [
         (cell(0.124), ROUNDING),  # rounds to 0.12
         (cell(0.126), DIFFERS),  # a single trial has no interval
@@ -204,10 +204,7 @@ def test_the_tables_verb_prints_and_writes_files(tmp_path, capsys):
     assert "### Table 1, difference" in out
     assert tables(["table1", "--format", "latex", "--out", str(tmp_path / "out")], runs) == 0
     written = (tmp_path / "out").glob("[!.]*")
-    assert sorted(p.name for p in written) == [
-        "table1-difference.tex",
-        "table1.tex",
-    ]
+    assert sorted(p.name for p in written) == ["table1-difference.tex", "table1.tex"]
     assert (
         tables(["table1", "--rows", "scene,densify", "--metrics", "psnr", "--format", "csv"], runs)
         == 0

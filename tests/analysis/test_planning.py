@@ -1,7 +1,5 @@
 """Plans against simulated sweeps that the judge decides."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ promises = script("promises")
 
 
 @pytest.mark.parametrize("purpose", [Purpose(), Purpose(looks=True), Purpose(0.0125, looks=True)])
-def test_designs_have_the_fewest_seeds_that_suffice(purpose: Purpose) -> None:
+def test_designs_have_the_fewest_seeds_that_suffice(purpose):
     designs = purpose.designs(0.2, 0.1)
     assert designs
     for one in designs:
@@ -22,7 +20,7 @@ def test_designs_have_the_fewest_seeds_that_suffice(purpose: Purpose) -> None:
         assert one.seeds == 2 or purpose.power(fewer, 0.2, 0.1) < POWER
 
 
-def test_the_power_of_a_check_is_that_of_its_verdicts() -> None:
+def test_the_power_of_a_check_is_that_of_its_verdicts():
     design, rng = Design(3, 4), np.random.default_rng(0)
     found = [promises.check(3, 4, 1.0, 0.2, 4)(rng) for _ in range(150)]
     planned = Purpose(0.05 / 4, looks=True).power(design, 0.2, 0.1)
@@ -30,14 +28,14 @@ def test_the_power_of_a_check_is_that_of_its_verdicts() -> None:
     assert planned < Purpose().power(design, 0.2, 0.1)
 
 
-def test_giving_up_and_a_single_capture_cost_power() -> None:
+def test_giving_up_and_a_single_capture_cost_power():
     plain, ledger = Purpose(0.005, looks=True), Purpose(0.005, looks=True, give_up=0.05, alone=3.0)
     for design in (Design(1, 8), Design(3, 5)):
         assert ledger.power(design, 0.15, 0.1) < plain.power(design, 0.15, 0.1)
     assert plain.power(Design(1, 2), 0.1, 0.0) == 1.0
 
 
-def test_the_range_of_the_deviation_holds_the_real_one_in_80_percent_of_pilots() -> None:
+def test_the_range_of_the_deviation_holds_the_real_one_in_80_percent_of_pilots():
     rng = np.random.default_rng(0)
     ranges = [
         deviation_range(estimate_components(list(rng.normal(0, 1, (3, 3))))) for _ in range(3000)

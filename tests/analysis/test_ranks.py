@@ -23,14 +23,14 @@ Make = Callable[..., Experiment]
 
 
 @pytest.fixture
-def seven(make_experiment) -> Experiment:
+def seven(make_experiment):
     return make_experiment(
         scenes=SCENES, densifiers=ARMS, effect={"psnr": 2.0, "lpips_vgg_raw": -0.1}
     )
 
 
 @pytest.mark.parametrize(
-    ("arms", "q"), [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)]
+    "arms, q", [(2, 1.960), (3, 2.343), (4, 2.569), (5, 2.728), (6, 2.850), (10, 3.164)]
 )
 def test_the_critical_values_are_those_of_demsar(arms, q):
     """Demšar 2006, table 5a."""
@@ -129,7 +129,7 @@ def test_report_and_site_have_the_plot_of_ranks(seven, tmp_path):
     assert f"that no arm differs: p {p_text(ranking.p)}.</p>" in svg
 
 
-def numbers(pattern: str, text: str) -> list[list[float]]:
+def numbers(pattern, text):
     found = re.findall(pattern.replace("#", r'"([\d.]+)"'), text)
     return [[float(number) for number in np.atleast_1d(one)] for one in found]
 

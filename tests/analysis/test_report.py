@@ -8,7 +8,6 @@ import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,7 +32,7 @@ from gsbench.analysis.report.build import (
     trial_figures,
 )
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
-from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
 from gsbench.analysis.verdict_words import by_scene_lines, sentence
 from gsbench.analysis.verdicts import judge_pairs
@@ -48,7 +47,7 @@ ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Path:
+def runs(tmp_path_factory):
     """Two scenes with pictures, in which "volumetric" differs only by a clearly better LPIPS."""
     folder = tmp_path_factory.mktemp("runs")
     write_runs(folder, Plan(effect={"lpips_vgg_raw": -0.05}, views=3, pictures=True, random_seed=1))
@@ -56,12 +55,12 @@ def runs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def experiment(runs) -> Experiment:
+def experiment(runs):
     return load_experiment(runs, "exp")
 
 
 @pytest.fixture(scope="module")
-def page(experiment) -> str:
+def page(experiment):
     return build_report(experiment)
 
 
@@ -86,24 +85,24 @@ class Elements(HTMLParser):
 
     VOID = ("meta", "link", "img", "input", "br")
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
+        self.found = []
+        self.open = []
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))
         if tag not in self.VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attrs):
         self.found.append((tag, dict(attrs)))
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag, f"{tag} closes out of order at {self.getpos()}"
 
-    def all(self, tag: str) -> list[dict[str, str | None]]:
+    def all(self, tag):
         return [attrs for name, attrs in self.found if name == tag]
 
 
@@ -436,7 +435,7 @@ def test_an_axis_has_round_ticks_within_its_range(values, log):
 
 
 @pytest.mark.parametrize(
-    ("values", "log", "ticks", "labels"),
+    "values, log, ticks, labels",
     [
         ((2, 5), False, [2, 3, 4, 5], ["2", "3", "4", "5"]),
         ((0, 10), False, [0, 2.5, 5, 7.5, 10], ["0.0", "2.5", "5.0", "7.5", "10.0"]),
@@ -458,7 +457,7 @@ def test_ticks_are_at_round_values_with_matching_labels(values, log, ticks, labe
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
+    "value, text",
     [
         (0, "0"),
         (1e-4, "0.0001"),
@@ -485,7 +484,7 @@ def test_a_row_of_a_forest_plot_has_the_colour_of_its_verdict():
 
 
 @pytest.mark.parametrize(
-    ("key", "better"), [("psnr", "right of zero is better"), ("flip", "left of zero is better")]
+    "key, better", [("psnr", "right of zero is better"), ("flip", "left of zero is better")]
 )
 def test_a_forest_plot_of_a_verdict_has_its_scenes_and_from_two_on_their_mean(key, better):
     scenes = [
@@ -509,7 +508,7 @@ def test_an_axis_from_zero_begins_at_zero():
 
 
 @pytest.mark.parametrize(
-    ("settings", "expected"),
+    "settings, expected",
     [
         ({"volume_threshold": 0.03}, 0.03),
         ({"volume_threshold": 0.03, "threshold_mode": "absolute"}, 0.03),
@@ -646,7 +645,7 @@ def test_scenes_that_disagree_are_named_under_a_verdict_on_their_mean(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("plan", "decided"),
+    "plan, decided",
     [
         ({"trial_noise": 0, "residual_noise": 0}, False),
         ({"scenes": ("garden",), "effect": {"psnr": 5.0}, "trial_noise": 0.01}, True),

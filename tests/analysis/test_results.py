@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +13,7 @@ from gsbench.runs.trial_record import read_rows
 from tests.analysis.synthetic import Plan, write_arms, write_runs
 
 
-def rewrite(path: Path, **changes: object) -> None:
+def rewrite(path, **changes):
     data = json.loads((path / "results.json").read_text())
     (path / "results.json").write_text(json.dumps(data | changes))
 

@@ -1,7 +1,5 @@
 """Statistics and planning against SciPy, textbooks, cases counted by hand, and simulations."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
@@ -31,7 +29,7 @@ from gsbench.errors import InputError
 from tests.analysis.untruths import KINDS, rates
 
 
-def test_the_test_of_one_scene_is_the_paired_t_test() -> None:
+def test_the_test_of_one_scene_is_the_paired_t_test():
     values = np.array([0.3, 0.1, 0.25, 0.4])
     found, expected = t_test(values[None]), scipy.stats.ttest_1samp(values, 0)
     assert found is not None
@@ -42,7 +40,7 @@ def test_the_test_of_one_scene_is_the_paired_t_test() -> None:
     assert t_test(np.array([[0.3]])) is None
 
 
-def test_scenes_have_equal_weights_and_their_own_variances() -> None:
+def test_scenes_have_equal_weights_and_their_own_variances():
     """By hand: variances 1 and 2 of three pairs each, and 1 and 9."""
     rows = np.array([[1.0, 2.0, 3.0], [3 - 2**0.5, 3.0, 3 + 2**0.5]])
     found = t_test(rows)
@@ -56,7 +54,7 @@ def test_scenes_have_equal_weights_and_their_own_variances() -> None:
     assert one_noisy.p == pytest.approx(2 * scipy.stats.t.sf(1.5 / (1 / 12) ** 0.5, 2))
 
 
-def test_the_error_is_that_of_welch() -> None:
+def test_the_error_is_that_of_welch():
     rng = np.random.default_rng(0)
     one, other = rng.normal(0, 1, 5), rng.normal(0, 4, 5)
     found, welch = (
@@ -67,9 +65,7 @@ def test_the_error_is_that_of_welch() -> None:
     assert found.mean / found.error == pytest.approx(welch.statistic)
 
 
-def test_two_pairs_suffice_and_single_ones_have_the_spread_of_scenes_for_that_of_trainings() -> (
-    None
-):
+def test_two_pairs_suffice_and_single_ones_have_the_spread_of_scenes_for_that_of_trainings():
     for rows in ([[0.1, 0.3]], [[0.1], [0.3]], [[0.3], [0.1], [0.5]]):
         values = np.array(rows)
         found = t_test(values)
@@ -78,15 +74,13 @@ def test_two_pairs_suffice_and_single_ones_have_the_spread_of_scenes_for_that_of
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "known"), [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)]
+    "low, high, known", [(0, 1, False), (-1, 0, False), (-1, 1, False), (0.1, 1, True)]
 )
-def test_an_interval_that_ends_at_zero_does_not_exclude_it(
-    low: float, high: float, known: bool
-) -> None:
+def test_an_interval_that_ends_at_zero_does_not_exclude_it(low, high, known):
     assert Interval(low, high).excludes_zero() == Interval(-high, -low).excludes_zero() == known
 
 
-def test_without_spread_p_is_zero_or_for_no_difference_one() -> None:
+def test_without_spread_p_is_zero_or_for_no_difference_one():
     same = t_test(np.full((2, 3), 0.2))
     assert same is not None
     assert (same.p, same.interval()) == (0.0, Interval(same.mean, same.mean))
@@ -95,7 +89,7 @@ def test_without_spread_p_is_zero_or_for_no_difference_one() -> None:
     assert nothing.p == 1.0
 
 
-def test_holm_is_step_down_and_monotone() -> None:
+def test_holm_is_step_down_and_monotone():
     """Textbook case: 0.01 x 4, 0.02 x 3, 0.03 x 2, 0.04 x 1, with the running maximum."""
     p_values = [0.04, 0.01, 0.03, 0.02]
     adjusted = [p * factor for p, factor in zip(p_values, holm_factors(p_values), strict=True)]
@@ -111,7 +105,7 @@ def test_holm_is_step_down_and_monotone() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_an_interval_excludes_zero_exactly_if_p_is_below_5_percent(seed: int) -> None:
+def test_an_interval_excludes_zero_exactly_if_p_is_below_5_percent(seed):
     rng = np.random.default_rng(seed)
     size, scenes, seeds = (int(n) for n in rng.integers((1, 1, 2), (25, 9, 5)))
     for one in answer_family(
@@ -125,7 +119,7 @@ def test_an_interval_excludes_zero_exactly_if_p_is_below_5_percent(seed: int) ->
 
 
 @pytest.mark.parametrize(
-    ("interval", "sign", "expected"),
+    "interval, sign, expected",
     [
         ((0.1, 2.0), 1, "supported"),
         ((0.1, 2.0), -1, "refuted"),
@@ -139,13 +133,11 @@ def test_an_interval_excludes_zero_exactly_if_p_is_below_5_percent(seed: int) ->
         ((0.1, 2.0), 0, "undecided"),
     ],
 )
-def test_the_interval_alone_decides_the_outcome(
-    interval: tuple[float, float], sign: int, expected: str
-) -> None:
+def test_the_interval_alone_decides_the_outcome(interval, sign, expected):
     assert outcome_of(Interval(*interval), sign, 0.5) == expected
 
 
-def test_too_small_is_decided_at_an_equal_share_of_the_error_rate() -> None:
+def test_too_small_is_decided_at_an_equal_share_of_the_error_rate():
     clear, other = np.array([[0.30, 0.31, 0.29]]), np.array([[0.0, 5.0, -4.0]])
     one = answer_family([clear, other])[0]
     assert (one.rate, one.equal_rate) == (pytest.approx(ALPHA / 2), ALPHA / 2)
@@ -159,7 +151,7 @@ def test_too_small_is_decided_at_an_equal_share_of_the_error_rate() -> None:
 # --- scenes like these
 
 
-def test_scenes_like_these_are_judged_by_the_sign_test() -> None:
+def test_scenes_like_these_are_judged_by_the_sign_test():
     means = np.array([-0.044, 0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.007])
     found = judge_like_these(means, 1, 0.005)
     assert found is not None
@@ -171,10 +163,10 @@ def test_scenes_like_these_are_judged_by_the_sign_test() -> None:
     assert found.outcome == "undecided"
     assert found.needed == 8
     assert found.power() == pytest.approx(0.9**8)
-    assert judge_like_these(np.abs(means), 1, 0.001).outcome == "supported"  # type: ignore[union-attr]
+    assert judge_like_these(np.abs(means), 1, 0.001).outcome == "supported"
     lower, either = (judge_like_these(means, sign, 0.005) for sign in (-1, 0))
-    assert (lower.helped, lower.beyond) == (1, 1)  # type: ignore[union-attr]
-    assert (either.helped, either.beyond) == (7, 3)  # type: ignore[union-attr]
+    assert (lower.helped, lower.beyond) == (1, 1)
+    assert (either.helped, either.beyond) == (7, 3)
     assert judge_like_these(means[:5], 1, 0.005) is None
     nothing = judge_like_these(np.zeros(6), 1, 0.0)
     assert nothing is not None
@@ -190,7 +182,7 @@ def test_scenes_like_these_are_judged_by_the_sign_test() -> None:
     assert none_helped.p == pytest.approx(scipy.stats.binomtest(0, 6).pvalue)
 
 
-def test_the_interval_of_the_median_is_exact() -> None:
+def test_the_interval_of_the_median_is_exact():
     """The ends of eight values miss the median with probability 2 / 2^8; six reach 5 %, not 1 %."""
     values = np.arange(8.0)
     assert median_interval(values, 0.05) == Interval(0.0, 7.0)
@@ -203,7 +195,7 @@ def test_the_interval_of_the_median_is_exact() -> None:
     assert median_interval(values[:6], 0.01) is None
 
 
-def test_the_statement_agrees_with_the_sign_test_at_every_level() -> None:
+def test_the_statement_agrees_with_the_sign_test_at_every_level():
     rng = np.random.default_rng(1)
     for _ in range(50):
         found = judge_like_these(
@@ -216,10 +208,8 @@ def test_the_statement_agrees_with_the_sign_test_at_every_level() -> None:
 # --- looks
 
 
-@pytest.mark.parametrize(("scenes", "noise"), [(1, 1.0), (3, 1.0), (3, 10.0), (8, 10.0)])
-def test_all_looks_together_err_in_at_most_5_percent_also_with_a_noisy_scene(
-    scenes: int, noise: float
-) -> None:
+@pytest.mark.parametrize("scenes, noise", [(1, 1.0), (3, 1.0), (3, 10.0), (8, 10.0)])
+def test_all_looks_together_err_in_at_most_5_percent_also_with_a_noisy_scene(scenes, noise):
     looks = (2, 3, 4, 5, 6)
     levels = look_levels(scenes, looks, 0.05)
     shares = [0.05 * (seeds / 6) ** 1.5 for seeds in looks]
@@ -227,13 +217,13 @@ def test_all_looks_together_err_in_at_most_5_percent_also_with_a_noisy_scene(
     deviations = np.where(np.arange(scenes) == 0, noise, 1.0)
     sweeps = np.random.default_rng(1).normal(0, 1, (4000, scenes, looks[-1])) * deviations[:, None]
     false = [
-        any(t_test(sweep[:, :seeds]).p < level for seeds, level in zip(looks, levels, strict=True))  # type: ignore[union-attr]
+        any(t_test(sweep[:, :seeds]).p < level for seeds, level in zip(looks, levels, strict=True))
         for sweep in sweeps
     ]
     assert np.mean(false) < 0.05 + 3 * (0.05 * 0.95 / len(sweeps)) ** 0.5
 
 
-def test_levels_of_looks_and_numbers_of_seeds_at_looks() -> None:
+def test_levels_of_looks_and_numbers_of_seeds_at_looks():
     assert look_levels(3, (4,), 0.05) == (0.05,)
     # the test keeps any level, so the first look has what it may spend
     assert look_levels(1, (2, 3), 1e-6)[0] == pytest.approx(1e-6 * (2 / 3) ** 1.5)
@@ -259,29 +249,29 @@ LIMIT = 0.05 + 3 * (0.05 * 0.95 / CHECKS) ** 0.5  # three standard errors above 
         pytest.param("a training in ten fails, either arm", marks=pytest.mark.slow),
     ],
 )
-def test_no_outcome_is_false_in_more_than_5_percent(kind: str) -> None:
+def test_no_outcome_is_false_in_more_than_5_percent(kind):
     for effect in (0.0, 0.5, 1.0, 2.0):
         found = rates(KINDS[kind], effect, CHECKS)
         assert max(found.untrue.values()) < LIMIT, (effect, found)
         assert found.like_these < LIMIT, (effect, found)
 
 
-def test_a_noisy_scene_with_few_seeds_causes_no_false_verdicts() -> None:
+def test_a_noisy_scene_with_few_seeds_causes_no_false_verdicts():
     found = rates(KINDS["2, 10 and 10 pairs, the small scene noisy"], 0.0, CHECKS)
     assert max(found.untrue.values()) < LIMIT
 
 
-def test_an_effect_that_matters_is_found() -> None:
+def test_an_effect_that_matters_is_found():
     found = rates(KINDS["normal"], 2.0, CHECKS)
     assert found.outcomes["supported"] > 0.8
 
 
-def test_seeds_needed_give_the_promised_power() -> None:
+def test_seeds_needed_give_the_promised_power():
     seeds = seeds_needed(deviation=0.1, scenes=2, difference=0.1)
     assert seeds is not None
     rng = np.random.default_rng(0)
 
-    def power(count: int) -> float:
+    def power(count):
         tests = [t_test(sample) for sample in rng.normal(0.1, 0.1, (2000, 2, count))]
         return float(np.mean([test is not None and test.p < ALPHA for test in tests]))
 
@@ -297,7 +287,7 @@ def test_seeds_needed_give_the_promised_power() -> None:
 KNOWN = Components(between=0.3, within=0.5, scenes=4, trials=12)
 
 
-def test_components_are_unbiased_also_with_unequal_seeds() -> None:
+def test_components_are_unbiased_also_with_unequal_seeds():
     rng = np.random.default_rng(0)
     within, between = [], []
     for _ in range(4000):
@@ -309,7 +299,7 @@ def test_components_are_unbiased_also_with_unequal_seeds() -> None:
     assert np.mean(between) == pytest.approx(0.09, abs=0.03)  # cut off at zero, so a little above
 
 
-def test_components_of_equal_scenes_by_hand() -> None:
+def test_components_of_equal_scenes_by_hand():
     # Means 1 and 4, variance 2 within each: 4.5 between means, of which 2 / 2 is noise.
     found = estimate_components([np.array([0.0, 2.0]), np.array([3.0, 5.0])])
     assert found.within == pytest.approx(2**0.5)
@@ -317,7 +307,7 @@ def test_components_of_equal_scenes_by_hand() -> None:
     assert (found.scenes, found.trials) == (2, 4)
 
 
-def test_equal_scenes_have_no_variance_between_them() -> None:
+def test_equal_scenes_have_no_variance_between_them():
     assert estimate_components([np.array([0.0, 2.0]), np.array([0.0, 2.0])]).between == 0.0
     assert estimate_components([np.array([0.0, 2.0])]).between is None
     with pytest.raises(InputError, match="two seeds"):
@@ -325,7 +315,7 @@ def test_equal_scenes_have_no_variance_between_them() -> None:
 
 
 @pytest.mark.parametrize("like_asked", [False, True])
-def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_asked: bool) -> None:
+def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_asked):
     rng = np.random.default_rng(1)
     design, effect, sweeps = Design(8, 3), 0.35, 4000
     scenes = rng.normal(0, KNOWN.between or 0.0, (sweeps, design.scenes, 1)) if like_asked else 0.0
@@ -339,7 +329,7 @@ def test_power_is_the_share_of_simulated_sweeps_that_see_the_difference(like_ask
 
 
 @pytest.mark.parametrize("like_these", [False, True])
-def test_planned_designs_have_the_fewest_seeds_that_suffice(like_these: bool) -> None:
+def test_planned_designs_have_the_fewest_seeds_that_suffice(like_these):
     designs = designs_needed(0.35, KNOWN, like_these)
     assert designs
     for one in designs:
@@ -350,7 +340,7 @@ def test_planned_designs_have_the_fewest_seeds_that_suffice(like_these: bool) ->
     assert min(one.scenes for one in designs) >= (6 if like_these else 1)
 
 
-def test_seeds_do_not_replace_scenes() -> None:
+def test_seeds_do_not_replace_scenes():
     """If scenes differ by more than the effect, no number of seeds shows scenes like these."""
     scattered = Components(between=5.0, within=0.1, scenes=4, trials=12)
     assert designs_needed(0.5, scattered, like_these=True) == []
@@ -358,7 +348,7 @@ def test_seeds_do_not_replace_scenes() -> None:
     assert Design(1, 3).trials == 6  # of two arms
 
 
-def test_impossible_plans_are_refused() -> None:
+def test_impossible_plans_are_refused():
     one_scene = estimate_components([np.array([0.0, 2.0])])
     with pytest.raises(InputError, match="two"):
         designs_needed(1.0, one_scene, like_these=True)

@@ -9,7 +9,6 @@ import statistics
 import subprocess
 from collections.abc import Callable
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,14 +21,7 @@ from gsbench.analysis.quantities import (
     relative_change,
 )
 from gsbench.analysis.results import Experiment, load_experiment
-from gsbench.analysis.table_formats import (
-    Table,
-    escape_latex,
-    to_csv,
-    to_html_page,
-    to_latex,
-    to_markdown,
-)
+from gsbench.analysis.table_formats import escape_latex, to_csv, to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table, with_agreement
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
@@ -37,13 +29,7 @@ from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 Make = Callable[..., Experiment]
 
 
-def one_trial(
-    runs: Path,
-    seed: int,
-    config_hash: str = "c0ffee00",
-    settings: dict | None = None,
-    **values: object,
-) -> Path:
+def one_trial(runs, seed, config_hash="c0ffee00", settings=None, **values):
     """A trial of one scene; ``psnr=…`` gives a metric, ``_iterations=…`` a key of results.json."""
     metrics = {key: value for key, value in values.items() if not key.startswith("_")}
     plan = Plan()
@@ -55,7 +41,7 @@ def one_trial(
     return write_trial(runs, data, views, config_hash, **(settings or {}))
 
 
-def texts(table: Table) -> list[list[str]]:
+def texts(table):
     return [
         [*row.labels, *(f"*{e.text}*" if e.bold else e.text for e in row.entries)]
         for row in table.rows
@@ -143,7 +129,7 @@ def test_the_lpips_of_the_protocol_has_a_column_even_when_it_is_missing(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("key", "values"),
+    "key, values",
     [
         ("iterations", (7000, 30000)),
         ("raster", ("cpu", "cuda")),
@@ -200,7 +186,7 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("second_budget", "blocked", "compared"),
+    "second_budget, blocked, compared",
     [
         # neither cap acted, so none limited the growth
         ({"max_gaussians": None, "cap": None}, (0, 0), True),
@@ -330,12 +316,12 @@ def test_csv_has_a_line_for_each_cell_in_full_precision(make_experiment):
 class Balance(HTMLParser):
     """Counts cells by row and checks that tags close in order."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.open: list[str] = []
-        self.rows: list[int] = []
+        self.open = []
+        self.rows = []
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         if tag not in ("meta", "br"):
             self.open.append(tag)
         if tag == "tr":
@@ -343,7 +329,7 @@ class Balance(HTMLParser):
         if tag in ("td", "th"):
             self.rows[-1] += int(dict(attrs).get("colspan") or 1)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
 
@@ -363,7 +349,7 @@ def test_latex_escapes_what_is_special():
     assert escape_latex("a_b & 5 % ± 1 → #1") == "a\\_b \\& 5 \\% $\\pm$ 1 ? \\#1"
 
 
-def has_latex() -> bool:
+def has_latex():
     """Whether pdflatex and booktabs are installed."""
     if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
         return False
@@ -410,7 +396,7 @@ def test_results_files_are_plain_json(make_experiment):
 
 
 @pytest.mark.parametrize(
-    ("gaussians", "seconds", "headings"),
+    "gaussians, seconds, headings",
     [
         (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
         (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
@@ -454,7 +440,7 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
 
 
 @pytest.mark.parametrize(
-    ("metrics", "said"),
+    "metrics, said",
     [
         (("psnr", "lpips_vgg_raw"), "was 0.52 for PSNR in one study"),
         (("ssim", "psnr"), "was 0.52 for PSNR, 0.37 for SSIM in one study"),

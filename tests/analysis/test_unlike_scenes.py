@@ -1,11 +1,6 @@
 """An arm that has other settings or conditions on other scenes: no mean hides that."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +11,6 @@ from gsbench.analysis.judgement import judge
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.table_formats import Table
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Declaration, Question
@@ -26,14 +20,7 @@ STAGES = {"scene": 1, "init": 1, "train": 1, "evaluate": 1}
 NO_MEAN = "No mean over the scenes is shown, since they differ in conditions or code."
 
 
-def write(
-    runs: Path,
-    scene: str,
-    config_hash: str = "c0ffee00",
-    densify: str = "adc",
-    settings: Mapping[str, Any] | None = None,
-    **results: Any,
-) -> None:
+def write(runs, scene, config_hash="c0ffee00", densify="adc", settings=None, **results):
     """Two trials of a scene; ``settings`` are settings, ``results`` keys of results.json."""
     for seed in (0, 1):
         views = {"psnr": 20.0 + (densify == "mcmc") + np.zeros(2) + seed}
@@ -41,13 +28,13 @@ def write(
         write_trial(runs, data, views, config_hash, **(settings or {}))
 
 
-def table(runs: Path, **how: Any) -> tuple[Table, bool]:
+def table(runs, **how):
     """The table of the experiment, and whether it has a mean over scenes."""
     made = build_table(load_experiment(runs, "exp"), metrics=["psnr"], **how)
     return made, any(row.labels[0].startswith("mean of") for row in made.rows)
 
 
-def lines(made: Table) -> list[str]:
+def lines(made):
     return [note for note in made.notes if "more than the scene" in note or "No mean" in note]
 
 
@@ -87,7 +74,7 @@ def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("key", "values"),
+    "key, values",
     [
         ("protocol", ("paper-1", "standard-1")),
         ("iterations", (2000, 7000)),

@@ -1,10 +1,7 @@
 """A round of votes in words."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, LikeThese
@@ -17,9 +14,9 @@ from tests.analysis.synthetic import Plan, write_runs
 ADC, MCMC = Arm("sfm", "adc"), Arm("sfm", "mcmc")
 
 
-def showing(number: int, chosen: Any) -> Showing:
+def showing(number, chosen):
     sides = {"left": "sfm-adc", "right": "sfm-mcmc"}
-    place: Any = {"kind": "pair", "scene": "yard", "view": f"v{number}", "seed": 0}
+    place = {"kind": "pair", "scene": "yard", "view": f"v{number}", "seed": 0}
     return Showing(id=f"s{number}", chosen=chosen, **place, **sides)
 
 
@@ -49,7 +46,7 @@ PAIR = PairVotes(
 )
 
 
-def verdict(count: int, people: int, *pairs: PairVotes, **more: Any) -> RoundVerdict:
+def verdict(count, people, *pairs, **more):
     key = RoundKey(
         salt="s",
         time="2026-02-03T04:05:06Z",
@@ -58,7 +55,7 @@ def verdict(count: int, people: int, *pairs: PairVotes, **more: Any) -> RoundVer
         traps_allowed=0,
         showings=(showing(0, "random"), showing(1, "random")),
     )
-    ballots: Any = tuple(SimpleNamespace() for _ in range(count))
+    ballots = tuple(SimpleNamespace() for _ in range(count))
     parts = {"left_out": {}, "ranking": (), "consistent": 0.75, "left": 0.52} | more
     return RoundVerdict(key=key, counted=ballots, pairs=pairs, **parts)
 

@@ -1,7 +1,5 @@
 """The simulation of ``scripts/untruths.py``, for the tests."""
 
-from __future__ import annotations
-
 from tests.conftest import script
 
 decision_rules = script("decision_rules")  # first, since the other imports it

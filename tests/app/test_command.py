@@ -2,8 +2,6 @@
 
 import copy
 import logging
-from collections.abc import Sequence
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -21,14 +19,14 @@ from gsbench.launch.jobs import Outcome
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
 
-OWN_FILES: dict[str, Any] = {
+OWN_FILES = {
     **{"run": {"dir": "."}, "sweep": {"dir": ".", "subdir": "."}},
     **{"output_subdir": None, "job_logging": {}},
 }
 
 
 @pytest.mark.parametrize(
-    ("changes", "typed", "multirun", "launch", "added"),
+    "changes, typed, multirun, launch, added",
     [
         ({}, [], True, "serial", []),
         (
@@ -77,7 +75,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("changes", "multirun", "said"),
+    "changes, multirun, said",
     [
         ({}, False, None),
         ({"hydra.sweeper.params": {"seed": "0,1"}}, True, None),
@@ -121,7 +119,7 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 
 
 @pytest.mark.parametrize(
-    ("ends", "code", "advice"),
+    "ends, code, advice",
     [
         ("dd", 0, "2 of 2 trials done; the table: gsbench tables x"),
         ("d", 0, "1 of 1 trials done; the table: gsbench tables x; renders and model: "),
@@ -134,7 +132,7 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
 )
 def test_the_end_of_a_command_tells_what_to_do_next(tmp_path, caplog, capsys, ends, code, advice):
     caplog.set_level(logging.INFO, "gsbench")
-    status: Any = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
+    status = {"d": "done", "q": "queued", "f": "failed", "b": "failed"}
     trials = [trial(tmp_path, seed) for seed in range(len(ends))]
     outcomes = [
         Outcome(one.folder, status[end], "why", end == "b")
@@ -160,20 +158,17 @@ def test_the_failure_of_a_single_trial_is_raised(tmp_path):
 
 
 def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatch):
-    asked: list[Any] = []
+    asked = []
     made = [trial(tmp_path, scene={"name": name}) for name in ("a", "b")]
 
-    def compose_trials(words: Sequence[str], multirun: bool) -> list[Trial]:
+    def compose_trials(words, multirun):
         asked.append((words, multirun))
         return made
 
     monkeypatch.setattr(command, "compose_trials", compose_trials)
     assert one_trial_per_scene("gate", ["scene=a,b"], "train_time") == {"a": made[0], "b": made[1]}
     one_trial_per_scene("gate", ["+name=y"], "train_time")
-    assert asked == [
-        (["scene=a,b", "seed=0", "name=gate"], True),
-        (["+name=y", "seed=0"], True),
-    ]
+    assert asked == [(["scene=a,b", "seed=0", "name=gate"], True), (["+name=y", "seed=0"], True)]
     for words, said in (
         (["seed=1"], "seed follows from the other words"),
         (["+eval.primary=psnr"], r"eval\.primary follows from"),
@@ -196,14 +191,11 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
         command.compose_trials(["hydra.run.dir=${nope}"])
 
 
-@pytest.mark.parametrize(
-    ("words", "trials", "code"),
-    [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)],
-)
+@pytest.mark.parametrize("words, trials, code", [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)])
 def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
     made = [trial(tmp_path, seed) for seed in range(trials)]
 
-    def run_app(words: Sequence[str], multirun: bool, task: Any) -> None:
+    def run_app(words, multirun, task):
         assert task.look_only == (task.handle is command.list_trials)
         task.trials = made
 
@@ -213,7 +205,7 @@ def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trial
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):
-    asked: list[Any] = []
+    asked = []
     monkeypatch.setattr(command, "set_up_logging", asked.append)
     command.compose_trials(["hydra.verbose=true"])
     command.compose_trials(["hydra.verbose=[gsbench.scene]", "seed=0,1"], multirun=True)

@@ -1,7 +1,5 @@
 """Several grids in one experiment: the trials that they make, and plan, dry run and retry."""
 
-from pathlib import Path
-
 import pytest
 
 from gsbench import cli
@@ -27,7 +25,7 @@ KNOWN = {
 pytestmark = pytest.mark.usefixtures("runs")
 
 
-def arms(*words: str) -> list[tuple[str, int]]:
+def arms(*words):
     """Densifier and seed of each trial, in order."""
     return [
         (trial.values["densify"]["name"], trial.values["seed"]) for trial in compose_trials(words)
@@ -127,7 +125,7 @@ def test_grids_in_a_users_own_experiment(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "text"),
+    "words, text",
     [
         (
             ["+experiment=threshold", "hydra/sweeper=basic"],
@@ -152,7 +150,7 @@ def test_plan_dry_run_and_retry_see_one_experiment(runs, monkeypatch, capsys, sa
     first.mkdir(parents=True)
     (first / "config.yaml").write_text(trials[0].yaml)
     write_results(first, trials[0].values)
-    ran: list[Path] = []
+    ran = []
 
     def run_trials(again):
         ran.extend(TrialFolder.of(trial.values).path for trial in again)

@@ -23,7 +23,7 @@ def test_now_is_the_same_in_all_trials_of_a_sweep():
 
 
 @pytest.mark.parametrize(
-    ("words", "text"),
+    "words, text",
     [
         (["+hydra.job.env_set.OMP_NUM_THREADS='1'"], "hydra.job.env_set can change what runs"),
         (["densify.interval=1000000000000000000000"], "whole number of 64 bits"),

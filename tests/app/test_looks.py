@@ -1,17 +1,14 @@
 """A sweep in planned looks: which trials each look launches, when it stops, how it continues."""
 
 import logging
-from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsbench import cli
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import read_experiment
-from gsbench.config.compose import Trial
 from gsbench.launch.jobs import Outcome, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.runs.experiments import read_declarations
@@ -35,16 +32,11 @@ class Fake:
     Trials with the seed ``fails`` fail; at the seed ``stops_at`` comes a Ctrl-C.
     """
 
-    def __init__(
-        self,
-        psnr: Callable[[str, int], float],
-        fails: int | None = None,
-        stops_at: int | None = None,
-    ) -> None:
+    def __init__(self, psnr, fails=None, stops_at=None):
         self.psnr, self.fails, self.stops_at = psnr, fails, stops_at
-        self.batches: list[list[tuple[str, int]]] = []
+        self.batches = []
 
-    def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
+    def __call__(self, trials):
         add_to_plan(trials)
         declare(trials)
         self.batches.append([])
@@ -71,7 +63,7 @@ class Fake:
 
 
 @pytest.fixture
-def sweep(runs, monkeypatch) -> Callable[..., int]:
+def sweep(runs, monkeypatch):
     def run(fake, *words):
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run([*SWEEP, *words])
@@ -79,11 +71,11 @@ def sweep(runs, monkeypatch) -> Callable[..., int]:
     return run
 
 
-def noise(arm: str, seed: int) -> float:
+def noise(arm, seed):
     return float(np.random.default_rng([seed, arm == "adc"]).normal(26, 2))
 
 
-def clear(arm: str, seed: int) -> float:
+def clear(arm, seed):
     """Volumetric gains much, other arms nothing; seeds hardly differ."""
     return 26 + 2 * (arm == "volumetric") + 1e-3 * np.sin(seed + len(arm))
 
@@ -105,7 +97,7 @@ def test_a_decided_sweep_given_again_runs_nothing(sweep, runs, caplog):
     assert "4 of 8 trials were not needed" in caplog.text
 
 
-def verdicts_of(runs: Path) -> list[Verdict]:
+def verdicts_of(runs):
     """The verdicts on the questions that were last declared for the sweep."""
     return judge(read_experiment(runs / "stop").trials, read_declarations(runs / "stop")[-1])
 
@@ -228,7 +220,7 @@ def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, cap
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["eval.primary=null"], "needs the metric that decides"),
         (["seed=3"], "at least 2 seeds"),

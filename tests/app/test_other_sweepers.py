@@ -3,7 +3,6 @@
 import logging
 from contextlib import nullcontext
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -15,12 +14,12 @@ from gsbench.errors import InputError
 from tests.app.stand_ins import done, trial
 
 
-def config_of(**hydra: Any) -> Any:
+def config_of(**hydra):
     return OmegaConf.create({"name": "x", "hydra": {"sweeper": {}} | hydra})
 
 
 @pytest.mark.parametrize(
-    ("sweeper", "sign"),
+    "sweeper, sign",
     [
         ({"direction": "maximize"}, 1),
         ({"direction": "MAXIMIZE"}, 1),
@@ -34,7 +33,7 @@ def config_of(**hydra: Any) -> Any:
 )
 def test_another_sweeper_gets_all_seeds_of_a_job(monkeypatch, caplog, sweeper, sign):
     caplog.set_level(logging.INFO, "gsbench")
-    composed: list[Any] = []
+    composed = []
     monkeypatch.setattr(command.compose, "hydra_ready", nullcontext)
     monkeypatch.setattr(command.compose, "compose_whole", composed.append)
     values = {"eval": {"primary": "lpips_vgg", "extra": {}}}
@@ -62,13 +61,13 @@ def test_another_sweeper_gets_all_seeds_of_a_job(monkeypatch, caplog, sweeper, s
 
 
 @pytest.mark.parametrize(
-    ("primary", "sign", "decay", "best"),
+    "primary, sign, decay, best",
     [("psnr", 1, "0.3", "22"), ("psnr", -1, "0.3", "22"), ("lpips_vgg", -1, "0.1", "20")],
 )
 def test_the_best_values_are_said_with_the_command_that_repeats_them(
     tmp_path, primary, sign, decay, best
 ):
-    def record_of(files: Any) -> Any:
+    def record_of(files):
         number = {"0.1": 20.0, "0.2": None, "0.3": 22.0}[files.decay]
         return None if number is None else SimpleNamespace(metrics={primary: number})
 
@@ -114,7 +113,7 @@ def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(caps
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (
             RuntimeError("study is\ngone"),
@@ -124,7 +123,7 @@ def test_a_dry_run_of_another_sweeper_lists_a_grid_or_says_that_it_searches(caps
     ],
 )
 def test_what_another_sweeper_raises_is_named_as_its_own(monkeypatch, error, said):
-    def run_main(*_: Any) -> None:
+    def run_main(*_):
         raise error
 
     monkeypatch.setattr(command.compose, "run_main", run_main)

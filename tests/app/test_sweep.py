@@ -3,9 +3,7 @@
 import logging
 import os
 import pickle
-from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from hydra.core.utils import JobReturn, JobStatus
@@ -14,7 +12,6 @@ from omegaconf import OmegaConf
 
 from gsbench.app import sweep
 from gsbench.app.sweep import Objective, Sweep, TrialTask, metric_of
-from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
 from tests.app.stand_ins import done, trial
@@ -24,7 +21,7 @@ from tests.finished import write_results
 
 
 @pytest.mark.parametrize(
-    ("primary", "found"),
+    "primary, found",
     [
         (None, ("psnr", 1)),
         ("ssim", ("ssim", 1)),
@@ -61,18 +58,18 @@ def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_
 
 
 @pytest.fixture
-def job(tmp_path, monkeypatch) -> SimpleNamespace:
+def job(tmp_path, monkeypatch):
     """A job of Hydra's that makes a trial for each list of words."""
     state = SimpleNamespace(mode=RunMode.RUN, log={}, did=[])
 
-    def instance() -> Any:
+    def instance():
         node = {"job_logging": state.log, "verbose": "x", "overrides": ["w"], "mode": state.mode}
         return SimpleNamespace(cfg=SimpleNamespace(hydra=SimpleNamespace(**node)))
 
-    def resolve(config: Any, words: Sequence[str]) -> Trial:
+    def resolve(config, words):
         return trial(tmp_path / "runs", config.seed, words)
 
-    def note(name: str) -> Any:
+    def note(name):
         return lambda *given: state.did.append((name, *given[-2:]))
 
     monkeypatch.setattr(sweep.HydraConfig, "instance", instance)
@@ -115,14 +112,14 @@ def test_a_job_of_a_sweep_raises_its_failure_and_returns_its_value(job, tmp_path
     assert (task.trials, task.outcomes) == ([], [])  # whoever launched it collects them
     for bad_input, kind in ((True, InputError), (False, GsbenchError)):
 
-        def failing(trials: Sequence[Trial], bad_input: bool = bad_input) -> list[Outcome]:
+        def failing(trials, bad_input=bad_input):
             return [Outcome(one.folder, "failed", "no luck", bad_input) for one in trials]
 
         with pytest.raises(GsbenchError, match="no luck") as error:
             TrialTask(failing, folder=job.folder)(job.config)
         assert type(error.value) is kind
 
-    def measured(trials: Sequence[Trial]) -> list[Outcome]:
+    def measured(trials):
         for one in trials:
             write_results(one.folder, one.values, metrics={"psnr": 20.0 + one.values["seed"]})
         return done(trials)
@@ -148,17 +145,17 @@ def test_a_task_is_pickled_without_what_it_collected(tmp_path):
 
 
 @pytest.fixture
-def begun(monkeypatch) -> list[Any]:
-    begun: list[Any] = []
+def begun(monkeypatch):
+    begun = []
     monkeypatch.setattr(sweep, "begin_for_another_launcher", begun.append)
     return begun
 
 
-def sweep_of(task: TrialTask, launcher: str, launch: Any = None, **more: Any) -> Sweep:
+def sweep_of(task, launcher, launch=None, **more):
     hydra = {"runtime": {"choices": {"hydra/launcher": launcher}}}
     config = OmegaConf.create({"hydra": hydra | more})
-    made: Any = launch and SimpleNamespace(launch=launch)
-    return Sweep(config, task, None, made)  # type: ignore[arg-type]
+    made = launch and SimpleNamespace(launch=launch)
+    return Sweep(config, task, None, made)
 
 
 def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
@@ -168,9 +165,9 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
         sweep_of(task, name).launch(trials)
         assert task.trials == trials
     assert begun == []
-    asked: list[Any] = []
+    asked = []
 
-    def launch(jobs: Any, initial_job_idx: int) -> list[JobReturn]:
+    def launch(jobs, initial_job_idx):
         asked.append((jobs, initial_job_idx))
         good, bad = JobReturn(), JobReturn()
         good._return_value, bad._return_value = 1.0, InputError("no photos")
@@ -190,7 +187,7 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    "error, said",
     [
         (GsbenchError("ours"), "^ours$"),
         (ValueError("a\n b"), "^hydra/launcher=joblib: a b .gsbench status tells"),
@@ -198,7 +195,7 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
     ],
 )
 def test_any_error_of_another_launcher_is_one_line(tmp_path, begun, error, said):
-    def launch(jobs: Any, initial_job_idx: int) -> None:
+    def launch(jobs, initial_job_idx):
         raise error
 
     with pytest.raises(GsbenchError, match=said):
@@ -206,9 +203,9 @@ def test_any_error_of_another_launcher_is_one_line(tmp_path, begun, error, said)
 
 
 def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
-    composed: list[Any] = []
+    composed = []
 
-    def compose_jobs(loader: Any, config: Any, jobs: Any) -> list[Trial]:
+    def compose_jobs(loader, config, jobs):
         composed.extend(jobs)
         seeds = [int(dict(word.split("=") for word in job).get("seed", "7")) for job in jobs]
         name = lambda job: {"name": job[0].replace("=", "")}  # noqa: E731
@@ -220,13 +217,13 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep.compose, "compose_jobs", compose_jobs)
     monkeypatch.setattr(sweep.OverridesParser, "create", lambda loader: None)
 
-    def run(trials: Sequence[Trial]) -> list[Outcome]:
+    def run(trials):
         outcomes = []
         for one in trials:
             name = one.values["scene"]["name"]
             value = 20.0 + one.values["seed"] + 10 * (name == "a2")
             write_results(one.folder, one.values, metrics={"psnr": value})
-            status: Any = "failed" if name == "a3" else "done"
+            status = "failed" if name == "a3" else "done"
             outcomes.append(Outcome(one.folder, status, "no luck", bad_input=True))
         return outcomes[::-1]
 

@@ -3,9 +3,8 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +16,8 @@ from gsbench.analysis.report.build import build_report, search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.app.tuning import TuneSettings
-from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError
-from gsbench.launch.jobs import Outcome, outcome_of_error, outcome_of_results
+from gsbench.launch.jobs import outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import Arm, TuningRecord
@@ -61,20 +59,18 @@ class Fake:
     Ctrl-C comes in the trial with the number ``stops``; those with numbers in ``fails`` fail.
     """
 
-    def __init__(
-        self, stops: int | None = None, fails: Sequence[int] = (), own_metric: bool = False
-    ) -> None:
+    def __init__(self, stops=None, fails=(), own_metric=False):
         self.stops, self.fails, self.own_metric = stops, fails, own_metric
-        self.trained: list[Trial] = []
-        self.batches: list[int] = []
+        self.trained = []
+        self.batches = []
 
-    def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
+    def __call__(self, trials):
         add_to_plan(trials)
         declare(trials)
         self.batches.append(len(trials))
         return [self.run(trial) for trial in trials]
 
-    def run(self, trial: Trial) -> Outcome:
+    def run(self, trial):
         results = trial.folder / RESULTS
         if not results.exists():
             self.trained.append(trial)
@@ -94,12 +90,12 @@ class Fake:
             (trial.folder / CONFIG).write_text(trial.yaml)
         return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
 
-    def tuning(self, arm: str) -> list[Trial]:
+    def tuning(self, arm):
         return [
             trial for trial in self.trained if trial.values["name"] == f"fair-tune-random-{arm}"
         ]
 
-    def judged(self) -> list[Trial]:
+    def judged(self):
         return [trial for trial in self.trained if trial.values["name"] == "fair"]
 
 
@@ -107,7 +103,7 @@ Sweep = Callable[..., int]
 
 
 @pytest.fixture
-def sweep(runs, tmp_path, monkeypatch) -> Sweep:
+def sweep(runs, tmp_path, monkeypatch):
     def run(fake, *words, file=FILE):
         conf = tmp_path / "conf" / "experiment"
         conf.mkdir(parents=True, exist_ok=True)
@@ -118,11 +114,11 @@ def sweep(runs, tmp_path, monkeypatch) -> Sweep:
     return run
 
 
-def tuning(runs: Path, arm: str) -> TuningRecord:
+def tuning(runs, arm):
     return read_typed(runs / f"fair-tune-random-{arm}" / TUNING, TuningRecord)
 
 
-def chosen(runs: Path, arm: str) -> dict[str, Any]:
+def chosen(runs, arm):
     best = tuning(runs, arm).best
     assert best is not None
     return dict(best.settings)
@@ -327,7 +323,7 @@ def test_a_users_metric_is_optimised_in_the_direction_of_its_class(sweep, runs, 
 # --- what is printed
 
 
-def notes(runs: Path, *words: str) -> list[str]:
+def notes(runs, *words):
     trials = with_variants(load_experiment(runs, "fair").trials)
     table = fairness_table(trials, Arm("random", "adc"), Arm("random", "volumetric"))
     return [note for note in table.notes if note.startswith("Tuning.")]
@@ -423,7 +419,7 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("file", "word", "part"), MISTAKES)
+@pytest.mark.parametrize("file, word, part", MISTAKES)
 def test_mistakes_are_one_line_before_any_work(file, word, part, sweep, runs, capsys):
     fake = Fake()
     assert sweep(fake, *([word] if word else []), file=file) == 2

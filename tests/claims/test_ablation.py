@@ -1,16 +1,12 @@
 """Switches of densifiers: which are on, which runs they make, and verdicts on known gains."""
 
-from collections.abc import Mapping
 from dataclasses import MISSING, fields
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from gsbench.analysis.results import load_experiment
 from gsbench.claims.ablation import (
-    Run,
     choose_switches,
     declared_switches,
     effective_run,
@@ -24,7 +20,7 @@ from gsbench.config.compose import compose_one
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
@@ -36,7 +32,7 @@ NESTED = {
 }
 
 
-def on(*names: str) -> Run:
+def on(*names):
     return frozenset(names)
 
 
@@ -103,10 +99,7 @@ def test_the_volumetric_class_declares_three_switches_and_only_those_that_are_on
 
 
 def test_switches_in_a_yaml_file_do_not_change_the_configuration_hash():
-    values: dict[str, Any] = {
-        "grow": 1,
-        "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}},
-    }
+    values = {"grow": 1, "switches": {"growth": {"off": {"grow": 0}, "words": "it grows"}}}
     assert declared_switches({}, values) == {"growth": Switch({"grow": 0}, "it grows")}
     plain = compose_one(["densify=adc"]).values
     named = compose_one(
@@ -127,9 +120,7 @@ def test_an_unknown_switch_is_refused_with_the_nearest_name():
     assert list(choose_switches(NESTED, ["once"], "x")) == ["once"]
 
 
-def write_ablation(
-    runs: Path, gains: Mapping[str, float], seeds: int = 3
-) -> dict[Run, dict[str, str]]:
+def write_ablation(runs, gains, seeds=3):
     """Write trials in which each part of `NESTED` that acts adds its gain in PSNR.
 
     Returns their folders by run and scene.
@@ -179,7 +170,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["densify=none"], "declares no switch"),
         (["densify=adc,volumetric"], "one densifier"),

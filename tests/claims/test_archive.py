@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import yaml
@@ -20,7 +18,7 @@ from tests.analysis.synthetic import Plan, write_runs
 MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)
 
 
-def export(tmp_path: Path, plan: Plan = Plan()) -> Path:  # noqa: B008 - never changed
+def export(tmp_path, plan=Plan()):  # noqa: B008 - never changed
     runs = tmp_path / "runs"
     write_runs(runs, plan)
     (runs / "exp" / "declared.jsonl").write_text(
@@ -30,12 +28,12 @@ def export(tmp_path: Path, plan: Plan = Plan()) -> Path:  # noqa: B008 - never c
     return tmp_path / "exp.zip"
 
 
-def members(file: Path) -> dict[str, bytes]:
+def members(file):
     with zipfile.ZipFile(file) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def rewrite(file: Path, change: Callable[[dict[str, bytes]], None]) -> None:
+def rewrite(file, change):
     content = members(file)
     change(content)
     with zipfile.ZipFile(file, "w") as archive:
@@ -125,27 +123,27 @@ def test_an_archive_is_an_ro_crate(tmp_path):
     assert references(crate["@graph"]) <= by_id.keys() | {"https://w3id.org/ro/crate/1.2"}
 
 
-def cut(file: Path) -> None:
+def cut(file):
     file.write_bytes(file.read_bytes()[:-600])
 
 
-def edit(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
-    def change(content: dict[str, bytes]) -> None:
+def edit(name, old, new):
+    def change(content):
         assert old in content[name]
         content[name] = content[name].replace(old, new)
 
     return lambda file: rewrite(file, change)
 
 
-def drop(name: str) -> Callable[[Path], None]:
+def drop(name):
     return lambda file: rewrite(file, lambda content: content.pop(name) and None)
 
 
-def resigned(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
+def resigned(name, old, new):
     """An edit by somebody who also updates the checksum."""
     import hashlib
 
-    def change(content: dict[str, bytes]) -> None:
+    def change(content):
         assert old in content[name]
         content[name] = content[name].replace(old, new)
         manifest = json.loads(content["archive.json"])
@@ -155,14 +153,14 @@ def resigned(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
     return lambda file: rewrite(file, change)
 
 
-def flip_a_bit(file: Path) -> None:
+def flip_a_bit(file):
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 0x40
     file.write_bytes(bytes(data))
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    "damage, message",
     [
         (cut, "not a complete zip"),
         (flip_a_bit, "exp.zip: "),

@@ -2,10 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -16,16 +13,14 @@ from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import Answer, StudentT
 from gsbench.claims.check import (
-    Check,
     Checked,
     ClaimVerdict,
     prepare,
 )
 from gsbench.claims.check_page import _number, make_page, to_html
 from gsbench.claims.file import parse_claims
-from gsbench.claims.stopping import KeyAndSeed
 from gsbench.cli import run
-from gsbench.config.compose import Trial, with_seed
+from gsbench.config.compose import with_seed
 from gsbench.errors import InputError
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
@@ -41,23 +36,23 @@ SENTENCE = (
 EFFECT = 1.0  # dB, of "volumetric" in the made-up trials
 
 
-def content(**changes: Any) -> dict[str, Any]:
+def content(**changes):
     claims = [GOOD["claims"][0] | {"metric": "psnr", "direction": "higher", "least": 0.3} | changes]
     return without("settings", "eval.lpips") | {"scenes": {"courtyard": None}, "claims": claims}
 
 
-def check_of(tmp_path: Path, **changes: Any) -> Check:
+def check_of(tmp_path, **changes):
     return prepare(parse_claims(content(**changes)), tmp_path, lambda trials: [])
 
 
 class FakeRunner:
     """Writes made-up results instead of training; ``fails`` names a seed that fails."""
 
-    def __init__(self, noise: float, fails: int | None = None) -> None:
+    def __init__(self, noise, fails=None):
         self.noise, self.fails = noise, fails
-        self.batches: list[int] = []
+        self.batches = []
 
-    def __call__(self, trials: Sequence[Trial]) -> None:
+    def __call__(self, trials):
         import numpy as np
 
         self.batches.append(len(trials))
@@ -78,10 +73,10 @@ class FakeRunner:
             write_trial(folder.runs, data, views, folder.path.name.partition("-")[0])
 
 
-def looked(check: Check, runner: FakeRunner) -> list[ClaimVerdict]:
+def looked(check, runner):
     """Go through the looks; trials that are done are not run again."""
 
-    def run(planned: Sequence[KeyAndSeed]) -> None:
+    def run(planned):
         trials = check.to_run(planned)
         if left := [
             one for one in trials if not (TrialFolder.of(one.values).path / "results.json").exists()
@@ -185,9 +180,7 @@ def test_the_page_has_verdicts_looks_and_declarations(tmp_path):
     assert "http" not in alone  # one file, no network
 
 
-def judged(
-    outcome: Any, mean: float = 0.0, error: float = 0.0, direction: str = "higher", **more: Any
-) -> ClaimVerdict:
+def judged(outcome, mean=0.0, error=0.0, direction="higher", **more):
     """A verdict on a claim with a least effect of 0.3.
 
     With an ``error`` of 0, its interval is the mean.
@@ -202,7 +195,7 @@ def judged(
 
 
 @pytest.mark.parametrize(
-    ("one", "said"),
+    "one, said",
     [
         (judged("supported", 1.0), "better"),
         (judged("supported", 0.3), "better"),

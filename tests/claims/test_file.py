@@ -3,8 +3,6 @@
 import copy
 import dataclasses
 import re
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import yaml
@@ -14,7 +12,7 @@ from gsbench.errors import InputError
 from tests.conftest import ROOT
 
 SHIPPED = sorted((ROOT / "conf" / "claims").glob("*.yaml"))
-GOOD: dict[str, Any] = {
+GOOD = {
     "name": "check_it",
     "paper": "A paper",
     "seeds": 4,
@@ -37,26 +35,26 @@ GOOD: dict[str, Any] = {
 }
 
 
-def changed(*path: Any, to: Any) -> dict[str, Any]:
+def changed(*path, to):
     """The good file with one value changed."""
     content = copy.deepcopy(GOOD)
-    place: Any = content
+    place = content
     for key in path[:-1]:
         place = place[key]
     place[path[-1]] = to
     return content
 
 
-def without(*path: Any) -> dict[str, Any]:
+def without(*path):
     content = copy.deepcopy(GOOD)
-    place: Any = content
+    place = content
     for key in path[:-1]:
         place = place[key]
     del place[path[-1]]
     return content
 
 
-def second_claim(**changes: Any) -> dict[str, Any]:
+def second_claim(**changes):
     content = copy.deepcopy(GOOD)
     content["claims"].append(content["claims"][0] | {"id": "other"} | changes)
     return content
@@ -130,7 +128,7 @@ def test_the_least_effect_is_a_difference_or_a_percentage():
     assert (relative.size, str(relative)) == (pytest.approx(0.1), "10 %")
 
 
-BAD: list[tuple[str, Callable[[], Any], str]] = [
+BAD = [
     (
         "an unknown arm",
         lambda: changed("claims", 0, "arm", to="volumetrik"),
@@ -228,7 +226,7 @@ BAD: list[tuple[str, Callable[[], Any], str]] = [
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [case[1:] for case in BAD], ids=[case[0] for case in BAD]
+    "content, message", [case[1:] for case in BAD], ids=[case[0] for case in BAD]
 )
 def test_bad_input_is_refused_in_one_line(content, message):
     with pytest.raises(InputError, match=message) as caught:

@@ -1,11 +1,6 @@
 """The gate on made-up trials: results of the new version, and refused questions."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +8,7 @@ import pytest
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.results import TrialResult, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Answer, StudentT
 from gsbench.claims.archive import write_archive
 from gsbench.claims.gate import (
@@ -35,26 +30,21 @@ from gsbench.claims.gate import (
 )
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.runs.experiments import Declaration
 from gsbench.runs.trial_record import Code
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 
-VALUES: dict[str, Any] = {"eval": {"extra": {}}}
+VALUES = {"eval": {"extra": {}}}
 SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
 
 
-def asked(
-    metric: str = "psnr", least: str | None = "0.1", seeds: int = 4, **scenes: tuple[str, str]
-) -> Declaration:
+def asked(metric="psnr", least="0.1", seeds=4, **scenes):
     return replace(
         declare_gate(metric, least, scenes or SCENES, range(seeds), VALUES),
         time="2020-01-01T00:00:00Z",
     )
 
 
-def trials(
-    runs: Path, effect: float, noise: float, seeds: int = 4, scenes: Sequence[str] = tuple(SCENES)
-) -> Any:
+def trials(runs, effect, noise, seeds=4, scenes=tuple(SCENES)):
     """Trials of one version, whose PSNR is 26 + ``effect`` with that noise (dB)."""
     for scene in scenes:
         for seed in range(seeds):
@@ -69,14 +59,12 @@ def trials(
     return load_experiment(runs, "gate").trials
 
 
-def gate(
-    tmp_path: Path, effect: float, noise: float, declared: Declaration | None = None
-) -> tuple[Verdict, int]:
+def gate(tmp_path, effect, noise, declared=None):
     """The verdict on a version with that effect, and the most seeds that were asked for."""
     old, new = (trials(tmp_path / str(k), k * effect, noise) for k in (0, 1))
     most = [0]
 
-    def run_them(planned: Sequence[tuple[str, int]]) -> None:
+    def run_them(planned):
         most[0] = max(seed for _, seed in planned) + 1
 
     found = ask_gate(
@@ -87,7 +75,7 @@ def gate(
 
 
 @pytest.mark.parametrize(
-    ("effect", "noise", "result", "words", "seeds"),
+    "effect, noise, result, words, seeds",
     [
         (-1.0, 0.01, WORSE, "worse: worse in PSNR (dB) on these scenes: −0.99", 2),
         (1.0, 0.01, PASSED, "passed: better in PSNR", 2),
@@ -97,14 +85,14 @@ def gate(
     ],
 )
 def test_the_gate_passes_fails_or_stays_undecided_by_effect_and_noise(
-    tmp_path: Path, effect: float, noise: float, result: str, words: str, seeds: int
-) -> None:
+    tmp_path, effect, noise, result, words, seeds
+):
     verdict, most = gate(tmp_path, effect, noise)
     assert (result_of(verdict), most) == (result, seeds)
     assert words in describe(verdict)
 
 
-def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_path: Path) -> None:
+def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_path):
     verdict, most = gate(tmp_path, 0.25, 0.02, asked(least="0.35"))
     assert (verdict.outcome, result_of(verdict)) == ("undecided", PASSED)
     assert "not worse by 0.35 in PSNR" in describe(verdict)
@@ -113,7 +101,7 @@ def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("sign", "mean", "result"),
+    "sign, mean, result",
     [
         (1, -0.1, NOT_DECIDED),
         (1, -0.09, PASSED),
@@ -122,16 +110,14 @@ def test_a_version_that_is_shown_not_to_be_worse_passes_even_if_undecided(tmp_pa
         (1, -0.2, NOT_DECIDED),
     ],
 )
-def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(
-    sign: int, mean: float, result: str
-) -> None:
+def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(sign, mean, result):
     question = replace(asked().questions[0], sign=sign)
     answer = Answer(mean, StudentT(mean, 0.0, 3.0), 0.05, 0.05, 0.05)
     undecided = Verdict(question, asked_quantity("psnr"), Pairs(()), answer=answer)
     assert result_of(undecided) == result
 
 
-def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path: Path) -> None:
+def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
     old = trials(tmp_path, 0, 0.1)
     (verdict,) = ask_gate(
         asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]
@@ -141,10 +127,8 @@ def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path: Path)
     assert "trials are missing" in describe(verdict)
 
 
-def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(
-    tmp_path: Path,
-) -> None:
-    def made_by(own: Sequence[TrialResult], state: str, measured: str) -> list[TrialResult]:
+def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
+    def made_by(own, state, measured):
         code = Code(rooms={"densify": state})
         return [
             replace(one, record=replace(one.record, code=code, measured=measured)) for one in own
@@ -162,7 +146,7 @@ def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(
     assert result_of(refused) == NOT_DECIDED
 
 
-def test_deviations_name_machines_and_libraries(tmp_path: Path) -> None:
+def test_deviations_name_machines_and_libraries(tmp_path):
     own = trials(tmp_path, 0, 0.1)
     assert deviations(own, own) == []
     machine = {"cpu": "Ours", "kernels": "znver4", "torch": "AVX512", "device": "cpu"}
@@ -178,7 +162,7 @@ def test_deviations_name_machines_and_libraries(tmp_path: Path) -> None:
     assert "with torch 2.13.0, the new trials with 9.9" in second
 
 
-def test_questions_that_cannot_be_judged_are_refused() -> None:
+def test_questions_that_cannot_be_judged_are_refused():
     for words, message in (
         (("psn", None), "did you mean psnr"),
         (("gaussians", None), "give --least"),
@@ -195,7 +179,7 @@ def test_questions_that_cannot_be_judged_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         ([], "the following arguments are required: archive"),
         (["nowhere.zip"], "no such file"),
@@ -210,13 +194,7 @@ def test_questions_that_cannot_be_judged_are_refused() -> None:
         (["exp.zip", "launch.wait=false"], "launch.wait"),
     ],
 )
-def test_bad_input_of_gate_is_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    message: str,
-) -> None:
+def test_bad_input_of_gate_is_refused(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GSBENCH_RUNS", raising=False)
     write_runs(tmp_path / "made", Plan(densifiers=("adc", "volumetric")))
@@ -227,19 +205,12 @@ def test_bad_input_of_gate_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("effect", "code", "words"), [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed: better in PSNR")]
+    "effect, code, words", [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed: better in PSNR")]
 )
-def test_the_exit_code_of_gate_is_its_result(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    effect: float,
-    code: int,
-    words: str,
-) -> None:
-    trained: list[Any] = []
+def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effect, code, words):
+    trained = []
 
-    def train(planned: Sequence[Any]) -> int:
+    def train(planned):
         for trial in planned:
             seed, folder = trial.values["seed"], trial.folder
             trained.append(seed)
@@ -266,10 +237,10 @@ def test_the_exit_code_of_gate_is_its_result(
 
 
 @pytest.mark.parametrize("worse", range(1, 13))
-def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse: int) -> None:
-    asked_for: list[int] = []
+def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse):
+    asked_for = []
 
-    def result(commit: int) -> str:
+    def result(commit):
         asked_for.append(commit)
         return WORSE if commit >= worse else PASSED
 
@@ -277,7 +248,7 @@ def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse: in
     assert len(asked_for) == len(set(asked_for)) <= most_steps(12) - SPARE
 
 
-def test_bisecting_skips_commits_that_are_undecided_or_do_not_train() -> None:
+def test_bisecting_skips_commits_that_are_undecided_or_do_not_train():
     assert first_worse(12, lambda commit: PASSED) is None
     answers = {6: NOT_DECIDED, 7: None}
     assert first_worse(
@@ -286,9 +257,9 @@ def test_bisecting_skips_commits_that_are_undecided_or_do_not_train() -> None:
     assert first_worse(
         12, lambda commit: answers.get(commit, WORSE if commit >= 8 else PASSED)
     ) == (5, 8)
-    asked_for: list[int] = []
+    asked_for = []
 
-    def never(commit: int) -> str:
+    def never(commit):
         asked_for.append(commit)
         return WORSE if commit == 12 else NOT_DECIDED
 
@@ -301,7 +272,7 @@ def test_bisecting_skips_commits_that_are_undecided_or_do_not_train() -> None:
 # ---- steps of a bisection
 
 
-def step(tmp_path: Path, loss: float, place: str, noise: float = 0.01) -> tuple[str, str]:
+def step(tmp_path, loss, place, noise=0.01):
     """The result and words of a commit like the first one, the last one, or between both."""
     losses = {"first": 0.0, "last": loss, "between": loss / 2}
     good, last = trials(tmp_path / "a", 0.0, noise), trials(tmp_path / "b", -loss, noise)
@@ -314,22 +285,20 @@ def step(tmp_path: Path, loss: float, place: str, noise: float = 0.01) -> tuple[
 
 
 @pytest.mark.parametrize("loss", [0.06, 0.3])
-@pytest.mark.parametrize(("place", "result"), [("first", PASSED), ("last", WORSE)])
-def test_a_loss_below_the_least_that_matters_is_placed_too(
-    tmp_path: Path, loss: float, place: str, result: str
-) -> None:
+@pytest.mark.parametrize("place, result", [("first", PASSED), ("last", WORSE)])
+def test_a_loss_below_the_least_that_matters_is_placed_too(tmp_path, loss, place, result):
     found, words = step(tmp_path, loss, place)
     assert found == result
     assert words.startswith(f"{result}; against the first: ")
     assert "; against the last: " in words
 
 
-def test_a_commit_between_both_ends_or_within_the_noise_is_undecided(tmp_path: Path) -> None:
+def test_a_commit_between_both_ends_or_within_the_noise_is_undecided(tmp_path):
     assert step(tmp_path / "x", 0.3, "between")[0] == NOT_DECIDED
     assert step(tmp_path / "y", 0.06, "first", noise=0.3)[0] == NOT_DECIDED
 
 
-def test_a_commit_that_is_equal_to_an_end_is_like_it(tmp_path: Path) -> None:
+def test_a_commit_that_is_equal_to_an_end_is_like_it(tmp_path):
     good, last = trials(tmp_path / "a", 0.0, 0.01), trials(tmp_path / "b", -0.3, 0.01)
     for new, result in ((good, PASSED), (last, WORSE)):
         verdicts = ask_step(asked(), 0.01, lambda: good, lambda: last, lambda new=new: new).judged()
@@ -337,7 +306,7 @@ def test_a_commit_that_is_equal_to_an_end_is_like_it(tmp_path: Path) -> None:
         assert "equal to the last bit" in describe_step(verdicts)
 
 
-def test_a_loss_that_steps_cannot_see_is_said_before_they_begin(tmp_path: Path) -> None:
+def test_a_loss_that_steps_cannot_see_is_said_before_they_begin(tmp_path):
     good, *bad = (trials(tmp_path / str(loss), -loss, 0.1) for loss in (0.0, 0.1, 0.5))
     small, large = (ask_gate(asked(), lambda: good, lambda one=one: one).judged()[0] for one in bad)
     assert too_small_to_place(large, 0.05 / 7) == ""

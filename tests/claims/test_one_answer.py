@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsbench.analysis.comparison import compare, unused_trials
-from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
@@ -130,7 +129,7 @@ def by_ledger(scenes, seeds, trials):
     return verdict, {"text": "\n".join([ended.reason, *texts(rules.unused(book, trials))])}
 
 
-def facts(verdict: Verdict):
+def facts(verdict):
     """All that an answer is made of."""
     return verdict.outcome, verdict.mean, verdict.interval, verdict.pairs.seeds, verdict.equal
 

@@ -1,16 +1,13 @@
 """The page of a check on scenes like these, machines, clouds and initialisers."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from gsbench.analysis.judgement import judge
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import read_experiment
 from gsbench.claims.check import Checked, claim_verdicts
-from gsbench.claims.check_page import Page, make_page, to_html, to_text
+from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
 from gsbench.runs.experiments import Declaration
 from tests.analysis.synthetic import Plan, write_runs
@@ -20,14 +17,14 @@ EARLY = "2020-01-01T00:00:00Z"
 SIZE = "nine scenes, 30,000 iterations"
 
 
-def made(runs: Path, scenes: Sequence[str], seeds: int = 4, **plan: Any) -> list[TrialResult]:
+def made(runs, scenes, seeds=4, **plan):
     write_runs(
         runs, Plan(scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0}, **plan)
     )
     return list(read_experiment(runs / "exp").trials)
 
 
-def page_of(trials: Sequence[TrialResult]) -> Page:
+def page_of(trials):
     """The page of one claim about all scenes of the trials."""
     names = list(dict.fromkeys(trial.scene for trial in trials))
     file = parse_claims(

@@ -5,7 +5,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -99,14 +98,7 @@ def test_studies_are_rows_of_a_table():
     assert second == "| b | -0.5 | – |  |"
 
 
-def archive(
-    tmp_path: Path,
-    name: str,
-    seed: int = 0,
-    protocol: str = "paper-1",
-    budget: dict[str, Any] | None = None,
-    **plan: Any,
-) -> Path:
+def archive(tmp_path, name, seed=0, protocol="paper-1", budget=None, **plan):
     """Write the archive of a laboratory in which "volumetric" gains 1 dB."""
     runs = tmp_path / f"runs_{name}_{seed}"
     paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
@@ -268,8 +260,8 @@ def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
     )
     adc, other = Arm("sfm", "adc"), Arm("dim", "adc")
 
-    def pairs(*arms: Arm, arm: str = "volumetric", baseline: str = "adc") -> list[tuple[Arm, Arm]]:
-        trials: Any = [
+    def pairs(*arms, arm="volumetric", baseline="adc"):
+        trials = [
             SimpleNamespace(arm=one, init=one.init, config={}, variant=one.variant) for one in arms
         ]
         return _arm_pairs(trials, replace(WANTED, arm=(arm,), baseline=(baseline,)), Path("a.zip"))

@@ -3,7 +3,6 @@
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +21,7 @@ HOSTILE = "<img src=x onerror=alert(1)>&\"'"
 CLAIM = {"courtyard": ("courtyard/sfm-adc/c0ffee00", "courtyard/sfm-volumetric/c0ffee00")}
 
 
-def archive(tmp_path: Path, plan: Plan, pictures: bool = False, claim: str = "") -> Path:
+def archive(tmp_path, plan, pictures=False, claim=""):
     """The archive of made-up trials, with a declared claim of that name."""
     runs, file = tmp_path / f"runs-{plan.experiment}", tmp_path / f"{plan.experiment}.zip"
     write_runs(runs, plan)
@@ -35,7 +34,7 @@ def archive(tmp_path: Path, plan: Plan, pictures: bool = False, claim: str = "")
     return file
 
 
-def site(tmp_path: Path, *archives: Path) -> str:
+def site(tmp_path, *archives):
     assert run(["site", *map(str, archives), "--out", str(tmp_path / "site")]) == 0
     return (tmp_path / "site" / "index.html").read_text()
 
@@ -43,16 +42,16 @@ def site(tmp_path: Path, *archives: Path) -> str:
 class Elements(HTMLParser):
     """The names of all elements with their attributes, and all text."""
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.elements = []
         self.text = ""
         self.feed(page)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.text += data
 
 
@@ -100,7 +99,7 @@ def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "taken", "key"),
+    "name, taken, key",
     [
         ("A b!", set(), "a-b"),
         ("exp", {"exp"}, "exp-2"),

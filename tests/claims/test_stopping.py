@@ -8,12 +8,7 @@ from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import plan_looks
-from gsbench.claims.stopping import (
-    KeyAndSeed,
-    plan_sweep,
-    run_looks,
-    trials_of_look,
-)
+from gsbench.claims.stopping import plan_sweep, run_looks, trials_of_look
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Declaration, Question
 from tests.composed import composed
@@ -33,7 +28,7 @@ DECLARATION = Declaration(
 )
 
 
-def verdict(final: bool) -> Verdict:
+def verdict(final):
     return Verdict(BOTH, asked_quantity("psnr"), Pairs(()), final=final)
 
 
@@ -47,7 +42,7 @@ def test_trials_of_a_look_are_ordered_by_seed_and_each_is_listed_once():
 
 
 @pytest.mark.parametrize(
-    ("finals", "looked"),
+    "finals, looked",
     [
         ([(True, True)], []),  # decided before: nothing is run
         ([(False, True), (True, True)], [4]),
@@ -56,7 +51,7 @@ def test_trials_of_a_look_are_ordered_by_seed_and_each_is_listed_once():
     ],
 )
 def test_looks_end_when_nothing_can_be_decided(finals, looked):
-    batches: list[list[KeyAndSeed]] = []
+    batches = []
     answers = iter(finals)
     verdicts = run_looks(
         DECLARATION, lambda: [verdict(final) for final in next(answers)], batches.append
@@ -95,7 +90,7 @@ def test_each_pair_of_arms_is_a_question_about_the_primary_metric():
 
 @pytest.mark.usefixtures("runs")
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         ([*WORDS, "name=a,b"], "all trials of the sweep need one name and one eval.primary"),
         ([*WORDS, "eval.primary=null"], "needs the metric that decides"),

@@ -4,10 +4,9 @@ import itertools
 import json
 import random
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ SHARP = {"left": "right", "right": "left"}
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory) -> Path:
+def pictures(tmp_path_factory):
     """A runs folder with pictures: two scenes with seven views each, two seeds."""
     folder = tmp_path_factory.mktemp("votes")
     write_runs(
@@ -45,13 +44,13 @@ def pictures(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def runs(pictures, monkeypatch) -> Path:
+def runs(pictures, monkeypatch):
     monkeypatch.setenv("GSBENCH_RUNS", str(pictures))
     return pictures
 
 
 @pytest.fixture
-def made(runs, tmp_path) -> Callable[..., RoundKey]:
+def made(runs, tmp_path):
     """A function that makes a round of ``exp`` with its page in ``page``, and returns its key."""
 
     def make(*words, pairs="12", out="page"):
@@ -66,14 +65,14 @@ def made(runs, tmp_path) -> Callable[..., RoundKey]:
     return make
 
 
-def prefers(arm: str) -> Chooser:
+def prefers(arm):
     """The votes of a person who always prefers ``arm`` and passes every trap."""
     return lambda showing: next(
         (side for side in SHARP if getattr(showing, side) in (arm, "photograph")), "same"
     )
 
 
-def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: str = "") -> Ballot:
+def ballot(key, person, choose, minute=0, name=""):
     votes = tuple(Vote(showing=one.id, answer=choose(one), seconds=1.0) for one in key.showings)
     finished = f"2099-11-27T00:{minute:02}:00Z"
     return Ballot(
@@ -81,15 +80,13 @@ def ballot(key: RoundKey, person: int, choose: Chooser, minute: int = 0, name: s
     )
 
 
-def saved(folder: Path, one: Ballot) -> str:
+def saved(folder, one):
     file = folder / f"votes-{one.person}.json"
     file.write_text(json.dumps(one.to_json()))
     return str(file)
 
 
-def made_up(
-    arms: Sequence[str], scenes: int, views: int, people: int = 9, traps: int = 4
-) -> RoundKey:
+def made_up(arms, scenes, views, people=9, traps=4):
     """A key without pictures: every two arms on each view."""
     showings = [
         Showing(
@@ -240,7 +237,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["make", "exp"], "needs --out"),
         (["make", "exp", "--out", "."], "is there already"),
@@ -304,7 +301,7 @@ def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, re
     )
 
 
-OTHER_KEYS: dict[str, Callable[[RoundKey], dict[str, Any]]] = {
+OTHER_KEYS = {
     "salt": lambda key: {"salt": "other"},
     "time": lambda key: {"time": "2026-01-01T00:00:00Z"},
     "arms": lambda key: {"arms": key.arms[::-1]},
@@ -333,7 +330,7 @@ def test_every_field_of_the_key_is_sealed_by_the_rounds_name():
     for name, change in OTHER_KEYS.items():
         assert replace(key, **change(key)).round != key.round, name
     for name, value in OTHER_SHOWINGS.items():
-        edited: Any = replace(key.showings[0], **{name: value})
+        edited = replace(key.showings[0], **{name: value})
         assert replace(key, showings=(edited, *key.showings[1:])).round != key.round, name
 
 
@@ -359,21 +356,21 @@ def test_late_files_never_take_the_place_of_counted_ones(made, runs, tmp_path, r
     assert "before its round was made" in refused("vote", "judge", "exp", saved(tmp_path, old))
 
 
-def _copied(path: Path) -> None:
+def _copied(path):
     path.with_name(f"{7:016x}.json").write_text(path.read_text())
 
 
-def _edited(path: Path) -> None:
+def _edited(path):
     path.write_text(path.read_text().replace('"left"', '"right"'))
 
 
-def _without_votes(path: Path) -> None:
+def _without_votes(path):
     values = json.loads(path.read_text())
     path.write_text(json.dumps(values | {"ballot": values["ballot"] | {"votes": []}}))
 
 
 @pytest.mark.parametrize(
-    ("change", "people", "said"),
+    "change, people, said",
     [
         (_copied, 2, "copy of another file"),
         (_edited, 1, "was edited"),
@@ -556,20 +553,20 @@ def test_intervals_of_a_ranking_contain_the_truth():
 class Voter:
     """A person at the page, who uses the keyboard alone."""
 
-    def __init__(self, browser: Browser, key: RoundKey, choose: Chooser) -> None:
+    def __init__(self, browser, key, choose):
         self.browser, self.key, self.choose = browser, key, choose
 
-    def press(self, name: str, modifiers: int = 0) -> None:
+    def press(self, name, modifiers=0):
         for kind in ("keyDown", "keyUp"):
             self.browser.call("Input.dispatchKeyEvent", type=kind, key=name, modifiers=modifiers)
 
-    def value(self, script: str) -> Any:
+    def value(self, script):
         return self.browser.call("Runtime.evaluate", expression=script)["result"].get("value")
 
-    def wait(self, script: str) -> None:
+    def wait(self, script):
         self.browser.wait_for(lambda: self.value(script) or None, script)
 
-    def answer(self, first: int, last: int) -> None:
+    def answer(self, first, last):
         keys = {"left": "ArrowLeft", "right": "ArrowRight", "same": "ArrowDown"}
         for number in range(first, last):
             self.wait(f"ready && state.votes.length === {number}")

@@ -1,9 +1,6 @@
 """Words of a command line, without a composition."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -30,7 +27,7 @@ from gsbench.config.command_words import (
 from gsbench.errors import InputError
 
 
-def test_options_and_words_may_come_in_any_order(tmp_path: Path) -> None:
+def test_options_and_words_may_come_in_any_order(tmp_path):
     folder = f"hydra.searchpath=['file://{tmp_path}']"
     for words in (
         ["a=1", "--config-dir", str(tmp_path), "-m", "b=2", "--dry-run"],
@@ -48,7 +45,7 @@ def test_options_and_words_may_come_in_any_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["--config-name", "mine"], "--config-name: gsbench's main configuration is its own: write "
             "yours to FOLDER/experiment/mine.yaml"),
@@ -64,14 +61,14 @@ def test_options_and_words_may_come_in_any_order(tmp_path: Path) -> None:
         (["--config-dir", "/nowhere"], "--config-dir /nowhere: no such folder"),
     ],
 )  # fmt: skip
-def test_options_that_do_not_exist_are_explained(words: list[str], said: str) -> None:
+def test_options_that_do_not_exist_are_explained(words, said):
     with pytest.raises(InputError) as error:
         parse(words)
     assert said in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["scene=courtyard", "+densify.x=1", "~densify.x", "~raster.x", "init={a:1}"], None),
         (["densify=adc,mcmc", "+experiment=demo", "hydra.job.name=a", "seed=range(3)"], None),
@@ -94,7 +91,7 @@ def test_options_that_do_not_exist_are_explained(words: list[str], said: str) ->
         (["a=" + "[" * 41 + "]" * 41], "opens more than 40 brackets"),
     ],
 )
-def test_words_without_effect_are_refused(words: list[str], said: str | None) -> None:
+def test_words_without_effect_are_refused(words, said):
     if said is None:
         check_words(words)
     else:
@@ -103,7 +100,7 @@ def test_words_without_effect_are_refused(words: list[str], said: str | None) ->
         assert said in str(error.value)
 
 
-def test_brackets_are_counted_while_they_are_open() -> None:
+def test_brackets_are_counted_while_they_are_open():
     for word in ("a=" + "[" * 40 + "]" * 40, "a=[" + ",".join(["[1]"] * 50) + "]"):
         assert parse_word(word).key_or_group == "a"
     for name in ("name", "x.path"):
@@ -112,7 +109,7 @@ def test_brackets_are_counted_while_they_are_open() -> None:
             check_text(f"{name}=a, 1_0")
 
 
-def test_only_a_list_of_plain_names_gives_permission() -> None:
+def test_only_a_list_of_plain_names_gives_permission():
     assert typed_permissions(["a=1", "allow_targets=[a]", "+allow_targets=[b,c.d]"]) == ("b", "c.d")
     assert typed_permissions(["allow_targets=[a]", "allow_targets=[b],[c]"]) == ("a",)
     for wrong in ("a", "[1]", "[a,'']", "['${a}']", "{a:1}"):
@@ -121,7 +118,7 @@ def test_only_a_list_of_plain_names_gives_permission() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    "word, said",
     [
         ("hydra.searchpath=[file:///a,/b,pkg://gsbench.x,pkg://mine/sub]", None),
         ("hydra.searchpath=[pkg://other]", r"imports a package; if you trust it, add "
@@ -132,7 +129,7 @@ def test_only_a_list_of_plain_names_gives_permission() -> None:
         ("hydra.searchpath=[pkg://a],[pkg://b]", None),  # refused as a list of values
     ],
 )  # fmt: skip
-def test_packages_of_settings_need_permission(word: str, said: str | None) -> None:
+def test_packages_of_settings_need_permission(word, said):
     if said is None:
         check_search_path([word], ["mine"])
     else:
@@ -140,11 +137,11 @@ def test_packages_of_settings_need_permission(word: str, said: str | None) -> No
             check_search_path(["a=1", word], ["mine"])
 
 
-def points(*words: str) -> list[str]:
+def points(*words):
     return [" ".join(point) for point in grid_points([parse_word(word) for word in words])]
 
 
-def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch):
     assert points("a=1,2", "b=x", "~c", "d=range(0,2)") == [
         f"a={a} b=x ~c d={d}" for a in (1, 2) for d in (0, 1)
     ]
@@ -163,18 +160,18 @@ def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(
-    ("key", "other"),
+    "key, other",
     [
         *((key, True) for key in ("seed", "name", "densify", "densify.start", "scene.path")),
         *((key, False) for key in ("threads", "init.threads", "eval.primary", "launch.parallel")),
         ("densify.primary", True),
     ],
 )
-def test_settings_that_make_other_trials(key: str, other: bool) -> None:
+def test_settings_that_make_other_trials(key, other):
     assert makes_other_trials(key) == other
 
 
-def test_words_tell_their_key_value_and_kind() -> None:
+def test_words_tell_their_key_value_and_kind():
     assert [key_of(word) for word in ("+a.b=1", "~a.b", "++a/b=1", "a=1")] == [
         *("a.b", "a.b", "a/b", "a")
     ]
@@ -184,7 +181,7 @@ def test_words_tell_their_key_value_and_kind() -> None:
     assert [is_interval(parse_word(word)) for word in ("a=1", "a=1,2", "a=interval(0,1)")] == [
         *(False, False, True)
     ]
-    values: list[Any] = [None, True, [1, [None, "a"]], 1.5, "True"]
+    values = [None, True, [1, [None, "a"]], 1.5, "True"]
     assert [value_text(value) for value in values] == [
         *("null", "true", "[1,[null,a]]", "1.5", "True")
     ]
@@ -196,7 +193,7 @@ def test_words_tell_their_key_value_and_kind() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    "word, said",
     [
         ("a b=1", r"is not a setting like key=value \([^;]*\)$"),
         ("a=b(c", r"'a=\"b\(c\"'$"),
@@ -207,13 +204,13 @@ def test_words_tell_their_key_value_and_kind() -> None:
         ("word", "'word' is not a setting like key=value"),
     ],
 )
-def test_special_characters_are_shown_quoted(word: str, said: str) -> None:
+def test_special_characters_are_shown_quoted(word, said):
     with pytest.raises(InputError, match=said):
         parse_word(word)
 
 
-@pytest.mark.parametrize(("group", "word"), [("experiment", "experiment=a"), ("init", "init=[a]")])
-def test_choices_of_the_users_folder_are_listed_too(tmp_path: Path, group: str, word: str) -> None:
+@pytest.mark.parametrize("group, word", [("experiment", "experiment=a"), ("init", "init=[a]")])
+def test_choices_of_the_users_folder_are_listed_too(tmp_path, group, word):
     (tmp_path / group).mkdir()
     (tmp_path / group / "of_mine.yaml").touch()
     words, *_ = parse(["--config-dir", str(tmp_path), word])
@@ -221,7 +218,7 @@ def test_choices_of_the_users_folder_are_listed_too(tmp_path: Path, group: str, 
         check_words(words)
 
 
-def test_a_word_that_is_a_choice_gets_a_hint(tmp_path: Path) -> None:
+def test_a_word_that_is_a_choice_gets_a_hint(tmp_path):
     assert hint_for("raster").startswith("; raster is a group: choose one by raster=NAME (")
     assert hint_for("mcmc") == "; did you mean densify=mcmc?"
     assert hint_for("demo") == "; did you mean +experiment=demo?"

@@ -3,7 +3,6 @@
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,7 +19,7 @@ from tests.strange import no_trial
 from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
-STRANGE_TRIALS: dict[str, tuple[dict[str, Any], str]] = {
+STRANGE_TRIALS = {
     "a class": ({"densify": {"_target_": "bomb.Bomb"}}, "add allow_targets=[bomb] to the command"),
     "a metric": (
         {"eval": {"extra": {"x": {"_target_": "bomb.Bomb"}}}},
@@ -57,7 +56,7 @@ STRANGE_TRIALS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-def strange_runs(settings: dict[str, Any]) -> Path:
+def strange_runs(settings):
     """A stranger's failed trial that is in no plan; its configuration allows itself everything."""
     (trial,) = compose_trials(["name=x"])
     values = json.loads(json.dumps(trial.values)) | {
@@ -108,7 +107,7 @@ def test_permissions_in_a_trials_configuration_are_dropped():
 
 def test_retry_runs_what_its_command_allows(monkeypatch):
     strange_runs({"densify": {"_target_": "mine.Mine"}})
-    began: list[Any] = []
+    began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
     assert [trial.values["allow_targets"] for trial in began] == [["mine"]]
@@ -126,7 +125,7 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     assert str(theirs) in strange
     assert "allow_targets=[mine]" in strange
     plan.write_text(strange)
-    began: list[Any] = []
+    began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert "add allow_targets=[mine] to the command" in refused("retry", "x")
     monkeypatch.chdir(place)
@@ -171,7 +170,7 @@ PROGRAM = [
 
 
 @pytest.mark.parametrize(
-    ("words", "missing"),
+    "words, missing",
     [
         ([], "python"),
         (["densify.version_command=[curl,strange]"], "python,curl"),
@@ -238,7 +237,7 @@ def test_retry_sends_nothing_to_a_tracker_that_a_strangers_folder_names(monkeypa
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.setattr("gsbench.app.command.run_trials", no_trial)
     assert f"to allow it, type tracking.uri={address}" in refused("retry", "x")
-    began: list[Any] = []
+    began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
     assert cli.run(["retry", "x"]) == 0

@@ -5,11 +5,10 @@ import json
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
 from gsbench.config.command_words import check_words, key_of, parse_word
@@ -17,19 +16,19 @@ from gsbench.config.compose import compose_one
 from gsbench.config.schema import checked_values, plain, register_schemas
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build, build_metrics
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS, TrainConfig
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch")
 
 
-def options(group: str) -> list[str]:
+def options(group):
     return sorted(path.stem for path in Path(conf_dir(), group).glob("*.yaml"))
 
 
 @cache
-def composed(*overrides: str) -> dict[str, Any]:
+def composed(*overrides):
     """The values of a configuration, which tests share and do not change."""
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
@@ -38,14 +37,14 @@ def composed(*overrides: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def base() -> DictConfig:
+def base():
     """A composed configuration, for changes of single values: a composition takes long."""
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return compose("config")
 
 
-def changed(base: DictConfig, changes: dict[str, Any]) -> dict[str, Any]:
+def changed(base, changes):
     config = base.copy()
     OmegaConf.set_struct(config, False)
     for key, value in changes.items():
@@ -53,7 +52,7 @@ def changed(base: DictConfig, changes: dict[str, Any]) -> dict[str, Any]:
     return checked_values(config)
 
 
-def checked(base: DictConfig, *words: str) -> dict[str, Any]:
+def checked(base, *words):
     return changed(base, {key_of(word): parse_word(word).value() for word in words})
 
 
@@ -77,12 +76,12 @@ PROGRAMS = {
 PLACES = {option: ["init.path=/data/model.ply"] for option in ("ply", "points")}
 
 
-def needs(option: str) -> list[str]:
+def needs(option):
     return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
 
 
 @pytest.mark.parametrize(
-    ("group", "option"), [(group, option) for group in GROUPS for option in options(group)]
+    "group, option", [(group, option) for group in GROUPS for option in options(group)]
 )
 def test_every_option_composes(group, option):
     extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
@@ -132,7 +131,7 @@ def test_the_paper_schedule_is_the_class_default():
     }
 
 
-def sweep_size(experiment: str) -> int:
+def sweep_size(experiment):
     register_schemas()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose(
@@ -166,7 +165,7 @@ def test_experiments_have_the_size_of_the_paper():
 
 
 @pytest.mark.parametrize(
-    ("overrides", "key"),
+    "overrides, key",
     [
         (["scene.test_every=1"], "scene.test_every"),
         (["train.iterations=0"], "train.iterations"),
@@ -182,7 +181,7 @@ def test_errors_name_the_key(base, overrides, key):
 
 
 @pytest.mark.parametrize(
-    ("words", "error"),
+    "words, error",
     [
         (
             ["eval.primary=lpips_vg"],
@@ -248,7 +247,7 @@ def test_asking_for_more_metrics_changes_the_hash(base):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["eval.more=[psnr]"], "eval.more"),
         (["eval.more=[gmsd,gmsd]"], "at most once"),
@@ -293,7 +292,7 @@ def test_a_users_metric_needs_a_plain_name_that_is_not_taken(base, name):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    "changes, said",
     [
         ({"scene.transparent": "white", "train.background": [1, 1, 1]}, None),
         ({"scene.transparent": "white", "train.background": [0, 0, 0]}, "background=[1,1,1]"),
@@ -397,7 +396,7 @@ def test_an_impossible_number_of_threads_is_refused(base, threads):
 
 
 @pytest.mark.parametrize(
-    ("word", "is_kept"),
+    "word, is_kept",
     [
         ("name=1_1", False),
         ("name=1e3", False),
@@ -423,7 +422,7 @@ def test_a_text_is_kept_as_typed_or_refused(word, is_kept):
 
 
 @pytest.mark.parametrize(
-    ("words", "scaled"),
+    "words, scaled",
     [
         (["train=paper", "train.steps_scaler=0.1"], (3000, 50, 1500, 10, 300)),
         (
@@ -434,7 +433,7 @@ def test_a_text_is_kept_as_typed_or_refused(word, is_kept):
         (["train=quick", "train.steps_scaler=1e-6"], (1, 1, 1, 1, 1)),
     ],
 )
-def test_all_steps_of_the_schedule_are_scaled(words: list[str], scaled: tuple[int, ...]) -> None:
+def test_all_steps_of_the_schedule_are_scaled(words, scaled):
     values = composed("densify=adc", *words)
     train, densify = values["train"], values["densify"]
     keys = ("iterations", "densify_start", "densify_stop", "densify_interval")
@@ -447,6 +446,6 @@ def test_all_steps_of_the_schedule_are_scaled(words: list[str], scaled: tuple[in
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "x", "true"])
-def test_a_scale_that_is_no_number_above_zero_is_refused(value: str) -> None:
+def test_a_scale_that_is_no_number_above_zero_is_refused(value):
     with pytest.raises(InputError, match=r"train\.steps_scaler must be"):
         composed(f"train.steps_scaler={value}")

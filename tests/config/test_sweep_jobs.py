@@ -37,9 +37,9 @@ SWEEPS = {  # words, and how often Hydra composes for them
 
 
 @pytest.fixture
-def compositions(monkeypatch) -> list[list[str]]:
+def compositions(monkeypatch):
     """The words of each of Hydra's compositions of a job."""
-    asked: list[list[str]] = []
+    asked = []
     compose = ConfigLoaderImpl.load_sweep_config
 
     def counted(self, master_config, sweep_overrides):
@@ -71,7 +71,7 @@ def test_a_bad_value_is_refused_in_a_shared_composition(words):
 
 
 @pytest.mark.parametrize(
-    ("words", "values"),
+    "words, values",
     [
         (["a.b=1", "seed=2", "c=3", "d.e='4'"], {"a.b": 1, "seed": 2, "d.e": "4"}),
         (["a.b={c:1}", "d.e=2"], {}),  # a mapping, whose order matters

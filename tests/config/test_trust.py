@@ -7,7 +7,6 @@ makes a folder.
 import importlib.util
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,7 +17,7 @@ from gsbench.config.compose import compose_one
 from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variables, load_class
 from gsbench.errors import InputError
 from gsbench.pipeline.parts import build
-from gsbench.runs.keys import module_digest
+from gsbench.runs.user_code import module_digest
 from gsbench.system.own_modules import allow_modules
 from tests.strange import BOMB, ask, experiment
 from tests.strange import place as place
@@ -28,13 +27,13 @@ MKDIR = {"_target_": "os.mkdir", "path": "exploded"}
 LOG_CALLBACK = "hydra.experimental.callbacks.LogJobReturnCallback"
 
 
-def calls(**settings: Any) -> dict[str, Any]:
+def calls(**settings):
     """Settings of one of Hydra's own callbacks, with a stranger's further ``settings``."""
     return {"hydra": {"callbacks": {"x": {"_target_": LOG_CALLBACK} | settings}}}
 
 
 # settings of a file, and a part of the line that refuses them
-STRANGE: dict[str, tuple[dict[str, Any], str]] = {
+STRANGE = {
     "a callback": ({"hydra": {"callbacks": {"x": MKDIR}}}, "allow_targets=[os]"),
     "below a callback": (calls(inner=MKDIR), "allow_targets=[os]"),
     "in a list below a callback": (calls(inner=[{"a": [[MKDIR]]}]), "callbacks.x.inner.0.a.0.0."),
@@ -233,7 +232,7 @@ SOME = ("a callback", "made of a text", "a module of a package", "logging", "a l
 
 
 @pytest.mark.parametrize(
-    ("case", "mode"),
+    "case, mode",
     [*((case, "run") for case in STRANGE), *product(SOME, ["dry run", "question", "info"])],
 )
 def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
@@ -242,7 +241,7 @@ def test_code_that_a_file_names_is_not_run(case, mode, capsys, monkeypatch):
     assert not Path("exploded").exists()
 
 
-JOBS: dict[str, tuple[dict[str, Any], str]] = {  # the words that a file's sweep gives its jobs
+JOBS = {  # the words that a file's sweep gives its jobs
     "a callback": ({"+hydra.callbacks.x._target_": "os.mkdir"}, "cannot differ from job to job"),
     "a search path": ({"hydra.searchpath": "[pkg://bombs]"}, "cannot differ from job to job"),
     "a variable": ({"+hydra.job.env_set.PYTHONPATH": "/strange"}, "cannot differ from job to job"),
@@ -337,7 +336,7 @@ def test_only_variables_that_choose_threads_and_devices_need_no_permission(monke
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    "word, said",
     [
         ("hydra.searchpath=[pkg://bombs]", "allow_targets=[bombs]"),
         ("hydra.searchpath=[file://conf,pkg://bombs/sub]", "allow_targets=[bombs]"),
@@ -403,7 +402,7 @@ def test_a_typed_permission_also_covers_classes_in_files(capsys):
 
 
 @pytest.mark.parametrize(
-    ("target", "said"),
+    "target, said",
     [
         ("mine.os.mkdir", "cannot be imported"),
         ("mine.os", "is not a class for densify"),
@@ -424,7 +423,7 @@ def test_permission_for_a_module_covers_gsbenchs_classes_in_it():
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    "settings, said",
     [
         ({"_target_": "mine.Popen", "args": "true"}, "is subprocess.Popen"),
         ({"_target_": "mine.Mine"}, "is not a class of hydra.experimental.callback.Callback"),

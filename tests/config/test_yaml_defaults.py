@@ -2,8 +2,6 @@
 
 import dataclasses
 import importlib
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 import yaml
@@ -40,12 +38,12 @@ WHOLE = {
 }
 
 
-def read(path: str) -> dict[str, Any]:
+def read(path):
     content = yaml.safe_load((conf_dir() / f"{path}.yaml").read_text(encoding="utf-8"))
     return content if isinstance(content, dict) else {}
 
 
-def bases(path: str) -> Iterator[str]:
+def bases(path):
     """The files of the same group that a file is built on, nearest first."""
     group = path.partition("/")[0]
     for entry in read(path).get("defaults", []):
@@ -60,7 +58,7 @@ def bases(path: str) -> Iterator[str]:
             yield from bases(base)
 
 
-def class_of(path: str) -> type | None:
+def class_of(path):
     """The dataclass whose options a file states."""
     targets = [
         values["_target_"] for values in map(read, (path, *bases(path))) if "_target_" in values
@@ -81,9 +79,9 @@ FILES = [
 ]
 
 
-def stated(path: str) -> dict[str, Any]:
+def stated(path):
     """The values that a file and its bases state, except names and references to other settings."""
-    values: dict[str, Any] = {}
+    values = {}
     for file in (*reversed(list(bases(path))), path):
         values |= read(file)
     given = {
@@ -92,13 +90,13 @@ def stated(path: str) -> dict[str, Any]:
     return {key: value for key, value in given.items() if not str(value).startswith(("${", "???"))}
 
 
-def allowed(path: str) -> set[str]:
+def allowed(path):
     if path in OWN_CLASS:
         return DELIBERATE.get(path, set())
     return set().union(*(DELIBERATE.get(file, set()) for file in (path, *bases(path))))
 
 
-def plain(value: Any) -> Any:
+def plain(value):
     return list(value) if isinstance(value, tuple) else value
 
 

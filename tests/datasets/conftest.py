@@ -1,20 +1,17 @@
 """Small archives with the layout of the real ones, and a server for them."""
 
-from __future__ import annotations
-
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsbench.datasets.catalog import read_catalog
-from tests.datasets.server import Server, serve
+from tests.datasets.server import serve
 
 
-def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[str, bytes]:
+def archive_content(scene_folder, seed=0, photos=4):
     """The files of a scene in an archive: four sizes, a model, and files that are not wanted."""
     rng = np.random.default_rng([seed, *scene_folder.encode()])
     files = {}
@@ -30,21 +27,19 @@ def archive_content(scene_folder: str, seed: int = 0, photos: int = 4) -> dict[s
     return files
 
 
-def write_archive(
-    path: Path, content: Mapping[str, bytes], compression: int = zipfile.ZIP_DEFLATED
-) -> None:
+def write_archive(path, content, compression=zipfile.ZIP_DEFLATED):
     with zipfile.ZipFile(path, "w", compression) as archive:
         for name, data in content.items():
             archive.writestr(name, data)
 
 
 @pytest.fixture(scope="session")
-def made_archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_archives(tmp_path_factory):
     """A folder with small files under the names of all archives in the catalogue."""
     folder = tmp_path_factory.mktemp("archives")
     for dataset in read_catalog().values():
         for archive in dataset.archives:
-            content: dict[str, bytes] = {}
+            content = {}
             for place in archive.scenes.values():
                 content |= archive_content(place)
             write_archive(folder / archive.name, content)
@@ -52,12 +47,12 @@ def made_archives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def archives(made_archives: Path, tmp_path: Path) -> Path:
+def archives(made_archives, tmp_path):
     """A copy of `made_archives` that the test may change."""
     return Path(shutil.copytree(made_archives, tmp_path / "archives"))
 
 
 @pytest.fixture
-def server(archives: Path) -> Iterator[Server]:
+def server(archives):
     with serve(archives) as running:
         yield running

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -40,20 +40,20 @@ class Server:
 
 
 @contextmanager
-def serve(folder: Path) -> Iterator[Server]:
+def serve(folder):
     """Serve the files of ``folder`` while the block runs."""
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
-        def log_message(self, *_: object) -> None:
+        def log_message(self, *_):
             return
 
-        def end_headers(self) -> None:
+        def end_headers(self):
             self.send_header("Connection", "close")
             super().end_headers()
 
-        def do_GET(self) -> None:
+        def do_GET(self):
             manners = state.manners
             asked = self.headers.get("Range", "")
             state.requests.append((self.path, asked))
@@ -95,7 +95,7 @@ def serve(folder: Path) -> Iterator[Server]:
             self.end_headers()
             self.body(path, file, first, last + 1)
 
-        def body(self, path: str, file: Path, first: int, end: int) -> None:
+        def body(self, path, file, first, end):
             manners = state.manners
             with file.open("rb") as stream:
                 stream.seek(first)

@@ -1,15 +1,11 @@
 """Archives of scenes: on faulty servers, damaged, or malicious."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,12 +23,13 @@ from gsbench.datasets.archive import (
 from gsbench.datasets.catalog import SceneFiles
 from gsbench.downloads import FetchError, RetryPolicy, download, with_retries
 from gsbench.errors import InputError
-from tests.datasets.server import Manners, Server, serve
+from tests.datasets.server import Manners, serve
+from tests.helpers import refusal, write
 
 PATIENT = RetryPolicy(timeout=0.3, tries=3, pause=0.01)
 
 
-def packed(*names: str) -> bytes:
+def packed(*names):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name in names:
@@ -40,7 +37,7 @@ def packed(*names: str) -> bytes:
     return stream.getvalue()
 
 
-def patched(data: bytes, signature: bytes, offset: int, layout: str, value: int) -> bytes:
+def patched(data, signature, offset, layout, value):
     at = data.index(signature) + offset
     return data[:at] + struct.pack(layout, value) + data[at + struct.calcsize(layout) :]
 
@@ -49,28 +46,28 @@ DIRECTORY, LOCAL = b"PK\x01\x02", b"PK\x03\x04"
 
 
 @pytest.mark.parametrize("version", [64, 99, 255])
-def test_an_archive_of_a_later_version_is_refused(version: int, tmp_path: Path) -> None:
+def test_an_archive_of_a_later_version_is_refused(version, tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 6, "<H", version)
-    with pytest.raises(InputError, match="is not a complete zip archive"):
+    with refusal("is not a complete zip archive"):
         open_archive(io.BytesIO(data), "x.zip")
 
 
-def extract_only(archive: zipfile.ZipFile, target: Path, which: int = 0) -> None:
+def extract_only(archive, target, which=0):
     member = list(wanted_members(archive, "s", ["images"], "x.zip").values())[which]
     extract(archive, member, target, lambda count: None)
 
 
 @pytest.mark.parametrize("value", [5, 10**9, 2**32 - 2])
-def test_a_wrong_offset_counts_as_damage(value: int, tmp_path: Path) -> None:
+def test_a_wrong_offset_counts_as_damage(value, tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 42, "<I", value)
     with open_archive(io.BytesIO(data), "x.zip") as archive, pytest.raises(DamagedMemberError):
         extract_only(archive, tmp_path / "a.jpg")
     assert not (tmp_path / "a.jpg").exists()
 
 
-def test_the_progress_of_a_damaged_member_is_taken_back(tmp_path: Path) -> None:
+def test_the_progress_of_a_damaged_member_is_taken_back(tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 24, "<I", 14)  # bytes
-    counts: list[int] = []
+    counts = []
     with (
         open_archive(io.BytesIO(data), "x.zip") as archive,
         pytest.raises(DamagedMemberError, match="13 bytes instead of 14"),
@@ -79,12 +76,11 @@ def test_the_progress_of_a_damaged_member_is_taken_back(tmp_path: Path) -> None:
     assert counts == [13, -13]
 
 
-def test_progress_counts_the_bytes_of_the_missing_files(tmp_path: Path) -> None:
+def test_progress_counts_the_bytes_of_the_missing_files(tmp_path):
     files = SceneFiles("truck", "db/truck", ("images",))
     there = tmp_path / STAGING / "truck" / "images" / "b.jpg"
-    there.parent.mkdir(parents=True)
-    there.write_bytes(b"content of it")  # by an earlier fetch that was interrupted
-    told: list[tuple[str, int, int]] = []
+    write(there, b"content of it")  # by an earlier fetch that was interrupted
+    told = []
     data = packed("s/images/a.jpg", "s/images/b.jpg", "s/images/c.jpg")
     with open_archive(io.BytesIO(data), "x.zip") as archive:
         line = fetch_scene(
@@ -94,16 +90,16 @@ def test_progress_counts_the_bytes_of_the_missing_files(tmp_path: Path) -> None:
     assert line == f"3 files, 39 bytes, in {tmp_path / 'db/truck'} (images)"
 
 
-def test_a_packing_that_cannot_be_read_is_no_damage(tmp_path: Path) -> None:
+def test_a_packing_that_cannot_be_read_is_no_damage(tmp_path):
     data = patched(packed("s/images/a.jpg"), DIRECTORY, 8, "<H", 1)  # encrypted
     with (
         open_archive(io.BytesIO(data), "x.zip") as archive,
-        pytest.raises(InputError, match=r"a\.jpg is packed in a way that cannot be read here"),
+        refusal(r"a\.jpg is packed in a way that cannot be read here"),
     ):
         extract_only(archive, tmp_path / "a.jpg")
 
 
-def test_a_member_without_a_name_is_skipped() -> None:
+def test_a_member_without_a_name_is_skipped():
     data = packed("s/images/a.jpg", "x")
     # zipfile cuts a name at the first NUL
     data = patched(data, b"x" + data[data.rindex(b"x") + 1 :], 0, "<B", 0)
@@ -113,7 +109,7 @@ def test_a_member_without_a_name_is_skipped() -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    "names, said",
     [
         (("s/images/a", "s/images/a/b.jpg"), "images/a is a file and a folder in one"),
         (("s/images/a/b/c.jpg", "s/images/a"), "images/a is a file and a folder in one"),
@@ -121,16 +117,13 @@ def test_a_member_without_a_name_is_skipped() -> None:
         (("s/images/a\nb.jpg",), "a name that no file can have"),
     ],
 )
-def test_names_that_cannot_be_files_together_are_refused(names: tuple[str, ...], said: str) -> None:
-    with (
-        open_archive(io.BytesIO(packed(*names)), "x.zip") as archive,
-        pytest.raises(InputError, match=said),
-    ):
+def test_names_that_cannot_be_files_together_are_refused(names, said):
+    with open_archive(io.BytesIO(packed(*names)), "x.zip") as archive, refusal(said):
         wanted_members(archive, "s", ["images"], "x.zip")
 
 
 @pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_damaged_bytes_of_a_member_are_detected(compression: int, tmp_path: Path) -> None:
+def test_damaged_bytes_of_a_member_are_detected(compression, tmp_path):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as archive:
         archive.writestr("s/images/a.jpg", content := np.random.default_rng(0).bytes(300))
@@ -147,7 +140,7 @@ def test_damaged_bytes_of_a_member_are_detected(compression: int, tmp_path: Path
     assert not (tmp_path / "a.jpg").exists()
 
 
-def test_a_file_is_complete_by_its_size_and_checksum(tmp_path: Path) -> None:
+def test_a_file_is_complete_by_its_size_and_checksum(tmp_path):
     file = tmp_path / "a.jpg"
     checksum = zlib.crc32(b"content")
     assert not is_complete(file, 7, checksum)
@@ -157,17 +150,14 @@ def test_a_file_is_complete_by_its_size_and_checksum(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_as_an_archive_is_refused_and_not_awaited(tmp_path: Path) -> None:
+def test_a_pipe_as_an_archive_is_refused_and_not_awaited(tmp_path):
     os.mkfifo(tmp_path / "x.zip")
-    with (
-        pytest.raises(InputError, match=r"x\.zip"),
-        open_archive_at(str(tmp_path / "x.zip"), PATIENT),
-    ):
+    with refusal(r"x\.zip"), open_archive_at(str(tmp_path / "x.zip"), PATIENT):
         pass
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Iterator[Server]:
+def served(tmp_path):
     with zipfile.ZipFile(tmp_path / "file.zip", "w") as archive:
         for name in ("first", "second"):
             content = np.random.default_rng(len(name)).bytes(300_000)
@@ -176,7 +166,7 @@ def served(tmp_path: Path) -> Iterator[Server]:
         yield running
 
 
-def fetched(server: Server, target: Path) -> bytes:
+def fetched(server, target):
     """The bytes of the second member."""
     url = f"{server.url}/file.zip"
     with open_archive_at(url, PATIENT) as archive:
@@ -194,9 +184,7 @@ def fetched(server: Server, target: Path) -> bytes:
         Manners(redirect=True),
     ],
 )
-def test_a_member_is_fetched_whole_and_alone(
-    served: Server, tmp_path: Path, manners: Manners
-) -> None:
+def test_a_member_is_fetched_whole_and_alone(served, tmp_path, manners):
     served.manners = manners
     assert fetched(served, tmp_path / "out") == np.random.default_rng(6).bytes(300_000)
     if not manners.cut_every and not manners.stall_every:
@@ -204,7 +192,7 @@ def test_a_member_is_fetched_whole_and_alone(
 
 
 @pytest.mark.parametrize(
-    ("manners", "kind", "said"),
+    "manners, kind, said",
     [
         (Manners(cut_every=100), FetchError, r"3 failures in a row .*cut.*same command again"),
         (Manners(stall_every=1), FetchError, "no answer in time"),
@@ -215,16 +203,14 @@ def test_a_member_is_fetched_whole_and_alone(
         (Manners(shift=7), DamagedMemberError, None),
     ],
 )
-def test_faults_of_the_server_are_reported(
-    served: Server, tmp_path: Path, manners: Manners, kind: type[Exception], said: str | None
-) -> None:
+def test_faults_of_the_server_are_reported(served, tmp_path, manners, kind, said):
     served.manners = manners
     with pytest.raises(kind, match=said):
         fetched(served, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_server_is_reported() -> None:
+def test_a_missing_server_is_reported():
     with (
         pytest.raises(FetchError, match="Connection refused"),
         open_archive_at("http://127.0.0.1:9/file.zip", PATIENT),
@@ -232,7 +218,7 @@ def test_a_missing_server_is_reported() -> None:
         pass
 
 
-def test_a_file_that_changes_between_requests_is_detected(served: Server, tmp_path: Path) -> None:
+def test_a_file_that_changes_between_requests_is_detected(served, tmp_path):
     url = f"{served.url}/file.zip"
     with open_archive_at(url, PATIENT) as archive:
         content = bytearray((served.folder / "file.zip").read_bytes())
@@ -241,13 +227,13 @@ def test_a_file_that_changes_between_requests_is_detected(served: Server, tmp_pa
         with pytest.raises(DamagedMemberError, match="CRC-32"):
             extract_only(archive, tmp_path / "out", 1)
         os.truncate(served.folder / "file.zip", 1000)
-        with pytest.raises(InputError, match="416"):
+        with refusal("416"):
             with_retries(lambda: extract_only(archive, tmp_path / "out", 1), url, PATIENT)
 
 
-def test_a_download_is_complete_or_fails(served: Server, tmp_path: Path) -> None:
+def test_a_download_is_complete_or_fails(served, tmp_path):
     served.manners = Manners(ranges=False, cut_every=300_000, cuts=2)
-    seen: list[tuple[int, int | None]] = []
+    seen = []
     url, target = f"{served.url}/file.zip", tmp_path / "copy"
     download(url, target, PATIENT, lambda *state: seen.append(state))
     content = (served.folder / "file.zip").read_bytes()
@@ -258,7 +244,7 @@ def test_a_download_is_complete_or_fails(served: Server, tmp_path: Path) -> None
         download(url, target, PATIENT, lambda *_: None)
 
 
-def test_offsets_beyond_four_gigabytes_are_read(tmp_path: Path) -> None:
+def test_offsets_beyond_four_gigabytes_are_read(tmp_path):
     """The real archive has 12.5 GB and needs zip64; a sparse file takes no space."""
     file = tmp_path / "large.zip"
     with file.open("wb") as stream:

@@ -1,12 +1,9 @@
 """`gsbench fetch` brings the wanted files of an archive, complete or not at all."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
+from shlex import split
 
 import pytest
 
@@ -15,14 +12,13 @@ from gsbench.datasets.catalog import how_to_get, read_catalog, wanted_files
 from gsbench.downloads import RetryPolicy
 from gsbench.system.install import conf_dir
 from tests.datasets.conftest import archive_content, write_archive
-from tests.datasets.server import Manners, Server
+from tests.datasets.server import Manners
 
-Fetch = Callable[..., int]
 BAD_INPUT, FAILED = 2, 1
 
 
 @pytest.fixture
-def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def data(tmp_path, monkeypatch):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     monkeypatch.delenv("GSBENCH_MIRROR", raising=False)
     # handlers of other tests write to closed files
@@ -31,22 +27,22 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def fetch(server: Server, data: Path, monkeypatch: pytest.MonkeyPatch) -> Fetch:
+def fetch(server, data, monkeypatch):
     patience = RetryPolicy(timeout=0.3, tries=3, pause=0.01)
     monkeypatch.setattr("gsbench.verbs.fetch.PATIENCE", patience)
 
-    def call(*words: str) -> int:
+    def call(*words):
         return run(["fetch", *words, "--mirror", server.url])
 
     return call
 
 
-def files_below(folder: Path) -> dict[str, bytes]:
+def files_below(folder):
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
-def wanted(place: str, images: str) -> dict[str, bytes]:
+def wanted(place, images):
     parts = (f"{place}/{images}/IMG", f"{place}/sparse/0/")
     return {
         name.removeprefix(f"{place}/"): data
@@ -55,7 +51,7 @@ def wanted(place: str, images: str) -> dict[str, bytes]:
     }
 
 
-def test_every_scene_of_the_catalogue_has_a_scene_file_with_the_same_folder() -> None:
+def test_every_scene_of_the_catalogue_has_a_scene_file_with_the_same_folder():
     known = {}
     for dataset in read_catalog().values():
         for archive in dataset.archives:
@@ -67,8 +63,8 @@ def test_every_scene_of_the_catalogue_has_a_scene_file_with_the_same_folder() ->
 
 
 def test_fetch_brings_the_files_that_the_scene_file_needs_and_no_others(
-    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    fetch, server, data, capsys
+):
     assert fetch("mipnerf360", "garden", "room", "flowers") == 0
     images = {"garden": "images_4", "room": "images_2", "flowers": "images_4"}
     for scene, folder in images.items():
@@ -86,9 +82,7 @@ def test_fetch_brings_the_files_that_the_scene_file_needs_and_no_others(
     assert files_below(data / "db" / "playroom") == wanted("db/playroom", "images")
 
 
-def test_a_second_fetch_makes_no_request(
-    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_second_fetch_makes_no_request(fetch, server, data, capsys):
     fetch("mipnerf360", "garden")
     asked = len(server.requests)
     assert fetch("mipnerf360", "garden") == 0
@@ -99,8 +93,8 @@ def test_a_second_fetch_makes_no_request(
     assert files_below(data / "garden") == wanted("garden", "images_4")
 
 
-def test_an_interrupted_fetch_continues(fetch: Fetch, server: Server, data: Path) -> None:
-    def die_after(path: str, _: int, body: bytes) -> bytes:
+def test_an_interrupted_fetch_continues(fetch, server, data):
+    def die_after(path, _, body):
         if server.sent > 90_000:  # the directory is 64 kB
             server.manners.status = {path: 500}
         return body
@@ -121,9 +115,7 @@ def test_an_interrupted_fetch_continues(fetch: Fetch, server: Server, data: Path
     assert len(server.requests) - asked <= missing + 2
 
 
-def test_faults_of_the_server_do_not_change_the_files(
-    fetch: Fetch, server: Server, data: Path
-) -> None:
+def test_faults_of_the_server_do_not_change_the_files(fetch, server, data):
     """test_archive.py tests each fault alone."""
     server.manners = Manners(cut_every=6_000, cuts=1, fail_first=1, redirect=True)
     assert fetch("mipnerf360", "garden", "stump") == 0
@@ -131,13 +123,11 @@ def test_faults_of_the_server_do_not_change_the_files(
     assert files_below(data / "stump") == wanted("stump", "images_4")
 
 
-def test_damaged_bytes_are_detected_and_not_kept(
-    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_bytes_are_detected_and_not_kept(fetch, server, data, capsys):
     with zipfile.ZipFile(server.folder / "360_v2.zip") as archive:
         spoilt = archive.getinfo("garden/images_4/IMG_0002.JPG").header_offset + 4_000
 
-    def damage(_: str, offset: int, body: bytes) -> bytes:
+    def damage(_, offset, body):
         place = spoilt - offset
         if not 0 <= place < len(body):
             return body
@@ -152,17 +142,15 @@ def test_damaged_bytes_are_detected_and_not_kept(
     assert files_below(data / "garden") == wanted("garden", "images_4")
 
 
-def test_a_folder_can_be_the_mirror(
-    archives: Path, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == 0
+def test_a_folder_can_be_the_mirror(archives, data, capsys):
+    assert run(split(f"fetch mipnerf360 room --mirror {archives}")) == 0
     assert files_below(data / "room") == wanted("room", "images_2")
     (archives / "360_v2.zip").unlink()
-    assert run(["fetch", "mipnerf360", "garden", "--mirror", str(archives)]) == BAD_INPUT
+    assert run(split(f"fetch mipnerf360 garden --mirror {archives}")) == BAD_INPUT
     assert "360_v2.zip cannot be read" in capsys.readouterr().err
 
 
-def test_another_image_folder_is_added_to_the_first(fetch: Fetch, data: Path) -> None:
+def test_another_image_folder_is_added_to_the_first(fetch, data):
     assert fetch("mipnerf360", "garden", "--images", "images_8") == 0
     assert files_below(data / "garden") == wanted("garden", "images_8")
     assert fetch("mipnerf360", "garden") == 0
@@ -170,9 +158,7 @@ def test_another_image_folder_is_added_to_the_first(fetch: Fetch, data: Path) ->
     assert files_below(data / "garden") == both
 
 
-def test_the_list_tells_which_scenes_are_here(
-    fetch: Fetch, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_tells_which_scenes_are_here(fetch, data, capsys):
     fetch("mipnerf360", "garden")
     capsys.readouterr()
     assert run(["fetch", "--list"]) == 0
@@ -181,12 +167,12 @@ def test_the_list_tells_which_scenes_are_here(
     assert lines["bicycle"].endswith("not here")
     assert "about 12.5 GB" in lines["https://storage.googleapis.com/gresearch/refraw360/360_v2.zip"]
     shutil.rmtree(data / "garden" / "images_4")
-    run(["fetch", "--list", "mipnerf360"])
+    run(split("fetch --list mipnerf360"))
     assert "images_4 is missing" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["mipnerf"], "no data set 'mipnerf'; did you mean mipnerf360?"),
         (["garden"], "garden is a scene: gsbench fetch mipnerf360 garden"),
@@ -198,9 +184,7 @@ def test_the_list_tells_which_scenes_are_here(
         ),
     ],
 )
-def test_unknown_names_and_addresses_are_refused(
-    archives: Path, data: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
+def test_unknown_names_and_addresses_are_refused(archives, data, capsys, words, said):
     mirror = [] if "--mirror" in words else ["--mirror", str(archives)]
     assert run(["fetch", *words, *mirror]) == BAD_INPUT
     error = capsys.readouterr().err
@@ -209,25 +193,17 @@ def test_unknown_names_and_addresses_are_refused(
 
 
 @pytest.mark.parametrize("place", ["a-file", "a-file/below", "/proc/nosuch"])
-def test_a_data_folder_that_cannot_be_made_is_refused(
-    archives: Path,
-    data: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    place: str,
-) -> None:
+def test_a_data_folder_that_cannot_be_made_is_refused(archives, data, capsys, monkeypatch, place):
     (data.parent / "a-file").touch()
     monkeypatch.setenv("GSBENCH_DATA", str(data.parent / place))
-    assert run(["fetch", "mipnerf360", "room", "--mirror", str(archives)]) == BAD_INPUT
+    assert run(split(f"fetch mipnerf360 room --mirror {archives}")) == BAD_INPUT
     error = capsys.readouterr().err
     assert "cannot be the data folder" in error
     assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("name", ["garden/images_4/up\\x.JPG", "garden/images_4//etc/x.JPG"])
-def test_names_that_lead_out_of_the_folder_are_refused(
-    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_names_that_lead_out_of_the_folder_are_refused(fetch, server, data, capsys, name):
     content = archive_content("garden") | {name: b"x", "garden/images_4/../../../escaped.JPG": b"x"}
     write_archive(server.folder / "360_v2.zip", content)
     assert fetch("mipnerf360", "garden") == BAD_INPUT
@@ -235,17 +211,13 @@ def test_names_that_lead_out_of_the_folder_are_refused(
     assert not [path for path in data.parent.rglob("*.JPG") if not path.name.startswith("IMG_")]
 
 
-def test_a_file_that_is_no_zip_archive_is_refused(
-    fetch: Fetch, server: Server, data: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_is_no_zip_archive_is_refused(fetch, server, data, capsys):
     (server.folder / "360_v2.zip").write_text("<html>this file has moved</html>")
     assert fetch("mipnerf360", "garden") == BAD_INPUT
     assert "360_v2.zip is not a complete zip archive" in capsys.readouterr().err
 
 
-def test_the_command_is_given_for_scenes_that_it_would_bring_to_the_missing_folder(
-    data: Path, tmp_path: Path
-) -> None:
+def test_the_command_is_given_for_scenes_that_it_would_bring_to_the_missing_folder(data, tmp_path):
     missing = [("stump", data / "stump"), ("garden", data / "garden"), ("mine", data / "mine")]
     assert "`gsbench fetch mipnerf360 garden stump`" in how_to_get(missing)
     assert "mine" not in how_to_get(missing)

@@ -1,32 +1,27 @@
 """Helpers for tests of densifiers: Gaussians in training, made-up renders, checks of a round."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
 
-from gsbench.densify import Densifier, RefineEvent, Refinement
-from gsbench.gaussians.model import Gaussians
+from gsbench.densify import RefineEvent, Refinement
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from tests.densify import restatement
-from tests.densify.restatement import Row
 
 EXTENT = 4.0
 
 
-def generator(seed: int = 0) -> torch.Generator:
+def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def trained(gaussians: Gaussians, extent: float = EXTENT) -> TrainableGaussians:
+def trained(gaussians, extent=EXTENT):
     return TrainableGaussians(gaussians, LearningRates(), extent)
 
 
-def with_moments(gaussians: Gaussians) -> TrainableGaussians:
+def with_moments(gaussians):
     """Take one step of Adam, so that there are moments for edits to keep."""
     trainable = trained(gaussians)
     for tensor in trainable.values.tensors().values():
@@ -35,11 +30,11 @@ def with_moments(gaussians: Gaussians) -> TrainableGaussians:
     return trainable
 
 
-def at(step: int, trainable: Any, seed: int = 0) -> Refinement:
+def at(step, trainable, seed=0):
     return Refinement(step, trainable, generator(seed), RefineEvent(step, len(trainable)))
 
 
-def rendered(gradient: Any, radii: Any = None, absolute: Any = None, **more: Any) -> RenderOutput:
+def rendered(gradient, radii=None, absolute=None, **more):
     """A render without pixels, with the screen gradients ``gradient`` [N, 2].
 
     All Gaussians are visible if no ``radii`` are given.
@@ -51,7 +46,7 @@ def rendered(gradient: Any, radii: Any = None, absolute: Any = None, **more: Any
     return RenderOutput(none, none, seen.to(torch.int32), points, absolute, **more)
 
 
-def gathered(densifier: Densifier, gradient: Any, absolute: Any = None) -> None:
+def gathered(densifier, gradient, absolute=None):
     """Set the statistics as if all Gaussians were visible once, with these gradients [N]."""
     densifier.statistics["gradient_sum"] = torch.as_tensor(gradient)
     densifier.statistics["visible_count"][:] = 1
@@ -59,7 +54,7 @@ def gathered(densifier: Densifier, gradient: Any, absolute: Any = None) -> None:
         densifier.statistics["absolute_sum"] = torch.as_tensor(absolute)
 
 
-def to_rows(trainable: TrainableGaussians) -> list[Row]:
+def to_rows(trainable):
     tensors = dict(trainable.values.tensors())
     for name, state in trainable.adam.items():
         tensors |= {f"first {name}": state.first, f"second {name}": state.second}
@@ -69,20 +64,20 @@ def to_rows(trainable: TrainableGaussians) -> list[Row]:
     ]
 
 
-def noise_of(seed: int, *counts: int) -> Any:
+def noise_of(seed, *counts):
     """The rows of the real code's normal draws: [2 S, 3] for each rule that splits S parents."""
     rng = generator(seed)
     draws = [torch.randn(2 * s, 3, generator=rng, dtype=torch.float64).numpy() for s in counts]
     return iter([row for batch in draws for row in batch])
 
 
-def assert_same(trainable: TrainableGaussians, rows: list[Row]) -> None:
+def assert_same(trainable, rows):
     found = to_rows(trainable)
     assert len(found) == len(rows)
     for real, expected in zip(found, rows, strict=True):
         assert real.keys() == expected.keys()
         for name, value in real.items():
-            np.testing.assert_allclose(value, expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
+            assert_allclose(value, expected[name], rtol=1e-5, atol=1e-7, err_msg=name)
             apart = np.abs(value - expected[name]) / np.maximum(1, np.abs(expected[name]))
             restatement.DIFFERENCES.append(float(apart.max(initial=0)))
 
@@ -90,9 +85,7 @@ def assert_same(trainable: TrainableGaussians, rows: list[Row]) -> None:
 class Round:
     """A real round at ``step``, with the state before it; ``check`` compares the result."""
 
-    def __init__(
-        self, densifier: Densifier, trainable: TrainableGaussians, step: int, seed: int = 0
-    ) -> None:
+    def __init__(self, densifier, trainable, step, seed=0):
         self.densifier, self.trainable, self.step = densifier, trainable, step
         self.rows, self.counts = to_rows(trainable), dict[str, int]()
         forecast = getattr(densifier, "forecast", None)
@@ -102,7 +95,7 @@ class Round:
         assert event is not None
         self.event = event
 
-    def check(self, rows: list[Row], pruned: bool = False) -> None:
+    def check(self, rows, pruned=False):
         """Compare with the restated ``rows``, after pruning these as ADC does unless ``pruned``."""
         if not pruned:
             rows = restatement.prune(rows, self.step, EXTENT, self.counts)

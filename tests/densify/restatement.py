@@ -5,20 +5,15 @@ Normal draws are an iterator of rows, in the order in which the rules use them: 
 then all second ones.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-Row = dict[str, Any]
-DIFFERENCES: list[float] = []  # found by comparisons with the real code, for scripts/fidelity.py
+DIFFERENCES = []  # found by comparisons with the real code, for scripts/fidelity.py
 PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 
 
-def rotation(q: np.ndarray) -> np.ndarray:
+def rotation(q):
     w, x, y, z = q / np.sqrt((q * q).sum())
     return np.array(
         [
@@ -29,15 +24,15 @@ def rotation(q: np.ndarray) -> np.ndarray:
     )
 
 
-def opacity(row: Row) -> float:
+def opacity(row):
     return float(1 / (1 + np.exp(-row["opacity_logits"])))
 
 
-def logit(value: float) -> float:
+def logit(value):
     return float(np.log(value / (1 - value)))
 
 
-def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
+def newborn(parent, mean, log_scales):
     child = {name: np.array(parent[name], copy=True) for name in PARAMETERS}
     child["means"], child["log_scales"] = mean, log_scales
     for name in PARAMETERS:
@@ -46,9 +41,7 @@ def newborn(parent: Row, mean: np.ndarray, log_scales: np.ndarray) -> Row:
     return child
 
 
-def split_all(
-    rows: list[Row], chosen: list[int], scales: dict[int, np.ndarray], noise: Iterator[np.ndarray]
-) -> list[Row]:
+def split_all(rows, chosen, scales, noise):
     """Replace each chosen row by two children: append all first ones, then all second ones."""
     children = []
     for _ in range(2):
@@ -59,13 +52,7 @@ def split_all(
     return [row for i, row in enumerate(rows) if i not in chosen] + children
 
 
-def adc_growth(
-    rows: list[Row],
-    mean_gradient: np.ndarray,
-    extent: float,
-    noise: Iterator[np.ndarray],
-    events: dict[str, int],
-) -> list[Row]:
+def adc_growth(rows, mean_gradient, extent, noise, events):
     clones = []
     chosen = []
     for i, row in enumerate(rows):
@@ -80,9 +67,7 @@ def adc_growth(
     return split_all(rows + clones, chosen, scales, noise)
 
 
-def volume_growth(
-    rows: list[Row], threshold: float, noise: Iterator[np.ndarray], events: dict[str, int]
-) -> list[Row]:
+def volume_growth(rows, threshold, noise, events):
     chosen, scales, again = [], {}, 0
     for i, row in enumerate(rows):
         s = np.exp(row["log_scales"])
@@ -95,7 +80,7 @@ def volume_growth(
     return split_all(rows, chosen, scales, noise)
 
 
-def prune(rows: list[Row], step: int, extent: float, events: dict[str, int]) -> list[Row]:
+def prune(rows, step, extent, events):
     kept, events["pruned_opacity"], events["pruned_size"] = [], 0, 0
     for row in rows:
         if opacity(row) < 0.005:

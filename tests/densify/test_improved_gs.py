@@ -1,14 +1,12 @@
 """Improved-GS and GNS against restatements, one Gaussian at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis
 from gsbench.densify.scores import draw
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
 from tests.densify import restatement
@@ -29,7 +27,7 @@ from tests.densify.test_scores import COUNT, Room, alphas, find_edges, over_mean
 from tests.gaussians.helpers import random_gaussians
 
 
-def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[restatement.Row]:
+def halves(rows, mean_gradient):
     """Replace Gaussians with a gradient of at least 0.0008 by two halves along the longest axis.
 
     With d = 0.45, the centres are 3 d s from the parent's. The longest axis is multiplied by 0.55,
@@ -54,7 +52,7 @@ def halves(rows: list[restatement.Row], mean_gradient: np.ndarray) -> list[resta
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_round_of_long_axis_matches_the_restatement(seed: int, step: int) -> None:
+def test_a_round_of_long_axis_matches_the_restatement(seed, step):
     densifier = LongAxis(gradient="absolute", gradient_threshold=0.0008)
     trainable, _ = prepared(densifier, seed)
     gradient = np.random.default_rng(seed).uniform(0, 0.0016, len(trainable))
@@ -66,16 +64,16 @@ def test_a_round_of_long_axis_matches_the_restatement(seed: int, step: int) -> N
     real.check(grown)
 
 
-def expected_scores(gaussians: object, views: list[int]) -> np.ndarray:
+def expected_scores(gaussians, views):
     room, total = Room(), np.zeros(COUNT)
     for view in views:
-        weights = alphas(gaussians, room.cameras[view])  # type: ignore[arg-type]
+        weights = alphas(gaussians, room.cameras[view])
         total += over_mean((weights * find_edges(room.images[view])).sum((1, 2))) / len(views)
     return total
 
 
-@pytest.mark.parametrize(("step", "views"), [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
-def test_edge_aware_scores_match_the_restatement(step: int, views: int) -> None:
+@pytest.mark.parametrize("step, views", [(700, 2), (3400, 3), (6400, 3), (9400, 2)])
+def test_edge_aware_scores_match_the_restatement(step, views):
     """A score is the mean over the drawn views, each normalised by its own mean.
 
     400 iterations after the first two resets, all views are used.
@@ -85,27 +83,25 @@ def test_edge_aware_scores_match_the_restatement(step: int, views: int) -> None:
     with torch.no_grad():
         scores = densifier.scores(trainable.values, step, generator(step))
     drawn = torch.randperm(3, generator=generator(step))[:views].tolist()
-    np.testing.assert_allclose(
-        scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9
-    )
+    assert_allclose(scores, expected_scores(trainable.values.detach(), drawn), rtol=1e-6, atol=1e-9)
 
 
-def test_in_the_last_500_iterations_the_score_is_the_gradient_and_the_threshold_is_lower() -> None:
+def test_in_the_last_500_iterations_the_score_is_the_gradient_and_the_threshold_is_lower():
     densifier = EdgeAware(gradient_threshold=3e-4)
     trainable, gradient = started(densifier, 0)
     for step, threshold in ((14_500, 3e-4), (14_600, 2e-4)):
         over, _ = densifier.candidates(at(step, trainable))
-        np.testing.assert_array_equal(over, gradient >= threshold)
-    np.testing.assert_allclose(densifier.scores(trainable.values, 14_600, generator()), gradient)
+        assert_array_equal(over, gradient >= threshold)
+    assert_allclose(densifier.scores(trainable.values, 14_600, generator()), gradient)
     full = EdgeAware(gradient_threshold=3e-4, max_gaussians=COUNT)
     trainable, _ = started(full, 0)
     over, _ = full.candidates(at(14_600, trainable))
-    np.testing.assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold is not lowered
+    assert_array_equal(over, gradient >= 3e-4)  # no room: the threshold is not lowered
 
 
 @pytest.mark.parametrize("step", [600, 3100, 14_900])
 @pytest.mark.parametrize("seed", range(2))
-def test_a_round_of_edge_aware_matches_the_restatement(seed: int, step: int) -> None:
+def test_a_round_of_edge_aware_matches_the_restatement(seed, step):
     """Drawn Gaussians are replaced by halves along the longest axis.
 
     Faint Gaussians are pruned except in the last round; huge ones are kept.
@@ -134,7 +130,7 @@ def test_a_round_of_edge_aware_matches_the_restatement(seed: int, step: int) -> 
     assert event.balances()
 
 
-def test_a_candidate_that_covers_no_edge_is_not_split_even_if_there_is_room() -> None:
+def test_a_candidate_that_covers_no_edge_is_not_split_even_if_there_is_room():
     densifier = EdgeAware(
         gradient_threshold=1e-9, max_gaussians=10 * COUNT, cap="hard", prune_opacity=0.0
     )
@@ -147,9 +143,7 @@ def test_a_candidate_that_covers_no_edge_is_not_split_even_if_there_is_room() ->
 
 
 @pytest.mark.parametrize("room", [0, 9])
-def test_no_view_is_rendered_if_nothing_can_grow(
-    room: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_view_is_rendered_if_nothing_can_grow(room, monkeypatch):
     """Without room, all candidates count as blocked; without candidates, none does."""
     densifier = EdgeAware(max_gaussians=COUNT + room, cap="hard")
     trainable, _ = started(densifier, 0)
@@ -161,7 +155,7 @@ def test_no_view_is_rendered_if_nothing_can_grow(
     assert blocked == candidates.sum()
 
 
-def test_the_root_cap_rises_with_the_square_root_of_the_progress() -> None:
+def test_the_root_cap_rises_with_the_square_root_of_the_progress():
     densifier = EdgeAware(max_gaussians=10_000, start=500, stop=15_000)
     trainable, _ = started(densifier, 0)
     rng = generator()
@@ -177,7 +171,7 @@ def test_the_root_cap_rises_with_the_square_root_of_the_progress() -> None:
     assert event.blocked_by_cap > 0
 
 
-def test_edge_aware_prunes_once_early_and_after_two_resets() -> None:
+def test_edge_aware_prunes_once_early_and_after_two_resets():
     """At iteration 300, opacities below 0.02 are pruned.
 
     At 3,300 and 6,300, the faintest fifth is pruned after the round. Resets lower opacities to
@@ -204,7 +198,7 @@ def test_edge_aware_prunes_once_early_and_after_two_resets() -> None:
     assert [step for step, event in events.items() if event is None] == [299, 15_300]
 
 
-def test_edge_aware_gathers_gradients_after_iteration_500() -> None:
+def test_edge_aware_gathers_gradients_after_iteration_500():
     densifier = EdgeAware()
     trainable, _ = prepared(densifier, 0)  # observes iterations 1 to 3
     observe(densifier, trainable, np.random.default_rng(0), 500)
@@ -213,19 +207,19 @@ def test_edge_aware_gathers_gradients_after_iteration_500() -> None:
     assert densifier.statistics["visible_count"].any()
 
 
-def begun(**options: object) -> tuple[GNS, Gaussians]:
-    densifier, gaussians = GNS(**options), random_gaussians(50, 1)  # type: ignore[arg-type]
+def begun(**options):
+    densifier, gaussians = GNS(**options), random_gaussians(50, 1)
     gaussians.opacity_logits.copy_(torch.linspace(-6, 5, 50, dtype=torch.float64))
     densifier.begin(gaussians, DensifyContext(4.0))
     return densifier, gaussians
 
 
-def seen(densifier: GNS, step: int) -> None:
+def seen(densifier, step):
     nothing = torch.zeros(50, 2, dtype=torch.float64)
     densifier.observe(step, rendered(nothing, absolute=nothing))
 
 
-def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> float:
+def restated(densifier, logits, weight, soft):
     if not soft:
         return 3 * weight * (logits.mean() + 20) ** 2
     opacities = 1 / (1 + np.exp(-logits))
@@ -233,15 +227,14 @@ def restated(densifier: GNS, logits: np.ndarray, weight: float, soft: bool) -> f
 
 
 @pytest.mark.parametrize(
-    ("step", "soft"), [(15_001, True), (15_951, True), (16_001, False), (22_951, False)]
+    "step, soft", [(15_001, True), (15_951, True), (16_001, False), (22_951, False)]
 )
-def test_the_pressure_and_its_gradient_match_the_formula(step: int, soft: bool) -> None:
+def test_the_pressure_and_its_gradient_match_the_formula(step, soft):
     """Central differences show that the gradient also flows through the divisor."""
     densifier, gaussians = begun(max_gaussians=20)
     densifier.step = step - 1
     gaussians = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
     term = densifier.regularizer(gaussians)
-    assert term is not None
     logits = gaussians.opacity_logits.detach().numpy()
     assert term.item() == pytest.approx(restated(densifier, logits, 2e-4, soft), rel=1e-12)
     (gradient,) = torch.autograd.grad(term, gaussians.opacity_logits)
@@ -252,7 +245,7 @@ def test_the_pressure_and_its_gradient_match_the_formula(step: int, soft: bool) 
 
 
 @pytest.mark.parametrize("sinks", [0.0, 2.0])
-def test_the_weight_follows_an_aim_that_falls_to_zero(sinks: float) -> None:
+def test_the_weight_follows_an_aim_that_falls_to_zero(sinks):
     """The schedule of the authors, iteration by iteration, for constant opacities.
 
     If opacities sink once after the aim is set, the weight first falls, then stays while the aim
@@ -283,8 +276,8 @@ def test_the_weight_follows_an_aim_that_falls_to_zero(sinks: float) -> None:
     assert acted == list(range(15_001, 23_001, 50))
 
 
-@pytest.mark.parametrize(("budget", "place"), [(20, 19), (17, 16), (50, 49), (70, 49)])
-def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, place: int) -> None:
+@pytest.mark.parametrize("budget, place", [(20, 19), (17, 16), (50, 49), (70, 49)])
+def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget, place):
     densifier, gaussians = begun(max_gaussians=budget)
     densifier.step = 15_000
     densifier.regularizer(gaussians)
@@ -293,7 +286,7 @@ def test_the_aim_starts_from_the_last_gaussian_within_the_budget(budget: int, pl
     )
 
 
-def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget() -> None:
+def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget():
     densifier = GNS(max_gaussians=40)
     trainable, _ = started(densifier, 0)
     rng = generator(0)
@@ -324,9 +317,7 @@ def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget() -> N
     assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
 
 
-def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours_the_opaque(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours_the_opaque(caplog):
     densifier = GNS(max_gaussians=20)
     trainable, _ = started(densifier, 0)
     trainable.values.opacity_logits.data[20:] = -30.0
@@ -341,16 +332,14 @@ def test_at_the_end_of_the_pressure_the_excess_is_removed_by_a_draw_that_favours
     )
 
 
-def test_a_selection_close_to_its_budget_logs_no_warning(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_selection_close_to_its_budget_logs_no_warning(caplog):
     densifier = GNS(max_gaussians=COUNT - 1)
     trainable, _ = started(densifier, 0)
     assert densifier.refine(16_050, trainable, generator(0)).after == COUNT - 1
     assert caplog.text == ""
 
 
-def test_the_pressure_lasts_at_least_one_round() -> None:
+def test_the_pressure_lasts_at_least_one_round():
     shortest = GNS(start=0, stop=3, interval=1, pressure_length=1e-3)
     shortest.begin(random_gaussians(3), DensifyContext(1.0))
     assert (shortest.pressure_interval, shortest.pressure_time) == (1, 1)
@@ -360,7 +349,7 @@ def test_the_pressure_lasts_at_least_one_round() -> None:
     assert [usual.in_first_part(step) for step in (15_999, 16_000)] == [True, False]
 
 
-def test_the_selection_continues_after_saving_and_loading() -> None:
+def test_the_selection_continues_after_saving_and_loading():
     densifier, gaussians = begun(max_gaussians=20)
     for step in range(15_000, 15_200):
         densifier.regularizer(gaussians)
@@ -376,7 +365,7 @@ def test_the_selection_continues_after_saving_and_loading() -> None:
     assert twin.weight == densifier.weight != 2e-4
 
 
-def test_the_learning_rate_of_a_parameter_is_saved() -> None:
+def test_the_learning_rate_of_a_parameter_is_saved():
     trainable = trained(random_gaussians(4), 1.0)
     trainable.set_rate("opacity_logits", 0.2)
     again = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 1.0)

@@ -1,19 +1,15 @@
 """MCMC and MRNF against restatements, one Gaussian at a time."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.densify import ADC, MCMC, MRNF, DensifyContext
 from gsbench.densify.mcmc import bounds
 from gsbench.densify.scores import draw
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from tests.densify import restatement
 from tests.densify.helpers import EXTENT, assert_same, at, generator, to_rows, trained, with_moments
@@ -22,16 +18,14 @@ from tests.densify.test_scores import BLACK, COUNT, Room, alphas, find_edges, ov
 from tests.gaussians.helpers import random_gaussians
 
 
-def drawn(
-    rows: list[restatement.Row], weights: list[float], count: int, rng: torch.Generator
-) -> list[int]:
+def drawn(rows, weights, count, rng):
     """Draw with replacement: the places where uniform numbers fall in the cumulative weights."""
     line = np.cumsum(weights)
     numbers = torch.rand(count, generator=rng, dtype=torch.float64).numpy() * line[-1]
     return [next(i for i in range(len(rows)) if line[i] > number) for number in numbers]
 
 
-def shared(row: restatement.Row, copies: int) -> restatement.Row:
+def shared(row, copies):
     """Opacity and scale of each of ``copies`` copies (eq. 9), with moments of zero."""
     o, n = opacity(row), min(copies, 50)
     new = 1 - (1 - o) ** (1 / n)
@@ -45,7 +39,7 @@ def shared(row: restatement.Row, copies: int) -> restatement.Row:
     return changed | {"opacity_logits": np.array(logit(kept))}
 
 
-def with_copies(rows: list[restatement.Row], sources: list[int]) -> list[restatement.Row]:
+def with_copies(rows, sources):
     counts = {i: sources.count(i) + 1 for i in set(sources)}
     sharing = [shared(row, counts[i]) if i in counts else row for i, row in enumerate(rows)]
     return sharing + [
@@ -53,7 +47,7 @@ def with_copies(rows: list[restatement.Row], sources: list[int]) -> list[restate
     ]
 
 
-def prepared(count: int, seed: int, **options: Any) -> tuple[MCMC, TrainableGaussians]:
+def prepared(count, seed, **options):
     gaussians = random_gaussians(count, seed)
     gaussians.opacity_logits[: count // 4] = -9.0
     densifier, trainable = MCMC(**options), with_moments(gaussians)
@@ -63,7 +57,7 @@ def prepared(count: int, seed: int, **options: Any) -> tuple[MCMC, TrainableGaus
 
 @pytest.mark.parametrize("growth", [0.05, 0.5])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_round_of_mcmc_matches_the_restatement(seed: int, growth: float) -> None:
+def test_a_round_of_mcmc_matches_the_restatement(seed, growth):
     densifier, trainable = prepared(40, seed, max_gaussians=55, growth=growth)
     rows = to_rows(trainable)
     event = densifier.refine(600, trainable, generator(seed))
@@ -80,7 +74,7 @@ def test_a_round_of_mcmc_matches_the_restatement(seed: int, growth: float) -> No
     assert (event.relocated, event.added) == (10, more)
 
 
-def test_the_noise_of_mcmc_matches_the_formula() -> None:
+def test_the_noise_of_mcmc_matches_the_formula():
     """R S S R^T times a normal draw, sigmoid(-100 (o - 0.005)), 5e5 and the means' rate."""
     densifier, trainable = prepared(40, 1)
     trainable.values.opacity_logits.data.copy_(torch.linspace(-9, 2, 40))
@@ -95,7 +89,7 @@ def test_the_noise_of_mcmc_matches_the_formula() -> None:
     assert_same(trainable, rows)
 
 
-def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+def scored(values):
     """The largest refine weight [N] over the three views, and the factor for edges [N].
 
     The factor is 1 + 0.25 times the mean edge score divided by its median.
@@ -110,7 +104,7 @@ def scored(values: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     return weight, 1 + 0.25 * over_median(edge)
 
 
-def half(row: restatement.Row, side: int) -> restatement.Row:
+def half(row, side):
     """A child, moved by half a standard deviation along the longest axis to one ``side``.
 
     The scale of that axis is halved; the other scales are multiplied by 0.85.
@@ -126,21 +120,21 @@ def half(row: restatement.Row, side: int) -> restatement.Row:
     return child | {"opacity_logits": np.array(logit(0.6 * opacity(row)))}
 
 
-def decayed(row: restatement.Row, left: float) -> restatement.Row:
+def decayed(row, left):
     return row | {
         "opacity_logits": np.array(logit(opacity(row) - 0.004 * left)),
         "log_scales": row["log_scales"] + np.log(1 - 0.002 * left),
     }
 
 
-def placed(densifier: MRNF, seed: int) -> TrainableGaussians:
+def placed(densifier, seed):
     """Gaussians with moments, in a room with views."""
     trainable, _ = started(ADC(), seed)
     densifier.begin(trainable.values.detach(), DensifyContext(EXTENT, views=Room()))
     return trainable
 
 
-def begun(densifier: MRNF, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
+def begun(densifier, seed):
     trainable = placed(densifier, seed)
     trainable.values.opacity_logits.data[:6] = -7.0  # transparent
     trainable.values.means.data[6, 0] = 1e6  # far outside the scene
@@ -149,8 +143,8 @@ def begun(densifier: MRNF, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
     return trainable, seen
 
 
-@pytest.mark.parametrize(("step", "room"), [(600, 1000), (600, 5), (600, 0), (16_000, 1000)])
-def test_a_round_of_mrnf_matches_the_restatement(step: int, room: int) -> None:
+@pytest.mark.parametrize("step, room", [(600, 1000), (600, 5), (600, 0), (16_000, 1000)])
+def test_a_round_of_mrnf_matches_the_restatement(step, room):
     densifier = MRNF(max_gaussians=COUNT + room, growth_share=0.4, growth_threshold=0.5)
     trainable, seen = begun(densifier, 1)
     rows, (weight, guidance) = to_rows(trainable), scored(trainable.values.detach())
@@ -181,14 +175,14 @@ def test_a_round_of_mrnf_matches_the_restatement(step: int, room: int) -> None:
     assert not densifier.statistics["seen"].any()
 
 
-def test_without_growth_mrnf_still_replaces_pruned_gaussians() -> None:
+def test_without_growth_mrnf_still_replaces_pruned_gaussians():
     densifier = MRNF(growth_share=0.0)
     trainable, _ = begun(densifier, 1)
     event = densifier.refine(600, trainable, generator(0))
     assert (event.pruned_opacity, event.split_gradient, event.after) == (7, 7, COUNT)
 
 
-def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
+def test_decay_ends_and_keeps_opaque_gaussians_finite():
     densifier = MRNF(decay_until=1000)
     trainable = placed(densifier, 0)
     before = trainable.values.log_scales.detach().clone()
@@ -197,7 +191,7 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
         with torch.no_grad():
             densifier.decay(at(step, trainable))
         shrunk = (trainable.values.log_scales - before).exp()
-        torch.testing.assert_close(shrunk, torch.full_like(shrunk, 1 - 0.002 * remaining))
+        assert_close(shrunk, torch.full_like(shrunk, 1 - 0.002 * remaining))
     single = trained(random_gaussians(3, dtype=torch.float32))
     single.values.opacity_logits.data[:] = torch.tensor([50.0, -50.0, 0.0])
     with torch.no_grad():
@@ -206,14 +200,14 @@ def test_decay_ends_and_keeps_opaque_gaussians_finite() -> None:
     assert single.values.opacity_logits.tolist() == pytest.approx(expected, abs=0.1)
 
 
-def test_mrnf_has_a_round_every_200_iterations_until_its_window_ends() -> None:
+def test_mrnf_has_a_round_every_200_iterations_until_its_window_ends():
     densifier = MRNF(stop=1000)
     trainable, _ = begun(densifier, 0)
     due = [step for step in range(1, 1100) if densifier.refine(step, trainable, generator())]
     assert due == [200, 400, 600, 800]
 
 
-def test_gaussians_larger_than_the_scene_or_too_small_are_pruned() -> None:
+def test_gaussians_larger_than_the_scene_or_too_small_are_pruned():
     densifier = MRNF()
     trainable = placed(densifier, 0)
     half_size = bounds(trainable.values.means.detach())[1]
@@ -223,14 +217,14 @@ def test_gaussians_larger_than_the_scene_or_too_small_are_pruned() -> None:
     assert densifier.to_prune(trainable.values).nonzero().squeeze(-1).tolist() == [3, 4]
 
 
-def test_the_bounds_hold_the_central_four_fifths() -> None:
+def test_the_bounds_hold_the_central_four_fifths():
     means = torch.tensor([[i, 10.0 * i, -i] for i in range(101)], dtype=torch.float64)
     center, half_size, middle = bounds(means[torch.randperm(101, generator=generator(0))])
     assert center.tolist() == [50, 500, -50]
     assert (half_size, middle) == (400, 80)
 
 
-def test_the_noise_of_mrnf_moves_faint_seen_gaussians_and_is_limited() -> None:
+def test_the_noise_of_mrnf_moves_faint_seen_gaussians_and_is_limited():
     densifier, gaussians = MRNF(), random_gaussians(300, 2)
     gaussians.opacity_logits[:100], gaussians.opacity_logits[100:] = -9.0, 2.0
     trainable = trained(gaussians)

@@ -1,23 +1,19 @@
 """Whole refinement rounds give the Gaussians, moments and events of the slow restatement."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gsbench.densify import ADC, MCMC, MRNF, Densifier, DensifyContext, Volumetric
+from gsbench.densify import ADC, MCMC, MRNF, DensifyContext, Volumetric
 from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.train.options import TrainConfig
 from tests.densify import restatement
 from tests.densify.helpers import EXTENT, Round, at, generator, noise_of, rendered, trained
 from tests.gaussians.helpers import random_gaussians
 
 
-def prepared(
-    densifier: Densifier, seed: int, count: int = 60
-) -> tuple[TrainableGaussians, np.ndarray]:
+def prepared(densifier, seed, count=60):
     """Gaussians with different Adam moments, after three observed iterations.
 
     Also returns the mean gradient of each.
@@ -39,9 +35,7 @@ def prepared(
     return trainable, total / np.maximum(seen, 1)
 
 
-def observe(
-    densifier: Densifier, trainable: TrainableGaussians, rng: np.random.Generator, step: int
-) -> tuple[np.ndarray, np.ndarray]:
+def observe(densifier, trainable, rng, step):
     """Let the densifier observe a made-up render; return its gradients [N, 2] and radii [N]."""
     count = len(trainable)
     gradient, radii = rng.exponential(2e-4, (count, 2)), rng.integers(0, 3, count)
@@ -54,7 +48,7 @@ def observe(
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("step", [600, 3100])
-def test_a_round_of_adc_matches_the_restatement(seed: int, step: int) -> None:
+def test_a_round_of_adc_matches_the_restatement(seed, step):
     trainable, gradient = prepared(densifier := ADC(), seed)
     real = Round(densifier, trainable, step, seed)
     noise = noise_of(seed, real.event.split_gradient)
@@ -63,7 +57,7 @@ def test_a_round_of_adc_matches_the_restatement(seed: int, step: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_round_by_absolute_gradient_matches_the_restatement(seed: int) -> None:
+def test_a_round_by_absolute_gradient_matches_the_restatement(seed):
     """It is a round of ADC with another gradient and four times the threshold."""
     densifier = ADC(gradient="absolute", gradient_threshold=0.0008)
     trainable, gradient = prepared(densifier, seed)
@@ -74,7 +68,7 @@ def test_a_round_by_absolute_gradient_matches_the_restatement(seed: int) -> None
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_round_with_revised_opacity_matches_the_restatement(seed: int) -> None:
+def test_a_round_with_revised_opacity_matches_the_restatement(seed):
     """Clone, original and children of a split each have the opacity 1 - sqrt(1 - o)."""
     trainable, gradient = prepared(densifier := ADC(revised_opacity=True), seed)
     real = Round(densifier, trainable, 600, seed)
@@ -87,7 +81,7 @@ def test_a_round_with_revised_opacity_matches_the_restatement(seed: int) -> None
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_gaussians_whose_children_would_be_split_again_are_not_split(seed: int) -> None:
+def test_gaussians_whose_children_would_be_split_again_are_not_split(seed):
     densifier = Volumetric(volume_threshold=0.03, split_isotropic=False)
     trainable, gradient = prepared(densifier, seed, count=200)
     real = Round(densifier, trainable, 600, seed)
@@ -105,18 +99,24 @@ def test_gaussians_whose_children_would_be_split_again_are_not_split(seed: int) 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("step", [600, 3100])
-def test_a_volumetric_round_matches_the_restatement(seed: int, step: int) -> None:
-    trainable, gradient = prepared(densifier := Volumetric(volume_threshold=0.03), seed)
+@pytest.mark.parametrize("order, threshold", [("after_adc", 0.03), ("after_prune", 0.003)])
+def test_a_volumetric_round_matches_the_restatement(order, threshold, seed, step):
+    densifier = Volumetric(volume_threshold=threshold, volume_order=order)
+    trainable, gradient = prepared(densifier, seed)
     real = Round(densifier, trainable, step, seed)
     noise = noise_of(seed, real.event.split_gradient, real.event.split_volume)
     rows = restatement.adc_growth(real.rows, gradient, EXTENT, noise, real.counts)
-    real.check(restatement.volume_growth(rows, 0.03, noise, real.counts))
+    pruned = order == "after_prune"
+    if pruned:
+        rows = restatement.prune(rows, step, EXTENT, real.counts)
+        assert real.event.pruned_opacity > 0
+    real.check(restatement.volume_growth(rows, threshold, noise, real.counts), pruned)
     assert real.event.split_volume > 0
 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("step", [600, 3100])
-def test_volumes_may_be_split_before_the_gradient_rule(seed: int, step: int) -> None:
+def test_volumes_may_be_split_before_the_gradient_rule(seed, step):
     densifier = Volumetric(volume_threshold=0.03, volume_order="before_adc")
     trainable, gradient = prepared(densifier, seed)
     real = Round(densifier, trainable, step, seed)
@@ -130,20 +130,7 @@ def test_volumes_may_be_split_before_the_gradient_rule(seed: int, step: int) -> 
     assert min(real.event.split_volume, real.event.split_gradient) > 0
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("step", [600, 3100])
-def test_volumes_may_be_split_after_pruning(seed: int, step: int) -> None:
-    densifier = Volumetric(volume_threshold=0.003, volume_order="after_prune")
-    trainable, gradient = prepared(densifier, seed)
-    real = Round(densifier, trainable, step, seed)
-    noise = noise_of(seed, real.event.split_gradient, real.event.split_volume)
-    rows = restatement.adc_growth(real.rows, gradient, EXTENT, noise, real.counts)
-    rows = restatement.prune(rows, step, EXTENT, real.counts)
-    real.check(restatement.volume_growth(rows, 0.003, noise, real.counts), pruned=True)
-    assert min(real.event.split_volume, real.event.pruned_opacity) > 0
-
-
-SWITCHES: dict[str, list[object]] = {
+SWITCHES = {
     "gradient": ["signed", "absolute"],
     "threshold_inclusive": [True, False],
     "split_children": [2, 3],
@@ -164,7 +151,7 @@ SWITCHES: dict[str, list[object]] = {
 
 
 @pytest.mark.parametrize("seed", range(80))
-def test_any_combination_of_options_runs_through_several_rounds(seed: int) -> None:
+def test_any_combination_of_options_runs_through_several_rounds(seed):
     """Options are drawn at random; all seeds together cover all pairs.
 
     Every event balances, values stay finite, and an exact cap is kept.
@@ -173,13 +160,12 @@ def test_any_combination_of_options_runs_through_several_rounds(seed: int) -> No
     options = {name: values[rng.integers(len(values))] for name, values in SWITCHES.items()}
     if options["cap"] == "curve":
         options["max_gaussians"] = 90
-    densifier = Volumetric(**options)  # type: ignore[arg-type]
+    densifier = Volumetric(**options)
     trainable, _ = prepared(densifier, seed)
     rng_of_rules = generator(seed)
     for step in (2900, 3000, 3100, 3200):
         observe(densifier, trainable, rng, step)
         event = densifier.refine(step, trainable, rng_of_rules)
-        assert event is not None
         assert event.balances()
         assert event.after == len(trainable) == len(densifier.lineage.ids)
         assert event.after == len(densifier.statistics["gradient_sum"])
@@ -188,7 +174,7 @@ def test_any_combination_of_options_runs_through_several_rounds(seed: int) -> No
             assert len(trainable) <= 90
 
 
-def test_the_optimizer_skips_the_step_after_a_refinement_and_takes_the_next() -> None:
+def test_the_optimizer_skips_the_step_after_a_refinement_and_takes_the_next():
     densifier = ADC()
     trainable, _ = prepared(densifier, 0)
     for tensor in trainable.values.tensors().values():
@@ -203,19 +189,19 @@ def test_the_optimizer_skips_the_step_after_a_refinement_and_takes_the_next() ->
     assert float(trainable.adam["means"].step) == 3
 
 
-def test_opacity_reset_zeroes_the_opacity_moments_only() -> None:
+def test_opacity_reset_zeroes_the_opacity_moments_only():
     densifier = ADC(start=5000, stop=20_000)
     trainable, _ = prepared(densifier, 1)
     before = trainable.values.detach().map(torch.clone)
     event = densifier.refine(3000, trainable, generator())
     assert event.opacity_reset
-    torch.testing.assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
+    assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
     assert torch.equal(trainable.values.means, before.means)
     assert not trainable.adam["opacity_logits"].first.any()
     assert trainable.adam["means"].first.all()
 
 
-def test_adc_refines_and_resets_at_the_iterations_of_3dgs() -> None:
+def test_adc_refines_and_resets_at_the_iterations_of_3dgs():
     """144 refinements from 600 to 14,900, and resets at 3000, 6000, 9000 and 12,000."""
     densifier = ADC()
     gaussians = random_gaussians(4)
@@ -223,7 +209,7 @@ def test_adc_refines_and_resets_at_the_iterations_of_3dgs() -> None:
     trainable = trained(gaussians)
     densifier.begin(gaussians, DensifyContext(EXTENT))
     due, resets = [], []
-    densifier.grow_by_gradient = lambda refinement: due.append(refinement.step)  # type: ignore[method-assign]
+    densifier.grow_by_gradient = lambda refinement: due.append(refinement.step)
     for step in range(1, 30_001):
         event = densifier.refine(step, trainable, generator())
         if event is not None and event.opacity_reset:
@@ -233,7 +219,7 @@ def test_adc_refines_and_resets_at_the_iterations_of_3dgs() -> None:
     assert resets == [3000, 6000, 9000, 12_000]
 
 
-def test_default_windows_agree_with_the_options_of_training() -> None:
+def test_default_windows_agree_with_the_options_of_training():
     window = TrainConfig.densify_start, TrainConfig.densify_stop, TrainConfig.densify_interval
     assert (ADC.start, ADC.stop, ADC.interval) == window == (500, 15_000, 100)
     assert (MCMC.start, MCMC.stop, MCMC.interval) == (500, TrainConfig.mcmc_stop, 100)
@@ -241,10 +227,8 @@ def test_default_windows_agree_with_the_options_of_training() -> None:
     assert ADC.opacity_reset_interval == TrainConfig.opacity_reset_interval == 3000
 
 
-@pytest.mark.parametrize(("white", "resets"), [(False, [3000, 6000]), (True, [500, 3000, 6000])])
-def test_with_a_white_background_opacities_are_also_reset_at_the_start(
-    white: bool, resets: list[int]
-) -> None:
+@pytest.mark.parametrize("white, resets", [(False, [3000, 6000]), (True, [500, 3000, 6000])])
+def test_with_a_white_background_opacities_are_also_reset_at_the_start(white, resets):
     densifier = ADC(stop=9000)
     trainable, _ = prepared(densifier, 0, count=3)
     densifier.context = DensifyContext(EXTENT, white_background=white)
@@ -255,7 +239,7 @@ def test_with_a_white_background_opacities_are_also_reset_at_the_start(
     assert found == resets
 
 
-def test_adc_gathers_gradients_and_radii_until_the_window_ends() -> None:
+def test_adc_gathers_gradients_and_radii_until_the_window_ends():
     densifier = ADC(stop=800)
     densifier.begin(random_gaussians(3), DensifyContext(EXTENT))
     shown = [(1, [4, 0, 2]), (799, [3, 5, 2]), (800, [9, 9, 9])]  # the last is after the window
@@ -267,7 +251,7 @@ def test_adc_gathers_gradients_and_radii_until_the_window_ends() -> None:
     assert densifier.mean_gradient().tolist() == [5.0] * 3
 
 
-def test_huge_gaussians_are_pruned_by_size_or_radius_after_the_first_reset() -> None:
+def test_huge_gaussians_are_pruned_by_size_or_radius_after_the_first_reset():
     densifier = ADC(prune_screen_radius=20.0)
     densifier.begin(random_gaussians(4), DensifyContext(EXTENT))
     densifier.statistics["max_radii"] = torch.tensor([0, 20, 21, 0], dtype=torch.int32)

@@ -1,25 +1,21 @@
 """FastGS against a restatement: counts of bad pixels, growth, and the draw for pruning."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
 from gsbench.densify import FastGS
 from gsbench.densify.scores import draw
-from gsbench.errors import InputError
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.train.loss import torch_photometric_loss
 from tests.densify.helpers import EXTENT, assert_same, at, gathered, generator, to_rows
 from tests.densify.restatement import opacity
 from tests.densify.test_adc_variants import absgs_growth
 from tests.densify.test_scores import BLACK, COUNT, Room, alphas, started
+from tests.helpers import refusal
 
 
-def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+def counted(values, threshold):
     """The count and the pruning score [N] of each Gaussian over the three views.
 
     The count is the mean number of bad pixels, rounded down. The score is the sum of loss times
@@ -36,7 +32,7 @@ def counted(values: Gaussians, threshold: float) -> tuple[np.ndarray, np.ndarray
     return total // 3, (weighted - weighted.min()) / (weighted.max() - weighted.min())
 
 
-def ready(densifier: FastGS, seed: int) -> tuple[TrainableGaussians, np.ndarray, np.ndarray]:
+def ready(densifier, seed):
     trainable, _ = started(densifier, seed)
     trainable.values.log_scales.data[::4] -= 3.0
     draws = np.random.default_rng(seed)
@@ -47,7 +43,7 @@ def ready(densifier: FastGS, seed: int) -> tuple[TrainableGaussians, np.ndarray,
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(2))
-def test_a_round_of_fast_gs_matches_the_restatement(seed: int, step: int) -> None:
+def test_a_round_of_fast_gs_matches_the_restatement(seed, step):
     densifier = FastGS(error_threshold=0.5)
     trainable, signed, absolute = ready(densifier, seed)
     trainable.values.opacity_logits.data[20:40] = -9.0
@@ -91,7 +87,7 @@ def test_a_round_of_fast_gs_matches_the_restatement(seed: int, step: int) -> Non
     assert event.balances()
 
 
-def test_after_the_window_low_opacities_and_high_scores_are_pruned() -> None:
+def test_after_the_window_low_opacities_and_high_scores_are_pruned():
     densifier = FastGS()
     trainable, _, _ = ready(densifier, 1)
     trainable.values.opacity_logits.data[:5] = -3.0  # opacity 0.047
@@ -108,7 +104,7 @@ def test_after_the_window_low_opacities_and_high_scores_are_pruned() -> None:
     assert densifier.refine(16_500, trainable, generator()) is None
 
 
-def test_without_bad_pixels_nothing_grows() -> None:
+def test_without_bad_pixels_nothing_grows():
     densifier = FastGS(error_threshold=1.0)
     trainable, _, _ = ready(densifier, 0)
     event = densifier.refine(600, trainable, generator())
@@ -126,6 +122,6 @@ def test_without_bad_pixels_nothing_grows() -> None:
 
 
 @pytest.mark.parametrize("cap", ["freeze", "governor"])
-def test_caps_that_need_a_forecast_are_refused(cap: str) -> None:
-    with pytest.raises(InputError, match=r"densify\.cap must be"):
-        FastGS(cap=cap)  # type: ignore[arg-type]
+def test_caps_that_need_a_forecast_are_refused(cap):
+    with refusal(r"densify\.cap must be"):
+        FastGS(cap=cap)

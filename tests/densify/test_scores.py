@@ -1,20 +1,14 @@
 """Edge maps, sums over pixels, random draws and Taming 3DGS against restatements in numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from PIL import Image, ImageFilter
 
 from gsbench.densify import DensifyContext, EdgeAware, Taming
-from gsbench.densify.adc import ADC
 from gsbench.densify.scores import blended_sums, by_mean, by_median, draw, draw_views, edge_map
-from gsbench.errors import InputError
 from gsbench.eval.ssim import ssim_map
-from gsbench.gaussians.model import Gaussians
-from gsbench.gaussians.trainable import TrainableGaussians
-from gsbench.raster.base import RenderOutput
 from gsbench.raster.reference import (
     ReferenceRasterizer,
     bin_gaussians,
@@ -22,7 +16,6 @@ from gsbench.raster.reference import (
     project,
     tile_rectangles,
 )
-from gsbench.scene.types import Camera
 from gsbench.train.loss import torch_photometric_loss
 from tests.densify import restatement
 from tests.densify.helpers import (
@@ -36,6 +29,7 @@ from tests.densify.helpers import (
 )
 from tests.densify.restatement import opacity
 from tests.gaussians.helpers import front_camera, random_gaussians
+from tests.helpers import refusal
 
 COUNT = 60
 WIDTH, HEIGHT = 37, 21
@@ -45,30 +39,30 @@ BLACK = torch.zeros(3, dtype=torch.float64)
 class Room:
     """Training views: three made-up photographs, rendered in float64."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         rng = np.random.default_rng(0)
         self.cameras = [front_camera(WIDTH, HEIGHT, (5.0 * k, -3.0 * k)) for k in range(3)]
         self.images = [
             torch.from_numpy(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)) for _ in range(3)
         ]
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self.images)
 
-    def image(self, index: int) -> torch.Tensor:
+    def image(self, index):
         return self.images[index]
 
-    def render(self, index: int, gaussians: Gaussians, step: int) -> RenderOutput:
+    def render(self, index, gaussians, step):
         return ReferenceRasterizer().render(gaussians, self.cameras[index], 0, BLACK)
 
-    def dissimilarity(self, index: int, image: torch.Tensor) -> torch.Tensor:
+    def dissimilarity(self, index, image):
         return (1 - ssim_map(image, self.images[index].to(image) / 255).mean(0)).clamp_min(0)
 
-    def loss(self, index: int, image: torch.Tensor) -> torch.Tensor:
+    def loss(self, index, image):
         return torch_photometric_loss(image, self.images[index])[0]
 
 
-def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def alphas(gaussians, camera):
     """alpha T of every Gaussian in every pixel, [N, H, W]."""
     found = np.zeros((len(gaussians), HEIGHT, WIDTH))
     projected = project(gaussians, camera)
@@ -87,7 +81,7 @@ def alphas(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return found
 
 
-def find_edges(image: torch.Tensor) -> np.ndarray:
+def find_edges(image):
     """The edges that Pillow finds, with 0 in the outermost pixels."""
     edges = np.array(
         Image.fromarray(image.numpy()).convert("L").filter(ImageFilter.FIND_EDGES), np.float64
@@ -96,37 +90,37 @@ def find_edges(image: torch.Tensor) -> np.ndarray:
     return (edges - edges.min()) / (edges.max() - edges.min())
 
 
-def over_mean(values: np.ndarray) -> np.ndarray:
+def over_mean(values):
     return np.where(values > 0, values / values[values > 0].mean(), 0)
 
 
-def over_median(values: np.ndarray) -> np.ndarray:
+def over_median(values):
     positive = np.sort(values[values > 0])
     return np.where(values > 0, values / positive[(len(positive) - 1) // 2], 0)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_edge_maps_match_pillow(seed: int) -> None:
+def test_edge_maps_match_pillow(seed):
     image = torch.from_numpy(np.random.default_rng(seed).integers(0, 256, (13, 17, 3), np.uint8))
     image[3:9, 4:12] = torch.tensor([200, 30, 90], dtype=torch.uint8)
-    np.testing.assert_allclose(edge_map(image), find_edges(image), atol=1e-6)
+    assert_allclose(edge_map(image), find_edges(image), atol=1e-6)
     assert not edge_map(torch.full((5, 5, 3), 90, dtype=torch.uint8)).any()
     for narrow in (image[:1], image[:2], image[:, :2], image[:, :1], image[:1, :1]):
         assert torch.equal(edge_map(narrow), torch.zeros(narrow.shape[:2]))
 
 
-def test_blended_sums_are_sums_of_alpha_and_transmittance() -> None:
+def test_blended_sums_are_sums_of_alpha_and_transmittance():
     gaussians, room = random_gaussians(COUNT, 3, log_scale=(-3.5, -0.5)), Room()
     gaussians.sh_dc[:] = -9.0  # all black: their own colours have no gradient
     weights = torch.rand(HEIGHT, WIDTH, 3, generator=generator(0), dtype=torch.float64)
     with torch.no_grad():  # as in a refinement
         sums, _ = blended_sums(room, 1, gaussians, 1, weights)
     expected = np.einsum("nyx,yxc->nc", alphas(gaussians, room.cameras[1]), weights.numpy())
-    np.testing.assert_allclose(sums, expected, atol=1e-12)
+    assert_allclose(sums, expected, atol=1e-12)
     assert (expected[:, 0] > 0).sum() > 30
 
 
-def test_median_and_mean_ignore_values_that_are_not_positive() -> None:
+def test_median_and_mean_ignore_values_that_are_not_positive():
     values = torch.tensor([0.0, -3.0, float("nan"), 4.0, 2.0, 8.0, 6.0])
     assert by_median(values).tolist() == [0, 0, 0, 1, 0.5, 2, 1.5]
     assert by_mean(values).tolist() == pytest.approx([0, 0, 0, 0.8, 0.4, 1.6, 1.2])
@@ -134,7 +128,7 @@ def test_median_and_mean_ignore_values_that_are_not_positive() -> None:
     assert not by_mean(torch.zeros(3)).any()
 
 
-def test_draws_are_in_proportion_and_without_replacement() -> None:
+def test_draws_are_in_proportion_and_without_replacement():
     """Two of four are drawn: first one by score, then another of the rest by score.
 
     So the chance of each is known.
@@ -163,7 +157,7 @@ def test_draws_are_in_proportion_and_without_replacement() -> None:
     assert len({*draw_views(Room(), 2, rng)}) == 2
 
 
-def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
+def started(densifier, seed):
     """Gaussians with moments and mean gradients, in a room with views."""
     gaussians = random_gaussians(COUNT, seed, log_scale=(-5.0, 0.3))
     trainable = with_moments(gaussians)
@@ -173,7 +167,7 @@ def started(densifier: ADC, seed: int) -> tuple[TrainableGaussians, np.ndarray]:
     return trainable, gradient
 
 
-def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.ndarray:
+def taming_scores(trainable, gradient):
     """The score over all three views, term by term."""
     room, values = Room(), trainable.values.detach()
     scales = np.exp(values.log_scales.numpy())
@@ -209,16 +203,16 @@ def taming_scores(trainable: TrainableGaussians, gradient: np.ndarray) -> np.nda
     return total + 1e-6
 
 
-def test_taming_scores_match_the_restatement() -> None:
+def test_taming_scores_match_the_restatement():
     densifier = Taming(max_gaussians=COUNT)
     trainable, gradient = started(densifier, 0)
     densifier.score(at(600, trainable))
     scores = densifier.statistics["score"].detach()
-    np.testing.assert_allclose(scores, taming_scores(trainable, gradient), rtol=1e-4)
+    assert_allclose(scores, taming_scores(trainable, gradient), rtol=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_round_of_taming_matches_the_restatement(seed: int) -> None:
+def test_a_round_of_taming_matches_the_restatement(seed):
     densifier = Taming(max_gaussians=COUNT + 12, cap="hard")
     trainable, gradient = started(densifier, seed)
     rows, expected = to_rows(trainable), {}
@@ -246,7 +240,7 @@ def test_a_round_of_taming_matches_the_restatement(seed: int) -> None:
     assert event.balances()
 
 
-def test_taming_grows_a_single_candidate() -> None:
+def test_taming_grows_a_single_candidate():
     densifier = Taming(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
     trainable, _ = started(densifier, 0)
     densifier.statistics["gradient_sum"][1:] = 0.0
@@ -255,14 +249,14 @@ def test_taming_grows_a_single_candidate() -> None:
     assert (event.cloned + event.split_gradient, event.blocked_by_cap) == (1, 0)
 
 
-def with_forty_faint() -> tuple[Taming, TrainableGaussians]:
+def with_forty_faint():
     densifier = Taming(max_gaussians=COUNT, cap="hard")
     trainable, _ = started(densifier, 1)
     trainable.values.opacity_logits.data[:40] = -9.0
     return densifier, trainable
 
 
-def test_taming_prunes_at_most_half_of_the_faint_and_only_in_its_first_rounds() -> None:
+def test_taming_prunes_at_most_half_of_the_faint_and_only_in_its_first_rounds():
     for step in (600, 500 + 2700, 600 + 2700):
         densifier, trainable = with_forty_faint()
         event = densifier.refine(step, trainable, generator())
@@ -273,7 +267,7 @@ def test_taming_prunes_at_most_half_of_the_faint_and_only_in_its_first_rounds() 
     assert not densifier.statistics["score"].any()
 
 
-def test_taming_prunes_gaussians_with_low_scores_more_often() -> None:
+def test_taming_prunes_gaussians_with_low_scores_more_often():
     """Of forty faint Gaussians, the twenty with high scores are drawn a million times as rarely."""
     densifier, trainable = with_forty_faint()
     densifier.statistics["score"] = torch.where(torch.arange(COUNT) % 2 == 0, 1e6, 1.0)
@@ -288,7 +282,7 @@ def test_taming_prunes_gaussians_with_low_scores_more_often() -> None:
     assert refinement.event.pruned_opacity == len(gone) <= 20
 
 
-def test_taming_does_not_prune_gaussians_without_a_score() -> None:
+def test_taming_does_not_prune_gaussians_without_a_score():
     """Children of the same round have no score."""
     densifier, trainable = with_forty_faint()
     densifier.statistics["score"] = torch.where(torch.arange(COUNT) < 40, 0.0, 1e-3)
@@ -297,7 +291,7 @@ def test_taming_does_not_prune_gaussians_without_a_score() -> None:
     assert (refinement.event.pruned_opacity, len(trainable)) == (0, COUNT)
 
 
-def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:
+def test_taming_follows_its_curve_and_ends_at_the_budget():
     densifier = Taming(max_gaussians=150, gradient_threshold=1e-9, stop=1500, prune_opacity=0.0)
     trainable, _ = started(densifier, 2)
     counts, rng = [], generator(0)
@@ -308,17 +302,17 @@ def test_taming_follows_its_curve_and_ends_at_the_budget() -> None:
         densifier.statistics["visible_count"][:] = 1
         counts.append(densifier.refine(step, trainable, rng).after)
     progress = np.arange(1, 10) / 10
-    np.testing.assert_allclose(counts, COUNT + 90 * (2 * progress - progress**2), atol=2)
+    assert_allclose(counts, COUNT + 90 * (2 * progress - progress**2), atol=2)
 
 
 @pytest.mark.parametrize("cap", ["soft", "freeze", "governor"])
 @pytest.mark.parametrize("kind", [EdgeAware, Taming])
-def test_caps_without_a_limit_are_refused(kind: type[ADC], cap: str) -> None:
-    with pytest.raises(InputError, match=r"densify\.cap must be"):
-        kind(cap=cap)  # type: ignore[arg-type]
+def test_caps_without_a_limit_are_refused(kind, cap):
+    with refusal(r"densify\.cap must be"):
+        kind(cap=cap)
 
 
-def test_a_densifier_that_needs_views_names_the_missing_setting() -> None:
+def test_a_densifier_that_needs_views_names_the_missing_setting():
     densifier = Taming(max_gaussians=COUNT)
     trainable, _ = started(densifier, 0)
     densifier.context = DensifyContext(EXTENT)

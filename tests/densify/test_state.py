@@ -1,7 +1,5 @@
 """The state of every densifier: statistics that follow edits, lineage, saving, and causes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -28,14 +26,14 @@ class Gathering(Densifier):
     STATISTICS = {"sum": torch.float64, "seen": torch.bool}  # noqa: RUF012
 
 
-def started(densifier: Densifier, count: int) -> Refinement:
+def started(densifier, count):
     gaussians = trained(random_gaussians(count), 1.0)
     densifier.begin(gaussians.values.detach(), DensifyContext(1.0))
     return Refinement(7, gaussians, generator(0), RefineEvent(7, count))
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_statistics_and_lineage_follow_every_edit(seed: int) -> None:
+def test_statistics_and_lineage_follow_every_edit(seed):
     """The test edits a list of rows in the same way, one Gaussian at a time."""
     draw = np.random.default_rng(seed)
     densifier = Gathering()
@@ -70,7 +68,7 @@ def test_statistics_and_lineage_follow_every_edit(seed: int) -> None:
     assert len(refinement.gaussians) == len(rows)
 
 
-def test_statistics_are_saved_and_reset() -> None:
+def test_statistics_are_saved_and_reset():
     densifier = Gathering()
     refinement = started(densifier, 5)
     densifier.statistics["sum"] += 3.0
@@ -84,7 +82,7 @@ def test_statistics_are_saved_and_reset() -> None:
     assert saved["statistics"]["sum"].tolist() == [3.0] * 5  # a copy
 
 
-def test_the_initial_count_does_not_change_by_growth_or_saving() -> None:
+def test_the_initial_count_does_not_change_by_growth_or_saving():
     densifier = Gathering()
     refinement = started(densifier, 4)
     densifier.clone(refinement, torch.tensor([True, False, True, True]))
@@ -96,7 +94,7 @@ def test_the_initial_count_does_not_change_by_growth_or_saving() -> None:
     )
 
 
-def test_a_subclass_adds_to_the_statistics_of_its_base() -> None:
+def test_a_subclass_adds_to_the_statistics_of_its_base():
     @dataclass
     class Own(Volumetric):
         STATISTICS = {"hits": torch.int64}  # noqa: RUF012
@@ -106,12 +104,12 @@ def test_a_subclass_adds_to_the_statistics_of_its_base() -> None:
 
 
 @pytest.mark.parametrize(
-    ("order", "place"),
+    "order, place",
     [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)],
     ids=lambda value: str(value),
 )
-def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order: str, place: int) -> None:
-    densifier = Volumetric(volume_order=order)  # type: ignore[arg-type]
+def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order, place):
+    densifier = Volumetric(volume_order=order)
     refinement = started(densifier, 3)
     names = ["grow_by_gradient", "prune", "reset_statistics"]
     names.insert(place, "split_by_volume")
@@ -123,14 +121,14 @@ def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order: str, 
     assert densifier.rules(refinement) == []
 
 
-def test_every_cause_has_its_own_words_and_colour() -> None:
+def test_every_cause_has_its_own_words_and_colour():
     assert [cause.value for cause in Cause] == list(range(len(Cause)))  # lineage.npz indexes by it
     for first, second in combinations(Cause, 2):
         assert first.words != second.words
         assert np.abs(np.subtract(first.color, second.color)).max() > 60
 
 
-def test_an_event_balances_only_if_its_counts_add_up() -> None:
+def test_an_event_balances_only_if_its_counts_add_up():
     event = RefineEvent(
         600,
         before=10,
@@ -146,23 +144,21 @@ def test_an_event_balances_only_if_its_counts_add_up() -> None:
     assert not event.balances()
 
 
-def test_normal_draws_on_the_cpu_are_those_of_the_generator() -> None:
+def test_normal_draws_on_the_cpu_are_those_of_the_generator():
     like = torch.zeros(1, dtype=torch.float64)
     drawn = standard_normal((4, 3), generator(3), like)
     assert torch.equal(drawn, torch.randn(4, 3, generator=generator(3), dtype=torch.float64))
 
 
-def test_normal_draws_on_another_device_are_seeded_by_the_generator(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_normal_draws_on_another_device_are_seeded_by_the_generator(monkeypatch):
     rng, again = (generator(3) for _ in range(2))
     seeds = []
 
     class There:
-        def __init__(self, device: torch.device) -> None:
+        def __init__(self, device):
             assert device.type == "meta"
 
-        def manual_seed(self, seed: int) -> There:
+        def manual_seed(self, seed):
             seeds.append(seed)
             return self
 
@@ -175,7 +171,7 @@ def test_normal_draws_on_another_device_are_seeded_by_the_generator(
     assert seeds == [int(torch.randint(2**62, (1,), generator=again))]
 
 
-def test_an_unknown_class_keyword_is_refused() -> None:
+def test_an_unknown_class_keyword_is_refused():
     with pytest.raises(TypeError, match="keyword"):
 
         class Wrong(Densifier, wrong=1): ...
@@ -183,7 +179,7 @@ def test_an_unknown_class_keyword_is_refused() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_state_can_be_loaded_from_a_checkpoint_on_a_gpu() -> None:
+def test_state_can_be_loaded_from_a_checkpoint_on_a_gpu():
     """The trainer moves everything in a checkpoint to the GPU, but the lineage stays on the CPU."""
     cuda = torch.device("cuda")
     densifier = Gathering()

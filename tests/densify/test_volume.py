@@ -1,11 +1,10 @@
 """The formulas of the volume rule on cases computed by hand, and its thresholds and budgets."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.densify import DensifyContext, Volumetric
 from gsbench.densify.budget import admit, allowance
@@ -14,18 +13,18 @@ from tests.densify.helpers import generator, trained
 from tests.gaussians.helpers import random_gaussians
 
 
-def scales(*rows: tuple[float, float, float]) -> torch.Tensor:
+def scales(*rows):
     return torch.tensor(rows, dtype=torch.float64).log()
 
 
-def test_children_of_an_isotropic_gaussian_have_its_size() -> None:
+def test_children_of_an_isotropic_gaussian_have_its_size():
     sphere = scales((0.2, 0.2, 0.2))
     assert math.exp(log_volume(sphere)) == pytest.approx(4 / 3 * math.pi * 0.008)
     assert math.exp(log_condition(sphere)) == pytest.approx(1)
-    torch.testing.assert_close(Volumetric().child_log_scales(sphere), sphere)
+    assert_close(Volumetric().child_log_scales(sphere), sphere)
 
 
-def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand() -> None:
+def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand():
     """A Gaussian with axes 2, 1, 1 has kappa = 4.
 
     Its eigenvalues 4, 1, 1 become 1, 1/4, 1/4, so its axes become 1, 1/2, 1/2. The volume is
@@ -34,38 +33,34 @@ def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand() -> None
     parent = scales((2.0, 1.0, 1.0))
     assert math.exp(log_condition(parent)) == pytest.approx(4)
     child = Volumetric().child_log_scales(parent)
-    torch.testing.assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
+    assert_close(child.exp(), torch.tensor([[1.0, 0.5, 0.5]], dtype=torch.float64))
     assert math.exp(log_volume(parent) - log_volume(child)) == pytest.approx(8)
     as_adc = Volumetric(condition_of="nothing").child_log_scales(parent)  # no eq. 7
-    torch.testing.assert_close(as_adc.exp(), parent.exp() / 1.6)
+    assert_close(as_adc.exp(), parent.exp() / 1.6)
     in_scales = Volumetric(condition_of="scales").child_log_scales(parent)  # s / kappa
-    torch.testing.assert_close(
-        in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64)
-    )
+    assert_close(in_scales.exp(), torch.tensor([[0.5, 0.25, 0.25]], dtype=torch.float64))
 
 
-def test_children_of_a_needle_vanish_unless_kappa_is_limited() -> None:
+def test_children_of_a_needle_vanish_unless_kappa_is_limited():
     needle = scales((1.0, 1e-3, 1e-3))  # kappa = 1e6
-    torch.testing.assert_close(
+    assert_close(
         Volumetric().child_log_scales(needle).exp(),
         torch.tensor([[1e-3, 1e-6, 1e-6]], dtype=torch.float64),
     )
     limited = Volumetric(max_condition=4.0).child_log_scales(needle)
-    torch.testing.assert_close(
-        limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64)
-    )
+    assert_close(limited.exp(), torch.tensor([[0.5, 5e-4, 5e-4]], dtype=torch.float64))
 
 
-def test_volume_does_not_underflow() -> None:
+def test_volume_does_not_underflow():
     tiny = torch.full((1, 3), -300.0)
     assert float(log_volume(tiny)) == pytest.approx(-900 + math.log(4 * math.pi / 3))
 
 
-def run_volume_rule(log_scales: torch.Tensor, rounds: int = 1, **options: object):  # type: ignore[no-untyped-def]
+def run_volume_rule(log_scales, rounds=1, **options):
     gaussians = random_gaussians(len(log_scales))
     gaussians.log_scales = log_scales.clone()
     gaussians.opacity_logits.fill_(2.0)
-    densifier = Volumetric(**options)  # type: ignore[arg-type]
+    densifier = Volumetric(**options)
     densifier.begin(gaussians, DensifyContext(extent=10.0))
     trainable = trained(gaussians, 10.0)
     rng = generator(0)
@@ -73,11 +68,11 @@ def run_volume_rule(log_scales: torch.Tensor, rounds: int = 1, **options: object
     return trainable, events, densifier
 
 
-def radius_of(volume: float) -> float:
+def radius_of(volume):
     return (volume * 3 / (4 * math.pi)) ** (1 / 3)
 
 
-def test_only_a_volume_above_the_threshold_is_split() -> None:
+def test_only_a_volume_above_the_threshold_is_split():
     radius = radius_of(0.03)
     at = torch.full((1, 3), math.log(radius), dtype=torch.float64)
     exact = math.exp(float(log_volume(at)[0]))
@@ -87,7 +82,7 @@ def test_only_a_volume_above_the_threshold_is_split() -> None:
     assert event.split_volume == 1
 
 
-def test_isotropic_gaussians_are_split_in_every_round() -> None:
+def test_isotropic_gaussians_are_split_in_every_round():
     trainable, events, _ = run_volume_rule(scales((0.5, 0.5, 0.5)), rounds=5)
     assert [event.isotropic_resplit for event in events] == [1, 2, 4, 8, 16]
     assert len(trainable) == 32
@@ -106,7 +101,7 @@ def test_isotropic_gaussians_are_split_in_every_round() -> None:
     )  # a round that starts with 8 exceeds the cap, the next does not grow
 
 
-def test_vanishing_needles_are_reported() -> None:
+def test_vanishing_needles_are_reported():
     # children of the disc have axes of at most 1e-4
     shapes = scales((30.0, 30.0, 1e-4), (0.6, 0.5, 0.4))
     _, (event,), _ = run_volume_rule(shapes)
@@ -116,11 +111,11 @@ def test_vanishing_needles_are_reported() -> None:
     assert event.vanished == 0
 
 
-def test_each_threshold_mode_selects_the_expected_number() -> None:
+def test_each_threshold_mode_selects_the_expected_number():
     log_scales = random_gaussians(1000, log_scale=(-4, 0)).log_scales
     volumes = log_volume(log_scales)
 
-    def selected(**options: object) -> int:
+    def selected(**options):
         return run_volume_rule(log_scales, **options)[1][0].split_volume
 
     assert selected(threshold_mode="absolute") == int((volumes.exp() > 0.03).sum())
@@ -137,7 +132,7 @@ def test_each_threshold_mode_selects_the_expected_number() -> None:
     assert run_volume_rule(outlier, threshold_mode="auto")[1][0].split_volume == expected >= 3
 
 
-def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene() -> None:
+def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene():
     log_scales = random_gaussians(500, log_scale=(-5, 0.5)).log_scales
     log_scales[:5] += 2.5
     counts = {
@@ -149,7 +144,7 @@ def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "key"),
+    "options, key",
     [
         ({"volume_threshold": -1.0}, "densify.volume_threshold"),
         ({"max_condition": 0.5}, "densify.max_condition"),
@@ -161,12 +156,12 @@ def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene() -> None:
         ({"threshold_mode": "banana"}, "densify.threshold_mode"),
     ],
 )
-def test_bad_values_name_their_key(options: dict[str, object], key: str) -> None:
+def test_bad_values_name_their_key(options, key):
     with pytest.raises(ValueError, match=key):
-        Volumetric(**options)  # type: ignore[arg-type]
+        Volumetric(**options)
 
 
-def test_admit_chooses_the_best_scores_and_counts_the_refused() -> None:
+def test_admit_chooses_the_best_scores_and_counts_the_refused():
     candidates = torch.tensor([True, True, False, True])
     score = torch.tensor([1.0, 3.0, 9.0, 3.0])
     admitted, refused = admit(candidates, score, 1, 2)
@@ -178,7 +173,7 @@ def test_admit_chooses_the_best_scores_and_counts_the_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "most", "cap", "allowed"),
+    "count, most, cap, allowed",
     [
         (5, 10, "hard", 5),
         (12, 10, "hard", 0),
@@ -191,13 +186,11 @@ def test_admit_chooses_the_best_scores_and_counts_the_refused() -> None:
         (12, 10, "governor", None),
     ],
 )
-def test_each_cap_allows_the_expected_number(
-    count: int, most: int | None, cap: str, allowed: int | None
-) -> None:
-    assert allowance(count, most, cap) == allowed  # type: ignore[arg-type]
+def test_each_cap_allows_the_expected_number(count, most, cap, allowed):
+    assert allowance(count, most, cap) == allowed
 
 
-def test_the_volume_rule_can_have_its_own_window() -> None:
+def test_the_volume_rule_can_have_its_own_window():
     own = Volumetric(volume_start=1000, volume_stop=2000, volume_interval=200)
     assert [step for step in range(100, 3000, 100) if own.volume_due(step)] == [
         1200,
@@ -210,5 +203,5 @@ def test_the_volume_rule_can_have_its_own_window() -> None:
 
 
 @pytest.mark.parametrize("mode", ["quantile", "auto"])
-def test_the_threshold_of_an_empty_set_is_infinite(mode: str) -> None:
-    assert Volumetric(threshold_mode=mode).log_threshold(torch.zeros(0)) == math.inf  # type: ignore[arg-type]
+def test_the_threshold_of_an_empty_set_is_infinite(mode):
+    assert Volumetric(threshold_mode=mode).log_threshold(torch.zeros(0)) == math.inf

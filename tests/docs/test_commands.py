@@ -9,10 +9,8 @@ import importlib
 import inspect
 import io
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -43,7 +41,7 @@ OUR_FILES = ("src/", "conf/", "docs/", "tests/")
 VERBATIM = re.compile(r"^[\w/]+$")
 OWN = {"mine", "mycluster", "opacity", "NAME"}  # names that examples give to a reader's own
 TOP = {"name", "seed", "device", "threads", "runs", "allow_targets"}
-CLASSES: dict[str, tuple[type, ...]] = {
+CLASSES = {
     "scene": (SceneConfig,),
     "densify": (ComponentConfig, External),
     "init": (ComponentConfig,),
@@ -57,11 +55,11 @@ NO_SETTINGS = {"key", "stable", "grow_grad2d"}  # words of Hydra's grammar, of t
 
 
 @cache
-def keys_of(group: str) -> frozenset[str]:
+def keys_of(group):
     """The settings of a group: those of its dataclass, its files, and the classes in the files."""
     known = {field.name for kind in CLASSES.get(group, ()) for field in dataclasses.fields(kind)}
     for file in (ROOT / "conf" / group).rglob("*.yaml"):
-        content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
         known |= {str(key) for key in content}
         module, _, name = str(content.get("_target_", "")).rpartition(".")
         if module and name != External.__name__:  # External is in `CLASSES`
@@ -72,13 +70,13 @@ def keys_of(group: str) -> frozenset[str]:
 
 
 @cache
-def options_of(verb: str) -> frozenset[str]:
+def options_of(verb):
     with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
         load_verb(verb)(["--help"], Path("runs"))
     return frozenset(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", text.getvalue()))
 
 
-def fault_of_setting(word: str) -> str:
+def fault_of_setting(word):
     """The reason why a word ``key=value`` is no setting of gsbench; "" for other words."""
     match = SETTING.match(word.strip("'\","))
     if match is None or match[2] in NO_SETTINGS:
@@ -104,7 +102,7 @@ def fault_of_setting(word: str) -> str:
     return "" if key in everywhere else f"no setting is called {key}"
 
 
-def faults_of_command(command: str) -> Iterator[str]:
+def faults_of_command(command):
     """The reasons why words of a command are wrong."""
     words = command.partition("gsbench")[2].partition(" #")[0].split()
     words = words[: words.index("|")] if "|" in words else words
@@ -120,7 +118,7 @@ def faults_of_command(command: str) -> Iterator[str]:
             yield fault
 
 
-def faults_of(text: str) -> list[str]:
+def faults_of(text):
     """The faults of a document, each with its line."""
     text = FENCED.sub(lambda found: "\n" * found[0].count("\n"), text)
     # a command may continue on the next line
@@ -164,7 +162,7 @@ def test_files_in_the_architecture_document_exist():
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    "text, fault",
     [
         ("    gsbench tabels x", "no verb tabels"),
         ("say `gsbench tables x --formt csv`", "tables has no option --formt"),

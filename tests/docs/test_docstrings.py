@@ -4,8 +4,6 @@ import ast
 import doctest
 import importlib
 import re
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -37,9 +35,9 @@ UNPLAIN = frozenset(
 TITLED = (*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "src").rglob("*.yaml"))
 
 
-def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def public_docstrings(tree):
     """Line and text of a module's public docstrings, also of its classes, functions and methods."""
-    pending: list[ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef] = [tree]
+    pending = [tree]
     while pending:
         node = pending.pop()
         text = ast.get_docstring(node)
@@ -54,7 +52,7 @@ def public_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
             ]
 
 
-def comments(text: str) -> Iterator[tuple[int, str]]:
+def comments(text):
     """Line and text of comments on lines of their own; of a block, the first line only."""
     block = False
     for number, line in enumerate(text.splitlines(), 1):
@@ -64,11 +62,11 @@ def comments(text: str) -> Iterator[tuple[int, str]]:
         block = stripped.startswith("#") and not stripped.startswith("# @package")
 
 
-def first_word(text: str) -> str:
+def first_word(text):
     return re.split(r"[^a-z'’]+", text.strip().lower(), maxsplit=1)[0]
 
 
-def unplain(path: Path) -> list[str]:
+def unplain(path):
     text = path.read_text(encoding="utf-8")
     found = [] if path.suffix == ".yaml" else [*public_docstrings(ast.parse(text))]
     bad = [(line, words) for line, words in found if first_word(words) in UNPLAIN]
@@ -91,7 +89,7 @@ def test_docstrings_and_titles_begin_with_a_verb_or_a_noun():
 
 
 @pytest.mark.parametrize(
-    ("source", "lines"),
+    "source, lines",
     [
         ('"""What it is."""', [1]),
         ('def run():\n    """Whether it runs."""', [2]),
@@ -122,7 +120,7 @@ def test_examples_in_docstrings_are_true(name, capsys):
 
 
 @pytest.mark.parametrize(
-    ("extended", "word"),
+    "extended, word",
     [
         *((extended, "class ") for extended in (Densifier, Initializer, Metric, Rasterizer, Sink)),
         (External, "command="),

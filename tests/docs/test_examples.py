@@ -5,9 +5,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,10 +21,10 @@ BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# (\w+\.py)\n")  # the first line of a block that is a file of this name
 
 
-def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
+def run_blocks(document, folder):
     """Write the blocks that are files to ``folder``, run the others, and return their variables."""
     text = document.read_text(encoding="utf-8")
-    variables: dict[str, Any] = {"__name__": "document"}
+    variables = {"__name__": "document"}
     for match in BLOCK.finditer(text):
         code = match.group(1)
         name = FILE.match(code)
@@ -39,7 +37,7 @@ def run_blocks(document: Path, folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch) -> Iterator[Path]:
+def folder(tmp_path, monkeypatch):
     """An empty working folder, whose modules can be imported and are forgotten afterwards."""
     for key in os.environ:
         if key.startswith(("GSBENCH_", "MLFLOW_")):
@@ -197,7 +195,7 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
 
 
-@pytest.mark.parametrize(("module", "name"), [("careful", "Careful"), ("peak", "Peak")])
+@pytest.mark.parametrize("module, name", [("careful", "Careful"), ("peak", "Peak")])
 def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name):
     from gsbench.densify import ADC, DensifyContext
     from gsbench.gaussians.paper_values import LearningRates

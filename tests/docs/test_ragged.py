@@ -55,7 +55,7 @@ def test_no_message_is_printed_with_a_break_within_a_sentence():
 
 
 @pytest.mark.parametrize(
-    ("source", "lines"),
+    "source, lines",
     [
         ('"a setting that had "\n"no effect at this size"', [1]),
         ('f"of {a!r} and "\nf"{listed(b)} are"', [1]),

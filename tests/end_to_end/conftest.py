@@ -1,56 +1,39 @@
 """Run the real program as a user does: in a subprocess, in an empty folder."""
 
-from __future__ import annotations
-
 import hashlib
-import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
+from shlex import split
 
 import pytest
 from filelock import FileLock
 
 from gsbench.cli import run
-from tests.processes import heed_interrupts
-
-Run = Callable[..., "subprocess.CompletedProcess[str]"]
+from tests.helpers import read_json, words_of
+from tests.processes import completed, heed_interrupts
 
 # A whole trial in seconds: a small courtyard, its exact cameras, a random cloud, few iterations,
 # nothing downloaded.
-SMALL = [
-    "scene=courtyard",
-    "scene.views=12",
-    "scene.width=96",
-    "scene.height=72",
-    "init=random",
-    "init.count=3000",
-    "init.size=1.2",
-    "train.iterations=300",
-    "train.position_steps=300",
-    "train.densify_start=50",
-    "train.densify_interval=50",
-    "train.densify_stop=250",
-    "train.opacity_reset_interval=1000",
-    "train.checkpoint_every=40",
-    "eval.download=false",
-    "eval.lpips=[squeeze]",
-]
+SMALL = split(
+    "scene=courtyard scene.views=12 scene.width=96 scene.height=72 init=random "
+    "init.count=3000 init.size=1.2 train.iterations=300 train.position_steps=300 "
+    "train.densify_start=50 train.densify_interval=50 train.densify_stop=250 "
+    "train.opacity_reset_interval=1000 train.checkpoint_every=40 eval.download=false "
+    "eval.lpips=[squeeze]"
+)
 FINISHED = "finished"  # the name of the experiment that all tests may copy
 
 
-def common_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def common_folder(tmp_path_factory):
     """The temporary folder of this run of the tests, which is the same for all of its workers."""
     base = tmp_path_factory.getbasetemp()
     return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
 
 @pytest.fixture(scope="session")
-def finished_runs(environment, tmp_path_factory) -> Path:
+def finished_runs(environment, tmp_path_factory):
     """A runs folder with an experiment of four trials, trained once for all workers of the tests.
 
     Tests must not change it.
@@ -66,15 +49,10 @@ def finished_runs(environment, tmp_path_factory) -> Path:
                 "seed=0,1",
                 "tracking=none",
             ]
-            done = subprocess.run(
+            completed(
                 [sys.executable, "-m", "gsbench.cli", *sweep],
                 env=environment | {"GSBENCH_RUNS": str(runs)},
-                capture_output=True,
-                text=True,
-                timeout=600,
-                check=False,
             )
-            assert done.returncode == 0, done.stderr
             (runs / "complete").touch()
     return runs
 
@@ -84,13 +62,13 @@ SWEEP = ["-m", *SMALL, "name=attacked", "densify=adc,volumetric", "tracking=none
 
 
 @pytest.fixture
-def runs(finished_runs, tmp_path) -> Path:
+def runs(finished_runs, tmp_path):
     """A copy of the finished experiment's runs folder, with its scene and initial cloud."""
     return shutil.copytree(finished_runs, tmp_path / "runs", symlinks=True)
 
 
 @pytest.fixture(scope="session")
-def environment(tmp_path_factory) -> dict[str, str]:
+def environment(tmp_path_factory):
     """The environment of the program: its own runs folder, no weights, no settings of the user."""
     kept = {
         key: value
@@ -104,24 +82,17 @@ def environment(tmp_path_factory) -> dict[str, str]:
 
 
 @pytest.fixture
-def gsbench(environment, tmp_path) -> Run:
-    """Call ``gsbench`` with arguments; returns the finished process with its output as text."""
+def gsbench(environment, tmp_path):
+    """Call ``gsbench`` with arguments, as `completed`; words in capitals are of its environment."""
 
-    def run(*arguments, timeout=240, cwd=tmp_path, **changes):
-        return subprocess.run(
-            [sys.executable, "-m", "gsbench.cli", *arguments],
-            cwd=cwd,
-            env=environment | changes,
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-            check=False,
-        )
+    def run(*arguments, code=0, timeout=240, cwd=tmp_path, **changes):
+        command = [sys.executable, "-m", "gsbench.cli", *words_of(*arguments)]
+        return completed(command, code, cwd=cwd, env=environment | changes, timeout=timeout)
 
     return run
 
 
-def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) -> Path:
+def trial_of(settings, runs, capture, *words):
     """Run one trial of the capture in a folder within this process; returns the trial's folder."""
     assert (
         run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words])
@@ -136,9 +107,7 @@ def trial_of(settings: Sequence[str], runs: Path, capture: Path, *words: str) ->
 CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
-def start(
-    environment: dict[str, str], cwd: Path, runs: Path, *arguments: str, new_group: bool = False
-) -> subprocess.Popen[str]:
+def start(environment, cwd, runs, *arguments, new_group=False):
     """Start the program.
 
     With ``new_group``, it and all that it starts are a group, which can be sent Ctrl-C as by a
@@ -156,13 +125,11 @@ def start(
     )
 
 
-def results_of(runs: Path, name: str) -> dict[str, Any]:
+def results_of(runs, name):
     """The results of a sweep without times, with checksums of models, pictures and tables."""
-    found: dict[str, Any] = {}
+    found = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
-        results = {
-            key: value for key, value in json.loads(path.read_text()).items() if key not in CLOCKED
-        }
+        results = {key: value for key, value in read_json(path).items() if key not in CLOCKED}
         results["init_report"].pop("seconds", None)
         results.pop("experiment")
         files = [
@@ -179,7 +146,7 @@ def results_of(runs: Path, name: str) -> dict[str, Any]:
 
 
 @pytest.fixture
-def undisturbed(finished_runs) -> dict[str, Any]:
+def undisturbed(finished_runs):
     """The results of the trials of ``SWEEP`` from an undisturbed run."""
     return {
         trial: found

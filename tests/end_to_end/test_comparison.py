@@ -1,5 +1,7 @@
 """The notes of a comparison on its arms, from real trials of gsbench's and a user's classes."""
 
+from shlex import split
+
 import pytest
 
 from gsbench.cli import run
@@ -23,20 +25,10 @@ TINY = [
     "scene.height=36",
     "init.count=200",
 ]
-TINY += [
-    "raster=reference",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "seed=0,1",
-    "name=arms",
-]
-OWN = [
-    "densify=adc",
-    "densify._target_=patient_arm.Patient",
-    "densify.name=patient",
-    "+densify.patience=4",
-]
+TINY += split("raster=reference eval.lpips=[] eval.flip=false tracking=none seed=0,1 name=arms")
+OWN = split(
+    "densify=adc densify._target_=patient_arm.Patient densify.name=patient +densify.patience=4"
+)
 
 
 def test_differences_of_arms_are_named_and_arms_added_later_are_reported(

@@ -4,26 +4,28 @@ import csv
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from shlex import split
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.cli import run
 from gsbench.scene.types import ANGLE, DISTANCE
 from tests.end_to_end.conftest import SMALL
+from tests.helpers import read_json
+from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 EVAL = ["eval.lpips=[squeeze]", "eval.download=false"]
-SCENE = ["scene.views=12", "scene.width=96", "scene.height=72"]
+SCENE = split("scene.views=12 scene.width=96 scene.height=72")
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, environment) -> Path:
+def trained(tmp_path_factory, environment):
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
     changed = environment | {"GSBENCH_RUNS": str(runs)}
@@ -37,33 +39,30 @@ def trained(tmp_path_factory, environment) -> Path:
         "densify=adc",
         "seed=0,1",
     ]
-    done = subprocess.run(
-        command, cwd=runs, env=changed, capture_output=True, text=True, timeout=400, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    completed(command, cwd=runs, env=changed)
     return runs
 
 
 @pytest.fixture
-def runs(trained, tmp_path) -> Path:
+def runs(trained, tmp_path):
     """A copy of the runs folder that the test may change."""
     return Path(shutil.copytree(trained, tmp_path / "runs", copy_function=os.link))
 
 
-def trial(runs: Path, arm: str = "random-adc", seed: int = 0) -> Path:
+def trial(runs, arm="random-adc", seed=0):
     return next(runs.glob(f"small/courtyard/{arm}/*-seed{seed}"))
 
 
-def results(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "results.json").read_text())
+def results(folder):
+    return read_json(folder / "results.json")
 
 
-def views(folder: Path) -> dict[str, dict[str, str]]:
+def views(folder):
     with (folder / "per_view.csv").open() as stream:
         return {row.pop("view"): row for row in csv.DictReader(stream)}
 
 
-def better_renders(runs: Path, folder: Path, seed: int) -> Path:
+def better_renders(runs, folder, seed):
     """Renders nearer to the photographs than those of the arm, with names of another program."""
     folder.mkdir()
     own = trial(runs, seed=seed)
@@ -91,7 +90,6 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
             "--json",
             GSBENCH_RUNS=str(runs),
         )
-        assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)
         assert found["metrics"] == results(own)["metrics"]
         assert found["protocol"] == "paper-1"
@@ -116,17 +114,9 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     for seed in (0, 1):
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = gsbench(
-            "evaluate",
-            str(folder),
-            "--truth",
-            "courtyard",
-            "--as",
-            "small:theirs",
-            "--seed",
-            str(seed),
+            f"evaluate {folder} --truth courtyard --as small:theirs --seed {seed}",
             GSBENCH_RUNS=str(runs),
         )
-        assert done.returncode == 0, done.stderr
         assert "names matched apart from leading zeros" in done.stdout
     entered = trial(runs, "random-theirs", 1)
     found = results(entered)
@@ -134,12 +124,9 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert found["num_gaussians"] is None
     assert list(views(entered)) == list(views(trial(runs)))
     picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
-    np.testing.assert_array_equal(
-        picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png"))
-    )
+    assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
 
-    table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
-    assert table.returncode == 0, table.stderr
+    table = gsbench("tables small", GSBENCH_RUNS=str(runs))
     assert (
         "Renders of another program, measured as they are (its conditions are not known): "
         "random-theirs." in table.stdout
@@ -147,8 +134,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     row = next(line for line in table.stdout.splitlines() if "theirs" in line)
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
     assert "**" in row  # compared, and best
-    report = gsbench("report", "small", GSBENCH_RUNS=str(runs))
-    assert report.returncode == 0, report.stderr
+    gsbench("report small", GSBENCH_RUNS=str(runs))
     text = (runs / "small" / "report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
@@ -161,7 +147,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
         ["sync", "small"],
     ):
         assert run(words) == 0
-    for words in (["view"], ["export", "--out", "x.ply"]):
+    for words in (["view"], split("export --out x.ply")):
         capsys.readouterr()
         assert run([*words, "small:courtyard:theirs"]) == 2
         assert "renders" in capsys.readouterr().err
@@ -174,19 +160,7 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
     for arm, seed in (("ours", 0), ("theirs", 1)):
         folder = better_renders(runs, tmp_path / arm, seed)
         assert (
-            run(
-                [
-                    "evaluate",
-                    str(folder),
-                    "--truth",
-                    str(truth),
-                    "--as",
-                    f"new:{arm}",
-                    "--scene",
-                    "toy",
-                    *EVAL,
-                ]
-            )
+            run([*split(f"evaluate {folder} --truth {truth} --as new:{arm} --scene toy"), *EVAL])
             == 0
         )
     capsys.readouterr()
@@ -195,11 +169,11 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
-        (["SMALLER", "--truth", "small:courtyard:adc"], "sizes are never changed"),
+        (split("SMALLER --truth small:courtyard:adc"), "sizes are never changed"),
         (
-            ["FEWER", "--truth", "small:courtyard:adc"],
+            split("FEWER --truth small:courtyard:adc"),
             "1 of 2 photographs have no picture of their name (0008.png)",
         ),
     ],
@@ -226,19 +200,13 @@ def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_pa
     scene = [word for word in SMALL if word.startswith(("scene", "eval"))]
     words = [
         *scene,
-        "init=ply",
-        "init.name=random",
-        f"init.path={model}",
-        "train=none",
-        "densify=none",
-        "name=small",
+        *split(f"init=ply init.name=random init.path={model} train=none densify=none name=small"),
     ]
-    done = gsbench(*words, "densify.name=model", GSBENCH_RUNS=str(runs))
-    assert done.returncode == 0, done.stderr
+    gsbench(*words, "densify.name=model", GSBENCH_RUNS=str(runs))
     found = results(trial(runs, "random-model"))
     assert found["metrics"] == results(trial(runs))["metrics"]
     assert found["evaluated_from"] == "model"
     assert found["num_gaussians"] == results(trial(runs))["num_gaussians"]
-    table = gsbench("tables", "small", GSBENCH_RUNS=str(runs))
+    table = gsbench("tables small", GSBENCH_RUNS=str(runs))
     assert "A model that another program trained, rendered here" in table.stdout
     assert "not compared" not in table.stdout

@@ -7,9 +7,7 @@ test-hydra-plugins`` installs them into a folder of their own. Without it these 
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Iterator
 from importlib.util import find_spec
-from typing import Any
 
 import psutil
 import pytest
@@ -21,7 +19,7 @@ from tests.end_to_end.test_hydra import SECONDS, TINY, results_below
 pytestmark = pytest.mark.slow
 
 
-def need(package: str) -> None:
+def need(package):
     if find_spec(f"hydra_plugins.{package}") is None:
         pytest.skip(f"needs {package.replace('_', '-')}: make test-hydra-plugins (or group dev)")
 
@@ -47,7 +45,6 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
     assert not (tmp_path / "runs").exists()
 
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert done.returncode == 0, done.stderr
     assert f"psnr of test views, {direction}d" in done.stderr
     psnr = defaultdict(list)
     for result in results_below(tmp_path / "runs" / "x"):
@@ -66,9 +63,14 @@ def test_settings_that_a_sweeper_does_not_understand_are_refused_in_one_line(gsb
     need("hydra_optuna_sweeper")
     for words in (["hydra.sweeper.params=3"], ["hydra.sweeper.direction=up", "seed=0,1"]):
         done = gsbench(
-            "-m", *TINY, "hydra/sweeper=optuna", *words, GSBENCH_RUNS="runs", timeout=SECONDS
+            "-m",
+            *TINY,
+            "hydra/sweeper=optuna",
+            *words,
+            code=2,
+            GSBENCH_RUNS="runs",
+            timeout=SECONDS,
         )
-        assert done.returncode == 2
         assert "Traceback" not in done.stderr
         assert done.stderr.splitlines()[-1].startswith("gsbench: ")
 
@@ -86,10 +88,10 @@ def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench, tmp_path):
             "hydra/sweeper=optuna",
             "seed=0,1",
             word,
+            code=2,
             GSBENCH_RUNS="runs",
             timeout=SECONDS,
         )
-        assert done.returncode == 2
         assert "allow_targets=[hydra.sweeper]" in done.stderr
     assert not (tmp_path / "exploded").exists()
 
@@ -98,7 +100,7 @@ def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench, tmp_path):
 
 
 @pytest.fixture
-def cluster() -> Iterator[Any]:
+def cluster():
     """A Ray cluster of two nodes on this machine, each with one worker."""
     need("hydra_ray_launcher")
     from ray.cluster_utils import Cluster
@@ -110,7 +112,7 @@ def cluster() -> Iterator[Any]:
     cluster.shutdown()
 
 
-def ray_workers() -> list[psutil.Process]:
+def ray_workers():
     """The processes of the cluster that run a job now."""
     found = []
     for process in psutil.Process().children(recursive=True):
@@ -155,7 +157,6 @@ def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
 def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
     words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert done.returncode == 0, done.stderr
     (result,) = (tmp_path / "runs" / "x").rglob("results.json")  # and not below own/
     assert f"paths still start in {tmp_path}" in done.stderr
     assert yaml.safe_load((tmp_path / "own" / ".hydra" / "config.yaml").read_text())["name"] == "x"
@@ -165,7 +166,6 @@ def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
 
     sweep = ["-m", *TINY, "name=x", "seed=0,1", "hydra.sweep.dir=many", "hydra.output_subdir=h"]
     done = gsbench(*sweep, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert done.returncode == 0, done.stderr
     for job in ("0", "1"):
         assert yaml.safe_load((tmp_path / "many" / job / "h" / "config.yaml").read_text())[
             "seed"
@@ -177,7 +177,6 @@ def test_colours_of_a_log_reach_the_terminal(gsbench, tmp_path):
     need("hydra_colorlog")
     words = [*TINY, "name=x", "hydra/job_logging=colorlog", "hydra/hydra_logging=colorlog"]
     done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert done.returncode == 0, done.stderr
     assert "\x1b[32mINFO" in done.stdout
 
 
@@ -201,5 +200,4 @@ def test_debug_lines_are_shown_if_they_are_asked_for(gsbench, tmp_path):
             GSBENCH_RUNS=f"runs-{name}",
             timeout=SECONDS,
         )
-        assert done.returncode == 0, done.stderr
         assert ("a detail" in done.stderr, "another detail" in done.stderr) == shown, name

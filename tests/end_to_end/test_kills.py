@@ -1,6 +1,5 @@
 """The program, killed by signals or run twice at once, continues and ends as if undisturbed."""
 
-import json
 import os
 import random
 import re
@@ -15,8 +14,9 @@ import yaml
 
 from tests.claims.test_check import content
 from tests.end_to_end.conftest import SMALL, SWEEP, results_of, start
+from tests.helpers import read_json, write
 from tests.launch.test_declare import TINY
-from tests.processes import bytes_written
+from tests.processes import bytes_written, completed
 
 pytestmark = [
     pytest.mark.slow,
@@ -28,16 +28,14 @@ TRIALS = 2
 PATIENCE = 240.0
 
 
-def wait_for(
-    runs: Path, pattern: str, process: subprocess.Popen[str], seconds: float = 120
-) -> None:
+def wait_for(runs, pattern, process, seconds=120):
     deadline = time.monotonic() + seconds
     while not list(runs.glob(pattern)) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
     assert list(runs.glob(pattern)), f"{pattern} did not appear"
 
 
-def training_log_size(runs: Path) -> int:
+def training_log_size(runs):
     return bytes_written(runs, "store/train/.*.partial/metrics.jsonl")
 
 
@@ -89,7 +87,7 @@ def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
     content = bytearray(model.read_bytes())
     content[len(content) // 2] ^= 1
     model.write_bytes(content)
-    psnr = json.loads(other.read_text())["metrics"]["psnr"]
+    psnr = read_json(other)["metrics"]["psnr"]
     other.write_text(other.read_text().replace(f'"psnr": {psnr}', '"psnr": 99.0'))
     assert results_of(runs, "attacked") != undisturbed
     process = start(environment, tmp_path, runs, *SWEEP)
@@ -122,11 +120,11 @@ LOCAL = [
 ]
 
 
-def holders(runs: Path) -> dict[str, int]:
+def holders(runs):
     found = {}
     for path in runs.glob("local/*/*/*/.lock.holder"):
         try:
-            found[path.parent.name] = json.loads(path.read_text())["pid"]
+            found[path.parent.name] = read_json(path)["pid"]
         except (OSError, ValueError):
             continue
     return found
@@ -180,7 +178,7 @@ TUNED = [
 ]
 
 
-def views(arm: Path) -> set[str]:
+def views(arm):
     """The names of the views on which the trials of an arm are measured."""
     return {
         line.split(",")[0]
@@ -194,7 +192,6 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
     with subprocess.Popen(
         program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
     ) as first:
-        assert first.stderr is not None
         for line in first.stderr:
             if "point 1 of 2" in line:
                 first.send_signal(signal.SIGKILL)
@@ -204,16 +201,13 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
     assert not home.exists()
 
     done = gsbench(*TUNED, "launch=local", "launch.parallel=2")  # by another launcher, too
-    assert done.returncode == 0, done.stderr
     assert "trials done; the table: gsbench tables small\n" in done.stderr
     arms = sorted(
         path.name.removeprefix("small-tune-") for path in home.parent.glob("small-tune-*")
     )
     assert len(arms) == 2
     for arm in arms:
-        points = json.loads((home.parent / f"small-tune-{arm}" / "tuning.json").read_text())[
-            "points"
-        ]
+        points = read_json(home.parent / f"small-tune-{arm}" / "tuning.json")["points"]
         assert len(points) == 2
         best = max(points, key=lambda point: point["value"])
         (results,) = home.glob(f"courtyard/{arm}/*/results.json")
@@ -224,12 +218,12 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
             home.parent / f"small-tune-{arm}" / "courtyard" / arm
         )
 
-    sheet = gsbench("tables", "small", "--layout", "fairness")
+    sheet = gsbench("tables small --layout fairness")
     assert sheet.stdout.count("is the best of 2 points by psnr of validation views") == 2
     assert "tuning was unequal" not in sheet.stdout
 
 
-def page_of(runs: Path) -> list[str]:
+def page_of(runs):
     """The lines of the page without the time of the declaration, and without times and memory."""
     lines = (runs / "check_it" / "claims.html").read_text().splitlines()
     assert sum(" were declared " in line for line in lines) == 1
@@ -238,7 +232,7 @@ def page_of(runs: Path) -> list[str]:
     return [line for line in lines if not any(words in line for words in measured)]
 
 
-def count_done(runs: Path) -> int:
+def count_done(runs):
     return len(list(runs.glob("check_it/*/*/*/results.json")))
 
 
@@ -248,14 +242,14 @@ def test_a_killed_check_continues_and_ends_with_the_same_page(tmp_path):
     claim = content()["claims"][0] | {"baseline": "few", "arm": "many"}
     arms = {"few": {"init.count": 200}, "many": {"init.count": 300}}
     claims = tmp_path / "claims.yaml"
-    claims.write_text(
-        json.dumps(content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2})
-    )
+    write(claims, content() | {"settings": settings, "arms": arms, "claims": [claim], "seeds": 2})
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     check = [sys.executable, "-m", "gsbench.cli", "check", str(claims)]
-    subprocess.run(
-        check, env=os.environ | {"GSBENCH_RUNS": str(whole)}, check=True, timeout=2 * PATIENCE
-    )
+
+    def complete(runs):
+        completed(check, env=os.environ | {"GSBENCH_RUNS": str(runs)}, timeout=2 * PATIENCE)
+
+    complete(whole)
 
     for trials in (1, 3):  # in the middle of the first look, and once more before its last trial
         process = subprocess.Popen(check, env=os.environ | {"GSBENCH_RUNS": str(killed)})
@@ -267,9 +261,7 @@ def test_a_killed_check_continues_and_ends_with_the_same_page(tmp_path):
         assert count_done(killed) >= trials
         assert not (killed / "check_it" / "claims.html").exists()
     before = {path: path.read_bytes() for path in killed.glob("check_it/*/*/*/results.json")}
-    subprocess.run(
-        check, env=os.environ | {"GSBENCH_RUNS": str(killed)}, check=True, timeout=2 * PATIENCE
-    )
+    complete(killed)
     assert page_of(killed) == page_of(whole)
     assert all(path.read_bytes() == content for path, content in before.items())  # done once
     assert len((killed / "check_it" / "declared.jsonl").read_text().splitlines()) == 1

@@ -1,37 +1,28 @@
 """A ledger with real trainings: two ideas at once, a kill in the middle, and a user's class."""
 
-from __future__ import annotations
-
 import json
 import signal
-import subprocess
 import time
 import zipfile
-from pathlib import Path
+from shlex import split
 
 import pytest
 
 from gsbench.claims.ledger import RETRIES
 from gsbench.runs.ledger import Ended, Started, read_ledger
-from tests.end_to_end.conftest import SMALL, Run, start
+from tests.end_to_end.conftest import SMALL, start
 
 pytestmark = pytest.mark.slow
 
 TINY = [
     *SMALL,
-    "train.iterations=60",
-    "train.densify_start=10",
-    "train.densify_interval=10",
-    "train.densify_stop=55",
-    "init.count=500",
-    "scene.width=48",
-    "scene.height=36",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "raster=cpu",
+    *split(
+        "train.iterations=60 train.densify_start=10 train.densify_interval=10 "
+        "train.densify_stop=55 init.count=500 scene.width=48 scene.height=36 eval.lpips=[] "
+        "eval.flip=false tracking=none raster=cpu"
+    ),
 ]
-NEW = ["ledger", "new", "night", "--metric", "psnr", "--least", "0.1", *TINY, "densify=adc"]
+NEW = [*split("ledger new night --metric psnr --least 0.1"), *TINY, "densify=adc"]
 CLASS = """\
 from gsbench.densify import ADC
 
@@ -39,20 +30,18 @@ class Idea(ADC):
     def grow_by_gradient(self, refinement):
         {body}
 """
-OWN = ["densify._target_=mine.Idea", "densify.name=mine", "allow_targets=[mine]"]
+OWN = split("densify._target_=mine.Idea densify.name=mine allow_targets=[mine]")
 
 
-def do(gsbench: Run, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return gsbench(*words, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
+def do(gsbench, folder, *words):
+    return gsbench(*words, code=None, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
 
 
-def attempt(environment: dict[str, str], folder: Path, *words: str) -> subprocess.Popen[str]:
+def attempt(environment, folder, *words):
     return start(environment, folder, folder / "runs", "ledger", "try", "night", *words)
 
 
-def test_two_ideas_at_once_share_the_baseline(
-    gsbench: Run, environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_two_ideas_at_once_share_the_baseline(gsbench, environment, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
     words = (["densify=volumetric"], ["densify.split_size=0.1"])
     both = [attempt(environment, tmp_path, *own) for own in words]
@@ -69,9 +58,7 @@ def test_two_ideas_at_once_share_the_baseline(
     assert len(baselines) == 2  # that of the ledger, and that of the second idea
 
 
-def test_a_killed_try_continues_with_its_level(
-    gsbench: Run, environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_killed_try_continues_with_its_level(gsbench, environment, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
     home = tmp_path / "runs" / "night"
     killed = attempt(environment, tmp_path, "densify=volumetric")
@@ -89,9 +76,7 @@ def test_a_killed_try_continues_with_its_level(
     assert len([one for one in entries if isinstance(one, Ended)]) == 1
 
 
-def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(
-    gsbench: Run, tmp_path: Path
-) -> None:
+def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(gsbench, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1")
     results = []
     for body in ("raise RuntimeError('typing error')", "pass", "again = 1", "return None"):
@@ -104,7 +89,7 @@ def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(
     assert [one["idea"] for one in results] == ["mine", "mine-2", "mine-3", "mine-4"]
 
 
-def test_the_ledger_is_in_the_archive(gsbench: Run, tmp_path: Path) -> None:
+def test_the_ledger_is_in_the_archive(gsbench, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1")
     do(gsbench, tmp_path, "ledger", "try", "night", "densify=none")
     do(gsbench, tmp_path, "export", "--results", "night")

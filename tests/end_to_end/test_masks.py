@@ -2,10 +2,9 @@
 
 import csv
 import hashlib
-import json
 import shutil
 from functools import partial
-from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pycolmap
@@ -20,34 +19,22 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import read_mask
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
 SIZE = 192, 144
-QUICK = [
-    "scene=colmap",
-    "densify=adc",
-    "train.iterations=80",
-    "train.densify_start=20",
-    "train.densify_interval=20",
-    "train.densify_stop=70",
-    "eval.download=false",
-    "eval.lpips=[]",
-    "tracking=none",
-    "device=cpu",
-    "scene.masks=masks",
-]
-SIFT = [
-    "init=sfm",
-    "init.first_octave=0",
-    "init.max_num_features=1500",
-    "init.two_view_tracks=true",
-]
+QUICK = split(
+    "scene=colmap densify=adc train.iterations=80 train.densify_start=20 "
+    "train.densify_interval=20 train.densify_stop=70 eval.download=false eval.lpips=[] "
+    "tracking=none device=cpu scene.masks=masks"
+)
+SIFT = split("init=sfm init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true")
 SAME = ("point_cloud.ply", "events.jsonl", "lineage.npz", "per_view.csv")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory) -> tuple[Path, Path]:
+def captures(tmp_path_factory):
     """A COLMAP folder with masks of a moving disc and a margin; the same with noise below them."""
     folder = tmp_path_factory.mktemp("masked")
     clean, noisy = folder / "clean", folder / "noisy"
@@ -74,7 +61,7 @@ def captures(tmp_path_factory) -> tuple[Path, Path]:
 trial = partial(trial_of, QUICK)
 
 
-def bits(folder: Path) -> dict[str, str]:
+def bits(folder):
     names = [
         *SAME,
         *(
@@ -92,7 +79,7 @@ def bits(folder: Path) -> dict[str, str]:
         SIFT,
         ["init=sift_kornia"],
         [*SIFT, "scene.max_size=96"],
-        ["init=random", "densify=taming", "init.count=3000", "densify.max_gaussians=6000"],
+        split("init=random densify=taming init.count=3000 densify.max_gaussians=6000"),
         ["init=random", "densify=fastgs"],
         ["init=random", "train.resolution_schedule=pictures"],
     ],
@@ -101,7 +88,7 @@ def bits(folder: Path) -> dict[str, str]:
 def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, words):
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
-    clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
+    clean, noisy = (read_json(folder / "results.json") for folder in folders)
     assert clean["hashes"]["data"] != noisy["hashes"]["data"], (
         "the photographs differ, and results say so"
     )
@@ -114,9 +101,9 @@ def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, wor
     assert all(0.5 < share < 0.9 for share in shares)
 
 
-def _points(folder: Path) -> dict[str, str]:
+def _points(folder):
     """The digests of the trial's initial cloud and cameras."""
-    key = json.loads((folder / "results.json").read_text())["hashes"]["init"]
+    key = read_json(folder / "results.json")["hashes"]["init"]
     model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
 
@@ -138,9 +125,9 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
 ):
     capture = tmp_path / "edited"
     shutil.copytree(captures[0], capture)
-    words = ["init=random", "init.count=500", "densify=none", "train.iterations=5"]
+    words = split("init=random init.count=500 densify=none train.iterations=5")
     folder = trial(tmp_path / "runs", capture, *words)
-    first = json.loads((folder / "results.json").read_text())
+    first = read_json(folder / "results.json")
     mask = sorted((capture / "masks").iterdir())[3]  # of a training view
     before = mask.read_bytes()
     pixels = np.array(Image.open(mask))
@@ -149,12 +136,12 @@ def test_an_edited_mask_makes_a_new_trial_and_the_old_mask_finds_the_old_one(
     capsys.readouterr()
     trial(tmp_path / "runs", capture, *words)
     assert "already done" not in capsys.readouterr().err
-    second = json.loads((folder / "results.json").read_text())
+    second = read_json(folder / "results.json")
     assert first["hashes"]["train"] != second["hashes"]["train"]
     assert first["hashes"]["config"] == second["hashes"]["config"]
     mask.write_bytes(before)
     trial(tmp_path / "runs", capture, *words)
-    assert json.loads((folder / "results.json").read_text())["hashes"] == first["hashes"]
+    assert read_json(folder / "results.json")["hashes"] == first["hashes"]
 
 
 def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, capfd):
@@ -175,18 +162,15 @@ def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, c
     mask.unlink()
     assert f"add {mask.name}" in said("init=random")
     assert "no such folder; set scene.masks to one of: images, masks, sparse" in said(
-        "init=random", "scene.masks=msk"
+        "init=random scene.masks=msk"
     )
 
 
 def test_another_program_is_refused_with_masks(captures, tmp_path, capfd):
     words = ["init=random", "densify=external/program", "densify.command='echo {data} {output}'"]
-    words += [
-        "allow_targets=[echo]",
-        "densify.version=1",
-        "densify.result=point_cloud.ply",
-        f"runs={tmp_path}",
-    ]
+    words += split(
+        f"allow_targets=[echo] densify.version=1 densify.result=point_cloud.ply runs={tmp_path}"
+    )
     assert (
         run(
             [

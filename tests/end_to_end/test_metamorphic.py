@@ -4,20 +4,20 @@ A similarity (place, scale, rotation) may change a result as another seed does. 
 another format of the same values, may not change one bit.
 """
 
-import json
 import math
 import shutil
 import statistics
 import tempfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pycolmap
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from PIL import Image
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
@@ -26,34 +26,24 @@ from gsbench.cli import run
 from gsbench.files import file_sha256
 from gsbench.scene.colmap import write_model
 from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard
-from gsbench.scene.types import Camera
 from tests.end_to_end.conftest import trial_of
+from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    "densify=adc",
-    "train.iterations=400",
-    "train.position_steps=400",
-    "train.densify_start=100",
-    "train.densify_interval=100",
-    "train.densify_stop=350",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "threads=1",
-    "raster=cpu",
-    "init=dataset",
-]
+QUICK = split(
+    "densify=adc train.iterations=400 train.position_steps=400 train.densify_start=100 "
+    "train.densify_interval=100 train.densify_stop=350 eval.lpips=[] eval.flip=false "
+    "tracking=none threads=1 raster=cpu init=dataset"
+)
 train = partial(trial_of, QUICK)
 COLMAP = "scene=colmap"
 VIEWS, WIDTH, HEIGHT = 14, 96, 72
 SEEDS = 4
-Change = Callable[[Path, pycolmap.Reconstruction], None]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory) -> Path:
+def good(tmp_path_factory):
     """A COLMAP folder of the courtyard with exact cameras and a coloured cloud."""
     folder = tmp_path_factory.mktemp("made") / "good"
     render_courtyard(folder, VIEWS, WIDTH, HEIGHT)
@@ -63,7 +53,7 @@ def good(tmp_path_factory) -> Path:
     return folder
 
 
-def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, np.ndarray]:
+def surroundings(cameras, images):
     """Points [P, 3] of the ground and a round wall, and their colours [P, 3] in a photograph."""
     random = np.random.default_rng(0)
     angles, heights = random.uniform(0, 2 * np.pi, 1500), random.uniform(0, 6, 1500)
@@ -86,22 +76,22 @@ def surroundings(cameras: dict[str, Camera], images: Path) -> tuple[np.ndarray, 
 
 
 @pytest.fixture(scope="module")
-def original(good, tmp_path_factory) -> list[Path]:
+def original(good, tmp_path_factory):
     """Trials of the capture as it is, one for each seed."""
     runs = tmp_path_factory.mktemp("runs")
     return [train(runs / str(seed), good, COLMAP, f"seed={seed}") for seed in range(SEEDS)]
 
 
-def psnr_of(trial: Path) -> float:
-    return float(json.loads((trial / "results.json").read_text())["metrics"]["psnr"])
+def psnr_of(trial):
+    return float(read_json(trial / "results.json")["metrics"]["psnr"])
 
 
-def require_same_up_to_a_seed(trial: Path, original: list[Path]) -> None:
+def require_same_up_to_a_seed(trial, original):
     values = [psnr_of(one) for one in original]
     assert abs(psnr_of(trial) - statistics.fmean(values)) < 4 * statistics.stdev(values), values
 
 
-def copy_of(good: Path, folder: Path, change: Change, text: bool = False) -> Path:
+def copy_of(good, folder, change, text=False):
     """Copy the capture ``good``, and change the photographs and the model of the copy."""
     shutil.copytree(good / "images", folder / "images")
     model = pycolmap.Reconstruction(good / "sparse/0")
@@ -126,9 +116,7 @@ def test_a_similarity_changes_a_result_no_more_than_a_seed_does(
         require_given_coordinates(trial, original[0], similarity, Path(scratch) / "exported", moved)
 
 
-def require_given_coordinates(
-    trial: Path, untouched: Path, similarity: pycolmap.Sim3d, exported: Path, capture: Path
-) -> None:
+def require_given_coordinates(trial, untouched, similarity, exported, capture):
     """Check that the trial's Gaussians and cameras lie where the given model lies."""
     own, before = (
         PlyData.read(str(one / "point_cloud.ply"))["vertex"].data for one in (trial, untouched)
@@ -141,24 +129,24 @@ def require_given_coordinates(
     # Trainings differ as two seeds do, so their clouds have the same middle and spread, within a
     # tenth of a unit.
     for share in (0.1, 0.5, 0.9):
-        np.testing.assert_allclose(
+        assert_allclose(
             np.quantile(restored, share, axis=0),
             np.quantile(positions_before, share, axis=0),
             atol=0.5,
         )
     sizes, sizes_before = (np.median(table["scale_0"]) for table in (own, before))
     assert sizes - math.log(similarity.scale) == pytest.approx(sizes_before, abs=0.5)
-    assert run(["export", "init", str(trial), "--out", str(exported)]) == 0
+    assert run(split(f"export init {trial} --out {exported}")) == 0
     given_model, exported_model = (
         pycolmap.Reconstruction(folder / "sparse/0") for folder in (capture, exported)
     )
     resolution = 1e-8 * similarity.scale + 1e-15 * np.abs(similarity.translation).max()
     for image in given_model.images.values():
         center = exported_model.find_image_with_name(image.name).projection_center()
-        np.testing.assert_allclose(center, image.projection_center(), atol=100 * resolution)
+        assert_allclose(center, image.projection_center(), atol=100 * resolution)
 
 
-def rename(folder: Path, model: pycolmap.Reconstruction) -> None:
+def rename(folder, model):
     """Give each image another name of the same order, in a folder of its own."""
     (folder / "images/a").mkdir()
     for image in model.images.values():
@@ -167,7 +155,7 @@ def rename(folder: Path, model: pycolmap.Reconstruction) -> None:
         image.name = new
 
 
-def convert(suffix: str, folder: Path, model: pycolmap.Reconstruction) -> None:
+def convert(suffix, folder, model):
     """Write each photograph in another lossless format; the model keeps its names."""
     for file in sorted((folder / "images").iterdir()):
         Image.open(file).save(
@@ -176,14 +164,14 @@ def convert(suffix: str, folder: Path, model: pycolmap.Reconstruction) -> None:
         file.unlink()
 
 
-def as_opencv(folder: Path, model: pycolmap.Reconstruction) -> None:
+def as_opencv(folder, model):
     """Write PINHOLE cameras as OPENCV with zero distortion, as many exporters do."""
     for camera in model.cameras.values():
         params = [*camera.params, 0.0, 0.0, 0.0, 0.0]
         camera.model, camera.params = pycolmap.CameraModelId.OPENCV, params
 
 
-def as_distorted(name: str, zeros: int, folder: Path, model: pycolmap.Reconstruction) -> None:
+def as_distorted(name, zeros, folder, model):
     """Write cameras with one focal length under a model with zero coefficients."""
     for camera in model.cameras.values():
         fx, _, cx, cy = camera.params
@@ -193,14 +181,14 @@ def as_distorted(name: str, zeros: int, folder: Path, model: pycolmap.Reconstruc
         )
 
 
-def other_place(folder: Path, model: pycolmap.Reconstruction) -> None:
+def other_place(folder, model):
     """Put files into the folder that are no part of the capture."""
     (folder / "notes.txt").write_text("not a photograph")
     (folder / "images/.DS_Store").write_text("")
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    "change, text",
     [
         pytest.param(other_place, True, id="a text model"),
         pytest.param(rename, False, id="other names"),
@@ -241,5 +229,5 @@ def test_transforms_json_gives_the_result_of_the_colmap_model(good, original, tm
         "cy": cy,
         "ply_file_path": "points.ply",
     }
-    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
+    write(folder / "transforms.json", shared | {"frames": frames})
     require_same_up_to_a_seed(train(tmp_path / "runs", folder, "scene=transforms"), original)

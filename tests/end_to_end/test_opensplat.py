@@ -1,14 +1,14 @@
 """OpenSplat as an arm, where it is installed: its model lies at the right place, and it grows."""
 
-import json
 import shutil
-from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from gsbench.cli import run
+from tests.helpers import read_json
 
 PROGRAM = "opensplat"
 VERSION = "1.2.0"
@@ -25,39 +25,27 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def trial(tmp_path_factory) -> Path:
+def trial(tmp_path_factory):
     """The folder of a short trial of OpenSplat on a small courtyard, with a schedule of growth."""
     runs = tmp_path_factory.mktemp("runs")
-    scene = [
-        "scene.views=16",
-        "scene.width=128",
-        "scene.height=96",
-        "init=random",
-        "init.count=3000",
-    ]
-    growth = [
-        "densify_from=50",
-        "densify_until=200",
-        "refine_every=50",
-        "loss_threshold=0.02",
-        "sh_degree_interval=50",
-    ]
+    scene = split("scene.views=16 scene.width=128 scene.height=96 init=random init.count=3000")
+    growth = split(
+        "densify_from=50 densify_until=200 refine_every=50 loss_threshold=0.02 "
+        "sh_degree_interval=50"
+    )
     words = [
         f"densify=external/{PROGRAM}",
         f"densify.version={VERSION}",
         *(f"densify.options.{one}" for one in growth),
     ]
-    words += [
-        f"allow_targets=[{PROGRAM}]",
-        f"train.iterations={ITERATIONS}",
-        "tracking=none",
-        "eval.lpips=[]",
-    ]
+    words += split(
+        f"allow_targets=[{PROGRAM}] train.iterations={ITERATIONS} tracking=none eval.lpips=[]"
+    )
     assert run([*scene, *words, f"runs={runs}"]) == 0
     return next(runs.glob("default/courtyard/*/*-seed0"))
 
 
-def error(picture: np.ndarray, truth: np.ndarray) -> float:
+def error(picture, truth):
     return float(np.square(picture.astype(float) - truth).mean())
 
 
@@ -74,7 +62,7 @@ def test_renders_of_opensplat_are_neither_mirrored_nor_shifted(trial):
 
 
 def test_opensplat_grows_on_the_given_schedule(trial):
-    results = json.loads((trial / "results.json").read_text())
+    results = read_json(trial / "results.json")
     assert results["num_gaussians"] > results["num_init_points"]
     assert VERSION in results["trained_by"]["said"]
     rounds = [

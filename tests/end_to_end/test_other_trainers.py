@@ -1,7 +1,6 @@
 """Another program as an arm: its inputs, the trials made of its results, and its failures."""
 
 import hashlib
-import json
 import os
 import re
 import signal
@@ -9,9 +8,8 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from shlex import split
 
 import numpy as np
 import pytest
@@ -23,7 +21,8 @@ from gsbench.datasets.catalog import read_catalog
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.view.trials import find_trial, load_viewed
 from tests.datasets.server import serve
-from tests.processes import heed_interrupts, is_running
+from tests.helpers import read_json, write
+from tests.processes import completed, heed_interrupts, is_running
 
 pytestmark = pytest.mark.slow
 
@@ -47,30 +46,26 @@ command: ["{{python}}", {TRAINER}, --data, "{{data}}", --output, "{{output}}", -
 result: renders/*.png
 """
 QUICK = [
-    "init=random",
-    "init.count=2000",
-    "train.iterations=40",
-    "train.densify_start=500",
-    "tracking=none",
-    "eval.lpips=[squeeze]",
-    "eval.download=false",
+    *split(
+        "init=random init.count=2000 train.iterations=40 train.densify_start=500 tracking=none "
+        "eval.lpips=[squeeze] eval.download=false"
+    ),
     f"allow_targets=['{sys.executable}',PAINTER]",
 ]
 COURTYARD = ["scene.views=12", "scene.width=96", "scene.height=72", *QUICK]
 
 
 @pytest.fixture(scope="module")
-def trainers(tmp_path_factory) -> Path:
+def trainers(tmp_path_factory):
     """A folder of configurations with the two trainers: a user's own YAML files."""
     folder = tmp_path_factory.mktemp("conf")
-    (folder / "densify").mkdir()
-    (folder / "densify" / "cloud.yaml").write_text(CLOUD)
+    write(folder / "densify" / "cloud.yaml", CLOUD)
     (folder / "densify" / "painter.yaml").write_text(PAINTER)
     return folder
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory, environment, trainers) -> Path:
+def home(tmp_path_factory, environment, trainers):
     """A folder with a fetched scene, and a sweep of an arm of gsbench and two of other programs."""
     home = tmp_path_factory.mktemp("home")
     courtyard = home / "courtyard"
@@ -84,40 +79,29 @@ def home(tmp_path_factory, environment, trainers) -> Path:
             content.write(file, f"{archive.scenes['garden']}/{name}")
     with serve(archives) as server:
         program(environment, home, "fetch", "mipnerf360", "garden", "--mirror", server.url)
-    sweep = [
-        "densify=adc,cloud,painter",
-        "seed=0,1",
-        "name=three",
-        "scene=garden",
-        "eval.maps=true",
-    ]
+    sweep = split("densify=adc,cloud,painter seed=0,1 name=three scene=garden eval.maps=true")
     program(environment, home, "--config-dir", str(trainers), "-m", *QUICK, *sweep)
     return home
 
 
-def program(environment: dict[str, str], home: Path, *words: str) -> str:
-    done = subprocess.run(
+def program(environment, home, *words):
+    done = completed(
         [sys.executable, "-m", "gsbench.cli", *words],
         cwd=home,
-        capture_output=True,
-        text=True,
         env=environment | {"GSBENCH_RUNS": str(home / "runs")},
-        timeout=500,
-        check=False,
     )
-    assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def trial(home: Path, arm: str, seed: int = 0) -> Path:
+def trial(home, arm, seed=0):
     return next((home / "runs").glob(f"three/garden/random-{arm}/*-seed{seed}"))
 
 
-def results(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "results.json").read_text())
+def results(folder):
+    return read_json(folder / "results.json")
 
 
-def pixels(path: Path) -> str:
+def pixels(path):
     return hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
 
 
@@ -130,7 +114,7 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         for file in (trial(home, "adc", seed) / "renders").glob("*.png"):
             truth = Image.open(trial(home, "adc") / "ground_truth" / file.name)
             Image.blend(Image.open(file), truth, 0.5).save(folder / file.name)
-        words = ["--truth", "three:garden:adc", "--as", "three:folder", "--seed", str(seed)]
+        words = split(f"--truth three:garden:adc --as three:folder --seed {seed}")
         assert run(["evaluate", str(folder), *words]) == 0
     capsys.readouterr()
     assert run(["tables", "three"]) == 0
@@ -272,7 +256,7 @@ BAD_RENDERS = {
 }
 
 
-@pytest.mark.parametrize(("arm", "expected"), [("cloud", BAD), ("painter", BAD_RENDERS)])
+@pytest.mark.parametrize("arm, expected", [("cloud", BAD), ("painter", BAD_RENDERS)])
 def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
     trainers, tmp_path, monkeypatch, capsys, arm, expected
 ):
@@ -286,8 +270,7 @@ def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
         assert expected[mode] in line, (mode, line)
     assert len(list(tmp_path.glob("bad/*/*/*/results.json"))) == 1
     for failed in tmp_path.glob("bad/*/*/*/failed.json"):
-        log = re.search(r"log: (\S+)$", json.loads(failed.read_text())["message"])
-        assert log is not None
+        log = re.search(r"log: (\S+)$", read_json(failed)["message"])
         assert "observations 0" in Path(log[1]).read_text()
 
 
@@ -316,7 +299,7 @@ def test_a_program_that_hangs_is_ended_with_its_child(trainers, tmp_path, monkey
 
 
 @pytest.fixture
-def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
+def hanging(environment, trainers, tmp_path):
     """gsbench with a trainer that hangs and ignores SIGTERM; ids of the trainer and its child."""
     words = [
         "--config-dir",
@@ -333,7 +316,7 @@ def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[
         text=True,
         preexec_fn=heed_interrupts,
     )
-    pids: list[int] = []
+    pids = []
     deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:
         for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):
@@ -350,8 +333,7 @@ def hanging(environment, trainers, tmp_path) -> Iterator[tuple[subprocess.Popen[
 
 
 @pytest.mark.parametrize(
-    "signum",
-    [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))],
+    "signum", [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))]
 )
 def test_another_program_ends_with_gsbench(hanging, signum):
     process, pids = hanging
@@ -366,7 +348,7 @@ def test_another_program_ends_with_gsbench(hanging, signum):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    "words, said",
     [
         (["allow_targets=[]"], "if you trust it, add allow_targets=["),
         (

@@ -2,25 +2,26 @@
 
 import csv
 import html
-import json
 import os
 import re
 import shlex
 import sqlite3
-import subprocess
 import sys
-from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.raster import create_rasterizer
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
 from tests.conftest import ROOT
 from tests.end_to_end.conftest import FINISHED, SMALL
+from tests.helpers import read_json, write
+from tests.processes import completed
 
 TINY = [*SMALL, "train.iterations=20", "tracking=none", "eval.lpips=[]", "eval.flip=false"]
 MORTAL = """
@@ -38,11 +39,11 @@ class Mortal(ADC):
 """
 
 
-def trials_of(runs: Path, name: str = FINISHED) -> dict[str, Path]:
+def trials_of(runs, name=FINISHED):
     """The folders of finished trials by densifier and seed, such as ``adc-0``."""
     found = {}
     for path in sorted(runs.glob(f"{name}/*/*/*/results.json")):
-        results = json.loads(path.read_text())
+        results = read_json(path)
         found[f"{results['densify']}-{results['seed']}"] = path.parent
     return found
 
@@ -50,7 +51,7 @@ def trials_of(runs: Path, name: str = FINISHED) -> dict[str, Path]:
 def test_a_sweep_leaves_complete_trials(finished_runs):
     trials = trials_of(finished_runs)
     assert list(trials) == ["adc-0", "adc-1", "volumetric-0", "volumetric-1"]
-    records = [json.loads((trial / "results.json").read_text()) for trial in trials.values()]
+    records = [read_json(trial / "results.json") for trial in trials.values()]
     for record in records:
         assert record["status"] == "complete"
         assert record["protocol"] == "paper-1"
@@ -88,7 +89,7 @@ def test_the_viewer_draws_a_test_view_as_the_evaluation_did(finished_runs):
         for view in viewed.views:
             drawn = TrialPainter(viewed, create_rasterizer("cpu", cpu)).draw(view.camera, Layers())
             for folder, picture in (("renders", drawn), ("ground_truth", view.image)):
-                np.testing.assert_array_equal(Image.open(trial / folder / view.name), picture)
+                assert_array_equal(Image.open(trial / folder / view.name), picture)
 
 
 def test_the_same_command_again_computes_nothing(gsbench, runs):
@@ -101,17 +102,14 @@ def test_the_same_command_again_computes_nothing(gsbench, runs):
         "seed=0,1",
         "tracking=none",
     ]
-    done = gsbench(*sweep, GSBENCH_RUNS=str(runs))
-    assert done.returncode == 0, done.stderr
+    gsbench(*sweep, GSBENCH_RUNS=str(runs))
     assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
 
 
 def test_tables_and_report(gsbench, runs):
     table = gsbench("tables", FINISHED, GSBENCH_RUNS=str(runs))
-    assert table.returncode == 0, table.stderr
     assert re.search(r"\| courtyard \| random \| volumetric \|.* ± ", table.stdout)
-    report = gsbench("report", FINISHED, GSBENCH_RUNS=str(runs))
-    assert report.returncode == 0, report.stderr
+    gsbench("report", FINISHED, GSBENCH_RUNS=str(runs))
     page = (runs / FINISHED / "report.html").read_text()
     assert page.count("<svg") >= 1
     assert "data:image/" in page
@@ -119,18 +117,13 @@ def test_tables_and_report(gsbench, runs):
 
 def test_a_killed_trial_continues_to_the_same_bits(gsbench, runs, tmp_path):
     (tmp_path / "mortal.py").write_text(MORTAL)
-    own = [
-        "densify=adc",
-        "densify._target_=mortal.Mortal",
-        "densify.name=mortal",
-        "allow_targets=[mortal]",
-    ]
+    own = split(
+        "densify=adc densify._target_=mortal.Mortal densify.name=mortal allow_targets=[mortal]"
+    )
     command = [*SMALL, "name=killed", "tracking=none", *own]
-    killed = gsbench(*command, GSBENCH_RUNS=str(runs))
-    assert killed.returncode == -9
+    gsbench(*command, code=-9, GSBENCH_RUNS=str(runs))
     assert not trials_of(runs, "killed")
     resumed = gsbench(*command, GSBENCH_RUNS=str(runs))
-    assert resumed.returncode == 0, resumed.stderr
     assert "iteration 120" in resumed.stderr  # the checkpoint from which it continues
     (trial,) = trials_of(runs, "killed").values()
     whole = trials_of(runs)["adc-0"]
@@ -143,13 +136,8 @@ def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
         r"```python\n(# mine\.py\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL
     )
     (tmp_path / "mine.py").write_text(code)
-    own = [
-        "densify=adc",
-        "densify._target_=mine.Solid",
-        "densify.name=solid",
-        "allow_targets=[mine]",
-    ]
-    done = gsbench(
+    own = split("densify=adc densify._target_=mine.Solid densify.name=solid allow_targets=[mine]")
+    gsbench(
         *SMALL,
         "name=own",
         "tracking=none",
@@ -157,9 +145,8 @@ def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
         "+densify.min_opacity=0.3",
         GSBENCH_RUNS=str(runs),
     )
-    assert done.returncode == 0, done.stderr
     counts = [
-        json.loads((trial / "results.json").read_text())["num_gaussians"]
+        read_json(trial / "results.json")["num_gaussians"]
         for trial in (trials_of(runs, "own")["solid-0"], trials_of(runs)["adc-0"])
     ]
     assert counts[0] < counts[1]
@@ -171,8 +158,7 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
     (code,) = re.findall(r"```python\n(# mine\.py\n.*?)```", text, re.DOTALL)
     (experiment,) = re.findall(r"```yaml\n(# @package.*?)```", text, re.DOTALL)
     (tmp_path / "mine.py").write_text(code)
-    (tmp_path / "my" / "experiment").mkdir(parents=True)
-    (tmp_path / "my" / "experiment" / "opacity.yaml").write_text(experiment)
+    write(tmp_path / "my" / "experiment" / "opacity.yaml", experiment)
     commands = re.findall(
         r"^    gsbench (--config-dir my .*?) +#.*$|^    gsbench (report opacity)$", text, re.M
     )
@@ -182,11 +168,10 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
         *("train.steps_scaler=0.1", "densify.max_gaussians=1500", "eval.lpips=[]", "tracking=none"),
     ]
     done = gsbench(*first, *tiny, GSBENCH_RUNS=str(tmp_path / "runs"))
-    assert done.returncode == 0, done.stderr
     (verdict,) = [line for line in done.stderr.splitlines() if " against " in line]
     assert verdict.startswith("random-solid against random-adc: ")
     assert verdict.endswith("The metric was declared beforehand.")
-    assert gsbench(*second, GSBENCH_RUNS=str(tmp_path / "runs")).returncode == 0
+    gsbench(*second, GSBENCH_RUNS=str(tmp_path / "runs"))
     page = (tmp_path / "runs" / "opacity" / "report.html").read_text()
     assert verdict in html.unescape(page)
 
@@ -212,24 +197,11 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
         "seeds": 2,
     }
     (tmp_path / "claims.yaml").write_text(yaml.safe_dump(content))
-    checked = gsbench("check", "claims.yaml", GSBENCH_RUNS=str(runs))
-    assert checked.returncode == 0, checked.stderr
+    checked = gsbench("check claims.yaml", GSBENCH_RUNS=str(runs))
     assert " points: " in checked.stdout
     page = (runs / "check_it" / "claims.html").read_text()
-    exported = gsbench(
-        "export", "--results", "check_it", "--out", "published.zip", GSBENCH_RUNS=str(runs)
-    )
-    assert exported.returncode == 0, exported.stderr
-    again = gsbench(
-        "check",
-        "claims.yaml",
-        "--from",
-        "published.zip",
-        "--out",
-        "again.html",
-        GSBENCH_RUNS="elsewhere",
-    )
-    assert again.returncode == 0, again.stderr
+    gsbench("export --results check_it --out published.zip", GSBENCH_RUNS=str(runs))
+    gsbench("check claims.yaml --from published.zip --out again.html", GSBENCH_RUNS="elsewhere")
     headlines = [
         re.findall(r"<h2>.*?</h2>|<p>PSNR .*?</p>", text)
         for text in (page, (tmp_path / "again.html").read_text())
@@ -239,7 +211,7 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("word", "hint"),
+    "word, hint",
     [
         ("densify=volumetrik", "volumetric"),
         ("densify.grad_threshold=1", "gradient_threshold"),
@@ -247,8 +219,7 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
     ],
 )
 def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word, hint):
-    done = gsbench(word, GSBENCH_RUNS=str(tmp_path / "runs"))
-    assert done.returncode == 2
+    done = gsbench(word, code=2, GSBENCH_RUNS=str(tmp_path / "runs"))
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith("gsbench:")
     assert word.split("=")[-1] in line or word.split("=")[0] in line
@@ -257,11 +228,9 @@ def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word,
 
 
 def test_a_mirror_in_mlflow(gsbench, runs):
-    done = gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
-    assert done.returncode == 0, done.stderr
+    gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
     wanted = [
-        json.loads((trial / "results.json").read_text())["metrics"]["psnr"]
-        for trial in trials_of(runs).values()
+        read_json(trial / "results.json")["metrics"]["psnr"] for trial in trials_of(runs).values()
     ]
     with sqlite3.connect(runs / "mlflow.db") as database:  # without MLflow's own code
         sent = [
@@ -283,19 +252,15 @@ def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
         (bin_folder / name).write_text('#!/bin/sh\ncp "$1" "$KEPT"\necho Submitted batch job 7\n')
         (bin_folder / name).chmod(0o755)
     kept, path = tmp_path / "kept.sh", f"{bin_folder}{os.pathsep}{os.environ['PATH']}"
-    cluster = [
-        "launch=slurm",
-        "launch.wait=false",
-        "launch.gpus_per_trial=0",
-        "launch.cpus_per_trial=1",
-    ]
+    cluster = split(
+        "launch=slurm launch.wait=false launch.gpus_per_trial=0 launch.cpus_per_trial=1"
+    )
     done = gsbench(
         *("-m", *TINY, "name=x", "seed=0,1", "densify=none", *cluster),
         PATH=path,
         KEPT=str(kept),
         GSBENCH_RUNS=str(runs),
     )
-    assert done.returncode == 0, done.stderr
     assert "Slurm job 7: 2 trials" in done.stdout
     script = kept.read_text()
     assert "#SBATCH --array=0-1" in script
@@ -309,23 +274,13 @@ def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
     }
     task |= {"SLURM_JOB_NUM_NODES": "1", "SLURM_NTASKS": "1"}
     task |= {f"SLURM_{name}": "0" for name in ("PROCID", "LOCALID", "NODEID")}
-    ran = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env=os.environ | task,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert ran.returncode == 0, ran.stderr
+    completed(command, cwd=tmp_path, env=os.environ | task)
     assert list(trials_of(runs, "x")) == ["none-1"]
 
 
 @pytest.mark.slow
 def test_hydra_multirun_with_another_launcher(gsbench, runs):
     words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
-    done = gsbench(*words, GSBENCH_RUNS=str(runs))
-    assert done.returncode == 0, done.stderr
+    gsbench(*words, GSBENCH_RUNS=str(runs))
     assert list(trials_of(runs, "x")) == ["none-0", "none-1"]
-    assert "2 trials: 2 done" in gsbench("status", "x", GSBENCH_RUNS=str(runs)).stdout
+    assert "2 trials: 2 done" in gsbench("status x", GSBENCH_RUNS=str(runs)).stdout

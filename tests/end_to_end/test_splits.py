@@ -2,14 +2,13 @@
 
 import csv
 import hashlib
-import json
 import shutil
 from functools import partial
-from pathlib import Path
-from typing import Any
+from shlex import split
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.init import Sfm
@@ -17,26 +16,20 @@ from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    "scene=colmap",
-    "densify=adc",
-    "train.iterations=120",
-    "train.densify_start=20",
-    "train.densify_interval=20",
-    "train.densify_stop=100",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "device=cpu",
-]
+QUICK = split(
+    "scene=colmap densify=adc train.iterations=120 train.densify_start=20 "
+    "train.densify_interval=20 train.densify_stop=100 eval.lpips=[] eval.flip=false "
+    "tracking=none device=cpu"
+)
 TRAINED = ("point_cloud.ply", "events.jsonl", "lineage.npz")
 
 
 @pytest.fixture(scope="module")
-def captures(tmp_path_factory) -> tuple[Path, Path]:
+def captures(tmp_path_factory):
     """A COLMAP folder with points from all views; a copy with noise as every eighth photograph."""
     folder = tmp_path_factory.mktemp("captures")
     clean, noisy = folder / "clean", folder / "noisy"
@@ -58,55 +51,43 @@ def captures(tmp_path_factory) -> tuple[Path, Path]:
 trial = partial(trial_of, QUICK)
 
 
-def bits(folder: Path) -> dict[str, str]:
+def bits(folder):
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in TRAINED}
 
 
 @pytest.mark.parametrize(
-    ("init", "choice"),
-    [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")],
+    "init, choice", [("sfm", "train"), ("dataset", "train"), ("sift_kornia", "train")]
 )
 def test_test_photographs_do_not_change_one_bit_of_a_training(captures, tmp_path, init, choice):
     """Poses are given here. Renders are equal, too, and only their photographs differ."""
     words = [f"init={init}", f"init.points_from={choice}"]
     words += (
-        ["init.first_octave=0", "init.max_num_features=1500", "init.two_view_tracks=true"]
+        split("init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true")
         if init == "sfm"
         else []
     )
     folders = [trial(tmp_path, capture, *words) for capture in captures]
     assert bits(folders[0]) == bits(folders[1])
-    clean, noisy = (json.loads((folder / "results.json").read_text()) for folder in folders)
+    clean, noisy = (read_json(folder / "results.json") for folder in folders)
     assert clean["hashes"]["data"] != noisy["hashes"]["data"]
     assert clean["metrics"]["psnr"] > noisy["metrics"]["psnr"] + 3
     for render in (folders[0] / "renders").iterdir():
-        np.testing.assert_array_equal(
-            Image.open(render), Image.open(folders[1] / "renders" / render.name)
-        )
+        assert_array_equal(Image.open(render), Image.open(folders[1] / "renders" / render.name))
 
 
 def test_with_points_from_all_photographs_the_noise_changes_the_trial(captures, tmp_path):
     """This shows that the test above can fail."""
-    words = [
-        "init=sfm",
-        "init.first_octave=0",
-        "init.max_num_features=1500",
-        "init.two_view_tracks=true",
-    ]
+    words = split(
+        "init=sfm init.first_octave=0 init.max_num_features=1500 init.two_view_tracks=true"
+    )
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
     assert bits(clean) != bits(noisy)
 
 
 def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_path):
-    words = [
-        "init=dataset",
-        "densify=none",
-        "scene.split=sector",
-        "scene.sectors=4",
-        "scene.sector=3",
-    ]
+    words = split("init=dataset densify=none scene.split=sector scene.sectors=4 scene.sector=3")
     folder = trial(tmp_path, captures[0], *words)
-    results: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    results = read_json(folder / "results.json")
     assert results["split"] == "sector 3 of 4"
     assert "principal axis" in results["held_out"]
     assert (results["train_views"], results["test_views"]) == (9, 3)
@@ -122,9 +103,9 @@ def test_a_sector_is_recorded_with_its_views_and_their_distances(captures, tmp_p
 
 def test_a_search_with_validation_views_never_sees_a_test_view(captures, tmp_path):
     """Noise in place of test photographs changes nothing, not even the fingerprint."""
-    words = ["init=dataset", "densify=none", "scene.validation=true"]
+    words = split("init=dataset densify=none scene.validation=true")
     clean, noisy = (trial(tmp_path, capture, *words) for capture in captures)
-    one, other = (json.loads((folder / "results.json").read_text()) for folder in (clean, noisy))
+    one, other = (read_json(folder / "results.json") for folder in (clean, noisy))
     assert one["split"] == "every_nth, validation"
     assert one["hashes"]["data"] == other["hashes"]["data"]
     assert one["metrics"] == other["metrics"]

@@ -1,15 +1,14 @@
 """A COLMAP scene that other code wrote as transforms.json has the same cameras and training."""
 
 import hashlib
-import json
 import math
 import shutil
-from pathlib import Path
-from typing import Any
+from shlex import split
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.cli import run
@@ -20,28 +19,21 @@ from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap
-from gsbench.scene.types import Scene
+from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 
 # What `ns-process-data` does to COLMAP's coordinates: x and y exchanged, z turned round.
 APPLIED = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
-QUICK = [
-    "init=dataset",
-    "train.iterations=40",
-    "train.densify_start=10",
-    "train.densify_interval=10",
-    "train.densify_stop=30",
-    "eval.download=false",
-    "eval.lpips=[]",
-    "tracking=none",
-    "device=cpu",
-]
+QUICK = split(
+    "init=dataset train.iterations=40 train.densify_start=10 train.densify_interval=10 "
+    "train.densify_stop=30 eval.download=false eval.lpips=[] tracking=none device=cpu"
+)
 
 
-def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
+def as_nerfstudio(model, folder):
     """Write the model's cameras and points to ``folder`` as nerfstudio's documents describe."""
-    frames: list[dict[str, Any]] = []
+    frames = []
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
         focal, cx, cy, *radial = (
@@ -73,13 +65,11 @@ def as_nerfstudio(model: pycolmap.Reconstruction, folder: Path) -> None:
     ]
     (folder / "sparse_pc.ply").write_text(header + "\n".join(lines) + "\n")
     document = {"camera_model": "OPENCV", "frames": frames, "applied_transform": APPLIED.tolist()}
-    (folder / "transforms.json").write_text(
-        json.dumps(document | {"ply_file_path": "sparse_pc.ply"})
-    )
+    write(folder / "transforms.json", document | {"ply_file_path": "sparse_pc.ply"})
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
+def scene(tmp_path_factory):
     """A folder with a COLMAP model with points, and the same as transforms.json."""
     folder = tmp_path_factory.mktemp("transforms") / "yard"
     render_courtyard(folder, views=10, width=192, height=144)
@@ -91,7 +81,7 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
+def trial(runs, kind, folder, *words):
     assert (
         run(
             [
@@ -112,14 +102,14 @@ def trial(runs: Path, kind: str, folder: Path, *words: str) -> Path:
 def test_a_training_from_transforms_json_equals_that_from_colmap(scene, tmp_path):
     colmap = trial(tmp_path, "colmap", scene)
     read = trial(tmp_path, "transforms", scene)
-    first, second = (json.loads((folder / "results.json").read_text()) for folder in (colmap, read))
+    first, second = (read_json(folder / "results.json") for folder in (colmap, read))
     assert first["num_init_points"] == second["num_init_points"] > 100
     assert first["scene_extent"] == pytest.approx(second["scene_extent"], rel=1e-9)
     assert first["metrics"]["psnr"] == pytest.approx(second["metrics"]["psnr"], abs=0.02)
     for view in (colmap / "ground_truth").iterdir():
         stem = f"images__{view.name}"
         same = [np.asarray(Image.open(path)) for path in (view, read / "ground_truth" / stem)]
-        np.testing.assert_array_equal(*same)
+        assert_array_equal(*same)
         pair = [
             np.asarray(Image.open(path)).astype(int)
             for path in (colmap / "renders" / view.name, read / "renders" / stem)
@@ -133,10 +123,10 @@ def test_a_trial_is_trained_again_after_an_edit_of_transforms_json(scene, tmp_pa
     words = ["densify=none", "train.iterations=3"]
     before = trial(tmp_path / "runs", "transforms", folder, *words)
     digest = hashlib.sha256((before / "point_cloud.ply").read_bytes()).hexdigest()
-    document = json.loads((folder / "transforms.json").read_text())
+    document = read_json(folder / "transforms.json")
     for frame in document["frames"]:
         frame["fl_x"] *= 1.02
-    (folder / "transforms.json").write_text(json.dumps(document))
+    write(folder / "transforms.json", document)
     after = trial(tmp_path / "runs", "transforms", folder, *words)
     assert after == before
     assert hashlib.sha256((after / "point_cloud.ply").read_bytes()).hexdigest() != digest
@@ -145,9 +135,9 @@ def test_a_trial_is_trained_again_after_an_edit_of_transforms_json(scene, tmp_pa
 def test_without_points_the_error_names_other_initialisers(scene, tmp_path, capfd):
     folder = tmp_path / "bare"
     shutil.copytree(scene, folder)
-    document = json.loads((folder / "transforms.json").read_text())
+    document = read_json(folder / "transforms.json")
     document.pop("ply_file_path")
-    (folder / "transforms.json").write_text(json.dumps(document))
+    write(folder / "transforms.json", document)
     assert (
         run([*QUICK, "scene=transforms", f"scene.path={folder}", f"runs={tmp_path / 'runs'}"]) != 0
     )
@@ -155,7 +145,7 @@ def test_without_points_the_error_names_other_initialisers(scene, tmp_path, capf
     assert trial(tmp_path / "runs", "transforms", folder, "init=random", "init.count=500")
 
 
-def _scene(capture: Any, cache: Path) -> Scene:
+def _scene(capture, cache):
     return load_scene(capture, capture.model, cache, max_size=300)
 
 
@@ -170,7 +160,6 @@ def test_distorted_photographs_give_the_same_scene(shared, tmp_path):
     as_nerfstudio(model, folder)
     config = SceneConfig(name="church", kind="transforms", path=str(folder), max_images=6)
     captured = CaptureSource(config)
-    assert captured.step is not None
     (tmp_path / "made").mkdir()
     captured.step.build(tmp_path / "made")
     read = _scene(captured.read(tmp_path / "made"), tmp_path / "cache")
@@ -178,8 +167,8 @@ def test_distorted_photographs_give_the_same_scene(shared, tmp_path):
     assert len(read.train) == len(first.train) == 5
     for one, other in zip(first.train, read.train, strict=True):
         assert other.name == f"images/{one.name}"
-        np.testing.assert_allclose(one.camera.rotation, other.camera.rotation, atol=1e-12)
-        np.testing.assert_allclose(one.camera.translation, other.camera.translation, atol=1e-11)
+        assert_allclose(one.camera.rotation, other.camera.rotation, atol=1e-12)
+        assert_allclose(one.camera.translation, other.camera.translation, atol=1e-11)
         for key in ("width", "height", "fx", "fy", "cx", "cy"):
             assert math.isclose(getattr(one.camera, key), getattr(other.camera, key), rel_tol=1e-12)
         assert np.abs(one.image.astype(int) - other.image).max() <= 1

@@ -2,14 +2,12 @@
 
 import importlib.metadata
 import os
-import subprocess
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 
 from tests.end_to_end.test_hydra import TINY
+from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 SECONDS = 900
@@ -17,7 +15,7 @@ BOMB = "with open({mark!r}, 'a') as stream:\n    stream.write(__name__ + '\\n')\
 
 
 @pytest.fixture
-def capture(tmp_path) -> Path:
+def capture(tmp_path):
     """A folder with modules that leave a mark, named like the standard and the installed ones."""
     folder, mark = tmp_path / "capture", tmp_path / "exploded"
     folder.mkdir()
@@ -38,9 +36,7 @@ def capture(tmp_path) -> Path:
     return folder
 
 
-def gsbench(
-    folder: Path, *words: str, start: Sequence[str] = ("../gsbench",)
-) -> subprocess.CompletedProcess[str]:
+def gsbench(folder, *words, start=("../gsbench",)):
     kept = {
         key: value
         for key, value in os.environ.items()
@@ -51,15 +47,7 @@ def gsbench(
         "TORCH_HOME": str(folder.parent / "hub"),
     }
     command = [sys.executable, *start, *words]
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=SECONDS,
-        check=False,
-    )
+    return completed(command, cwd=folder, env=environment, timeout=SECONDS)
 
 
 def test_no_module_of_the_current_folder_is_imported(capture):
@@ -75,8 +63,7 @@ def test_no_module_of_the_current_folder_is_imported(capture):
         ["tables", "one"],
         ["status", "one"],
     ):
-        done = gsbench(capture, *words)
-        assert done.returncode == 0, done.stderr
+        gsbench(capture, *words)
         assert not (capture.parent / "exploded").exists(), (
             words,
             (capture.parent / "exploded").read_text(),
@@ -94,14 +81,11 @@ def test_an_isolated_process_imports_no_module_of_the_current_folder(capture):
 
 def test_python_m_gsbench_imports_no_module_of_the_current_folder(capture):
     code = "import runpy, sys; print(*sys.modules)"
-    before = subprocess.run(
-        [sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    before = completed([sys.executable, "-P", "-c", code]).stdout
     for name in {name.split(".")[0] for name in before.split()} | {"gsbench"}:
         (capture / f"{name}.py").unlink(missing_ok=True)
     for words in (["--help"], ["--cfg", "job"], ["seed=1", "--dry-run"]):
-        done = gsbench(capture, *words, start=("-m", "gsbench"))
-        assert done.returncode == 0, done.stderr
+        gsbench(capture, *words, start=("-m", "gsbench"))
     assert not (capture.parent / "exploded").exists(), (capture.parent / "exploded").read_text()
 
 

@@ -9,6 +9,7 @@ import inspect
 import itertools
 from collections import Counter
 from pathlib import Path
+from shlex import split
 
 import pytest
 
@@ -27,27 +28,16 @@ MAX_CROSSINGS = 18
 KEY = "densify.volume_threshold"
 TRIAL = [
     *SMALL,
-    "train.iterations=4",
-    "train.densify_start=1",
-    "train.densify_interval=2",
-    "train.densify_stop=4",
-    "scene.views=9",
-    "scene.width=48",
-    "scene.height=36",
-    "init.count=200",
-    "raster=reference",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "eval.maps=false",
-    "tracking=none",
-    "device=cpu",
-    "densify=volumetric",
-    f"{KEY}=1e-9",
+    *split(
+        "train.iterations=4 train.densify_start=1 train.densify_interval=2 train.densify_stop=4 "
+        "scene.views=9 scene.width=48 scene.height=36 init.count=200 raster=reference "
+        "eval.lpips=[] eval.flip=false eval.maps=false tracking=none device=cpu "
+        f"densify=volumetric {KEY}=1e-9"
+    ),
 ]
-Frame = tuple[int, str]  # its identity while it lives, and its file below gsbench/
 
 
-def stack() -> list[Frame]:
+def stack():
     """The present frames of gsbench, the outermost first."""
     frames = [(id(entry.frame), Path(entry.filename)) for entry in reversed(inspect.stack(0))]
     return [
@@ -57,7 +47,7 @@ def stack() -> list[Frame]:
     ]
 
 
-def way(stacks: list[list[Frame]]) -> list[str]:
+def way(stacks):
     """The files on the way from the end of each stack to the end of the next."""
     passed = stacks[0][-1:]
     for here, there in itertools.pairwise(stacks):
@@ -71,7 +61,7 @@ def way(stacks: list[list[Frame]]) -> list[str]:
     return [file for file, _ in itertools.groupby(file for _, file in passed)]
 
 
-def crossings(files: list[str]) -> int:
+def crossings(files):
     """The number of steps between folders on a way from ``conf/`` over these files."""
     folders = ["conf", *(file.partition("/")[0] for file in files)]
     return sum(one != other for one, other in itertools.pairwise(folders))
@@ -87,8 +77,8 @@ def test_a_way_is_counted_by_its_folders():
 
 
 def test_a_setting_is_checked_twice_and_crosses_few_folders_from_yaml_to_use(tmp_path, monkeypatch):
-    stacks: list[list[Frame]] = []
-    calls: Counter[str] = Counter()
+    stacks = []
+    calls = Counter()
 
     def watch(owner, name, counts=lambda *given: True):
         """Count the calls of ``owner.name`` that ``counts`` accepts; keep the first one's stack."""

@@ -5,11 +5,8 @@ training images have there, and writes a 3DGS PLY; or paints the points as seen 
 The option ``--mode`` says how it fails.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
-import json
 import os
 import signal
 import subprocess
@@ -21,6 +18,8 @@ import numpy as np
 import pycolmap
 from PIL import Image
 from scipy.spatial import cKDTree
+
+from tests.helpers import read_json, write
 
 SH_DC = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
 COLUMNS = [
@@ -36,9 +35,7 @@ COLUMNS = [
 ]
 
 
-def project(
-    image: pycolmap.Image, camera: pycolmap.Camera, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def project(image, camera, points):
     """Pixels [P, 2] and depths [P] of world points."""
     matrix = image.cam_from_world().matrix()
     local = points @ matrix[:, :3].T + matrix[:, 3]
@@ -48,7 +45,7 @@ def project(
     return np.stack([fx * local[:, 0] / safe + cx, fy * local[:, 1] / safe + cy], axis=1), depth
 
 
-def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) -> np.ndarray:
+def colors_of(data, model, points):
     """The median colour [P, 3] in [0, 1] of every point over the training images that show it."""
     seen = []
     for image in model.images.values():
@@ -72,7 +69,7 @@ def colors_of(data: Path, model: pycolmap.Reconstruction, points: np.ndarray) ->
     )
 
 
-def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
+def write_model(path, points, colors, mode):
     """Write a 3DGS PLY of harmonics of degree 0, without gsbench's code."""
     spacing = cKDTree(points).query(points, k=4)[0][:, 1:].mean(axis=1).clip(1e-4)
     table = np.zeros((len(points), len(COLUMNS)), "<f4")
@@ -83,15 +80,12 @@ def write_model(path: Path, points: np.ndarray, colors: np.ndarray, mode: str) -
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property float {name}" for name in COLUMNS] + ["end_header", ""]
     body = table.tobytes()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(
-        "\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body)
-    )
+    write(path, "\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body))
 
 
-def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, mode: str) -> None:
+def paint(cameras, output, points, colors, mode):
     """Draw the points, far ones first, as squares of 3 px."""
-    for frame in json.loads((cameras / "transforms.json").read_text())["frames"]:
+    for frame in read_json(cameras / "transforms.json")["frames"]:
         # world to OpenCV camera
         pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
         local = points @ pose[:3, :3].T + pose[:3, 3]
@@ -110,7 +104,7 @@ def paint(cameras: Path, output: Path, points: np.ndarray, colors: np.ndarray, m
             return
 
 
-def confess(folder: Path) -> None:
+def confess(folder):
     """Print every visible file below ``folder``, with a hash of the pixels of a picture."""
     for place, _, files in os.walk(folder, followlinks=True):
         for name in files:
@@ -123,7 +117,7 @@ def confess(folder: Path) -> None:
             print("saw", path.relative_to(folder).as_posix(), pixels)
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--version", action="version", version="painter 1.2.3")
     parser.add_argument("--data", type=Path, required=True)

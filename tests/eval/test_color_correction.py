@@ -1,10 +1,9 @@
 """The correction of colours, against numpy's least squares and known maps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.eval.color_correction import color_corrected
 from gsbench.eval.evaluator import Evaluator
@@ -16,12 +15,12 @@ MATRIX = np.array([[0.8, 0.1, 0.0], [0.05, 0.7, 0.1], [-0.1, 0.0, 0.9]])
 OFFSET = np.array([0.02, 0.05, 0.1])
 
 
-def corrected(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+def corrected(image, truth, mask=None):
     counted = None if mask is None else torch.from_numpy(mask)
     return color_corrected(torch.from_numpy(image), torch.from_numpy(truth), counted).numpy()
 
 
-def by_numpy(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def by_numpy(image, truth):
     """The definition with numpy's solver, with a set of pixels for each channel."""
     found, goal = image.reshape(-1, 3), truth.reshape(-1, 3)
     low, high = 0.5 / 255, 1 - 0.5 / 255
@@ -37,42 +36,40 @@ def by_numpy(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return found.reshape(image.shape)
 
 
-def test_an_affine_change_of_colours_is_undone() -> None:
+def test_an_affine_change_of_colours_is_undone():
     changed = TRUTH @ MATRIX.T + OFFSET
-    np.testing.assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
+    assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
 
 
-def test_the_correction_equals_least_squares_of_numpy_with_clipped_pixels() -> None:
+def test_the_correction_equals_least_squares_of_numpy_with_clipped_pixels():
     truth = RANDOM.uniform(0, 1, (24, 30, 3))
     truth[:3] = 1.0
     noisy = np.clip(1.6 * truth @ MATRIX.T + RANDOM.normal(0, 0.05, truth.shape), 0, 1)
     result = corrected(noisy, truth)
-    np.testing.assert_allclose(result, by_numpy(noisy, truth), atol=1e-9)
+    assert_allclose(result, by_numpy(noisy, truth), atol=1e-9)
     assert np.abs(result - truth)[3:].mean() < 0.5 * np.abs(noisy - truth)[3:].mean()
 
 
-def test_pixels_that_a_mask_ignores_do_not_count() -> None:
+def test_pixels_that_a_mask_ignores_do_not_count():
     changed = TRUTH @ MATRIX.T + OFFSET
     mask = np.ones(TRUTH.shape[:2], dtype=bool)
     mask[:8] = False
     changed[:8] = 0.5
-    np.testing.assert_allclose(corrected(changed, TRUTH, mask)[8:], TRUTH[8:], atol=1e-9)
+    assert_allclose(corrected(changed, TRUTH, mask)[8:], TRUTH[8:], atol=1e-9)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_the_correction_of_a_render_of_one_colour_is_finite(value: float) -> None:
+def test_the_correction_of_a_render_of_one_colour_is_finite(value):
     result = corrected(np.full_like(TRUTH, value), TRUTH)
     assert np.isfinite(result).all()
     if value == 0.5:  # the best single colour is the mean
-        np.testing.assert_allclose(
-            result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9
-        )
+        assert_allclose(result, np.broadcast_to(TRUTH.mean(axis=(0, 1)), TRUTH.shape), atol=1e-9)
     else:  # all pixels are clipped, so the map is unknown
-        np.testing.assert_array_equal(result, value)
+        assert_array_equal(result, value)
 
 
 @pytest.mark.parametrize("protocol", [PAPER, STANDARD])
-def test_corrected_metrics_are_those_of_the_corrected_render(protocol) -> None:
+def test_corrected_metrics_are_those_of_the_corrected_render(protocol):
     more = ["psnr_cc", "ssim_cc", "cc_gain"]
     evaluator = Evaluator(protocol, lpips=[], flip=False, more=more)
     darker = (TRUTH * 0.6 * 255 + 0.5).astype(np.uint8)

@@ -1,7 +1,5 @@
 """Metrics over the pixels that count, against other programs and under irrelevant changes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -15,7 +13,7 @@ HEIGHT, WIDTH = 64, 80
 
 
 @pytest.fixture
-def pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pair():
     rng = np.random.default_rng(0)
     truth = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     render = np.clip(truth + rng.integers(-40, 41, truth.shape), 0, 255).astype(np.uint8)
@@ -24,24 +22,22 @@ def pair() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return render, truth, mask
 
 
-def evaluator(protocol=STANDARD, shared=None, **options) -> Evaluator:
+def evaluator(protocol=STANDARD, shared=None, **options):
     weights = None if shared is None else shared / "weights"
     return Evaluator(
         protocol, lpips=["squeeze"] if shared else [], weights=weights, download=False, **options
     )
 
 
-def test_masked_psnr_is_over_the_pixels_that_count(pair) -> None:
+def test_masked_psnr_is_over_the_pixels_that_count(pair):
     render, truth, mask = pair
     found = evaluator().evaluate_view(render, truth, mask)["psnr"]
     squared = ((render.astype(float) - truth) / 255)[mask] ** 2
     assert found == pytest.approx(-10 * np.log10(squared.mean()), abs=1e-6)
 
 
-@pytest.mark.parametrize(("protocol", "inside"), [(STANDARD, True), (PAPER, False)])
-def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(
-    pair, protocol, inside
-) -> None:
+@pytest.mark.parametrize("protocol, inside", [(STANDARD, True), (PAPER, False)])
+def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(pair, protocol, inside):
     render, truth, mask = pair
     shown = np.where(mask[..., None], render, truth) / 255
     border = 0 if inside else 5
@@ -61,7 +57,7 @@ def test_masked_ssim_is_the_mean_of_scikit_images_map_where_pixels_count(
     assert found == pytest.approx(full[counts].mean(), abs=1e-9)
 
 
-def test_pixels_under_the_mask_change_no_metric(pair, shared) -> None:
+def test_pixels_under_the_mask_change_no_metric(pair, shared):
     render, truth, mask = pair
     noisy = np.where(mask[..., None], render, 255 - render)
     more = ["gmsd", "fsim"]
@@ -73,14 +69,14 @@ def test_pixels_under_the_mask_change_no_metric(pair, shared) -> None:
     assert one != evaluator(shared=shared, more=more).evaluate_view(render, truth)
 
 
-def test_a_mask_of_ones_changes_nothing(pair, shared) -> None:
+def test_a_mask_of_ones_changes_nothing(pair, shared):
     render, truth, mask = pair
     plain = evaluator(shared=shared).evaluate_view(render, truth)
     full = evaluator(shared=shared).evaluate_view(render, truth, np.ones_like(mask))
     assert full == pytest.approx(plain, rel=1e-6)
 
 
-def test_masking_perfect_pixels_makes_a_view_worse(pair, shared) -> None:
+def test_masking_perfect_pixels_makes_a_view_worse(pair, shared):
     render, truth, mask = pair
     half_right = np.where(mask[..., None], render, truth)
     plain = evaluator(shared=shared).evaluate_view(half_right, truth)
@@ -91,7 +87,7 @@ def test_masking_perfect_pixels_makes_a_view_worse(pair, shared) -> None:
     assert masked["flip"] > plain["flip"]
 
 
-def test_masked_lpips_is_the_distance_of_the_part_that_counts(shared) -> None:
+def test_masked_lpips_is_the_distance_of_the_part_that_counts(shared):
     """The mask chooses one of two pictures side by side."""
     rng = np.random.default_rng(3)
     network = load_lpips("squeeze", shared / "weights", download=False)
@@ -108,7 +104,7 @@ def test_masked_lpips_is_the_distance_of_the_part_that_counts(shared) -> None:
         assert float(network(first, second, mask)) == pytest.approx(wanted, abs=0.03 * alone)
 
 
-def test_ssim_of_a_view_without_a_counted_window_is_unavailable(pair) -> None:
+def test_ssim_of_a_view_without_a_counted_window_is_unavailable(pair):
     render, truth, mask = pair
     mask = np.zeros_like(mask)
     mask[:3] = True  # no window fits into the image there
@@ -119,7 +115,7 @@ def test_ssim_of_a_view_without_a_counted_window_is_unavailable(pair) -> None:
     assert "ssim" in judge.unavailable
 
 
-def test_a_users_metric_gets_the_mask_if_it_has_measure_masked(pair) -> None:
+def test_a_users_metric_gets_the_mask_if_it_has_measure_masked(pair):
     render, truth, mask = pair
 
     class Plain:

@@ -1,7 +1,5 @@
 """PSNR, SSIM and FLIP against scikit-image, brute force and values calculated by hand."""
 
-from __future__ import annotations
-
 import math
 import re
 
@@ -14,9 +12,7 @@ from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.ssim import ssim
 
 
-def distorted_pair(
-    height: int = 40, width: int = 53, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
+def distorted_pair(height=40, width=53, seed=0):
     """A smooth image and a noisy copy, [H, W, 3] float64 in [0, 1]."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0:height, 0:width]
@@ -25,7 +21,7 @@ def distorted_pair(
     return image, np.clip(image + rng.normal(0, 0.08, image.shape), 0, 1)
 
 
-def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> float:
+def brute_force_ssim(x, y):
     """Zero-padded SSIM of [H, W, 3], pixel by pixel, by its definition in a weighted window."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
@@ -50,13 +46,13 @@ def brute_force_ssim(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.mean(values))
 
 
-def test_psnr_matches_scikit_image() -> None:
+def test_psnr_matches_scikit_image():
     x, y = distorted_pair()
     expected = peak_signal_noise_ratio(x, y, data_range=1.0)
     assert float(psnr(torch.tensor(y), torch.tensor(x))) == pytest.approx(expected, abs=1e-9)
 
 
-def test_psnr_is_one_value_per_image_over_all_channels() -> None:
+def test_psnr_is_one_value_per_image_over_all_channels():
     # Channel errors of 0.1, 0.2 and 0 give mse (0.01 + 0.04) / 3; a mean of per-channel PSNRs would
     # be infinite.
     target = torch.zeros(2, 3, 4, 5, dtype=torch.float64)
@@ -67,13 +63,13 @@ def test_psnr_is_one_value_per_image_over_all_channels() -> None:
     )
 
 
-def test_psnr_of_identical_images_is_infinite() -> None:
+def test_psnr_of_identical_images_is_infinite():
     image = torch.rand(4, 5, 3)
     assert float(psnr(image, image)) == math.inf
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_ssim_valid_matches_scikit_image(seed: int) -> None:
+def test_ssim_valid_matches_scikit_image(seed):
     x, y = distorted_pair(seed=seed)
     expected = structural_similarity(
         x,
@@ -92,7 +88,7 @@ def test_ssim_valid_matches_scikit_image(seed: int) -> None:
     )
 
 
-def test_ssim_zero_padding_matches_brute_force() -> None:
+def test_ssim_zero_padding_matches_brute_force():
     x, y = distorted_pair(14, 17)
     expected = brute_force_ssim(x, y)
     assert float(ssim(torch.tensor(y), torch.tensor(x), "zero")) == pytest.approx(
@@ -102,7 +98,7 @@ def test_ssim_zero_padding_matches_brute_force() -> None:
     assert abs(expected - float(ssim(torch.tensor(y), torch.tensor(x), "valid"))) > 1e-3
 
 
-def test_a_batch_gives_the_values_of_its_images() -> None:
+def test_a_batch_gives_the_values_of_its_images():
     pairs = [distorted_pair(20, 24, seed) for seed in range(3)]
     first, second = (
         torch.tensor(np.stack([pair[k] for pair in pairs])).permute(0, 3, 1, 2) for k in (0, 1)
@@ -112,24 +108,23 @@ def test_a_batch_gives_the_values_of_its_images() -> None:
         assert metric(second, first).tolist() == pytest.approx(single, abs=1e-7)
 
 
-def test_flip_is_zero_for_identical_and_one_for_black_against_white() -> None:
+def test_flip_is_zero_for_identical_and_one_for_black_against_white():
     image = torch.rand(24, 30, 3)
     assert float(flip(image, image)) == 0.0
     black, white = torch.zeros(24, 30, 3), torch.ones(24, 30, 3)
     assert float(flip(white, black)) > 0.95
 
 
-def test_flip_depends_on_the_viewing_distance() -> None:
+def test_flip_depends_on_the_viewing_distance():
     x, y = (torch.tensor(image) for image in distorted_pair())
     # Seen from farther away (more pixels per degree) fine noise is less visible.
     assert float(flip(y, x, ppd=200.0)) < float(flip(y, x, ppd=67.0)) < float(flip(y, x, ppd=20.0))
 
 
 @pytest.mark.parametrize(
-    ("shape", "other"),
-    [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))],
+    "shape, other", [((4, 5, 3), (4, 6, 3)), ((3, 4, 5), (3, 4, 5)), ((2, 1, 4, 5), (2, 1, 4, 5))]
 )
-def test_wrong_shapes_are_refused(shape: tuple[int, ...], other: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_refused(shape, other):
     for metric in (
         psnr,
         ssim,
@@ -142,11 +137,11 @@ def test_wrong_shapes_are_refused(shape: tuple[int, ...], other: tuple[int, ...]
             metric(torch.zeros(shape), torch.zeros(other))
 
 
-def test_integer_images_are_refused() -> None:
+def test_integer_images_are_refused():
     with pytest.raises(ValueError, match="floating point"):
         psnr(torch.zeros(12, 12, 3, dtype=torch.uint8), torch.zeros(12, 12, 3, dtype=torch.uint8))
 
 
-def test_ssim_valid_refuses_images_below_the_window() -> None:
+def test_ssim_valid_refuses_images_below_the_window():
     with pytest.raises(ValueError, match="11 px"):
         ssim(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3), "valid")

@@ -3,10 +3,7 @@
 Files are cut, flipped, doubled, or filled with NaN, infinities, zeros or huge counts.
 """
 
-from __future__ import annotations
-
 import struct
-from random import Random
 
 VALUES = (
     struct.pack("<d", float("nan")),
@@ -38,7 +35,7 @@ WORDS = (
 )
 
 
-def corrupt(data: bytes, rng: Random) -> bytes:
+def corrupt(data, rng):
     """``data`` with one to three injuries, mostly one."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         injury = rng.choice((_cut, _flip, _overwrite, _insert, _remove, _word, _noise))
@@ -46,17 +43,17 @@ def corrupt(data: bytes, rng: Random) -> bytes:
     return data
 
 
-def _place(data: bytes, rng: Random) -> int:
+def _place(data, rng):
     """A position; near the start, where counts and headers are, half of the time."""
     end = min(len(data), 64) if rng.random() < 0.5 else len(data)
     return rng.randrange(end + 1)
 
 
-def _cut(data: bytes, rng: Random) -> bytes:
+def _cut(data, rng):
     return data[: _place(data, rng)]
 
 
-def _flip(data: bytes, rng: Random) -> bytes:
+def _flip(data, rng):
     changed = bytearray(data)
     for _ in range(rng.randint(1, 8)):
         if changed:
@@ -64,29 +61,29 @@ def _flip(data: bytes, rng: Random) -> bytes:
     return bytes(changed)
 
 
-def _overwrite(data: bytes, rng: Random) -> bytes:
+def _overwrite(data, rng):
     at, value = _place(data, rng), rng.choice(VALUES)
     return data[:at] + value + data[at + len(value) :]
 
 
-def _insert(data: bytes, rng: Random) -> bytes:
+def _insert(data, rng):
     at = _place(data, rng)
     return data[:at] + rng.randbytes(rng.randint(1, 16)) + data[at:]
 
 
-def _remove(data: bytes, rng: Random) -> bytes:
+def _remove(data, rng):
     at = _place(data, rng)
     return data[:at] + data[at + rng.randint(1, 16) :]
 
 
-def _word(data: bytes, rng: Random) -> bytes:
+def _word(data, rng):
     """Replace one word of a text file."""
     words = data.split(b" ")
     words[rng.randrange(len(words))] = rng.choice(WORDS)
     return b" ".join(words)
 
 
-def _noise(data: bytes, rng: Random) -> bytes:
+def _noise(data, rng):
     return (
         rng.randbytes(rng.randint(0, 200))
         if rng.random() < 0.2

@@ -8,12 +8,9 @@ It prints how many cases were refused and how many were read. A case with any ot
 its number is in ``FOLDER/current``.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -37,7 +34,7 @@ MEMBERS = {
 }
 
 
-def write_originals(folder: Path) -> None:
+def write_originals(folder):
     """Write a small model in both formats, a PLY file, pictures and archives."""
     import pycolmap
 
@@ -67,7 +64,7 @@ def write_originals(folder: Path) -> None:
                 archive.writestr(member, content)
 
 
-def run_case(originals: Path, work: Path, case: int) -> bool:
+def run_case(originals, work, case):
     """Return whether a damaged file was refused; otherwise it was read as sensible values."""
     rng = Random(case)
     kind = KINDS[case % len(KINDS)]
@@ -99,7 +96,7 @@ def run_case(originals: Path, work: Path, case: int) -> bool:
     return _refused(lambda: _check_model(target))
 
 
-def _check_model(folder: Path) -> None:
+def _check_model(folder):
     model = read_model(folder)
     poses = [image.cam_from_world().matrix() for image in model.images.values() if image.has_pose]
     points = [point.xyz for point in model.points3D.values()]
@@ -110,13 +107,13 @@ def _check_model(folder: Path) -> None:
     )
 
 
-def _check_gaussians(path: Path) -> None:
+def _check_gaussians(path):
     gaussians = read_ply(path)
     assert len(gaussians) > 0
     assert all(np.isfinite(tensor.numpy()).all() for tensor in gaussians.tensors().values())
 
 
-def _check_picture(path: Path) -> None:
+def _check_picture(path):
     width, height = image_size(path)
     assert exif_orientation(path) >= 0
     if width * height < 1 << 24:  # a larger one would take long and show nothing more
@@ -125,7 +122,7 @@ def _check_picture(path: Path) -> None:
         assert picture.dtype == np.uint8
 
 
-def _check_archive(path: Path, work: Path) -> None:
+def _check_archive(path, work):
     with path.open("rb") as file, open_archive(file, str(path)) as archive:
         members = wanted_members(archive, "scene", ("images",), str(path))
         for number, member in enumerate(members.values()):
@@ -137,7 +134,7 @@ def _check_archive(path: Path, work: Path) -> None:
             assert target.stat().st_size == member.file_size
 
 
-def _refused(read: Callable[[], None]) -> bool:
+def _refused(read):
     refusal = None
     try:
         read()
@@ -147,7 +144,7 @@ def _refused(read: Callable[[], None]) -> bool:
     return refusal is not None
 
 
-def main(folder: Path, first: int, count: int) -> None:
+def main(folder, first, count):
     """Run the cases ``first`` to ``first + count - 1``."""
     write_originals(folder)
     work = folder / "work"

@@ -9,8 +9,6 @@ how many cases were noticed and how many were read as sound. A case with any oth
 number is in ``FOLDER/current``.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import logging
@@ -19,10 +17,8 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from gsbench.analysis.cells import to_frame
 from gsbench.analysis.fairness import tuning_lines
@@ -48,6 +44,7 @@ from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
 from tests.finished import record_of
 from tests.fuzz.corrupt import corrupt
+from tests.helpers import read_json, write
 
 SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
@@ -67,7 +64,7 @@ NAMES = (
     "mlflow.json",
     ".lock.holder",
 )
-STRANGE: tuple[str, ...] = (
+STRANGE = (
     "null",
     "{}",
     "[]",
@@ -99,7 +96,7 @@ STRANGE: tuple[str, ...] = (
 )
 
 
-def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str, Any]:
+def values_of(runs, densify, seed, threshold):
     """A configuration as a trial writes it, with the settings that readers use."""
     return {
         "name": EXPERIMENT,
@@ -130,12 +127,11 @@ def values_of(runs: Path, densify: str, seed: int, threshold: float) -> dict[str
     }
 
 
-def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) -> Path:
+def write_trial(runs, densify, seed, threshold=0.03):
     """Write a trial with every file that its readers look for."""
     values = values_of(runs, densify, seed, threshold)
     folder = TrialFolder.of(values).path
-    folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(json.dumps(values))
+    write(folder / "config.yaml", values)
     steps = range(10, 101, 10)
     rows = [
         {"step": k, "psnr": 20 + k / 50, "num_gaussians": 10 * k, "seconds": k / 10, "loss": 1 / k}
@@ -168,38 +164,27 @@ def write_trial(runs: Path, densify: str, seed: int, threshold: float = 0.03) ->
     return folder
 
 
-def write_original(runs: Path) -> dict[str, Path]:
+def write_original(runs):
     """Write a small experiment; return the files that are damaged in turn, by name."""
     home = runs / EXPERIMENT
     done, *_ = [write_trial(runs, name, seed) for name in ("adc", "volumetric") for seed in (0, 1)]
     variant = write_trial(runs, "volumetric", 0, 0.5)
-    content = json.loads((variant / "results.json").read_text())
+    content = read_json(variant / "results.json")
     del content["made_of"]  # so that its settings are read from the YAML
-    (variant / "results.json").write_text(json.dumps(content))
+    write(variant / "results.json", content)
     failed = write_trial(runs, "volumetric", 1, 0.5)
     (failed / "results.json").unlink()
-    (failed / "failed.json").write_text(
-        json.dumps({"error": "E", "message": "m", "time": 1.0, "seed": 1})
+    write(failed / "failed.json", {"error": "E", "message": "m", "time": 1.0, "seed": 1})
+    write(failed / "building.json", {"stage": "train", "folder": str(done)})
+    write(failed / ".submitted.json", {"job": "5", "log": "l", "user": "u"})
+    write(
+        variant / "mlflow.json",
+        {"uri": "u", "token": "t", "started": 1, "logged": {"metrics.jsonl": 5}, "complete": "c"},
     )
-    (failed / "building.json").write_text(json.dumps({"stage": "train", "folder": str(done)}))
-    (failed / ".submitted.json").write_text(json.dumps({"job": "5", "log": "l", "user": "u"}))
-    (variant / "mlflow.json").write_text(
-        json.dumps(
-            {
-                "uri": "u",
-                "token": "t",
-                "started": 1,
-                "logged": {"metrics.jsonl": 5},
-                "complete": "c",
-            }
-        )
-    )
-    (done / ".lock.holder").write_text(
-        json.dumps({"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
-    )
+    write(done / ".lock.holder", {"host": "h", "pid": 1, "since": 1.0, "slurm": None, "what": "w"})
     entry = {"overrides": ["seed=0"], "cwd": str(runs), "time": 1.0}
     places = {path.relative_to(home).as_posix(): entry for path in (done, failed)}
-    (home / "plan.json").write_text(json.dumps({"version": 1, "trials": places}))
+    write(home / "plan.json", {"version": 1, "trials": places})
     declared = [
         {"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-11-21T20:05:00Z"},
         {
@@ -221,7 +206,7 @@ def write_original(runs: Path) -> dict[str, Path]:
         "log": [],
         "points": [{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}],
     }
-    (home / "tuning.json").write_text(json.dumps(tuning))
+    write(home / "tuning.json", tuning)
     places_of = {name: done / name for name in NAMES}
     places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "tuning.json")}
     places_of |= {
@@ -232,7 +217,7 @@ def write_original(runs: Path) -> dict[str, Path]:
     return places_of
 
 
-def damage(path: Path, sound: bytes, rng: Random) -> str:
+def damage(path, sound, rng):
     """Damage the file; return the kind of damage in one word."""
     kind = rng.choice(("shape",) * 6 + ("bytes",) * 3 + ("place",))
     if kind == "bytes":
@@ -256,7 +241,7 @@ def damage(path: Path, sound: bytes, rng: Random) -> str:
     return kind
 
 
-def _misshapen(sound: bytes, rng: Random) -> bytes:
+def _misshapen(sound, rng):
     """The JSON with one or two values, keys or whole lines replaced by strange ones."""
     lines = sound.decode().splitlines() if sound.count(b"\n{") else [sound.decode()]
     at = rng.randrange(len(lines))
@@ -264,7 +249,7 @@ def _misshapen(sound: bytes, rng: Random) -> bytes:
         tree = json.loads(lines[at])
     except ValueError:  # per_view.csv is not JSON
         return rng.choice(STRANGE).encode().join(sound.split(b",", rng.randint(1, 3)))
-    marks: dict[str, str] = {}
+    marks = {}
     for _ in range(rng.choice((1, 1, 2))):
         tree = _replaced(tree, rng, marks)
     text = json.dumps(tree)
@@ -274,7 +259,7 @@ def _misshapen(sound: bytes, rng: Random) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
+def _replaced(tree, rng, marks):
     if isinstance(tree, dict) and tree and rng.random() < 0.85:
         key = rng.choice(list(tree))
         how = rng.random()
@@ -291,7 +276,7 @@ def _replaced(tree: Any, rng: Random, marks: dict[str, str]) -> Any:
     return mark
 
 
-def look(runs: Path, places: dict[str, Path]) -> int:
+def look(runs, places):
     """Read everything as the verbs do; return how much was refused or left out.
 
     Raises any error that is not an InputError.
@@ -299,7 +284,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     home = runs / EXPERIMENT
     refused = 0
 
-    def attempt(read: Callable[[], object]) -> None:
+    def attempt(read):
         nonlocal refused
         try:
             read()
@@ -308,7 +293,7 @@ def look(runs: Path, places: dict[str, Path]) -> int:
                 raise RuntimeError("more than a line") from error
             refused += 1
 
-    def tables() -> None:
+    def tables():
         experiment = load_experiment(runs, EXPERIMENT)
         assert all(len(line.splitlines()) == 1 for line in experiment.warnings)
         nonlocal refused
@@ -320,9 +305,9 @@ def look(runs: Path, places: dict[str, Path]) -> int:
         attempt(lambda: event_charts(experiment.trials, arms))
         attempt(lambda: volume_charts(experiment.trials, arms))
         for first, second in itertools.pairwise(arms):
-            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))  # type: ignore[misc]
+            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))
         for trial in experiment.trials:
-            attempt(lambda trial=trial: read_views(trial))  # type: ignore[misc]
+            attempt(lambda trial=trial: read_views(trial))
 
     attempt(tables)
     attempt(lambda: explain_cell(f"{EXPERIMENT}:courtyard:psnr:adc", runs))
@@ -332,15 +317,15 @@ def look(runs: Path, places: dict[str, Path]) -> int:
     attempt(lambda: read_declarations(home))
     attempt(lambda: search_summary(home))
     for folder in {path.parent for path in places.values()} - {home}:
-        attempt(lambda folder=folder: TrialFolder(folder).configuration())  # type: ignore[misc]
-        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())  # type: ignore[misc]
-        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", MirrorState))  # type: ignore[misc]
-        attempt(lambda folder=folder: _mirror(folder))  # type: ignore[misc]
+        attempt(lambda folder=folder: TrialFolder(folder).configuration())
+        attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())
+        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", MirrorState))
+        attempt(lambda folder=folder: _mirror(folder))
     attempt(lambda: TrialFolder.of(v := values_of(runs, "adc", 0, 0.03)).why_not_done(v))
     return refused
 
 
-def _mirror(folder: Path) -> None:
+def _mirror(folder):
     trial = TrackedTrial(TrialFolder(folder), TrialFolder(folder).configuration())
     assert trial.params()
     assert trial.tags()
@@ -353,16 +338,16 @@ def _mirror(folder: Path) -> None:
 class Noticed(logging.Handler):
     """Counts warnings, each of which must be one line."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(logging.WARNING)
         self.count = 0
 
-    def emit(self, record: logging.LogRecord) -> None:
+    def emit(self, record):
         assert len(record.getMessage().splitlines()) == 1
         self.count += 1
 
 
-def main(folder: Path, first: int, count: int, only: str | None) -> None:
+def main(folder, first, count, only):
     """Run the cases; ``FOLDER/current`` has the number of the present one."""
     runs = folder / "runs"
     shutil.rmtree(runs, ignore_errors=True)
@@ -373,8 +358,8 @@ def main(folder: Path, first: int, count: int, only: str | None) -> None:
     logging.getLogger("gsbench").propagate = False
     assert look(runs, places) == 0
     assert warnings.count == 0
-    found: Counter[str] = Counter()
-    kinds: Counter[str] = Counter()
+    found = Counter()
+    kinds = Counter()
     for case in range(first, first + count):
         rng = Random(case)
         name = only or NAMES[case % len(NAMES)]

@@ -3,37 +3,32 @@
 They never cause a crash, a hang or nonsense.
 """
 
-from __future__ import annotations
-
 import struct
-import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
+from shlex import split
 
 import pytest
 from PIL import Image
 
 from gsbench import cli
+from tests.conftest import ROOT
 from tests.fuzz.models import write_originals
+from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
-CASES = 240  # in CI; `python -m tests.fuzz.models FOLDER 0 10000` tries more
 
-
-def test_damaged_files_are_refused_or_read_with_right_values(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.fuzz.models", str(tmp_path), "0", str(CASES)]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
-    )
+# More are tried by `python -m tests.fuzz.models FOLDER 0 10000`.
+@pytest.mark.parametrize("what, cases", [("models", 240), ("records", 300)])
+def test_damaged_files_are_refused_or_read_with_right_values(what, cases, tmp_path):
+    command = [sys.executable, "-m", f"tests.fuzz.{what}", tmp_path, 0, cases]
+    done = completed(command, code=None, cwd=ROOT)
     case = (tmp_path / "current").read_text()
     assert done.returncode == 0, f"case {case}: {done.stderr[-2000:]}"
-    assert done.stdout.startswith(f"{CASES} cases: ")
+    assert done.stdout.startswith(f"{cases} cases: ")
 
 
-def replaced(data: bytes, at: int, layout: str, *values: float) -> bytes:
+def replaced(data, at, layout, *values):
     return data[:at] + struct.pack(layout, *values) + data[at + struct.calcsize(layout) :]
 
 
@@ -41,7 +36,7 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("file", "harm", "words"),
+    "file, harm, words",
     [
         (
             "images.bin",
@@ -60,14 +55,7 @@ NAN = float("nan")
         ("points3D.bin", lambda data: data + b"\0", "1 bytes too many"),
     ],
 )
-def test_the_program_names_the_damaged_file(
-    file: str,
-    harm: Callable[[bytes], bytes],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_program_names_the_damaged_file(file, harm, words, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     write_originals(tmp_path)
     (tmp_path / "sparse").mkdir()
@@ -75,7 +63,7 @@ def test_the_program_names_the_damaged_file(
     (tmp_path / "images").mkdir()
     Image.new("RGB", (32, 24)).save(tmp_path / "images" / "x.png")
     (model / file).write_bytes(harm((model / file).read_bytes()))
-    words_given = ["scene=colmap", f"scene.path={tmp_path}", "init=dataset", "tracking=none"]
+    words_given = split(f"scene=colmap scene.path={tmp_path} init=dataset tracking=none")
     assert cli.run(words_given) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len([line for line in lines if line.startswith("gsbench:")]) == 1

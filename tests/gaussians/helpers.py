@@ -1,7 +1,5 @@
 """Small random sets of Gaussians and a camera that sees them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 
@@ -9,17 +7,11 @@ from gsbench.gaussians.model import NUM_SH_REST, Gaussians
 from gsbench.scene.types import Camera
 
 
-def random_gaussians(
-    count: int,
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
-    depth: tuple[float, float] = (2.0, 6.0),
-    log_scale: tuple[float, float] = (-3.0, -1.0),
-) -> Gaussians:
+def random_gaussians(count, seed=0, dtype=torch.float64, depth=(2.0, 6.0), log_scale=(-3.0, -1.0)):
     """Gaussians in front of ``front_camera``, of mixed sizes, shapes, opacities and colours."""
     rng = torch.Generator().manual_seed(seed)
 
-    def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
+    def uniform(low, high, *shape):
         return low + (high - low) * torch.rand(*shape, generator=rng, dtype=torch.float64)
 
     z = uniform(*depth, count)
@@ -34,9 +26,7 @@ def random_gaussians(
     ).map(lambda tensor: tensor.to(dtype))
 
 
-def front_camera(
-    width: int = 40, height: int = 30, shift: tuple[float, float] = (0.0, 0.0)
-) -> Camera:
+def front_camera(width=40, height=30, shift=(0.0, 0.0)):
     """A camera near the origin, looking nearly along z; ``shift`` moves the principal point, px."""
     angle = 0.05
     rotation = np.array(
@@ -46,7 +36,7 @@ def front_camera(
     return Camera(width, height, *intrinsics, rotation, np.array([0.1, -0.05, 0.2]))
 
 
-def differences(one: Gaussians, other: Gaussians) -> list[str]:
+def differences(one, other):
     """The names of the parameters whose bits differ between two sets."""
     others = other.tensors()
     return [name for name, value in one.tensors().items() if not torch.equal(value, others[name])]

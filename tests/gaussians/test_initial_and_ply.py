@@ -1,45 +1,43 @@
 """Gaussians made from point clouds, and PLY files."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import math
 import re
 import zipfile
-from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from numpy.lib.recfunctions import append_fields
+from numpy.lib.recfunctions import append_fields, drop_fields
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData, PlyElement
+from torch.testing import assert_close
 
-from gsbench.errors import InputError
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from gsbench.init.point_files import read_points
 from gsbench.normalization import Normalization
 from tests.gaussians.helpers import differences, random_gaussians
+from tests.helpers import refusal
 
 
-def table_of(path: Path, count: int = 4) -> np.ndarray:
+def table_of(path, count=4):
     write_ply(random_gaussians(count), path)
     return PlyData.read(str(path))["vertex"].data.copy()
 
 
-def with_type(table: np.ndarray, column: str, kind: str) -> np.ndarray:
+def with_type(table, column, kind):
     return table.astype([(name, kind if name == column else "f4") for name in table.dtype.names])
 
 
-def save(table: np.ndarray, path: Path) -> Path:
+def save(table, path):
     PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
     return path
 
 
-def test_initial_scales_are_the_root_mean_square_distance_to_three_neighbours() -> None:
+def test_initial_scales_are_the_root_mean_square_distance_to_three_neighbours():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]])
     colors = np.array([[255, 0, 127]] * 5, dtype=np.uint8)
     gaussians = gaussians_from_cloud(points, colors)
@@ -50,36 +48,36 @@ def test_initial_scales_are_the_root_mean_square_distance_to_three_neighbours() 
     assert shown.tolist() == pytest.approx([1.0, 0.0, 127 / 255], abs=1e-6)
 
 
-def test_scales_of_coincident_points_have_a_lower_limit() -> None:
+def test_scales_of_coincident_points_have_a_lower_limit():
     gaussians = gaussians_from_cloud(np.zeros((6, 3)), np.zeros((6, 3), dtype=np.uint8))
     assert float(gaussians.scales[0, 0]) == pytest.approx(math.sqrt(1e-7), rel=1e-5)
 
 
-def test_too_few_points_and_points_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(InputError, match="3 points"):
+def test_too_few_points_and_points_that_are_not_finite_are_refused():
+    with refusal("3 points"):
         gaussians_from_cloud(np.zeros((3, 3)), np.zeros((3, 3), dtype=np.uint8))
-    with pytest.raises(InputError, match="not finite"):
+    with refusal("not finite"):
         gaussians_from_cloud(np.full((5, 3), np.nan), np.zeros((5, 3), dtype=np.uint8))
 
 
-def test_ply_round_trip_is_exact(tmp_path: Path) -> None:
+def test_ply_round_trip_is_exact(tmp_path):
     gaussians = random_gaussians(20, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "a.ply")
     assert not differences(read_ply(tmp_path / "a.ply"), gaussians)
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_an_element_without_rows_is_accepted(tmp_path: Path, text: bool) -> None:
+def test_an_element_without_rows_is_accepted(tmp_path, text):
     """Programs for meshes write an element for faces even if there are none."""
     table = table_of(tmp_path / "a.ply")
     faces = PlyElement.describe(np.empty(0, dtype=[("a", "i4"), ("b", "i4"), ("c", "i4")]), "face")
     vertex = PlyElement.describe(table, "vertex")
     PlyData([vertex, faces], text=text).write(str(tmp_path / "b.ply"))
     found, wanted = (read_ply(tmp_path / name).tensors() for name in ("b.ply", "a.ply"))
-    torch.testing.assert_close(found, wanted)
+    assert_close(found, wanted)
 
 
-def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
+def test_ply_layout_is_the_standard_one(tmp_path):
     """plyfile finds the names in 3DGS's order, and harmonics stored channel by channel."""
     gaussians = random_gaussians(4, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "a.ply")
@@ -96,16 +94,16 @@ def test_ply_layout_is_the_standard_one(tmp_path: Path) -> None:
     assert vertex["rot_0"][1] == gaussians.quaternions[1, 0].item()  # w first
 
 
-def test_an_error_names_a_ply_that_is_cut_short(tmp_path: Path) -> None:
+def test_an_error_names_a_ply_that_is_cut_short(tmp_path):
     write_ply(random_gaussians(20, dtype=torch.float32), tmp_path / "a.ply")
     whole = (tmp_path / "a.ply").read_bytes()
     for length in (10, 400, len(whole) // 2, len(whole) - 1):
         (tmp_path / "torn.ply").write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"torn\.ply: not a"):
+        with refusal(r"torn\.ply: not a"):
             read_ply(tmp_path / "torn.ply")
 
 
-def rewritten(path: Path, old: bytes, new: bytes) -> Path:
+def rewritten(path, old, new):
     """Replace ``old``, which occurs once in the file, by ``new``; return the path."""
     content = path.read_bytes()
     assert content.count(old) == 1
@@ -113,10 +111,8 @@ def rewritten(path: Path, old: bytes, new: bytes) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("text", "bytes_each"), [(False, 61 * 4 + 8), (True, 62 * 2)])
-def test_a_header_that_promises_more_than_the_file_has_is_refused(
-    tmp_path: Path, text: bool, bytes_each: int
-) -> None:
+@pytest.mark.parametrize("text, bytes_each", [(False, 61 * 4 + 8), (True, 62 * 2)])
+def test_a_header_that_promises_more_than_the_file_has_is_refused(tmp_path, text, bytes_each):
     """The header promises 62 numbers each, one of them a double; in text, at least two bytes."""
     write_ply(random_gaussians(4), tmp_path / "a.ply")
     path = rewritten(tmp_path / "a.ply", b"property float opacity", b"property double opacity")
@@ -125,15 +121,15 @@ def test_a_header_that_promises_more_than_the_file_has_is_refused(
     if text:
         rewritten(path, b"format binary_little_endian", b"format ascii")
     said = f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         check_ply(path)
     check_ply(rewritten(path, b"element vertex 1000000", b"element vertex 2"))
-    with pytest.raises(InputError, match="count of an element is negative"):
+    with refusal("count of an element is negative"):
         check_ply(rewritten(path, b"element vertex 2", b"element vertex -1"))
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    "old, new, said",
     [
         (b" f_rest_0\n", b" f_rest_50\n", r"it has 45, with f_rest_50"),
         (b" f_rest_0\n", b" f_rest_00\n", r"it has 45, with f_rest_00"),
@@ -142,22 +138,20 @@ def test_a_header_that_promises_more_than_the_file_has_is_refused(
         (b"property float f_rest_43\nproperty float f_rest_44\n", b"", "it has 43"),
     ],
 )
-def test_harmonics_with_a_wrong_name_or_number_are_refused(
-    tmp_path: Path, old: bytes, new: bytes, said: str
-) -> None:
+def test_harmonics_with_a_wrong_name_or_number_are_refused(tmp_path, old, new, said):
     write_ply(random_gaussians(4, seed=2), tmp_path / "a.ply")
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_ply(rewritten(tmp_path / "a.ply", old, new))
 
 
-def test_rgb_to_dc_and_dc_to_rgb_are_inverse() -> None:
+def test_rgb_to_dc_and_dc_to_rgb_are_inverse():
     assert dc_to_rgb(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0.5, 0.78209479])
     rgb = torch.tensor([0.0, 0.25, 1.0])
     assert dc_to_rgb(rgb_to_dc(rgb)).tolist() == pytest.approx(rgb.tolist())
 
 
-@pytest.mark.parametrize(("degree", "stored"), [(0, 0), (1, 3), (2, 8), (3, 15)])
-def test_a_ply_of_a_lower_degree_is_read(tmp_path: Path, degree: int, stored: int) -> None:
+@pytest.mark.parametrize("degree, stored", [(0, 0), (1, 3), (2, 8), (3, 15)])
+def test_a_ply_of_a_lower_degree_is_read(tmp_path, degree, stored):
     """Some programs store fewer coefficients, channel by channel; the missing ones become zero."""
     table = table_of(tmp_path / "a.ply")
     gaussians = read_ply(tmp_path / "a.ply")
@@ -182,7 +176,7 @@ SIZES |= dict.fromkeys(["double", "float64"], 8)
 
 
 @pytest.mark.parametrize("kind", SIZES)
-def test_the_promised_size_counts_the_bytes_of_each_type(tmp_path: Path, kind: str) -> None:
+def test_the_promised_size_counts_the_bytes_of_each_type(tmp_path, kind):
     path = tmp_path / "a.ply"
     header = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex 1000\nproperty {kind} "
@@ -190,50 +184,48 @@ def test_the_promised_size_counts_the_bytes_of_each_type(tmp_path: Path, kind: s
     )
     path.write_text(header)
     promised = 1000 * SIZES[kind]
-    with pytest.raises(InputError, match=f"promises {promised} bytes or more"):
+    with refusal(f"promises {promised} bytes or more"):
         check_ply(path)
     path.write_bytes(header.encode() + bytes(promised - len(header)))
     check_ply(path)
 
 
-def test_the_end_of_a_header_is_searched_in_the_first_64_kib(tmp_path: Path) -> None:
+def test_the_end_of_a_header_is_searched_in_the_first_64_kib(tmp_path):
     path = tmp_path / "a.ply"
     for length, fits in ((60_000, True), (66_000, False)):
         comment = f"comment {'x' * length}"
         path.write_text(f"ply\nformat ascii 1.0\n{comment}\nelement vertex 0\nend_header\n")
-        with nullcontext() if fits else pytest.raises(InputError, match="it has no header"):
+        with refusal(None if fits else "it has no header"):
             check_ply(path)
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    "name, value, said",
     [
         ("x", np.nan, "x is not a finite number everywhere"),
         ("f_rest_44", np.inf, "f_rest_44 is not a finite number everywhere"),
         ("rot_", 0.0, r"a Gaussian has a rotation of \(0, 0, 0, 0\)"),
     ],
 )
-def test_an_error_names_the_property_with_an_invalid_value(
-    tmp_path: Path, name: str, value: float, said: str
-) -> None:
+def test_an_error_names_the_property_with_an_invalid_value(tmp_path, name, value, said):
     table = table_of(tmp_path / "a.ply")
     for column in [f"rot_{k}" for k in range(4)] if name == "rot_" else [name]:
         table[column][1] = value
-    with pytest.raises(InputError, match=rf"b\.ply: {said}"):
+    with refusal(rf"b\.ply: {said}"):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
-def test_a_model_without_gaussians_or_without_a_property_is_refused(tmp_path: Path) -> None:
+def test_a_model_without_gaussians_or_without_a_property_is_refused(tmp_path):
     nothing = save(table_of(tmp_path / "a.ply")[:0].copy(), tmp_path / "b.ply")
-    with pytest.raises(InputError, match="missing or odd properties: all, since it is empty"):
+    with refusal("missing or odd properties: all, since it is empty"):
         read_ply(nothing)
-    with pytest.raises(InputError, match=r"missing or odd properties: opacity$"):
+    with refusal(r"missing or odd properties: opacity$"):
         read_ply(rewritten(tmp_path / "a.ply", b" opacity\n", b" opaqueness\n"))
 
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("change", ["utf-8", "latin-1", "mark", "crlf"])
-def test_headers_of_other_programs_are_read(tmp_path: Path, change: str, text: bool) -> None:
+def test_headers_of_other_programs_are_read(tmp_path, change, text):
     table = table_of(tmp_path / "a.ply")
     vertex = PlyElement.describe(table, "vertex")
     PlyData([vertex], text=text, comments=["made by hand"]).write(str(tmp_path / "b.ply"))
@@ -248,14 +240,14 @@ def test_headers_of_other_programs_are_read(tmp_path: Path, change: str, text: b
     (tmp_path / "b.ply").write_bytes(changed)
     wanted = read_ply(tmp_path / "a.ply")
     assert not differences(read_ply(tmp_path / "b.ply"), wanted)
-    np.testing.assert_array_equal(read_points(tmp_path / "b.ply")[0], wanted.means.double())
+    assert_array_equal(read_points(tmp_path / "b.ply")[0], wanted.means.double())
 
 
 COMPRESSED = b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
 COMPRESSED += b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
 
 
-def zipped(*names: str) -> bytes:
+def zipped(*names):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name in names:
@@ -264,7 +256,7 @@ def zipped(*names: str) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    "name, content, said",
     [
         ("a.pth", b"PK\3\4" + bytes(9), "a checkpoint of PyTorch: give the PLY"),
         ("last.ckpt", bytes(9), "a checkpoint of PyTorch: give the PLY"),
@@ -275,14 +267,14 @@ def zipped(*names: str) -> bytes:
         ("a.json", b'{"frames": []}', "JSON: give the PLY of a model"),
     ],
 )
-def test_files_that_are_no_model_are_named(tmp_path: Path, name, content, said: str) -> None:
+def test_files_that_are_no_model_are_named(tmp_path, name, content, said):
     (tmp_path / name).write_bytes(content)
     for read in (read_ply, check_ply):
-        with pytest.raises(InputError, match=re.escape(f"(it is {said}")):
+        with refusal(re.escape(f"(it is {said}")):
             read(tmp_path / name)
 
 
-def test_the_filter_of_mip_splatting_is_applied(tmp_path: Path, caplog) -> None:
+def test_the_filter_of_mip_splatting_is_applied(tmp_path, caplog):
     """Scales .3 and filter .4 give scales .5, and opacity .8 times (.3 / .5)³."""
     table = table_of(tmp_path / "a.ply")
     for axis in range(3):
@@ -295,31 +287,34 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path: Path, caplog) -> None:
     assert read.opacities.tolist() == pytest.approx([0.8 * 0.6**3] * 3 + [0.8])
     assert read.scales[3].tolist() == pytest.approx([0.3] * 3)
     table["filter_3D"][1] = np.nan
-    with pytest.raises(InputError, match="filter_3D is negative or not a finite number"):
+    with refusal("filter_3D is negative or not a finite number"):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
 @pytest.mark.parametrize(
-    ("column", "refused", "said"),
+    "column, refused, said",
     [
         ("beta", True, "the column beta: Beta Splatting's kernels are no Gaussians"),
         ("sb_params_3", True, "Beta Splatting's"),
         ("nu_degree", True, "Student"),
         ("scale_t", True, "its Gaussians move with time"),
+        ("velocity_x", True, "its Gaussians move with time"),
+        ("Beta", True, "Beta Splatting's"),
+        ("f_offset_0", True, "Scaffold-GS computes its Gaussians by networks"),
+        ("f_asg_12", True, "Spec-Gaussian computes its colours by networks"),
+        ("FILTER_3d", False, "Mip-Splatting's filter_3D is applied"),
         ("segment", False, "the column segment is not known and not used"),
         ("scale_3", False, "the column scale_3 is not known and not used"),
         ("red", False, ""),
     ],
 )
-def test_unknown_columns_are_named_or_refused(
-    tmp_path: Path, column: str, refused: bool, said: str, caplog
-) -> None:
+def test_unknown_columns_are_named_or_refused(tmp_path, column, refused, said, caplog):
     table = append_fields(
         table_of(tmp_path / "a.ply"), column, np.zeros(4, np.float32), usemask=False
     )
     save(table, tmp_path / "b.ply")
     if refused:
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             read_ply(tmp_path / "b.ply")
         return
     read_ply(tmp_path / "b.ply")
@@ -327,7 +322,17 @@ def test_unknown_columns_are_named_or_refused(
     assert bool(caplog.text) is bool(said)
 
 
-def test_files_of_gsbench_are_not_suspected(tmp_path: Path, caplog) -> None:
+def test_models_with_two_scales_or_whole_numbers_are_refused_by_name(tmp_path):
+    table = table_of(tmp_path / "a.ply")
+    flat = drop_fields(table, "scale_2", usemask=False)
+    with refusal(r"scale_2: it has flat Gaussians \(2DGS\)"):
+        read_ply(save(flat, tmp_path / "flat.ply"))
+    kinds = [(name, "u1" if name == "opacity" else "f4") for name in table.dtype.names]
+    with refusal("opacity has whole numbers, as in a compressed model"):
+        read_ply(save(table.astype(kinds), tmp_path / "bytes.ply"))
+
+
+def test_files_of_gsbench_are_not_suspected(tmp_path, caplog):
     """Sparse clouds in large units have logarithms above 0, as lengths do."""
     gaussians = random_gaussians(4, dtype=torch.float32)
     gaussians.log_scales[:] = 0.5
@@ -341,7 +346,7 @@ def test_files_of_gsbench_are_not_suspected(tmp_path: Path, caplog) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    "name, content, said",
     [
         ("a.compressed.ply", COMPRESSED, "a compressed PLY, as SuperSplat writes it"),
         ("a.ply", gzip.compress(b"NGSP", mtime=0), "the format SPZ"),
@@ -353,20 +358,16 @@ def test_files_of_gsbench_are_not_suspected(tmp_path: Path, caplog) -> None:
         ("a.KSPLAT", bytes(32), "the format ksplat"),
     ],
 )
-def test_other_formats_are_named_with_the_command_that_unpacks_them(
-    tmp_path: Path, name, content, said: str
-) -> None:
+def test_other_formats_are_named_with_the_command_that_unpacks_them(tmp_path, name, content, said):
     (tmp_path / name).write_bytes(content)
     mend = f"{said}: unpack it with npx @playcanvas/splat-transform {name} out.ply"
     for read in (read_ply, check_ply, *((read_points,) if name.endswith("ply") else ())):
-        with pytest.raises(InputError, match=mend):
+        with refusal(mend):
             read(tmp_path / name)
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_opacities_of_zero_and_one_are_read(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_opacities_of_zero_and_one_are_read(tmp_path, kind, caplog):
     table = with_type(table_of(tmp_path / "a.ply"), "opacity", kind)
     table["opacity"] = [np.inf, -np.inf, 0.3, np.inf]
     opacities = torch.sigmoid(read_ply(save(table, tmp_path / "b.ply")).opacity_logits)
@@ -375,20 +376,20 @@ def test_opacities_of_zero_and_one_are_read(
     assert "3 Gaussians have an opacity of exactly 0 or 1" in caplog.text
     table["opacity"][2] = np.nan
     said = "opacity is not a finite number everywhere: it is nan in row 2 and in 0 more"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
-def test_a_value_beyond_float32_is_refused(tmp_path: Path) -> None:
+def test_a_value_beyond_float32_is_refused(tmp_path):
     table = with_type(table_of(tmp_path / "a.ply"), "x", "f8")
     table["x"][1] = 1e300
     said = r"x is not a finite number everywhere: it is 1e\+300 in row 1"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
 @pytest.mark.parametrize(
-    ("prefix", "values", "said"),
+    "prefix, values, said",
     [
         ("scale_", (0.001, 0.5), "all scales are positive"),
         ("scale_", (-0.001, 0.5), ""),
@@ -398,9 +399,7 @@ def test_a_value_beyond_float32_is_refused(tmp_path: Path) -> None:
         ("opacity", (0.0, 1.01), ""),
     ],
 )
-def test_values_that_look_activated_cause_a_warning(
-    tmp_path: Path, prefix, values, said: str, caplog
-) -> None:
+def test_values_that_look_activated_cause_a_warning(tmp_path, prefix, values, said, caplog):
     table = table_of(tmp_path / "a.ply")
     for name in table.dtype.names:
         if name.startswith(("scale_", "opacity")):
@@ -414,9 +413,7 @@ def test_values_that_look_activated_cause_a_warning(
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 10.0, 1000.0, 1e5])
 @pytest.mark.parametrize("activated", [False, True])
-def test_lengths_and_logarithms_are_told_apart_in_any_unit(
-    tmp_path: Path, unit: float, activated: bool, caplog
-) -> None:
+def test_lengths_and_logarithms_are_told_apart_in_any_unit(tmp_path, unit, activated, caplog):
     random = np.random.default_rng(0)
     table = table_of(tmp_path / "a.ply")
     for axis in "xyz":
@@ -429,7 +426,7 @@ def test_lengths_and_logarithms_are_told_apart_in_any_unit(
 
 
 @pytest.mark.parametrize(
-    ("center", "scale", "kind"),
+    "center, scale, kind",
     [
         ((0.0, 0.0, 0.0), 1.0, "f4"),
         ((0.1, -0.2, 0.3), 100.0, "f4"),
@@ -438,18 +435,18 @@ def test_lengths_and_logarithms_are_told_apart_in_any_unit(
     ],
 )
 def test_a_normalized_model_is_written_in_its_own_coordinates_and_read_back(
-    tmp_path: Path, center: tuple[float, float, float], scale: float, kind: str
-) -> None:
+    tmp_path, center, scale, kind
+):
     normalization = Normalization(center, scale)
     gaussians = random_gaussians(50, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "own.ply", normalization)
     table = PlyData.read(str(tmp_path / "own.ply"))["vertex"].data
     assert table["x"].dtype == np.dtype(kind)
     own = np.array(center) + gaussians.means.double().numpy() / scale
-    np.testing.assert_allclose(np.column_stack([table[axis] for axis in "xyz"]), own, rtol=2e-7)
+    assert_allclose(np.column_stack([table[axis] for axis in "xyz"]), own, rtol=2e-7)
     scales = gaussians.scales[:, 1] / scale
-    np.testing.assert_allclose(np.exp(table["scale_1"]), scales, rtol=1e-5)
+    assert_allclose(np.exp(table["scale_1"]), scales, rtol=1e-5)
     again = read_ply(tmp_path / "own.ply", normalization=normalization)
-    torch.testing.assert_close(again.means, gaussians.means, atol=1e-5, rtol=0)
-    torch.testing.assert_close(again.log_scales, gaussians.log_scales, atol=1e-5, rtol=0)
-    torch.testing.assert_close(again.quaternions, gaussians.quaternions)
+    assert_close(again.means, gaussians.means, atol=1e-5, rtol=0)
+    assert_close(again.log_scales, gaussians.log_scales, atol=1e-5, rtol=0)
+    assert_close(again.quaternions, gaussians.quaternions)

@@ -1,12 +1,11 @@
 """Rotations and colours of Gaussians, compared with SciPy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from scipy.special import lpmv
 
@@ -14,12 +13,12 @@ from gsbench.gaussians.model import basis, colors, quaternion_to_matrix
 from tests.gaussians.helpers import random_gaussians
 
 
-def unit_vectors(count: int) -> torch.Tensor:
+def unit_vectors(count):
     vectors = np.random.default_rng(0).normal(size=(count, 3))
     return torch.from_numpy(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def harmonics(directions: torch.Tensor, degree: int) -> np.ndarray:
+def harmonics(directions, degree):
     """Real harmonics [N, (degree + 1)^2] with the signs of 3DGS, from SciPy's Legendre functions."""
     x, y, z = directions.numpy().T
     azimuth, columns = np.arctan2(y, x), []
@@ -33,18 +32,18 @@ def harmonics(directions: torch.Tensor, degree: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_harmonics_and_colours_are_those_of_scipy(degree: int) -> None:
+def test_harmonics_and_colours_are_those_of_scipy(degree):
     directions, gaussians = unit_vectors(30), random_gaussians(30)
     expected = harmonics(directions, degree)
-    np.testing.assert_allclose(basis(directions, degree), expected, atol=1e-12)
+    assert_allclose(basis(directions, degree), expected, atol=1e-12)
     every = torch.cat([gaussians.sh_dc.unsqueeze(1), gaussians.sh_rest], dim=1).numpy()
     shown = np.einsum("nk,nkc->nc", expected, every[:, : expected.shape[1]]) + 0.5
     assert (shown < 0).any()
     found = colors(gaussians.sh_dc, gaussians.sh_rest, directions, degree)
-    np.testing.assert_allclose(found, np.maximum(shown, 0), atol=1e-12)
+    assert_allclose(found, np.maximum(shown, 0), atol=1e-12)
 
 
-def test_quaternions_of_any_length_give_scipys_rotations() -> None:
+def test_quaternions_of_any_length_give_scipys_rotations():
     quaternions = random_gaussians(9).quaternions * 3
     expected = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]].numpy()).as_matrix()
-    np.testing.assert_allclose(quaternion_to_matrix(quaternions), expected, atol=1e-12)
+    assert_allclose(quaternion_to_matrix(quaternions), expected, atol=1e-12)

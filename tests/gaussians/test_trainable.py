@@ -1,9 +1,8 @@
 """Steps and edits of trainable Gaussians, compared with torch's own Adam."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
@@ -11,18 +10,18 @@ from gsbench.gaussians.trainable import TrainableGaussians
 from tests.gaussians.helpers import differences, random_gaussians
 
 
-def give_gradients(trainable: TrainableGaussians, seed: int) -> None:
+def give_gradients(trainable, seed):
     rng = torch.Generator().manual_seed(seed)
     for tensor in trainable.values.tensors().values():
         tensor.grad = torch.randn(tensor.shape, generator=rng, dtype=tensor.dtype)
 
 
-def step_with(trainable: TrainableGaussians, seed: int, **arguments: object) -> None:
+def step_with(trainable, seed, **arguments):
     give_gradients(trainable, seed)
-    trainable.optimizer_step(**arguments)  # type: ignore[arg-type]
+    trainable.optimizer_step(**arguments)
 
 
-def test_steps_equal_those_of_torchs_adam() -> None:
+def test_steps_equal_those_of_torchs_adam():
     """The bits are equal. A parameter without a gradient does not change and counts no step."""
     ours = TrainableGaussians(random_gaussians(6, dtype=torch.float32), LearningRates(), 2.0)
     theirs = ours.values.map(lambda tensor: tensor.detach().clone().requires_grad_(True)).tensors()
@@ -39,18 +38,16 @@ def test_steps_equal_those_of_torchs_adam() -> None:
     assert not differences(ours.values, Gaussians(**theirs))
 
 
-def test_a_step_with_all_gaussians_visible_equals_a_plain_step() -> None:
+def test_a_step_with_all_gaussians_visible_equals_a_plain_step():
     whole = TrainableGaussians(random_gaussians(6), LearningRates(), 2.0)
     sparse = TrainableGaussians(random_gaussians(6), LearningRates(), 2.0)
     for seed in range(4):
         step_with(whole, seed)
         step_with(sparse, seed, visible=torch.ones(6, dtype=torch.bool))
-    torch.testing.assert_close(
-        whole.values.tensors(), sparse.values.tensors(), rtol=1e-9, atol=1e-12
-    )
+    assert_close(whole.values.tensors(), sparse.values.tensors(), rtol=1e-9, atol=1e-12)
 
 
-def test_a_step_of_visible_gaussians_does_not_change_the_others() -> None:
+def test_a_step_of_visible_gaussians_does_not_change_the_others():
     trainable = TrainableGaussians(random_gaussians(6), LearningRates(), 2.0)
     before = trainable.values.detach().map(torch.clone)
     visible = torch.tensor([True, False, True, False, False, True])
@@ -59,35 +56,33 @@ def test_a_step_of_visible_gaussians_does_not_change_the_others() -> None:
     assert not torch.isclose(trainable.values.means[visible], before.means[visible]).any()
 
 
-def test_steps_at_degree_0_count_for_the_unused_harmonics() -> None:
+def test_steps_at_degree_0_count_for_the_unused_harmonics():
     """Steps at degree 0, then at degree 3, equal Adam with zero gradients in the first steps."""
     quick = TrainableGaussians(random_gaussians(5), LearningRates(), 1.0)
     plain = TrainableGaussians(random_gaussians(5), LearningRates(), 1.0)
     for seed in range(3):
         step_with(quick, seed, sh_degree=0)
         give_gradients(plain, seed)
-        plain.values.sh_rest.grad.zero_()  # type: ignore[union-attr]
+        plain.values.sh_rest.grad.zero_()
         plain.optimizer_step()
     step_with(quick, 9)
     step_with(plain, 9)
-    torch.testing.assert_close(
-        quick.values.tensors(), plain.values.tensors(), rtol=1e-9, atol=1e-12
-    )
+    assert_close(quick.values.tensors(), plain.values.tensors(), rtol=1e-9, atol=1e-12)
 
 
-def test_load_restores_parameters_and_moments() -> None:
+def test_load_restores_parameters_and_moments():
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
     keep = torch.tensor([True, True, False, True, True])
     trainable.edit(keep, random_gaussians(2, seed=4))
-    copy = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 3.0)  # type: ignore[arg-type]
+    copy = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 3.0)
     for seed in (1, 2):
         step_with(trainable, seed)
         step_with(copy, seed)
     assert not differences(trainable.values, copy.values)
 
 
-def test_moments_have_the_shapes_of_their_parameters_after_an_edit() -> None:
+def test_moments_have_the_shapes_of_their_parameters_after_an_edit():
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     trainable.edit(append=random_gaussians(3, seed=1))
     tensors = trainable.values.tensors()
@@ -96,13 +91,13 @@ def test_moments_have_the_shapes_of_their_parameters_after_an_edit() -> None:
         assert state.first.shape == state.second.shape == tensors[name].shape
 
 
-def test_values_of_another_shape_are_refused() -> None:
+def test_values_of_another_shape_are_refused():
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     with pytest.raises(ValueError, match=r"overwrite: opacity_logits has shape \(5,\), got \(4,\)"):
         trainable.overwrite("opacity_logits", torch.zeros(4, dtype=torch.float64))
 
 
-def test_overwriting_clears_the_moments_of_the_chosen_gaussians() -> None:
+def test_overwriting_clears_the_moments_of_the_chosen_gaussians():
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
     means = trainable.adam["means"]
@@ -122,7 +117,7 @@ def test_overwriting_clears_the_moments_of_the_chosen_gaussians() -> None:
     assert means.step == 1
 
 
-def test_an_edit_keeps_old_moments_and_appends_zeros() -> None:
+def test_an_edit_keeps_old_moments_and_appends_zeros():
     trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 3.0)
     step_with(trainable, 0)
     old, added = trainable.values.detach(), random_gaussians(2, seed=1)
@@ -136,7 +131,7 @@ def test_an_edit_keeps_old_moments_and_appends_zeros() -> None:
     assert not state.first[3:].any()
 
 
-def test_the_rate_of_the_means_falls_log_linearly() -> None:
+def test_the_rate_of_the_means_falls_log_linearly():
     rates = LearningRates()
     wanted = {-10: 1.6e-4, 0: 1.6e-4, 15_000: 1.6e-5, 30_000: 1.6e-6, 60_000: 1.6e-6}
     assert {step: rates.position(step) for step in wanted} == pytest.approx(wanted)

@@ -1,22 +1,18 @@
 """A small capture with exact poses, and untrained networks that still match features."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.readers import read_colmap
-from gsbench.scene.types import Capture
 
 VIEWS, WIDTH, HEIGHT = 8, 320, 240
 
 
 @pytest.fixture(scope="session")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def courtyard(tmp_path_factory):
     """Eight views of the courtyard with their exact poses."""
     folder = tmp_path_factory.mktemp("courtyard")
     render_courtyard(folder, views=VIEWS, width=WIDTH, height=HEIGHT)
@@ -24,13 +20,13 @@ def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 @pytest.fixture(scope="session")
-def bare_photos(courtyard: Capture) -> Capture:
+def bare_photos(courtyard):
     """The same views without their cameras."""
     return replace(courtyard, model=None, exact_poses=False)
 
 
 @pytest.fixture(scope="session")
-def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def untrained_weights(tmp_path_factory):
     """A weights folder with a random SuperPoint, and a LightGlue whose layers add nothing.
 
     Random convolutions move with the picture, so their maxima and descriptors can be matched. With

@@ -1,26 +1,18 @@
 """COLMAP models of a few cameras, and a digest of written models."""
 
-from __future__ import annotations
-
 import hashlib
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 
-def camera_at(center: np.ndarray, rotation: np.ndarray | None = None) -> pycolmap.Rigid3d:
+def camera_at(center, rotation=None):
     """The pose of a camera; without a rotation it looks along +z, with y downwards."""
     turn = np.eye(3) if rotation is None else rotation
     return pycolmap.Rigid3d(np.column_stack([turn, -turn @ np.asarray(center)]))
 
 
-def model_with(
-    poses: Mapping[str, pycolmap.Rigid3d],
-    keypoints: Mapping[str, np.ndarray] | int = 0,
-    camera: pycolmap.Camera | None = None,
-) -> pycolmap.Reconstruction:
+def model_with(poses, keypoints=0, camera=None):
     """A model of images with ids from 1 and one camera, by default of 100 x 80 px, f = 100 px.
 
     ``keypoints`` are the keypoints [K, 2] of each image, or their number.
@@ -35,19 +27,14 @@ def model_with(
     return model
 
 
-def add_point(
-    model: pycolmap.Reconstruction,
-    position: object,
-    color: tuple[int, int, int] = (10, 20, 30),
-    seen_by: Mapping[int, int] | None = None,
-) -> None:
+def add_point(model, position, color=(10, 20, 30), seen_by=None):
     """Add a point; ``seen_by`` maps the ids of images to the indices of their keypoints."""
     elements = [pycolmap.TrackElement(*item) for item in (seen_by or {}).items()]
     place = np.asarray(position, dtype=float)
     model.add_point3D(place, pycolmap.Track(elements), np.array(color, dtype=np.uint8))
 
 
-def digest(model: Path) -> str:
+def digest(model):
     """The sha256 of all files of a model together."""
     files = sorted(model.glob("*.bin"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()

@@ -1,10 +1,7 @@
 """The YAML files of initialisers have all options and defaults of the classes."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,7 +12,7 @@ FOLDER = Path(__file__).parents[2] / "conf" / "init"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml"))
 REQUIRED = {"ply": ["init.path=a.ply"], "points": ["init.path=a.ply"]}
 # presets: a class under another name, with other values than its defaults
-DELIBERATE: dict[str, dict[str, Any]] = {
+DELIBERATE = {
     "dim_paper": {"pairs": "lowres", "max_keypoints": 4096, "min_inlier_ratio": 0.25},
     "sfm_preview": {
         "pairs": "auto",
@@ -26,13 +23,13 @@ DELIBERATE: dict[str, dict[str, Any]] = {
 }
 
 
-def composed(name: str) -> dict[str, Any]:
+def composed(name):
     """The settings of the initialiser as a trial gets them."""
     return compose_one([f"init={name}", "scene=courtyard", *REQUIRED.get(name, [])]).values["init"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_yaml_and_class_agree(name: str):
+def test_yaml_and_class_agree(name):
     values = composed(name)
     module, _, class_name = values.pop("_target_").rpartition(".")
     assert module == "gsbench.init"

@@ -1,15 +1,13 @@
 """Features from outside COLMAP give the same model as its own, in the right coordinates."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.init import Sfm
@@ -28,20 +26,18 @@ from gsbench.init.colmap.matches import match_sift
 from gsbench.init.networks.extractors import EXTRACTORS, extract_features
 from gsbench.init.networks.features import Features, FeatureSettings
 from gsbench.logs import no_progress
-from gsbench.scene.types import Capture
 
-Pair = tuple[str, str]
 SIFT = FeatureSettings(
     extractor="sift_kornia", matcher="mutual_nearest", max_image_size=1600, max_keypoints=2000
 )
 
 
-def new_database(path: Path, capture: Capture) -> list[str]:
+def new_database(path, capture):
     groups = unknown_camera_groups(capture.images, capture.image_names, "single", "PINHOLE", 300.0)
     return list(create_database(path, groups))
 
 
-def rewritten(own: Path, path: Path, capture: Capture, options: Sfm) -> dict[Pair, np.ndarray]:
+def rewritten(own, path, capture, options):
     """Write the features and matches of one database to another, as if they were foreign.
 
     Returns the matches of all pairs.
@@ -59,7 +55,7 @@ def rewritten(own: Path, path: Path, capture: Capture, options: Sfm) -> dict[Pai
 
 
 @pytest.fixture(scope="module")
-def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def own_path(bare_photos, tmp_path_factory):
     """A database with COLMAP's own features and matches."""
     path = tmp_path_factory.mktemp("own") / "database.db"
     names = new_database(path, bare_photos)
@@ -68,9 +64,7 @@ def own_path(bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory) -> 
     return path
 
 
-def test_sift_through_the_external_path_gives_the_same_model(
-    own_path: Path, bare_photos: Capture, tmp_path: Path
-):
+def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_photos, tmp_path):
     own, external = own_path, tmp_path / "external.db"
     rewritten(own, external, bare_photos, Sfm())
     assert database_counts(external) == database_counts(own)
@@ -81,14 +75,14 @@ def test_sift_through_the_external_path_gives_the_same_model(
     )
     assert first.num_points3D() == second.num_points3D() > 100
     for point_id, point in first.points3D.items():
-        np.testing.assert_array_equal(point.xyz, second.points3D[point_id].xyz)
+        assert_array_equal(point.xyz, second.points3D[point_id].xyz)
     for image_id, image in first.images.items():
-        np.testing.assert_array_equal(
+        assert_array_equal(
             image.cam_from_world().matrix(), second.images[image_id].cam_from_world().matrix()
         )
 
 
-def extract(path: Path, max_image_size: int) -> Features:
+def extract(path, max_image_size):
     """The features that kornia's SIFT finds."""
     cpu = torch.device("cpu")
     settings = replace(SIFT, max_image_size=max_image_size)
@@ -96,9 +90,7 @@ def extract(path: Path, max_image_size: int) -> Features:
 
 
 @pytest.mark.parametrize("max_image_size", [320, 213])
-def test_keypoints_of_kornia_coincide_with_those_of_colmap(
-    own_path: Path, bare_photos: Capture, max_image_size: int
-):
+def test_keypoints_of_kornia_coincide_with_those_of_colmap(own_path, bare_photos, max_image_size):
     """Two implementations of SIFT find the same points; a wrong convention would shift all of them."""
     name = bare_photos.image_names[0]
     with pycolmap.Database.open(own_path) as database:
@@ -114,13 +106,13 @@ def test_keypoints_of_kornia_coincide_with_those_of_colmap(
 
 
 @pytest.mark.parametrize("center", [(50.0, 40.0), (50.3, 39.8)])
-def test_a_blob_is_found_at_its_centre(tmp_path: Path, center: tuple[float, float]):
+def test_a_blob_is_found_at_its_centre(tmp_path, center):
     """The first pixel covers 0 to 1, both in the drawing and in the found keypoint."""
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
     features = extract(tmp_path / "blob.png", 1600)
-    np.testing.assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
+    assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
 
 
 def test_keypoints_are_scaled_separately_in_x_and_y():
@@ -131,19 +123,17 @@ def test_keypoints_are_scaled_separately_in_x_and_y():
         network_size=(100, 50),
         file_size=(400, 201),
     )
-    np.testing.assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
+    assert_allclose(features.colmap_keypoints, [[2.0, 2.01], [398.0, 198.99]], rtol=1e-6)
 
 
-def test_a_pair_must_keep_a_share_of_its_matches(
-    own_path: Path, bare_photos: Capture, tmp_path: Path
-):
+def test_a_pair_must_keep_a_share_of_its_matches(own_path, bare_photos, tmp_path):
     """Pairs below the ratio are dropped, and others are kept.
 
     COLMAP applies the ratio to each geometry that it tries (essential, fundamental, homography).
     So a kept pair may have another geometry than without the ratio, and other inliers. If the
     geometry is the same, so are the inliers.
     """
-    geometries: dict[float, dict[Pair, pycolmap.TwoViewGeometry]] = {}
+    geometries = {}
     for ratio in (0.0, 0.8):
         path = tmp_path / f"{ratio}.db"
         matches = rewritten(own_path, path, bare_photos, Sfm(min_inlier_ratio=ratio))
@@ -161,6 +151,6 @@ def test_a_pair_must_keep_a_share_of_its_matches(
         free, asked = geometries[0.0][pair], geometries[0.8][pair]
         assert len(asked.inlier_matches) >= 0.8 * len(matches[pair])
         if asked.config == free.config:
-            np.testing.assert_array_equal(asked.inlier_matches, free.inlier_matches)
+            assert_array_equal(asked.inlier_matches, free.inlier_matches)
     for pair in verified - kept:
         assert len(geometries[0.0][pair].inlier_matches) < 0.8 * len(matches[pair])

@@ -1,23 +1,21 @@
 """Clouds of points from files of all formats, against the written arrays and pycolmap."""
 
-from __future__ import annotations
-
 import codecs
+import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData, PlyElement
 
-from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Points, read_cloud
 from gsbench.init.base import PointCloud
 from gsbench.init.placed import GREY, points_in_view, seen_colors
 from gsbench.init.point_files import read_points
 from gsbench.scene.images import read_image
-from gsbench.scene.types import Capture
+from tests.helpers import refusal
 from tests.init.models import camera_at, model_with
 from tests.init.test_report import CENTERS, model_of
 
@@ -26,13 +24,7 @@ XYZ = RNG.uniform(-2, 2, (40, 3)).astype(np.float32).astype(np.float64)
 RGB = RNG.integers(0, 256, (40, 3))
 
 
-def write(
-    path: Path,
-    properties: list[tuple[str, str]],
-    values: dict[str, np.ndarray],
-    text: bool,
-    order: str,
-) -> Path:
+def write(path, properties, values, text, order):
     table = np.zeros(len(XYZ), dtype=[(name, kind) for name, kind in properties])
     for name, column in values.items():
         table[name] = column
@@ -43,49 +35,45 @@ def write(
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
-    ("names", "kind", "scale"),
+    "names, kind, scale",
     [
         (("red", "green", "blue"), "u1", 1),
         (("r", "g", "b"), "f4", 1 / 255),
         (("red", "green", "blue"), "u2", 257),
     ],
 )
-def test_ply_properties_may_have_any_order_and_type(
-    tmp_path: Path, text: bool, order: str, names, kind: str, scale: float
-):
+def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names, kind, scale):
     red, green, blue = ((name, kind) for name in names)
     properties = [blue, ("z", "f8"), ("nx", "f4"), ("x", "f4"), red, ("y", "f8"), green]
     values = dict(zip((*"xyz", *names), [*XYZ.T, *RGB.T * scale], strict=True))
     points, colors = read_points(write(tmp_path / "cloud.ply", properties, values, text, order))
-    np.testing.assert_allclose(points, XYZ, rtol=1e-6)
-    np.testing.assert_array_equal(colors, RGB)
+    assert_allclose(points, XYZ, rtol=1e-6)
+    assert_array_equal(colors, RGB)
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
 @pytest.mark.parametrize("colored", [False, True])
-def test_a_table_has_coordinates_with_or_without_colours(
-    tmp_path: Path, suffix: str, colored: bool
-):
+def test_a_table_has_coordinates_with_or_without_colours(tmp_path, suffix, colored):
     table = np.concatenate([XYZ, RGB], axis=1) if colored else XYZ
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, table, fmt="%.17g", delimiter="," if suffix == ".csv" else " ")
     points, colors = read_points(path)
-    np.testing.assert_array_equal(points, XYZ)
-    np.testing.assert_array_equal(colors, RGB if colored else None)
+    assert_array_equal(points, XYZ)
+    assert_array_equal(colors, RGB if colored else None)
 
 
 @pytest.mark.parametrize("suffix", [".xyz", ".csv"])
-def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path: Path, suffix: str):
+def test_a_table_may_have_a_byte_order_mark_and_line_ends_of_windows(tmp_path, suffix):
     path = tmp_path / f"cloud{suffix}"
     np.savetxt(path, XYZ, fmt="%.17g", delimiter="," if suffix == ".csv" else " ", newline="\r\n")
     path.write_bytes(codecs.BOM_UTF8 + path.read_bytes())
-    np.testing.assert_array_equal(read_points(path)[0], XYZ)
+    assert_array_equal(read_points(path)[0], XYZ)
     path.write_text("1 2 3\n", encoding="utf-16")
-    with pytest.raises(InputError, match="UTF-16 or UTF-32: save it as UTF-8"):
+    with refusal("UTF-16 or UTF-32: save it as UTF-8"):
         read_points(path)
 
 
-def rows(*columns: np.ndarray, between: str = " ") -> str:
+def rows(*columns, between=" "):
     table = np.column_stack(columns)
     return "".join(between.join(f"{value:.17g}" for value in row) + "\n" for row in table)
 
@@ -93,9 +81,13 @@ def rows(*columns: np.ndarray, between: str = " ") -> str:
 INTENSITY = np.arange(len(XYZ)) - 1200.0
 NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
 
+ALPHA = np.full(len(XYZ), 255)
+COUNTED = rows(np.arange(len(XYZ)), XYZ, RGB, between=",")
+WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
+
 
 @pytest.mark.parametrize(
-    ("name", "text", "colored"),
+    "name, text, colored",
     [
         ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY, RGB)}", True),
         ("a.pts", f"{len(XYZ)}\n{rows(XYZ, INTENSITY)}", False),
@@ -110,29 +102,63 @@ NORMALS = XYZ / np.linalg.norm(XYZ, axis=1)[:, None]
         ("a.xyz", rows(XYZ, NORMALS, RGB), True),
         ("a.xyz", rows(XYZ, RGB, INTENSITY), True),
         ("a.xyz", rows(XYZ, between="\t"), False),
+        ("a.xyz", rows(XYZ, RGB, ALPHA), True),
+        ("a.xyz", rows(XYZ, RGB, 257 * ALPHA), True),
+        ("a.csv", f"Easting,Northing,Height,R,G,B\n{rows(XYZ, RGB, between=',')}", True),
+        ("a.csv", f"n,pos_x,pos_y,pos_z,Color R,Color G,Color B\n{COUNTED}", True),
+        ("a.csv", f"x,y,z,r,g,b,Scalar field,Cloud index\n{WITH_FIELDS}", True),
+        ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
+        ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
     ],
 )
-def test_tables_of_scanners_and_other_programs_are_read(
-    tmp_path: Path, name: str, text: str, colored: bool
-):
+def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
     (tmp_path / name).write_text(text)
     points, colors = read_points(tmp_path / name)
-    np.testing.assert_array_equal(points, XYZ)
-    np.testing.assert_array_equal(colors, RGB if colored else None)
+    assert_array_equal(points, XYZ)
+    assert_array_equal(colors, RGB if colored else None)
 
 
-def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path: Path):
+@pytest.mark.parametrize(
+    "name, text, message",
+    [
+        ("a.csv", "lat,lon,alt\n47.1,8.5,400\n", "degrees of latitude and longitude: convert them"),
+        ("a.csv", "X;Y;Z;R\n1,5;2,5;3,5;7\n", "decimal commas: write points"),
+        ("a.txt", "1,5\t2,5\t3\n", "decimal commas: write points"),
+        ("a.xyz", "1 2 3 #ff8000\n", "colours such as #ff8000: write red, green and blue"),
+        ("a.txt", "#   POINT3D_ID, X, Y, Z, R, G, B\n1 2 3 4 5 6 7 8\n", "init=dataset reads its"),
+        ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "no line is a row of numbers"),
+        ("a.las", "LASF", "convert it to PLY, for example with CloudCompare"),
+    ],
+)
+def test_tables_that_would_be_read_wrong_are_refused_with_the_remedy(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with refusal(message):
+        read_points(tmp_path / name)
+
+
+def test_a_line_says_how_columns_without_names_are_read(tmp_path, caplog):
+    path = tmp_path / "a.xyz"
+    path.write_text(rows(XYZ, RGB, ALPHA))
+    read_points(path)
+    assert "read as x y z red green blue ?; a first line of names decides" in caplog.text
+    caplog.clear()
+    path.write_text(rows(XYZ, RGB))
+    read_points(path)
+    assert not caplog.text
+
+
+def test_colours_of_gaussians_come_from_their_constant_harmonic(tmp_path):
     """RGB = .5 + f_dc / (2 sqrt(pi)), clipped: 3DGS's colour without view dependence."""
     properties = [(name, "f4") for name in (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2")]
     dc = (RGB / 255 - 0.5) * 2 * np.sqrt(np.pi)
     dc[0], dc[1] = 9.0, -9.0
     values = dict(zip("xyz", XYZ.T, strict=True)) | {f"f_dc_{k}": dc[:, k] for k in range(3)}
     points, colors = read_points(write(tmp_path / "model.ply", properties, values, False, "<"))
-    np.testing.assert_array_equal(points, XYZ)
-    np.testing.assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
+    assert_array_equal(points, XYZ)
+    assert_array_equal(colors, [[255] * 3, [0] * 3, *RGB[2:]])
 
 
-def test_colours_come_from_the_nearest_photograph(courtyard: Capture):
+def test_colours_come_from_the_nearest_photograph(courtyard):
     model = pycolmap.Reconstruction(courtyard.model)
     points = RNG.uniform(-6, 6, (60, 3))
     found = seen_colors(points, courtyard, model)
@@ -146,24 +172,24 @@ def test_colours_come_from_the_nearest_photograph(courtyard: Capture):
             if pixel is not None and 0 <= pixel[0] < camera.width and 0 <= pixel[1] < camera.height:
                 expected = read_image(courtyard.images / image.name)[int(pixel[1]), int(pixel[0])]
                 break
-        np.testing.assert_array_equal(color, expected)
+        assert_array_equal(color, expected)
     assert 5 < (found[:, 0] >= 0).sum() < 60
 
 
 def test_black_counts_as_a_colour_and_points_without_a_camera_are_grey(
-    courtyard: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    courtyard, tmp_path, monkeypatch
 ):
     save(tmp_path / "scan.xyz", XYZ[:3])
     seen = np.array([[0, 0, 0], [-1, -1, -1], [0, 9, 255]], dtype=np.int16)
     monkeypatch.setattr("gsbench.init.placed.seen_colors", lambda *_: seen)
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
-    np.testing.assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
+    assert_array_equal(cloud.colors, [[0, 0, 0], [GREY] * 3, [0, 9, 255]])
     seen[:] = 0
     cloud = Points(path=tmp_path / "scan.xyz").cloud(courtyard, pycolmap.Reconstruction())
     assert not cloud.colors.any()
 
 
-def test_the_points_of_the_reference_are_all_replaced(courtyard: Capture, tmp_path: Path):
+def test_the_points_of_the_reference_are_all_replaced(courtyard, tmp_path):
     save(tmp_path / "scan.xyz", np.tile([0.0, 0.0, 5.0], (4, 1)) + np.arange(4)[:, None] / 10)
     model = model_of(CENTERS)
     own = {tuple(point.xyz) for point in model.points3D.values()}
@@ -178,9 +204,7 @@ def test_the_points_of_the_reference_are_all_replaced(courtyard: Capture, tmp_pa
     assert not any(len(image.points2D) for image in model.images.values())
 
 
-def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(
-    courtyard: Capture, tmp_path: Path
-):
+def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(courtyard, tmp_path):
     save(tmp_path / "scan.xyz", XYZ)
     options = Points(path=tmp_path / "scan.xyz", max_points=30, seed=1)
     report = options.run(courtyard, tmp_path / "out")
@@ -190,29 +214,29 @@ def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(
     assert distances.max() < 1e-9
     assert len(np.unique(cloud.points, axis=0)) == 30
     seen = seen_colors(cloud.points, courtyard, pycolmap.Reconstruction(courtyard.model))
-    np.testing.assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))
+    assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))
     first = options.content()
     save(tmp_path / "scan.xyz", 2 * XYZ)
     assert options.content() != first
 
 
-def save(path: Path, table: np.ndarray) -> None:
+def save(path, table):
     np.savetxt(path, table, fmt="%.17g")
 
 
-def bad_ply(path: Path) -> None:
+def bad_ply(path):
     path.write_bytes(
         b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n2\n3\n"
     )
 
 
-def empty_ply(path: Path) -> None:
+def empty_ply(path):
     properties = b"".join(b"property float %c\n" % axis for axis in b"xyz")
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\n" + properties + b"end_header\n")
 
 
 @pytest.mark.parametrize(
-    ("name", "make", "message"),
+    "name, make, message",
     [
         ("a.ply", bad_ply, "no property y, z"),
         ("a.ply", lambda path: path.write_bytes(b"no cloud"), "not a readable file of points"),
@@ -229,33 +253,31 @@ def empty_ply(path: Path) -> None:
         ("a.xyz", lambda path: save(path, XYZ + 1e6), "no point is in view of a training camera"),
     ],
 )
-def test_bad_files_are_refused_in_one_line(
-    courtyard: Capture, tmp_path: Path, name: str, make, message: str
-):
+def test_bad_files_are_refused_in_one_line(courtyard, tmp_path, name, make, message):
     make(tmp_path / name)
-    with pytest.raises(InputError, match=message) as caught:
+    with refusal(message) as caught:
         Points(path=tmp_path / name).cloud(courtyard, pycolmap.Reconstruction(courtyard.model))
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file_is_refused_and_photos_without_cameras_need_a_reference(
-    bare_photos: Capture, tmp_path: Path
+    bare_photos, tmp_path
 ):
-    with pytest.raises(InputError, match=r"init\.path=nowhere\.ply is not a file"):
+    with refusal(r"init\.path=nowhere\.ply is not a file"):
         Points(path="nowhere.ply")
     save(tmp_path / "a.xyz", XYZ)
     assert Points(path=tmp_path / "a.xyz").needs_reference(replace(bare_photos))
 
 
 @pytest.mark.parametrize(
-    ("shape", "kind"), [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
+    "shape, kind", [((4, 2), "float64"), ((4,), "float64"), ((4, 3), "float32")]
 )
-def test_a_cloud_refuses_points_of_another_shape_or_type(shape: tuple[int, ...], kind: str) -> None:
+def test_a_cloud_refuses_points_of_another_shape_or_type(shape, kind):
     with pytest.raises(ValueError, match="points must be"):
         PointCloud(np.zeros(shape, kind), np.zeros(shape, np.uint8))
 
 
-def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_behind() -> None:
+def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_behind():
     wide = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 100, 80)
     model = model_with({"a": camera_at([0, 0, 0])}, camera=wide)
     points = np.array(
@@ -271,7 +293,7 @@ def test_points_in_view_include_the_upper_and_left_border_and_exclude_points_beh
     )
     seen, pixels, distances = points_in_view(points, "a", model)
     assert seen.tolist() == [0, 2, 6]
-    np.testing.assert_allclose(pixels, [[0, 40], [50, 0], [80, 60]])
-    np.testing.assert_allclose(distances, [2**0.5, 1.64**0.5, 0.38**0.5])
+    assert_allclose(pixels, [[0, 40], [50, 0], [80, 60]])
+    assert_allclose(distances, [2**0.5, 1.64**0.5, 0.38**0.5])
     unknown = points_in_view(points, "b", model)
     assert [values.shape for values in unknown] == [(0,), (0, 2), (0,)]

@@ -1,20 +1,17 @@
 """The report on models whose numbers are known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsbench.init import Sfm, picture
-from gsbench.init.base import InitReport, PoseErrors, Preparation, Timer
+from gsbench.init.base import PoseErrors, Preparation, Timer
 from gsbench.init.colmap.alignment import (
     compare_poses,
     measure_gauge,
@@ -32,9 +29,7 @@ NAMES = ("a.png", "b.png", "c.png", "d.png")
 CENTERS = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 5.0, 0]])  # d is held out
 
 
-def model_of(
-    centers: np.ndarray, turn: Rotation | None = None, shift_px: float = 0.0
-) -> pycolmap.Reconstruction:
+def model_of(centers, turn=None, shift_px=0.0):
     """Cameras that look along +z, and two points that the first two cameras see.
 
     ``shift_px`` is the error of the observations in x.
@@ -54,11 +49,11 @@ def model_of(
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Capture:
+def capture(tmp_path):
     return Capture("hand", tmp_path, NAMES, ("d.png",), None, False, "0")
 
 
-def test_extent_is_that_of_the_training_cameras(capture: Capture):
+def test_extent_is_that_of_the_training_cameras(capture):
     # the mean of a, b and c is (0, 1/3, 0); a and b are sqrt(1 + 1/9) away
     assert training_extent(model_of(CENTERS), capture) == pytest.approx(1.1 * math.sqrt(1 + 1 / 9))
 
@@ -72,14 +67,12 @@ def test_the_gauge_expresses_the_threshold_of_the_paper():
     assert measure_gauge(0.0, None).threshold_over_extent_cubed is None
 
 
-def reported(
-    capture: Capture, model: Any, packages: tuple[str, ...] = (), **more: Any
-) -> InitReport:
+def reported(capture, model, packages=(), **more):
     """The report on a model whose poses were estimated."""
     return make_report("x", "own", capture, model, None, packages, settings={}, seconds={}, **more)
 
 
-def test_a_report_has_the_numbers_of_its_model(capture: Capture):
+def test_a_report_has_the_numbers_of_its_model(capture):
     model, capture = model_of(CENTERS, shift_px=0.75), replace(capture, image_names=(*NAMES, "e"))
     report = reported(capture, model, ("pycolmap",), counts={"features": 7})
     assert report.counts == {"features": 7}
@@ -95,7 +88,7 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("sound", "doubtful", "said"),
+    "sound, doubtful, said",
     [
         (
             {"num_registered": 9},
@@ -127,9 +120,7 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
         ),
     ],
 )
-def test_each_limit_has_its_own_warning(
-    capture: Capture, sound: dict[str, object], doubtful: dict[str, object], said: str
-) -> None:
+def test_each_limit_has_its_own_warning(capture, sound, doubtful, said):
     model = model_of(CENTERS)
     counts = dict.fromkeys(("num_images", "num_registered"), 10) | {"num_points": 100}
     report = replace(reported(capture, model), unregistered=tuple("abcdef"), **counts)
@@ -140,11 +131,9 @@ def test_each_limit_has_its_own_warning(
 
 
 @pytest.mark.parametrize(
-    ("focal", "view"), [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
+    "focal, view", [(1140.0, 5.02), (1150.0, 4.98), (13.5, 149.8), (13.2, 150.4)]
 )
-def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(
-    capture: Capture, focal: float, view: float
-) -> None:
+def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(capture, focal, view):
     """Along the longest side, 100 px, it is 2 atan(50 / focal)."""
     assert math.degrees(2 * math.atan(50 / focal)) == pytest.approx(view, abs=0.05)
     model = model_of(CENTERS)
@@ -173,9 +162,7 @@ def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     assert errors.center_max < 1e-9
 
 
-def test_two_common_cameras_are_not_compared_and_give_a_warning(
-    capture: Capture, tmp_path: Path
-) -> None:
+def test_two_common_cameras_are_not_compared_and_give_a_warning(capture, tmp_path):
     """A similarity needs at least three."""
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
@@ -214,14 +201,14 @@ def test_up_is_the_normal_of_a_ring_of_cameras():
         right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
         rotations.append([right, np.cross(forward, right), forward])
     axes = view_from_above(ring, np.array(rotations), np.zeros((1, 3)))
-    np.testing.assert_allclose(axes[2], up, atol=1e-9)
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_allclose(axes[2], up, atol=1e-9)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("size", [0.01, 100.0])
 @pytest.mark.parametrize("flatness", [1.0, 0.6, 0.4])
-def test_up_is_that_of_the_images_unless_the_cameras_lie_in_a_plane(size: float, flatness: float):
+def test_up_is_that_of_the_images_unless_the_cameras_lie_in_a_plane(size, flatness):
     """A plane may be half as thick as it is wide; the cameras are tilted by 20 degrees."""
     grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
     turn = Rotation.from_euler("x", -70, degrees=True).as_matrix()
@@ -230,7 +217,7 @@ def test_up_is_that_of_the_images_unless_the_cameras_lie_in_a_plane(size: float,
     )
     tilted = [0, math.sin(math.radians(20)), math.cos(math.radians(20))]
     expected = tilted if flatness > 0.5 else [0, 0, 1]
-    np.testing.assert_allclose(axes[2] * np.sign(axes[2, 2]), expected, atol=1e-9)
+    assert_allclose(axes[2] * np.sign(axes[2, 2]), expected, atol=1e-9)
 
 
 def test_cameras_in_a_plane_across_their_right_have_a_right_hand_view():
@@ -238,23 +225,23 @@ def test_cameras_in_a_plane_across_their_right_have_a_right_hand_view():
     centers = np.array([[0.0, y, z] for y in range(3) for z in range(4)])
     looking_along_y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     axes = view_from_above(centers, np.tile(looking_along_y, (12, 1, 1)), np.zeros((0, 3)))
-    np.testing.assert_allclose(np.abs(axes[2]), [1, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_allclose(np.abs(axes[2]), [1, 0, 0], atol=1e-9)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("points", [1, 5])
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_up_points_from_the_points_to_cameras_that_look_down(points: int, side: float):
+def test_up_points_from_the_points_to_cameras_that_look_down(points, side):
     """The cameras are above the points."""
     centers = np.array([[x, y, 10.0 * side] for x in range(4) for y in range(4)])
     # world to camera: looks along -z or z, the image's top is +y
     down = np.diag([side, -1.0, -side])
     axes = view_from_above(centers, np.tile(down, (16, 1, 1)), np.zeros((points, 3)))
-    np.testing.assert_allclose(axes[2], [0, 0, side], atol=1e-9)
+    assert_allclose(axes[2], [0, 0, side], atol=1e-9)
 
 
-def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path: Path) -> None:
+def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path):
     """All cameras are in the plane z = 0 and look along +z: x is right, y is down.
 
     Five units, and a twentieth of that on each side, fill 840 of 960 px. So a unit takes
@@ -268,7 +255,7 @@ def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path: Path) ->
         column, row = 480 + x * scale, 480 + (y - 2.5) * scale
         red = np.argwhere(np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8)
         near = red[np.abs(red - [row, column]).max(axis=1) < 8]
-        np.testing.assert_allclose(near.mean(axis=0), [row, column], atol=1.1)
+        assert_allclose(near.mean(axis=0), [row, column], atol=1.1)
         assert len(near) == pytest.approx(math.pi * 3.5**2, rel=0.3)
     for x, y in ((0, 0), (0.5, 0.5)):
         column, row = math.floor(480 + x * scale), math.floor(480 + (y - 2.5) * scale)
@@ -276,10 +263,10 @@ def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path: Path) ->
     assert (pixels == [10, 20, 30]).all(axis=-1).sum() == 2 * 9
     bar = np.flatnonzero((pixels[960 - 24] == 0).all(axis=-1))
     # the bar is one unit long
-    np.testing.assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
+    assert_allclose([bar.min(), bar.max()], [60, 60 + scale], atol=1.0)
 
 
-def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path: Path) -> None:
+def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path):
     """All cameras are in the plane z = 0 and look along +x, which is up in the picture."""
     sideways = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     places = [(0, 0, 0), (4, 0, 0), (0, 4, 0), (4, 4, 0), (2, 2, 0)]
@@ -294,12 +281,8 @@ def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path: Path) -> None:
     assert not red[480 + 40, 478:483].any()
 
 
-@pytest.mark.parametrize(
-    ("count", "inked"), [(2, 9), (5_000, 9), (5_001, 4), (50_000, 4), (50_001, 1)]
-)
-def test_more_points_are_drawn_smaller(
-    count: int, inked: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("count, inked", [(2, 9), (5_000, 9), (5_001, 4), (50_000, 4), (50_001, 1)])
+def test_more_points_are_drawn_smaller(count, inked, tmp_path, monkeypatch):
     """All points but one are at one place; the other one is measured."""
     points, colors = np.tile([1.0, 1, 5], (count, 1)), np.zeros((count, 3), np.uint8)
     points[0], colors[0] = (6, 4, 5), (30, 90, 30)
@@ -310,7 +293,7 @@ def test_more_points_are_drawn_smaller(
     assert (pixels == [30, 90, 30]).all(axis=-1).sum() == inked
 
 
-def test_a_camera_whose_right_is_up_gives_axes_at_right_angles() -> None:
+def test_a_camera_whose_right_is_up_gives_axes_at_right_angles():
     """The first of two cameras lies on its side, so another direction becomes the right."""
     up = np.array([1.0, 2, 2]) / 3
     down = np.array([2.0, 1, -2]) / 3  # at a right angle to it
@@ -319,5 +302,5 @@ def test_a_camera_whose_right_is_up_gives_axes_at_right_angles() -> None:
     axes = view_from_above(
         np.array([[0, 0, 0], [1.0, 0, 0]]), np.stack([first, second]), np.empty((0, 3))
     )
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(axes[2], up, atol=1e-12)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_allclose(axes[2], up, atol=1e-12)

@@ -1,34 +1,29 @@
 """Points that do not depend on test photographs (init.points_from=train)."""
 
-from __future__ import annotations
-
-import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia, read_cloud
-from gsbench.init.base import REPORT_FILE, Initializer
+from gsbench.init.base import REPORT_FILE
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
-from gsbench.scene.types import Capture
+from tests.helpers import read_json, refusal
 from tests.init.models import add_point
 
 
-def quick_sfm(**options: Any) -> Sfm:
+def quick_sfm(**options):
     """SIFT without enlarged images and with few features, to be fast."""
     return Sfm(**({"threads": 1, "first_octave": 0, "max_num_features": 1500} | options))
 
 
 @pytest.fixture(scope="module")
-def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def with_points(courtyard, tmp_path_factory):
     """The courtyard with points of all views, and image ids in the reverse order of names."""
     folder = tmp_path_factory.mktemp("points")
     quick_sfm().run(courtyard, folder)
@@ -50,14 +45,14 @@ def with_points(courtyard: Capture, tmp_path_factory: pytest.TempPathFactory) ->
     return replace(courtyard, model=folder / "turned")
 
 
-def seen_by(model: pycolmap.Reconstruction) -> list[set[str]]:
+def seen_by(model):
     return [
         {model.images[element.image_id].name for element in point.track.elements}
         for point in model.points3D.values()
     ]
 
 
-def poses(folder: Path) -> dict[str, bytes]:
+def poses(folder):
     model = read_model(folder / MODEL_FOLDER)
     return {
         image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()
@@ -65,10 +60,8 @@ def poses(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_dataset_keeps_the_points_that_two_training_views_see(
-    with_points: Capture, tmp_path: Path
-) -> None:
-    before = read_model(with_points.model)  # type: ignore[arg-type]
+def test_dataset_keeps_the_points_that_two_training_views_see(with_points, tmp_path):
+    before = read_model(with_points.model)
     train, test = set(with_points.train_names), set(with_points.test_names)
     wanted = sorted(  # as a list: features of two orientations may make two points at one place
         point.xyz.tobytes()
@@ -83,16 +76,15 @@ def test_dataset_keeps_the_points_that_two_training_views_see(
     assert all(len(names) >= 2 for names in seen_by(after))
     assert len(after.images) == len(before.images), "test views keep their cameras"
     points = report.training_points
-    assert points is not None
     kept, total = len(wanted), before.num_points3D()
     assert (points.choice, points.kept, points.total) == ("train", kept, total)
     assert points.removed == pytest.approx(1 - kept / total)
-    said = json.loads((tmp_path / REPORT_FILE).read_text())["training_points"]
+    said = read_json(tmp_path / REPORT_FILE)["training_points"]
     assert said["removed"] == points.removed
     assert not (tmp_path / "work").exists()
 
 
-def test_colours_come_from_training_photographs(with_points: Capture, tmp_path: Path) -> None:
+def test_colours_come_from_training_photographs(with_points, tmp_path):
     """Each colour is the mean of the photographs at the observations, interpolated here again."""
     Dataset(points_from="train").run(with_points, tmp_path)
     model = read_model(tmp_path / MODEL_FOLDER)
@@ -111,10 +103,10 @@ def test_colours_come_from_training_photographs(with_points: Capture, tmp_path: 
                 (1 - dy) * ((1 - dx) * picture[row, column] + dx * picture[row, column + 1])
                 + dy * ((1 - dx) * picture[row + 1, column] + dx * picture[row + 1, column + 1])
             )
-        np.testing.assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
+        assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
 
 
-def with_noise(capture: Capture, folder: Path) -> Capture:
+def with_noise(capture, folder):
     """The capture with its test photographs replaced by noise."""
     shutil.copytree(capture.images, folder)
     rng = np.random.default_rng(0)
@@ -125,7 +117,7 @@ def with_noise(capture: Capture, folder: Path) -> Capture:
     return replace(capture, images=folder)
 
 
-MAKERS: dict[str, Initializer] = {
+MAKERS = {
     "sfm": quick_sfm(points_from="train"),
     "sfm on all": quick_sfm(points_from="all"),  # this one must see the noise
     # takes the path of dim without weights
@@ -136,9 +128,7 @@ MAKERS: dict[str, Initializer] = {
 
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.slow
-def test_the_cloud_does_not_depend_on_test_photographs(
-    with_points: Capture, tmp_path: Path, name: str
-) -> None:
+def test_the_cloud_does_not_depend_on_test_photographs(with_points, tmp_path, name):
     clouds = []
     for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
         MAKERS[name].run(capture, tmp_path / place)
@@ -149,29 +139,24 @@ def test_the_cloud_does_not_depend_on_test_photographs(
 
 
 @pytest.mark.slow
-def test_estimated_cameras_keep_all_views_and_points_of_training_views(
-    bare_photos: Capture, tmp_path: Path
-) -> None:
+def test_estimated_cameras_keep_all_views_and_points_of_training_views(bare_photos, tmp_path):
     capture = replace(bare_photos, test_names=bare_photos.image_names[3:5])
     report = Sfm(points_from="train", threads=1).run(capture, tmp_path)
     model, test = read_model(tmp_path / MODEL_FOLDER), set(capture.test_names)
     assert report.num_registered == len(capture.image_names)
     assert not any(names & test for names in seen_by(model))
     points = report.training_points
-    assert points is not None
     assert points.total is not None
     assert points.kept == model.num_points3D() < points.total
 
 
-def test_points_from_train_is_refused_with_one_training_view(
-    with_points: Capture, tmp_path: Path
-) -> None:
+def test_points_from_train_is_refused_with_one_training_view(with_points, tmp_path):
     lonely = replace(with_points, test_names=with_points.image_names[1:])
-    with pytest.raises(InputError, match=r"init\.points_from=train: no point is left"):
+    with refusal(r"init\.points_from=train: no point is left"):
         Dataset(points_from="train").run(lonely, tmp_path)
 
 
-def test_the_key_of_an_initialiser_contains_points_from() -> None:
+def test_the_key_of_an_initialiser_contains_points_from():
     for made in (Sfm, SiftKornia, Dataset):
         assert options_of("init", made())["points_from"] == "all"
         assert options_of("init", made(points_from="train"))["points_from"] == "train"

@@ -3,8 +3,6 @@
 import json
 import logging
 import time
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -32,7 +30,7 @@ TINY = [
 ]
 
 
-def declaring(runs: Path, primary: str | None, seed: int = 0, **densify: Any) -> Trial:
+def declaring(runs, primary, seed=0, **densify):
     """A trial of a command with this ``eval.primary``."""
     named = {"densify": {"name": "adc"} | densify, "scene": {"name": "courtyard"}, "name": "exp"}
     return trial(runs, seed, eval={"primary": primary}, **named)
@@ -154,11 +152,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
         found.metric,
         len(found.standing([], experiment.trials).seen),
         [one.primary for one in found.earlier],
-    ) == (
-        "ssim",
-        1,
-        ["psnr"],
-    )
+    ) == ("ssim", 1, ["psnr"])
 
     # Another experiment gets the same numbers from the store: they were measured before its
     # declaration.

@@ -8,7 +8,6 @@ import json
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from gsbench.files import DiskFullError
 from gsbench.launch import jobs
 from gsbench.launch.jobs import Outcome, TrialJob, collect, job_folder, run_one
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
 from tests.finished import record_of, write_results
@@ -38,7 +37,7 @@ SLURM = {
 }
 
 
-def trial(runs: Path, seed: int = 0, launch: Any = LOCAL, **settings: Any) -> Trial:
+def trial(runs, seed=0, launch=LOCAL, **settings):
     more = {
         "launch": launch,
         "tracking": {"sink": f"of {seed}"},
@@ -52,35 +51,33 @@ def trial(runs: Path, seed: int = 0, launch: Any = LOCAL, **settings: Any) -> Tr
 class Mirrored:
     """Stands in for a `Mirror`, and keeps what it follows."""
 
-    def __init__(self, idle: bool = False) -> None:
+    def __init__(self, idle=False):
         self.idle, self.followed = idle, list[tuple[Path, Any]]()
 
-    def __enter__(self) -> "Mirrored":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         pass
 
-    def follow(self, folder: Path, settings: Any) -> None:
+    def follow(self, folder, settings):
         self.followed.append((folder, settings))
 
 
-def job(folder: Path, name: str) -> Any:
+def job(folder, name):
     """Stands in for a job of submitit that has not ended."""
     paths = SimpleNamespace(result_pickle=folder / f"{name}.pkl", stderr=folder / "log")
     return SimpleNamespace(job_id=name, paths=paths)
 
 
-def replace_trials(
-    monkeypatch: pytest.MonkeyPatch, run_trial: Callable[[Trial, bool], Any]
-) -> None:
+def replace_trials(monkeypatch, run_trial):
     """Run ``run_trial`` instead of a trial."""
     stand_in = SimpleNamespace(run_trial=run_trial)
     monkeypatch.setitem(sys.modules, "gsbench.pipeline.trial", stand_in)
 
 
 @contextmanager
-def nothing(*arguments: Any) -> Iterator[None]:
+def nothing(*arguments):
     yield
 
 
@@ -127,7 +124,7 @@ def test_a_single_trial_waits_for_another_process_and_several_are_counted(
     assert caplog.messages == [f"{k} of 2: {trials[k - 1].files.label}" for k in (1, 2)]
 
 
-def collected(runs: Path, failure: str = "", results: str = "") -> Outcome:
+def collected(runs, failure="", results=""):
     """The outcome of a job that left a pickled result, which is not read."""
     one, ended = trial(runs, launch=SLURM), job(runs, "1_0")
     one.folder.mkdir(parents=True, exist_ok=True)
@@ -166,9 +163,9 @@ def test_the_files_of_a_trial_tell_how_its_job_ended(tmp_path):
 
 
 @pytest.fixture
-def machine(monkeypatch) -> dict[str, Any]:
+def machine(monkeypatch):
     """What a job did to its process, with stand-ins for its trial and for all of that."""
-    did: dict[str, Any] = {}
+    did = {}
 
     def run_one(trial, mirror, wait):
         did["trial"], did["mirror"], did["wait"] = trial, mirror, wait
@@ -179,7 +176,7 @@ def machine(monkeypatch) -> dict[str, Any]:
         did["slots"] = runs, count
         yield 5
 
-    def note(name: str) -> Callable[..., None]:
+    def note(name):
         return lambda *arguments: did.update({name: arguments})
 
     monkeypatch.setattr(jobs, "run_one", run_one)
@@ -258,23 +255,23 @@ def test_a_job_gets_the_search_path_and_the_gpus_of_its_sweep(tmp_path, monkeypa
 class Jobs:
     """Stands in for submitit's executor; ``steps`` says after how many questions each job ends."""
 
-    def __init__(self, folder: Path, steps: Sequence[int]) -> None:
+    def __init__(self, folder, steps):
         self.folder, self.steps, self.parameters = folder, list(steps), {}
-        self.seeds: list[int] = []
-        self.sent: dict[int, int] = {}
+        self.seeds = []
+        self.sent = {}
         self.running = self.most = 0
 
-    def update_parameters(self, **parameters: Any) -> None:
+    def update_parameters(self, **parameters):
         self.parameters |= parameters
 
-    def submit(self, job: TrialJob) -> Any:
+    def submit(self, job):
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         seed, left = job.values["seed"], self.steps[len(self.seeds)]
         self.seeds.append(seed)
         self.running += 1
         self.most = max(self.most, self.running)
 
-        def done() -> bool:
+        def done():
             nonlocal left
             left -= 1
             if left < 0:
@@ -282,7 +279,7 @@ class Jobs:
             self.running -= left == 0
             return left == 0
 
-        def send_signal(number: int) -> None:
+        def send_signal(number):
             self.sent[seed] = number
 
         process = SimpleNamespace(poll=lambda: None if seed % 2 else 0, send_signal=send_signal)
@@ -290,10 +287,10 @@ class Jobs:
         return SimpleNamespace(done=done, paths=paths, _process=process)
 
 
-@pytest.mark.parametrize(("minutes", "limit"), [(None, 365 * 24 * 60), (30, 30)])
+@pytest.mark.parametrize("minutes, limit", [(None, 365 * 24 * 60), (30, 30)])
 def test_local_jobs_run_as_many_at_once_as_asked(tmp_path, monkeypatch, caplog, minutes, limit):
     caplog.set_level(logging.INFO, "gsbench")
-    pauses: list[float] = []
+    pauses = []
     monkeypatch.setattr("time.sleep", pauses.append)
     executor = Jobs(tmp_path, [3, 1, 2, 1])
     monkeypatch.setattr(submitit, "LocalExecutor", lambda folder: executor)
@@ -346,11 +343,11 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
 
 
 @pytest.fixture
-def slurm(tmp_path, monkeypatch) -> SimpleNamespace:
+def slurm(tmp_path, monkeypatch):
     """Stands in for Slurm: ``queue`` lists the jobs, ``submitted`` has the seeds of new ones."""
     state = SimpleNamespace(queue={}, submitted=[], error=None, asked=[])
 
-    def submit_array(tasks: list[TrialJob]) -> list[Any]:
+    def submit_array(tasks):
         if state.error:
             raise state.error
         state.submitted += [task.values["seed"] for task in tasks]
@@ -411,7 +408,7 @@ def test_a_command_waits_for_slurm_unless_told_otherwise(tmp_path, slurm, monkey
 
 
 def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
-    given: dict[str, Any] = {}
+    given = {}
 
     class Executor:
         def __init__(self, folder, max_num_timeout):
@@ -451,7 +448,7 @@ def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
     queues = iter([{"7_1"}, None, set(), {"7_1"}, set(), set()])
     asked = []
     monkeypatch.setattr(jobs, "read_queue", lambda users: asked.append(users) or next(queues))
-    pauses: list[float] = []
+    pauses = []
     monkeypatch.setattr("time.sleep", pauses.append)
     monkeypatch.setattr(jobs, "SECONDS_BETWEEN_QUEUE_CHECKS", -1)
     trials = [trial(tmp_path, seed, SLURM) for seed in (0, 1)]

@@ -1,9 +1,7 @@
 """Checks of trials before any of them runs, and the way to their launcher."""
 
 import sys
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -28,7 +26,7 @@ from tests.launch.test_jobs import trial as bare_trial
 
 
 @pytest.mark.parametrize(
-    ("group", "name", "target", "said"),
+    "group, name, target, said",
     [
         ("densify", "adc", "mine.Patient", ["densify.name=patient"]),
         # the name of another class of gsbench
@@ -43,7 +41,7 @@ from tests.launch.test_jobs import trial as bare_trial
 def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(group, name, target, said):
     values = {"init": {"name": "sfm"}, "densify": {"name": "adc"}}
     values[group] = {"name": name, "_target_": target}
-    trials: Any = [SimpleNamespace(values=values)] * 2
+    trials = [SimpleNamespace(values=values)] * 2
     lines = borrowed_names(trials)
     assert len(lines) == len(said)
     for line, word in zip(lines, said, strict=True):
@@ -51,7 +49,7 @@ def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(group, name, targe
         assert line.endswith(word)
 
 
-def trial(runs: Path, seed: int = 0, launch: Any = None, **settings: Any) -> Trial:
+def trial(runs, seed=0, launch=None, **settings):
     courtyard = {"name": "courtyard", "path": "", "kind": "courtyard"}
     launch = launch or LOCAL | {"name": "serial"}
     tracking = {"enabled": False, "sink": "nosuch"}
@@ -61,11 +59,11 @@ def trial(runs: Path, seed: int = 0, launch: Any = None, **settings: Any) -> Tri
 
 
 @pytest.fixture
-def called(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def called(monkeypatch):
     """The launchers and checks that were called, with their seeds, instead of doing it."""
-    names: list[Any] = []
+    names = []
 
-    def stand_in(name: str) -> Any:
+    def stand_in(name):
         def launcher(trials, *mirror, **words):
             seeds = [one.values["seed"] for one in trials]
             names.append((name, seeds, len(mirror), *words.values()))
@@ -80,7 +78,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    ("launch", "launcher", "mirrors"),
+    "launch, launcher, mirrors",
     [
         (LOCAL | {"name": "serial"}, "run_serial", 1),
         (LOCAL, "run_local", 1),
@@ -144,7 +142,7 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
 
-    def scene(name: str, kind: str, folder: str, **more: Any) -> Any:
+    def scene(name, kind, folder, **more):
         return {"scene": {"name": name, "kind": kind, "path": str(tmp_path / folder), **more}}
 
     trials = [
@@ -171,7 +169,7 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("word", "free"),
+    "word, free",
     [
         ("seed=3", True),
         ("densify=adc", True),
@@ -187,7 +185,7 @@ def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monk
     ],
 )
 def test_shipped_choices_alone_need_no_check(word, free):
-    trials: Any = [SimpleNamespace(overrides=words) for words in (("name=x",), ("seed=1", word))]
+    trials = [SimpleNamespace(overrides=words) for words in (("name=x",), ("seed=1", word))]
     assert need_no_check(trials) == free
 
 

@@ -3,20 +3,13 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.cli import run
 from gsbench.errors import InputError
-from gsbench.launch.progress import (
-    Progress,
-    _in_words,
-    _seconds_left,
-    progress_frame,
-    progress_of,
-)
+from gsbench.launch.progress import Progress, _in_words, _seconds_left, progress_frame, progress_of
 from gsbench.launch.states import TrialState
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
@@ -25,13 +18,13 @@ from tests.tracking.helpers import begin_trial, trial_values, write_trial
 ARMS, SEEDS = ("adc", "volumetric"), (0, 1, 2)
 
 
-def begin(runs: Path, arm: str, seed: int) -> Path:
+def begin(runs, arm, seed):
     values = trial_values(runs, seed, "swept") | {"densify": {"name": arm}}
     return begin_trial(values)
 
 
 @pytest.fixture
-def sweep(tmp_path) -> dict[tuple[str, int], Path]:
+def sweep(tmp_path):
     """A sweep: all trials of adc are done; of volumetric, one is done, one failed and one began."""
     folders = {(arm, seed): begin(tmp_path, arm, seed) for arm in ARMS for seed in SEEDS}
     # In the only seed that both have, adc is better; in the mean over all of its own trials it is
@@ -130,7 +123,7 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
 
 
 @pytest.mark.parametrize(
-    ("names", "states", "seconds"),
+    "names, states, seconds",
     [
         ([("adc", "a")], ["missing"], 11),  # its arm and scene
         ([("adc", "b")], ["partial"], 21),
@@ -143,8 +136,8 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
     ],
 )
 def test_a_trial_takes_as_long_as_those_most_like_it(tmp_path, names, states, seconds):
-    known: Any = {("adc", "a"): 1.0, ("adc", "b"): 11.0, ("volumetric", "a"): 30.0}
-    done: Any = [
+    known = {("adc", "a"): 1.0, ("adc", "b"): 11.0, ("volumetric", "a"): 30.0}
+    done = [
         SimpleNamespace(
             path=Path(str(k)), record=SimpleNamespace(seconds={"init": 10.0, "train": took})
         )

@@ -6,7 +6,6 @@ import re
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -33,7 +32,7 @@ LISTING = (
 
 
 def test_the_queue_is_asked_for_the_users_and_is_unknown_if_slurm_fails(monkeypatch):
-    asked: list[Any] = []
+    asked = []
 
     def answer(command, **how):
         asked.append((command, how["timeout"]))
@@ -55,15 +54,15 @@ def test_the_queue_is_asked_for_the_users_and_is_unknown_if_slurm_fails(monkeypa
         assert read_queue({"a"}) is None
 
 
-def fail(error: Exception) -> None:
+def fail(error):
     raise error
 
 
-def write_configuration(one: Trial, folder: Path) -> None:
+def write_configuration(one, folder):
     (folder / "config.yaml").write_text(json.dumps(one.values | {"tracking": options()}))
 
 
-def begun(runs: Path, seed: int = 0, step: int = 0, **settings: Any) -> Trial:
+def begun(runs, seed=0, step=0, **settings):
     """A trial with a folder, whose training has got to iteration ``step``."""
     one = trial(runs, seed, raster={"name": "cpu"}, **settings)
     one.folder.mkdir(parents=True, exist_ok=True)
@@ -77,7 +76,7 @@ def begun(runs: Path, seed: int = 0, step: int = 0, **settings: Any) -> Trial:
 
 
 @pytest.mark.parametrize(
-    ("queue", "state", "note"),
+    "queue, state, note",
     [
         ({"7_1": QueuedJob("REQUEUED", "None")}, "queued", "in train at iteration 70 Slurm job 7_1, requeued"),
         ({"7_1": QueuedJob("RUNNING", "None")}, "running", "in train at iteration 70 Slurm job 7_1, running"),
@@ -144,7 +143,7 @@ def test_states_have_the_time_of_the_file_that_tells_them(tmp_path, monkeypatch)
 
 
 def test_a_failed_trial_is_superseded_by_one_with_its_settings_that_got_further(tmp_path):
-    def copied(one: Trial, name: str, message: str = "") -> Path:
+    def copied(one, name, message=""):
         folder = one.folder.with_name(name)
         folder.mkdir()
         write_configuration(one, folder)
@@ -186,7 +185,7 @@ def test_removed_trials_leave_the_plan_and_links_stay(tmp_path):
 
 
 def test_a_trial_whose_removal_fails_does_not_look_finished(tmp_path, monkeypatch):
-    def fail(folder: Path) -> None:
+    def fail(folder):
         raise OSError("busy")
 
     trial = begun(tmp_path)
@@ -225,7 +224,7 @@ def test_an_unfinished_trial_takes_the_rest_of_its_time(tmp_path):
 
 
 def test_an_estimate_is_of_the_same_scene_and_rasterizer_and_if_possible_densifier(tmp_path):
-    def trained(name: str, **settings: Any) -> Trial:
+    def trained(name, **settings):
         train = {"iterations": 1000}
         named = {"densify": {"name": name}, "train": train, "raster": {"name": "cpu"}} | settings
         return trial(tmp_path, **named)

@@ -1,7 +1,5 @@
 """The notebooks run from top to bottom, and each .ipynb agrees with its .py, with small outputs."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
+from tests.helpers import write
 
 pytestmark = pytest.mark.slow
 
@@ -16,7 +15,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 TIMEOUT = 300  # s for a cell; on a fresh machine the first one also compiles the kernels
 
 
-def test_every_notebook_is_a_pair() -> None:
+def test_every_notebook_is_a_pair():
     assert [path.stem for path in NOTEBOOKS] == [
         path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))
     ]
@@ -24,7 +23,7 @@ def test_every_notebook_is_a_pair() -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_both_files_of_a_notebook_agree_and_outputs_are_small(path: Path) -> None:
+def test_both_files_of_a_notebook_agree_and_outputs_are_small(path):
     jupytext = pytest.importorskip("jupytext", reason="needs jupytext (group dev)")
     nbformat = pytest.importorskip("nbformat", reason="needs nbformat (group dev)")
     source = jupytext.read(path)
@@ -48,7 +47,7 @@ def test_both_files_of_a_notebook_agree_and_outputs_are_small(path: Path) -> Non
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook_runs(path, tmp_path, monkeypatch):
     nbclient = pytest.importorskip("nbclient", reason="needs nbclient and ipykernel (group dev)")
     nbformat = pytest.importorskip("nbformat", reason="needs nbformat (group dev)")
     pytest.importorskip("ipykernel", reason="needs nbclient and ipykernel (group dev)")
@@ -56,8 +55,7 @@ def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         if key.startswith(("GSBENCH_", "MLFLOW_")):
             monkeypatch.delenv(key)
     command = tmp_path / "bin" / "gsbench"  # the console script of the sources under test
-    command.parent.mkdir()
-    command.write_text(f"#!{sys.executable}\nfrom gsbench.cli import main\nmain()\n")
+    write(command, f"#!{sys.executable}\nfrom gsbench.cli import main\nmain()\n")
     command.chmod(0o755)
     monkeypatch.setenv("PATH", str(command.parent), prepend=os.pathsep)
     monkeypatch.setenv("GSBENCH_SMALL", "1")

@@ -1,15 +1,14 @@
 """What an evaluation depends on, and what it measures."""
 
 import csv
-import json
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.eval.evaluator import Evaluator
@@ -21,20 +20,22 @@ from gsbench.raster import create_rasterizer
 from gsbench.raster.contract import CASES
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs import keys
-from gsbench.runs.keys import INIT, TRAIN, Step, UserCode
+from gsbench.runs.keys import INIT, TRAIN, Step
 from gsbench.runs.store import Store
+from gsbench.runs.user_code import UserCode
 from gsbench.scene.types import ANGLE, COUNTED, DISTANCE, Scene, View
 from gsbench.train.trainer import snapshot_file
+from tests.helpers import read_json
 
 TRAINED = Step(TRAIN, {}, lambda folder: None)
 FOUR_LPIPS = ["lpips_alex", "lpips_squeeze", "lpips_vgg", "lpips_vgg_raw"]
 
 
-def inputs(fps: list[int] | None = None, **options: Any) -> dict[str, Any]:
+def inputs(fps=None, **options):
     """The inputs of an evaluation without LPIPS; a key needs no views."""
     evaluator = Evaluator(PAPER, lpips=[], **options)
     cpu = torch.device("cpu")
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         evaluator=evaluator,
         rasterizer=create_rasterizer("reference", cpu, 1),
         device=cpu,
@@ -87,9 +88,9 @@ def test_speed_is_measured_at_the_given_size(monkeypatch):
 
 
 @pytest.fixture
-def told(monkeypatch) -> list[tuple[Any, ...]]:
+def told(monkeypatch):
     """The progress that an evaluation reports."""
-    told: list[tuple[Any, ...]] = []
+    told = []
     monkeypatch.setattr(
         evaluate_module, "progress", lambda title: nullcontext(lambda *counts: told.append(counts))
     )
@@ -109,7 +110,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
     earlier = faint.select(torch.arange(50))
     write_ply(earlier, training / snapshot_file(7))
     np.savez(training / "lineage.npz", causes=np.zeros(80, dtype=np.int64), ids=np.arange(80))
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         evaluator=Evaluator(PAPER, lpips=[], flip=False),
         rasterizer=ReferenceRasterizer(),
         device=torch.device("cpu"),
@@ -119,7 +120,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
         user_code=UserCode(),
         program=None,
     )
-    views: Any = SimpleNamespace(store=store, scene=scene, init=init)
+    views = SimpleNamespace(store=store, scene=scene, init=init)
     folder = tmp_path / "built"
     folder.mkdir()
     evaluate_step(views, TRAINED, parts).build(folder)
@@ -135,7 +136,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
     means = {"last": 0.0, "earlier": 0.0}
     for view in scene.test:
         picture = np.asarray(Image.open(folder / "renders" / view.name)).astype(float)
-        np.testing.assert_array_equal(picture, rendered(truth, view))
+        assert_array_equal(picture, rendered(truth, view))
         counted = np.ones((32, 40), dtype=bool) if view.mask is None else view.mask
         for name, image in (("last", picture), ("earlier", rendered(earlier, view))):
             means[name] += 0.5 * 10 * np.log10(255**2 / ((image - view.image)[counted] ** 2).mean())
@@ -153,7 +154,7 @@ def test_an_evaluation_measures_the_pixels_of_its_png_files(tmp_path, truth, tin
         places = [np.linalg.norm(view.camera.center - other.camera.center) for other in scene.train]
         assert float(row[DISTANCE]) == pytest.approx(min(places) / scene.extent)
         assert float(row["fps"]) > 0
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     assert metrics["metrics"]["psnr"] == pytest.approx(means["last"], abs=1e-5)
     assert metrics["at"].keys() == {"7"}
     assert metrics["at"]["7"]["num_gaussians"] == 50
@@ -177,13 +178,13 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
     renders.mkdir(parents=True)
     for shift, view in enumerate(tiny_scene.test, 4):
         Image.fromarray((view.image // 2 + shift).astype(np.uint8)).save(renders / view.name)
-    parts: Any = SimpleNamespace(
+    parts = SimpleNamespace(
         evaluator=Evaluator(PAPER, lpips=[], flip=False),
         eval=SimpleNamespace(fps=[20, 16]),
         user_code=UserCode(),
         program=SimpleNamespace(leaves_model=False),
     )
-    views: Any = SimpleNamespace(store=store, scene=tiny_scene)
+    views = SimpleNamespace(store=store, scene=tiny_scene)
     folder = tmp_path / "built"
     folder.mkdir()
     step = evaluate_step(views, TRAINED, parts)
@@ -196,7 +197,7 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
         for shift, view in enumerate(tiny_scene.test, 4)
     ]
     assert found == pytest.approx(expected, abs=1e-5)
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     assert (
         metrics["unavailable"]["fps"]
         == "only the renders of the other program are known, not its model"
@@ -206,7 +207,7 @@ def test_renders_of_another_program_are_measured_without_changes(tmp_path, tiny_
 
 
 def test_the_mean_colour_of_counted_training_pixels_is_measured_against_the_test_views(tiny_scene):
-    def plain(view: View, color: tuple[int, int, int]) -> View:
+    def plain(view, color):
         return replace(view, image=np.broadcast_to(np.uint8(color), view.image.shape).copy())
 
     black, light, dark = (

@@ -1,6 +1,7 @@
 """The keys of one known trial in the store. If a key changes, stored results are not found."""
 
 from pathlib import Path
+from shlex import split
 
 from gsbench.config.compose import compose_one
 from gsbench.pipeline import trial as pipeline_trial
@@ -9,23 +10,15 @@ from gsbench.pipeline.steps import scene as scene_module
 from gsbench.pipeline.steps.scene import CaptureSource
 from gsbench.pipeline.trial import TrialSteps
 from gsbench.runs import keys
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.store import Store
 from gsbench.scene.types import Capture
 
-WORDS = [
-    "scene=garden",
-    "scene.path=photos",
-    "init=random",
-    "densify=volumetric",
-    "densify.volume_threshold=0.05",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "raster=cpu",
-    "device=cpu",
-    "threads=1",
-    "seed=3",
-]
+WORDS = split(
+    "scene=garden scene.path=photos init=random densify=volumetric "
+    "densify.volume_threshold=0.05 eval.lpips=[] eval.flip=false raster=cpu device=cpu "
+    "threads=1 seed=3"
+)
 BARE = Capture(
     "garden", Path("photos"), ("a.jpg", "b.jpg", "c.jpg"), ("a.jpg",), None, False, "0" * 64
 )
@@ -41,7 +34,7 @@ KEYS = [
 
 
 class BareSource(CaptureSource):
-    def read(self, made: Path | None) -> Capture:
+    def read(self, made):
         return BARE
 
 

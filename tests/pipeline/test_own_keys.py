@@ -1,8 +1,6 @@
 """Keys of trials with the user's classes: they change with everything that changes results."""
 
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +9,7 @@ from gsbench.pipeline import trial as pipeline_trial
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.scene import view_versions
 from gsbench.pipeline.trial import TrialSteps
-from gsbench.runs.keys import config_hash
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.store import Store
 from gsbench.system.own_modules import allowed_modules
 from tests.pipeline.test_keys import WORDS, BareSource
@@ -34,7 +32,7 @@ WRAPPED = (
 
 
 @pytest.fixture(autouse=True)
-def home(tmp_path, monkeypatch) -> Iterator[Path]:
+def home(tmp_path, monkeypatch):
     """The user's current folder."""
     monkeypatch.chdir(tmp_path)
     yield tmp_path
@@ -43,18 +41,18 @@ def home(tmp_path, monkeypatch) -> Iterator[Path]:
         allowed_modules().pop(name, None)
 
 
-def _forget() -> None:
+def _forget():
     """Forget the user's modules, as a new process would."""
     for name in MODULES:
         sys.modules.pop(name, None)
 
 
 @pytest.fixture(autouse=True)
-def bare_capture(monkeypatch) -> None:
+def bare_capture(monkeypatch):
     monkeypatch.setattr(pipeline_trial, "CaptureSource", BareSource)
 
 
-def keys_of(home: Path, *words: str) -> dict[str, str]:
+def keys_of(home, *words):
     """The keys of a trial by stage in a new process, and the hash of its configuration."""
     _forget()
     values = compose_one([*WORDS, f"allow_targets=[{','.join(MODULES)}]", *words]).values
@@ -62,7 +60,7 @@ def keys_of(home: Path, *words: str) -> dict[str, str]:
     return {"config": config_hash(values)} | {step.stage.name: step.key for step in steps}
 
 
-def moved(one: dict[str, str], other: dict[str, str]) -> set[str]:
+def moved(one, other):
     return {name for name in one if one[name] != other[name]}
 
 

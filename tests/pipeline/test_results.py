@@ -2,8 +2,7 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from shlex import split
 
 import pytest
 
@@ -12,7 +11,8 @@ from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, REPORT_FILE
 from gsbench.pipeline.trial import cloud_hash, results_of, source_files, versions
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.runs.experiments import Declaration, Question, open_question, record_text
-from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step, sha256_of
+from gsbench.runs.keys import EVALUATE, INIT, STAGES, TRAIN, Step
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Capture
@@ -37,17 +37,17 @@ PROGRAM = {
 EVENTS = [{"step": 1, "cloned": 2, "pruned_size": 1}, {"step": 2, "cloned": 3}]
 
 
-def write(files: dict[str, Any], folder: Path) -> None:
+def write(files, folder):
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
 
 
 @pytest.fixture
-def made(tmp_path, tiny_scene) -> Any:
+def made(tmp_path, tiny_scene):
     """A function that makes the results of a trial with the training ``TRAINING`` and changes."""
     values = compose_one(
-        ["scene=courtyard", "name=x", f"runs={tmp_path}", "eval.primary=psnr", "seed=4"]
+        split(f"scene=courtyard name=x runs={tmp_path} eval.primary=psnr seed=4")
     ).values
     store = Store(tmp_path / "store")
     capture = Capture("made", tmp_path, (), (), None, False, "0abc", "every eighth view")
@@ -129,7 +129,7 @@ def test_results_combine_the_results_of_the_steps(made):
 
 
 @pytest.mark.parametrize(
-    ("changes", "evaluated_from", "raster", "unknown", "timed"),
+    "changes, evaluated_from, raster, unknown, timed",
     [
         ({"iterations": 0}, "model", "reference", {"train_time", "total_time"}, False),
         (PROGRAM, "model", "reference", set(), True),

@@ -1,14 +1,12 @@
 """A trial's steps in order, its files, and its failures, with stand-ins for the steps."""
 
-import json
 import logging
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.files import DiskFullError
@@ -16,13 +14,15 @@ from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.normalization import IDENTITY, Normalization
 from gsbench.pipeline import trial as trials
 from gsbench.pipeline.trial import TrialSteps, _publish, _recorded_failures, run_trial
-from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Stage, Step, config_hash
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.keys import CAPTURE, EVALUATE, GROUND_TRUTH, INIT, TRAIN, Step
 from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.locks import BusyError, hold
 from tests.finished import record_of
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import read_json, write
 from tests.launch.test_jobs import trial
 
 # ---- the frame
@@ -32,16 +32,15 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
     caplog.set_level(logging.INFO, "gsbench")
     one = trial(tmp_path)
     record = record_of(one.values, hashes={"config": config_hash(one.values)})
-    ran: list[Any] = []
+    ran = []
 
-    def run(given: Any, folder: TrialFolder) -> Any:
+    def run(given, folder):
         ran.append((given, sorted(path.name for path in folder.path.iterdir())))
         folder.write_finished(one.values, record)
         return record
 
     monkeypatch.setattr(trials, "_run", run)
-    one.folder.mkdir(parents=True)
-    (one.folder / ".a.tmp-1").touch()
+    write(one.folder / ".a.tmp-1", b"")
     with hold(one.files.lock, "other"), pytest.raises(BusyError, match="seed 0"):
         run_trial(one, wait=False)
     assert run_trial(one) == record
@@ -56,7 +55,7 @@ def test_a_trial_runs_unless_it_is_done_and_one_process_at_a_time(tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("error", "kind", "message", "bad_input"),
+    "error, kind, message, bad_input",
     [
         (InputError("no photos"), InputError, "no photos", True),
         (TrainingError("nan"), TrainingError, "nan", False),
@@ -79,7 +78,7 @@ def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, me
         )
         assert type(error).__name__ in failure.traceback
 
-    def full(path: Path, values: Any) -> None:
+    def full(path, values):
         raise OSError(28, "full")
 
     monkeypatch.setattr(trials, "write_json", full)
@@ -90,33 +89,33 @@ def test_a_failure_is_recorded_and_raised(tmp_path, monkeypatch, error, kind, me
 # ---- the steps
 
 
-def step(stage: Stage, **inputs: Any) -> Step:
+def step(stage, **inputs):
     return Step(stage, inputs, lambda folder: (folder / "made").write_text(str(inputs)))
 
 
 @pytest.fixture
-def made(monkeypatch) -> SimpleNamespace:
+def made(monkeypatch):
     """What the steps of a trial are made of; the keys of steps are the words that made them."""
     state = SimpleNamespace(capture_step=None, masking=None, normalizing=None, needs=False)
-    told: list[Any] = []
+    told = []
     state.told = told
 
     class Source:
-        def __init__(self, options: Any) -> None:
+        def __init__(self, options):
             self.step = state.capture_step
 
-        def read(self, folder: Path | None) -> Any:
+        def read(self, folder):
             told.append(("read", folder))
             return "given"
 
-    def note(name: str, result: Any) -> Any:
-        def call(*arguments: Any) -> Any:
+    def note(name, result):
+        def call(*arguments):
             told.append((name, *arguments))
             return result() if callable(result) else result
 
         return call
 
-    def init(store: Any, capture: Any, initializer: Any, *more: Any) -> Step:
+    def init(store, capture, initializer, *more):
         told.append(("init", capture, initializer, *more))
         return step(INIT, of=str(initializer))
 
@@ -208,12 +207,11 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
         ],
         GROUND_TRUTH: ["a.png", "b.png", "masks/b.png"],
     }
-    entries: dict[str, Any] = {}
+    entries = {}
     for stage, names in content.items():
         place = tmp_path / stage.name
         for name in names:
-            (place / name).parent.mkdir(parents=True, exist_ok=True)
-            (place / name).write_text(f"{stage.name} {name}")
+            write(place / name, f"{stage.name} {name}")
         entries[stage.name] = SimpleNamespace(path=place)
     gaussians = random_gaussians(5, dtype=torch.float32)
     write_ply(gaussians, tmp_path / "train" / "point_cloud.ply")
@@ -234,14 +232,14 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     assert {name: (folder / name).read_text() for name in texts} == texts
     model = read_ply(folder / "point_cloud.ply")
     given = gaussians.means / normalization.scale + torch.tensor(normalization.center)
-    torch.testing.assert_close(model.means, given.float())
+    assert_close(model.means, given.float())
     assert (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply") == (
         normalization is IDENTITY
     )
 
 
 @pytest.fixture
-def running(tmp_path, monkeypatch) -> SimpleNamespace:
+def running(tmp_path, monkeypatch):
     """A trial whose steps write a file each; ``record`` are the results."""
     one = trial(tmp_path)
     state = SimpleNamespace(trial=one, seen={}, error=None, raster="raster")
@@ -253,16 +251,16 @@ def running(tmp_path, monkeypatch) -> SimpleNamespace:
         threads = 3
         raster = "proven"
 
-        def __init__(self, values: Any) -> None:
+        def __init__(self, values):
             self.values = values
 
-        def check(self, on_this_machine: bool) -> None:
+        def check(self, on_this_machine):
             state.seen["checked"] = on_this_machine
             if state.error:
                 raise state.error
 
         @property
-        def rasterizer(self) -> str:
+        def rasterizer(self):
             state.seen["rasterizer"] = True
             return "r"
 
@@ -270,10 +268,10 @@ def running(tmp_path, monkeypatch) -> SimpleNamespace:
         capture = photographs = SimpleNamespace(normalization=IDENTITY)
         views = SimpleNamespace(scene=SimpleNamespace(train=(1, 2, 3), test=(1, 2)))
 
-        def __init__(self, parts: Any, store: Store) -> None:
+        def __init__(self, parts, store):
             pass
 
-        def steps(self) -> Any:
+        def steps(self):
             for number, stage in enumerate((CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)):
                 yield replace(
                     step(stage, number=number),
@@ -283,11 +281,11 @@ def running(tmp_path, monkeypatch) -> SimpleNamespace:
                 if stage is INIT:  # read while the training runs
                     state.seen["report"] = (one.folder / "init_report.json").read_text()
 
-    def build(folder: Path) -> None:
+    def build(folder):
         (folder / trials.REPORT_FILE).write_text("{}")
         state.seen.setdefault("building", []).append(one.files.building())
 
-    def results_of(*given: Any) -> Any:
+    def results_of(*given):
         state.seen["given"] = given
         return state.record
 
@@ -303,8 +301,7 @@ def running(tmp_path, monkeypatch) -> SimpleNamespace:
 def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     caplog.set_level(logging.INFO, "gsbench")
     one, folder = running.trial, running.trial.folder
-    folder.mkdir(parents=True)
-    (folder / "failed.json").write_text("{}")
+    write(folder / "failed.json", "{}")
     assert run_trial(one) == running.record
     seen = running.seen
     assert (seen["checked"], seen["rasterizer"], seen["threads"]) == (True, True, 3)
@@ -329,7 +326,6 @@ def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     assert not (folder / "failed.json").exists()
     assert not (folder / "building.json").exists()
     made_of = one.files.made_of()
-    assert made_of is not None
     # the photographs of a scene that gsbench made are not looked at again
     assert set(made_of.entries) == {"init", "train", "ground_truth", "evaluate"}
     assert set(made_of.published) == {"config.yaml", "init_report.json"}
@@ -355,9 +351,8 @@ def test_equal_results_are_called_done_and_useless_ones_are_named(running, caplo
 
 def test_a_refused_part_leaves_the_earlier_configuration(running):
     one, running.error = running.trial, InputError("no such device")
-    one.folder.mkdir(parents=True)
-    (one.folder / "config.yaml").write_text("earlier")
+    write(one.folder / "config.yaml", "earlier")
     with pytest.raises(GsbenchError, match="no such device"):
         run_trial(one)
     assert (one.folder / "config.yaml").read_text() == "earlier"
-    assert json.loads((one.folder / "failed.json").read_text())["status"] == "failed"
+    assert read_json(one.folder / "failed.json")["status"] == "failed"

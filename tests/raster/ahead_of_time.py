@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,8 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, make_backend
 from triton.runtime.jit import JITFunction, create_function_from_signature
+
+from tests.processes import completed
 
 TARGETS = (80, 86, 89, 90, 120)  # A100, RTX 30, RTX 40, H100/H200, RTX 50
 BINARIES = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
@@ -34,16 +34,16 @@ class Launch:
     named: dict[str, Any]
 
     @property
-    def name(self) -> str:
+    def name(self):
         return str(self.kernel.fn.__name__)
 
 
 @contextmanager
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
+def recorded(monkeypatch):
     """Within this context, kernels do not run; their launches are appended to the list."""
-    launches: list[Launch] = []
+    launches = []
 
-    def run(kernel: JITFunction, *arguments: Any, grid: Any, warmup: bool, **named: Any) -> None:
+    def run(kernel, *arguments, grid, warmup, **named):
         launches.append(Launch(kernel, arguments, named))
 
     with monkeypatch.context() as patch:
@@ -51,7 +51,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
         yield launches
 
 
-def specialization(launch: Launch, compute_capability: int = 90) -> tuple[Any, ...]:
+def specialization(launch, compute_capability=90):
     """The properties for which Triton compiles a kernel separately.
 
     These are types, constants, and which arguments are divisible by 16.
@@ -73,12 +73,12 @@ class Compiled:
     text: str  # SASS
 
     @property
-    def inner_loop(self) -> int:
+    def inner_loop(self):
         """Instructions of the longest innermost loop; 0 without one."""
         return max(self.loops.values(), default=0)
 
 
-def compile_for(launch: Launch, compute_capability: int) -> Compiled:
+def compile_for(launch, compute_capability):
     target = GPUTarget("cuda", compute_capability, 32)
     backend = make_backend(target)
     kernel = launch.kernel
@@ -100,10 +100,10 @@ def compile_for(launch: Launch, compute_capability: int) -> Compiled:
     )
 
 
-def innermost_loops(text: str) -> dict[str, int]:
+def innermost_loops(text):
     """For each innermost loop, the number of instructions from its label to the branch back."""
-    labels: dict[str, int] = {}
-    loops: dict[str, tuple[int, int]] = {}
+    labels = {}
+    loops = {}
     place = 0
     for line in text.splitlines():
         if label := re.match(r"\s*(\.L_\w+):", line):
@@ -122,11 +122,9 @@ def innermost_loops(text: str) -> dict[str, int]:
     return {label: loops[label][1] - loops[label][0] for label in sorted(inner)}
 
 
-def _run(tool: str, *arguments: str) -> str:
+def _run(tool, *arguments):
     path = BINARIES / tool
     command = str(path) if path.exists() else shutil.which(tool)
     if command is None:
         pytest.skip(f"this Triton has no {tool}")
-    return subprocess.run(
-        [command, *arguments], capture_output=True, text=True, check=True, timeout=120
-    ).stdout
+    return completed([command, *arguments]).stdout

@@ -4,15 +4,13 @@ It must be chosen before Triton is imported. So the tests that use it run in sep
 which ``test_triton.py`` starts.
 """
 
-from __future__ import annotations
-
 import os
 import re
 
 INTERPRETING = os.environ.get("TRITON_INTERPRET") == "1"
 
 
-def interpreter_fault(triton: str, numpy: str) -> str | None:
+def interpreter_fault(triton, numpy):
     """Why this Triton's interpreter fails with this NumPy; None if it works."""
     versions = [
         tuple(int(number) for number in re.findall(r"\d+", text)[:2]) for text in (triton, numpy)
@@ -28,7 +26,7 @@ def interpreter_fault(triton: str, numpy: str) -> str | None:
 collect_ignore = [] if INTERPRETING else ["test_triton_interpreted.py"]
 
 
-def _patch_once() -> None:
+def _patch_once():
     """Let the interpreter patch Triton's language once for each module.
 
     It would patch it at every call of a function, which takes most of its time. The patches made by
@@ -39,7 +37,7 @@ def _patch_once() -> None:
     original, seen = interpreter._patch_lang, set()
     no_patches = getattr(interpreter, "_LangPatchScope", None)  # since Triton 3.6
 
-    def patch(function):  # type: ignore[no-untyped-def]
+    def patch(function):
         if function.__module__ not in seen:
             seen.add(function.__module__)
             original(function)

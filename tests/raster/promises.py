@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
-from gsbench.raster.base import Rasterizer, RenderOutput
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
 
@@ -28,22 +27,20 @@ class Subject:
     needle_limit: float  # largest error, as a fraction of the largest gradient of a needle
 
 
-def bits(output: RenderOutput, gradients: dict[str, Tensor]) -> list[bytes]:
+def bits(output, gradients):
     tensors = [output.image, output.alpha, output.radii, *gradients.values()]
     return [tensor.detach().numpy().tobytes() for tensor in tensors]
 
 
-def bits_of(rasterizer: Rasterizer, case: Case) -> list[bytes]:
+def bits_of(rasterizer, case):
     return bits(*render_with_gradients(rasterizer, case, torch.float32))
 
 
-def leaves(case: Case) -> Gaussians:
+def leaves(case):
     return case.gaussians().map(lambda tensor: tensor.float().requires_grad_())
 
 
-def both(
-    subject: Subject, gaussians: Gaussians, case: Case, degree: int, name: str
-) -> list[Tensor]:
+def both(subject, gaussians, case, degree, name):
     """The gradients by the parameter ``name``: those of the executor, and those of the reference.
 
     The loss is the sum of the squared image.
@@ -60,7 +57,7 @@ def both(
     return found
 
 
-def equal_depths_are_blended_in_the_order_of_the_index(subject: Subject) -> None:
+def equal_depths_are_blended_in_the_order_of_the_index(subject):
     gaussians = Gaussians(
         torch.tensor([[0.3, 0.2, 3.0]] * 5),
         torch.full((5, 3), -1.0),
@@ -76,7 +73,7 @@ def equal_depths_are_blended_in_the_order_of_the_index(subject: Subject) -> None
     assert reference.max() > 0.5
 
 
-def needles_keep_their_gradients(subject: Subject) -> None:
+def needles_keep_their_gradients(subject):
     """A needle is long and thin: computed as ac - b^2, its determinant loses all digits."""
     case = Case(50, 40, 20, sh_degree=0)
     gaussians = case.gaussians()
@@ -87,7 +84,7 @@ def needles_keep_their_gradients(subject: Subject) -> None:
     assert (found - expected).abs().max() < subject.needle_limit * expected.abs().max()
 
 
-def turning_a_ball_has_no_gradient(subject: Subject) -> None:
+def turning_a_ball_has_no_gradient(subject):
     """A sphere has no gradient, not even a rounding error, which Adam would scale to a full step.
 
     A Gaussian that is almost a sphere has one.
@@ -101,7 +98,7 @@ def turning_a_ball_has_no_gradient(subject: Subject) -> None:
         assert (found - expected).abs().max() < 1e-3 * expected.abs().max() + 1e-12
 
 
-def renders_may_be_differentiated_late_and_twice(subject: Subject) -> None:
+def renders_may_be_differentiated_late_and_twice(subject):
     """Two graphs exist at once; the second is differentiated first, the first one twice."""
     rasterizer, cases = subject.make(), (subject.small, subject.large)
     alone = [render_with_gradients(rasterizer, case, torch.float32)[1]["means"] for case in cases]
@@ -121,7 +118,7 @@ def renders_may_be_differentiated_late_and_twice(subject: Subject) -> None:
         assert torch.equal(parameters[k].means.grad.double(), alone[k])
 
 
-def results_that_are_kept_are_not_overwritten(subject: Subject) -> None:
+def results_that_are_kept_are_not_overwritten(subject):
     rasterizer = subject.make()
     output, gradients = render_with_gradients(rasterizer, subject.small, torch.float32)
     kept = bits(output, gradients)
@@ -134,7 +131,7 @@ def results_that_are_kept_are_not_overwritten(subject: Subject) -> None:
     assert torch.equal(image, before)
 
 
-def strided_parameters_are_taken_and_the_background_has_a_gradient(subject: Subject) -> None:
+def strided_parameters_are_taken_and_the_background_has_a_gradient(subject):
     gaussians = subject.small.gaussians().map(Tensor.float)
     strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], -1)[..., 0])
     assert not strided.means.is_contiguous()
@@ -143,11 +140,10 @@ def strided_parameters_are_taken_and_the_background_has_a_gradient(subject: Subj
     output = rasterizer.render(strided, camera, 3, background)
     assert torch.equal(output.image, rasterizer.render(gaussians, camera, 3, background).image)
     output.image.sum().backward()
-    assert background.grad is not None
     assert background.grad[0].item() == pytest.approx((1 - output.alpha).sum().item(), rel=1e-5)
 
 
-def float64_is_refused(subject: Subject) -> None:
+def float64_is_refused(subject):
     case = subject.small
     with pytest.raises(ValueError, match="float32"):
         subject.make().render(case.gaussians(), case.camera(), 0, BLACK.double())

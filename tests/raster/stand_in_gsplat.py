@@ -6,39 +6,35 @@ here in plain torch. Its autograd function saves the means that it was given and
 gradient as an attribute of them, as gsplat's does.
 """
 
-from __future__ import annotations
-
 import itertools
 import sys
 import weakref
 from types import SimpleNamespace
-from typing import Any
 
 import torch
 from gsplat.cuda import _torch_impl as definitions
-from torch import Tensor
 
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999  # gsplat 1.5; the clamp blocks the gradient
 TRANSMITTANCE_MIN = 1e-4
 
-calls: list[str] = []  # the names of the functions that were called
+calls = []  # the names of the functions that were called
 # one for every compositing in an autograd graph; it is dead when the graph is freed
-graphs: list[weakref.ref] = []
+graphs = []
 
 
 def fully_fused_projection(
-    means: Tensor,
-    covars: None,
-    quats: Tensor,
-    scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,  # noqa: N803 - gsplat's name
-    width: int,
-    height: int,
-    eps2d: float = 0.3,
-    near_plane: float = 0.01,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
+    means,
+    covars,
+    quats,
+    scales,
+    viewmats,
+    Ks,  # noqa: N803 - gsplat's name
+    width,
+    height,
+    eps2d=0.3,
+    near_plane=0.01,
+):
     calls.append("fully_fused_projection")
     if len(means) == 0:
         raise ZeroDivisionError(
@@ -51,43 +47,26 @@ def fully_fused_projection(
     return radii.detach(), means2d.contiguous(), depths, conics, None
 
 
-def isect_tiles(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-) -> tuple[Tensor, Tensor, Tensor]:
+def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
     calls.append("isect_tiles")
     return definitions._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
 
 
-def isect_offset_encode(
-    isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int
-) -> Tensor:
+def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
     calls.append("isect_offset_encode")
     return definitions._isect_offset_encode(isect_ids, n_images, tile_width, tile_height)
 
 
-def spherical_harmonics(
-    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
-) -> Tensor:
+def spherical_harmonics(degrees_to_use, dirs, coeffs, masks=None):
     calls.append("spherical_harmonics")
     colors = definitions._spherical_harmonics(degrees_to_use, dirs, coeffs)
     return colors if masks is None else torch.where(masks.unsqueeze(-1), colors, 0.0)
 
 
-def head() -> SimpleNamespace:
+def head():
     """The stand-in for gsplat 1.6, whose harmonics take poses and check every shape."""
 
-    def spherical_harmonics(
-        degrees_to_use: int,
-        means: Tensor,
-        viewmats: Tensor,
-        coeffs: Tensor,
-        masks: Tensor | None = None,
-    ) -> Tensor:
+    def spherical_harmonics(degrees_to_use, means, viewmats, coeffs, masks=None):
         calls.append("spherical_harmonics of 1.6")
         cameras, count = len(viewmats), len(means)
         assert means.shape == (count, 3)
@@ -109,18 +88,18 @@ def head() -> SimpleNamespace:
 
 
 def rasterize_to_pixels(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    image_width: int,
-    image_height: int,
-    tile_size: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    backgrounds: Tensor | None = None,
-    absgrad: bool = False,
-) -> tuple[Tensor, Tensor]:
+    means2d,
+    conics,
+    colors,
+    opacities,
+    image_width,
+    image_height,
+    tile_size,
+    isect_offsets,
+    flatten_ids,
+    backgrounds=None,
+    absgrad=False,
+):
     calls.append("rasterize_to_pixels")
     settings = (image_width, image_height, tile_size, isect_offsets, flatten_ids, absgrad)
     return _Rasterize.apply(means2d, conics, colors, opacities, backgrounds, settings)
@@ -133,7 +112,7 @@ class _Rasterize(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, means2d: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+    def forward(ctx, means2d, *rest):
         *tensors, settings = rest
         image, alpha, _ = _composite(means2d, *tensors, settings)
         ctx.save_for_backward(means2d, *tensors)
@@ -142,7 +121,7 @@ class _Rasterize(torch.autograd.Function):
         return image, alpha
 
     @staticmethod
-    def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx, g_image, g_alpha):
         means2d, *tensors = ctx.saved_tensors
         with torch.enable_grad():
             leaves = [tensor.detach().requires_grad_() for tensor in (means2d, *tensors[:3])]
@@ -162,14 +141,7 @@ class _Rasterize(torch.autograd.Function):
         return *found[:4], None, None
 
 
-def _composite(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    backgrounds: Tensor,
-    settings: Any,
-) -> tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
+def _composite(means2d, conics, colors, opacities, backgrounds, settings):
     """Return image [1, H, W, 3], alpha [1, H, W, 1] and a list with two tensors for each tile.
 
     These are the tile's Gaussians [K] and copies of their means for each pixel [P, K, 2].

@@ -1,10 +1,7 @@
 """Hypothesis strategies for extreme scenes; ordinary ones are in ``gsbench.raster.contract``."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import strategies as st
-from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.contract import CASES, Case, render_with_gradients
@@ -17,11 +14,11 @@ _LOGITS = st.sampled_from([-100.0, -6.0, 0.0, 5.0, 100.0])
 
 
 @st.composite
-def extreme_gaussians(draw: st.DrawFn) -> Gaussians:
+def extreme_gaussians(draw):
     """0 to 6 float32 Gaussians of any size, in, behind or far outside the frustum."""
     count = draw(st.integers(0, 6))
 
-    def rows(elements: st.SearchStrategy[float], width: int) -> Tensor:
+    def rows(elements, width):
         values = draw(st.lists(elements, min_size=count * width, max_size=count * width))
         return torch.tensor(values, dtype=torch.float32).reshape(count, width)
 

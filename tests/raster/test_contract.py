@@ -1,7 +1,5 @@
 """The contract of ``gsbench.raster.base``: every executor that runs here against the reference."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -11,7 +9,6 @@ from hypothesis import HealthCheck, given, settings
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster import EXECUTORS, create_rasterizer
-from gsbench.raster.base import Rasterizer
 from gsbench.raster.contract import (
     CASES,
     FOOTPRINT_TOLERANCE,
@@ -20,7 +17,7 @@ from gsbench.raster.contract import (
     footprint_errors,
     render_with_gradients,
 )
-from gsbench.raster.executors import Executor, find_executor, offers
+from gsbench.raster.executors import find_executor, offers
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera
 from tests.raster.strategies import extreme_gaussians
@@ -28,12 +25,12 @@ from tests.raster.strategies import extreme_gaussians
 PEERS = ("gsplat",)  # only for comparison; their modules list their departures from the contract
 
 
-def _home(executor: Executor) -> str:
+def _home(executor):
     """The type of device that an executor is made for."""
     return "cpu" if executor.runs_on("cpu") else "cuda"
 
 
-def _available() -> list[str]:
+def _available():
     places = {"cpu": True, "cuda": torch.cuda.is_available()}
     here = [
         executor
@@ -44,21 +41,19 @@ def _available() -> list[str]:
 
 
 @pytest.fixture(params=_available())
-def device(request: pytest.FixtureRequest) -> str:
+def device(request):
     return _home(find_executor(request.param))
 
 
 @pytest.fixture
-def rasterizer(request: pytest.FixtureRequest, device: str) -> Rasterizer:
+def rasterizer(request, device):
     return create_rasterizer(
         request.node.callspec.params["device"], torch.device(device), threads=2
     )
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_values_and_gradients_match_the_reference(
-    rasterizer: Rasterizer, device: str, case: Case
-) -> None:
+def test_values_and_gradients_match_the_reference(rasterizer, device, case):
     """Tests in ``test_executors.py`` show that `departures` finds each kind of departure."""
     assert departures(rasterizer, device, (case,)) == []
     expected, references = render_with_gradients(ReferenceRasterizer(), case, torch.float64)
@@ -75,7 +70,7 @@ def test_values_and_gradients_match_the_reference(
     assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE
 
 
-def test_unused_coefficients_get_a_zero_gradient(rasterizer: Rasterizer, device: str) -> None:
+def test_unused_coefficients_get_a_zero_gradient(rasterizer, device):
     _, gradients = render_with_gradients(
         rasterizer, Case(50, 37, 120, sh_degree=1), torch.float32, device
     )
@@ -83,9 +78,7 @@ def test_unused_coefficients_get_a_zero_gradient(rasterizer: Rasterizer, device:
     assert gradients["sh_rest"][:, 3:].abs().max() == 0
 
 
-def test_the_gradient_of_the_colour_clamp_passes_at_zero(
-    rasterizer: Rasterizer, device: str
-) -> None:
+def test_the_gradient_of_the_colour_clamp_passes_at_zero(rasterizer, device):
     """The colour is max(0, SH + 0.5): no gradient below 0, the whole gradient at exactly 0."""
     gaussians = _one_gaussian(device)
     c0 = math.sqrt(1 / (4 * math.pi))
@@ -107,9 +100,7 @@ def test_the_gradient_of_the_colour_clamp_passes_at_zero(
     assert gradient[0].item() == pytest.approx(gradient[2].item(), rel=1e-5)
 
 
-def test_without_visible_gaussians_the_image_is_the_background(
-    rasterizer: Rasterizer, device: str
-) -> None:
+def test_without_visible_gaussians_the_image_is_the_background(rasterizer, device):
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
     for gaussians in (
         _one_gaussian(device, z=-5.0),
@@ -133,14 +124,12 @@ def test_without_visible_gaussians_the_image_is_the_background(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(gaussians=extreme_gaussians())
-def test_extreme_gaussians_give_finite_results(
-    rasterizer: Rasterizer, device: str, gaussians: Gaussians
-) -> None:
+def test_extreme_gaussians_give_finite_results(rasterizer, device, gaussians):
     leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
     background = torch.zeros(3, device=device)
     output = rasterizer.render(
         leaves, _camera(37, 21), 3, background, absolute_gradient=True, splitting_matrix=True
-    )  # type: ignore[call-arg]
+    )
     assert output.image.isfinite().all()
     assert ((output.alpha >= 0) & (output.alpha <= 1)).all()
     assert (output.radii >= 0).all()
@@ -156,16 +145,14 @@ def test_extreme_gaussians_give_finite_results(
     "name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"]
 )
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_an_error_names_the_parameter_that_is_not_finite(
-    rasterizer: Rasterizer, device: str, name: str, value: float
-) -> None:
+def test_an_error_names_the_parameter_that_is_not_finite(rasterizer, device, name, value):
     gaussians = _one_gaussian(device)
     getattr(gaussians, name).flatten()[0] = value
     with pytest.raises(ValueError, match=name):
         rasterizer.render(gaussians, _camera(16, 16), 3, torch.zeros(3, device=device))
 
 
-def test_an_error_names_the_input_that_cannot_be_used(rasterizer: Rasterizer, device: str) -> None:
+def test_an_error_names_the_input_that_cannot_be_used(rasterizer, device):
     gaussians, black = _one_gaussian(device), torch.zeros(3, device=device)
     camera = _camera(16, 16)
     for word, view, degree, background in (
@@ -183,13 +170,13 @@ def test_an_error_names_the_input_that_cannot_be_used(rasterizer: Rasterizer, de
         rasterizer.render(gaussians, _camera(16, 16), 0, black)
 
 
-def _camera(width: int, height: int, focal: float | None = None) -> Camera:
+def _camera(width, height, focal=None):
     return Camera(
         width, height, focal or width, focal or width, width / 2, height / 2, np.eye(3), np.zeros(3)
     )
 
 
-def _one_gaussian(device: str, z: float = 3.0) -> Gaussians:
+def _one_gaussian(device, z=3.0):
     gaussians = Gaussians(
         torch.tensor([[0.0, 0.0, z]]),
         torch.full((1, 3), -1.0),

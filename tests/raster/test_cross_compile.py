@@ -1,10 +1,7 @@
 """The CPU kernels compile, with vector instructions, for processors that are not present."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
-from typing import Any
 
 import llvmlite.binding as llvm
 import numba
@@ -30,7 +27,7 @@ FREE_OF_VECTORS = {"sort_by_depth", "start_tiles", "fill_shards", "balance_tiles
 
 
 @cache
-def kernels() -> dict[str, Any]:
+def kernels():
     """The kernels of a training step and of a footprint, by name; runs one step to compile them."""
     case = Case(33, 49, 50, sh_degree=3)
     trainable = TrainableGaussians(case.gaussians().map(torch.Tensor.float), LearningRates(), 1.0)
@@ -49,7 +46,7 @@ def kernels() -> dict[str, Any]:
 
 
 @cache
-def intermediate_code(name: str) -> str:
+def intermediate_code(name):
     """LLVM's code of a kernel, without the lines and attributes that name the processor."""
     function = kernels()[name]
     compiled = numba.njit(nogil=True, error_model="numpy", _nrt=False)(function.py_func)
@@ -59,7 +56,7 @@ def intermediate_code(name: str) -> str:
     return re.sub(r'"(target-cpu|target-features|tune-cpu|probe-stack)"(="[^"]*")?', "", text)
 
 
-def check(target: str, name: str) -> None:
+def check(target, name):
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     triple, processor = TARGETS[target]
@@ -77,12 +74,12 @@ def check(target: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_the_costliest_kernel_compiles_for_arm(target: str) -> None:
+def test_the_costliest_kernel_compiles_for_arm(target):
     check(target, "composite_backward_tiles")
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_kernels_compile_for_arm(target: str) -> None:
+def test_kernels_compile_for_arm(target):
     assert len(kernels()) >= 12
     for name in kernels():
         check(target, name)

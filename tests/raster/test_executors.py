@@ -1,31 +1,27 @@
 """The table of executors: what `raster=` accepts, what `auto` takes, how departures are reported."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
-from gsbench.errors import InputError
 from gsbench.pipeline.parts import locate
 from gsbench.raster import create_rasterizer, executors
-from gsbench.raster.base import Footprint, RenderOutput
 from gsbench.raster.contract import CASES, departures
-from gsbench.raster.executors import EXECUTORS, Executor, RasterConfig, find_executor, resolve
+from gsbench.raster.executors import EXECUTORS, RasterConfig, find_executor, resolve
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.install import conf_dir, install_command
+from tests.helpers import refusal
 
 CPU = torch.device("cpu")
 
 
-def installed(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+def installed(monkeypatch, *packages):
     """Pretend that ``packages`` are installed, and no other packages of executors."""
     monkeypatch.setattr(
         executors.importlib.util, "find_spec", lambda name: object() if name in packages else None
@@ -33,7 +29,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 
 
 @pytest.mark.parametrize("executor", EXECUTORS, ids=lambda executor: executor.name)
-def test_the_facts_of_an_executor_agree_with_its_class(executor: Executor) -> None:
+def test_the_facts_of_an_executor_agree_with_its_class(executor):
     if executor.name == "triton" and not executor.is_installed:
         pytest.skip("Triton has no wheels for this system")
     kind = locate(executor.target, "raster", [])
@@ -42,18 +38,18 @@ def test_the_facts_of_an_executor_agree_with_its_class(executor: Executor) -> No
     assert (executor.package is None) == (executor.install == "")
 
 
-def test_every_executor_has_its_file_in_conf() -> None:
+def test_every_executor_has_its_file_in_conf():
     assert {path.stem for path in (conf_dir() / "raster").glob("*.yaml")} == set(executors.names())
 
 
-def test_the_documents_name_every_executor() -> None:
+def test_the_documents_name_every_executor():
     root = Path(__file__).resolve().parents[2]
     for document in ("README.md", "docs/rasterizer.md"):
         for name in executors.names():
             assert f"`{name}`" in (root / document).read_text(encoding="utf-8"), (document, name)
 
 
-def test_the_table_does_not_import_torch() -> None:
+def test_the_table_does_not_import_torch():
     code = (
         "import sys, gsbench.raster.executors, gsbench.raster.base; sys.exit('torch' in "
         "sys.modules)"
@@ -61,9 +57,7 @@ def test_the_table_does_not_import_torch() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
 
-def test_auto_takes_the_best_installed_executor(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_auto_takes_the_best_installed_executor(monkeypatch, caplog):
     assert resolve("auto", "cpu").name == "cpu"
     installed(monkeypatch, "gsplat")
     assert resolve("auto", "cuda").name == "gsplat"
@@ -75,9 +69,7 @@ def test_auto_takes_the_best_installed_executor(
     assert resolve("auto", "mps").name == "reference"
 
 
-def test_an_executor_that_cannot_run_is_refused_with_a_remedy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_executor_that_cannot_run_is_refused_with_a_remedy(monkeypatch):
     assert resolve("reference", "cpu").name == "reference"
     assert isinstance(create_rasterizer("reference", CPU, threads=1), ReferenceRasterizer)
     for name, device, said in (
@@ -85,19 +77,17 @@ def test_an_executor_that_cannot_run_is_refused_with_a_remedy(
         ("gsplat", "cpu", "gsplat runs on device=cuda, not on cpu; choose from reference, cpu"),
         ("cpu", "cuda", "cpu runs on device=cpu, not on cuda; choose from reference, "),
     ):
-        with pytest.raises(InputError, match=f"^raster={said}"):
+        with refusal(f"^raster={said}"):
             resolve(name, device)
     installed(monkeypatch)
-    with pytest.raises(
-        InputError, match=f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"
-    ):
+    with refusal(f"raster=gsplat needs gsplat: {re.escape(install_command('gsplat'))}"):
         resolve("gsplat", "cuda")
     assert find_executor("gsplat").obstacle("cuda") is not None
 
 
-def test_departures_lists_errors_and_accepts_missing_options() -> None:
+def test_departures_lists_errors_and_accepts_missing_options():
     class Broken(ReferenceRasterizer):
-        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+        def render(self, *arguments, **options):
             raise RuntimeError("no kernel")
 
     class Plain(ReferenceRasterizer):
@@ -112,9 +102,7 @@ def test_departures_lists_errors_and_accepts_missing_options() -> None:
     ]
 
 
-def test_python_headers_are_searched_in_the_usual_scheme(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_headers_are_searched_in_the_usual_scheme(tmp_path, monkeypatch):
     """Debian's own scheme, ``posix_local``, names a folder without headers."""
     asked = []
     monkeypatch.setattr(
@@ -140,21 +128,19 @@ def test_python_headers_are_searched_in_the_usual_scheme(
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
-def test_an_error_says_why_the_gpu_cannot_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_says_why_the_gpu_cannot_be_used(monkeypatch):
     pytest.importorskip("triton")
     monkeypatch.setattr(executors, "missing_tools", list)
-    with pytest.raises(InputError, match=r"^Triton cannot start: "):
+    with refusal(r"^Triton cannot start: "):
         executors.load_driver()
     monkeypatch.setattr(executors, "missing_tools", lambda: ["a C compiler", "Python.h"])
-    with pytest.raises(InputError, match=r"^Triton needs a C compiler and Python.h$"):
+    with refusal(r"^Triton needs a C compiler and Python.h$"):
         executors.load_driver()
 
 
-def test_an_unknown_rasterizer_is_refused() -> None:
+def test_an_unknown_rasterizer_is_refused():
     assert RasterConfig(name="cpu").name == "cpu"
-    with pytest.raises(
-        InputError, match=r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"
-    ):
+    with refusal(r"raster must be one of auto, reference, .*, got 'cpuu'.*cpu"):
         RasterConfig(name="cpuu")
     assert RasterConfig(name="mine", _target_="mine.Mine")._target_ == "mine.Mine"
 
@@ -165,18 +151,18 @@ TINY = CASES[-1]
 class Changed(ReferenceRasterizer):
     """The reference, with changed outputs: ``change`` gets the number of Gaussians and the output."""
 
-    def __init__(self, change: Callable[[int, RenderOutput], dict[str, object]]) -> None:
+    def __init__(self, change):
         self.change = change
 
-    def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
+    def render(self, gaussians, *arguments, **options):
         out = super().render(gaussians, *arguments, **options)
         return dataclasses.replace(out, **self.change(len(gaussians), out))
 
 
-def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint]:
+def footprint_of(out, **changes):
     """The footprint of a view with some fields multiplied by the factors ``changes``."""
 
-    def footprint(values: torch.Tensor | None = None) -> Footprint:
+    def footprint(values=None):
         true = out.require_footprint(values)
         factors = {name: factor * getattr(true, name) for name, factor in changes.items()}
         return dataclasses.replace(true, **factors)
@@ -185,7 +171,7 @@ def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    "change, told",
     [
         (
             lambda out: {"image": out.image[None]},
@@ -210,28 +196,26 @@ def footprint_of(out: RenderOutput, **changes: float) -> Callable[..., Footprint
         ),
     ],
 )
-def test_each_kind_of_departure_is_listed(
-    change: Callable[[RenderOutput], dict[str, object]], told: str
-) -> None:
+def test_each_kind_of_departure_is_listed(change, told):
     (line,) = departures(Changed(lambda n, out: change(out) if n else {}), cases=(TINY,))
     assert line.startswith(f"{TINY}: {told}")
 
 
 @pytest.mark.parametrize("name", ["image", "alpha"])
-def test_departures_tests_the_image_without_gaussians(name: str) -> None:
+def test_departures_tests_the_image_without_gaussians(name):
     wrong = Changed(lambda n, out: {name: getattr(out, name) + (n == 0)})
     assert departures(wrong, cases=(TINY,)) == [
         "without Gaussians: the image is not the background"
     ]
 
 
-def test_departures_tests_the_backward_pass_without_gaussians() -> None:
+def test_departures_tests_the_backward_pass_without_gaussians():
     wrong = Changed(lambda n, out: {} if n else {"image": out.image.detach()})
     (told,) = departures(wrong, cases=(TINY,))
     assert told.startswith("without Gaussians: RuntimeError: ")
 
 
-def test_the_scenes_of_the_contract_do_not_change() -> None:
+def test_the_scenes_of_the_contract_do_not_change():
     """Reports about rasterizers outside gsbench name these scenes."""
     assert [str(case) for case in CASES] == [
         "33x49-n50-sh3",

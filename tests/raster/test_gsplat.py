@@ -3,16 +3,12 @@
 It runs on a stand-in with gsplat's signatures.
 """
 
-from __future__ import annotations
-
 import gc
 import weakref
-from types import ModuleType
 
 import pytest
 import torch
 
-from gsbench.gaussians.model import Gaussians
 from gsbench.raster.contract import Case, departures, render_with_gradients
 from gsbench.raster.gsplat import GsplatRasterizer, _DeviceCamera, _reaches_image, _square_radii
 from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
@@ -23,7 +19,7 @@ FAINT = Case(50, 37, 60, sh_degree=3, log_scale=-2.0, logit=-3.0, principal=(3.0
 
 
 @pytest.fixture
-def library() -> ModuleType:
+def library():
     pytest.importorskip("gsplat", reason="the stand-in is made of gsplat's torch definitions")
     from tests.raster import stand_in_gsplat
 
@@ -32,7 +28,7 @@ def library() -> ModuleType:
     return stand_in_gsplat
 
 
-def test_values_and_gradients_match_the_reference(library: ModuleType) -> None:
+def test_values_and_gradients_match_the_reference(library):
     expected, references = render_with_gradients(ReferenceRasterizer(), FAINT, torch.float64)
     output, gradients = render_with_gradients(
         GsplatRasterizer(library=library), FAINT, torch.float32
@@ -50,7 +46,7 @@ def test_values_and_gradients_match_the_reference(library: ModuleType) -> None:
     assert (output.radii - expected.radii)[both].abs().max() <= 1  # rounding may change the ceil
 
 
-def test_the_two_versions_of_gsplat_give_the_same_results(library: ModuleType) -> None:
+def test_the_two_versions_of_gsplat_give_the_same_results(library):
     (image, gradients), (expected, references) = (
         render_with_gradients(GsplatRasterizer(library=version), FAINT, torch.float32)
         for version in (library.head(), library)
@@ -65,7 +61,7 @@ def test_the_two_versions_of_gsplat_give_the_same_results(library: ModuleType) -
         assert (gradients[name] - reference).abs().max() <= 1e-5 * reference.abs().max(), name
 
 
-def test_backward_may_run_late_and_twice_without_the_absolute_gradient(library: ModuleType) -> None:
+def test_backward_may_run_late_and_twice_without_the_absolute_gradient(library):
     rasterizer = GsplatRasterizer(library=library)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
     background = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
@@ -82,9 +78,7 @@ def test_backward_may_run_late_and_twice_without_the_absolute_gradient(library: 
     assert torch.equal(outputs[0].screen_points.grad[:, 0] != 0, once.abs().sum(-1) != 0)
 
 
-def test_screen_points_have_a_gradient_even_if_no_parameter_requires_one(
-    library: ModuleType,
-) -> None:
+def test_screen_points_have_a_gradient_even_if_no_parameter_requires_one(library):
     _, expected = render_with_gradients(GsplatRasterizer(library=library), FAINT, torch.float32)
     gaussians = FAINT.gaussians().map(torch.Tensor.float)
     output = GsplatRasterizer(library=library).render(
@@ -97,7 +91,7 @@ def test_screen_points_have_a_gradient_even_if_no_parameter_requires_one(
     assert torch.equal(output.screen_points.grad.double(), expected["screen_points"])
 
 
-def test_a_step_leaves_no_tensor_and_no_graph_alive(library: ModuleType) -> None:
+def test_a_step_leaves_no_tensor_and_no_graph_alive(library):
     """All memory is freed without the garbage collector.
 
     A cycle through the graph would keep 60 MB per step at a million Gaussians.
@@ -105,7 +99,7 @@ def test_a_step_leaves_no_tensor_and_no_graph_alive(library: ModuleType) -> None
     rasterizer = GsplatRasterizer(library=library)
     camera, black = FAINT.camera(), torch.zeros(3)
     leaves = FAINT.gaussians().map(lambda tensor: tensor.float().requires_grad_())
-    alive: list[weakref.ref] = library.graphs
+    alive = library.graphs
     gc.collect()
     gc.disable()
     try:
@@ -126,7 +120,7 @@ def test_a_step_leaves_no_tensor_and_no_graph_alive(library: ModuleType) -> None
         gc.enable()
 
 
-def test_gsplat_is_not_called_without_gaussians(library: ModuleType) -> None:
+def test_gsplat_is_not_called_without_gaussians(library):
     none = (
         Case(20, 17, 1, 3)
         .gaussians()
@@ -146,16 +140,16 @@ def test_gsplat_is_not_called_without_gaussians(library: ModuleType) -> None:
     assert output.screen_gradient_abs.shape == (0, 2)
 
 
-def test_an_error_names_the_parameter_that_is_not_finite(library: ModuleType) -> None:
+def test_an_error_names_the_parameter_that_is_not_finite(library):
     rasterizer = GsplatRasterizer(library=library)
     for name in ("means", "opacity_logits", "sh_rest"):
-        gaussians: Gaussians = FAINT.gaussians().map(torch.Tensor.float)
+        gaussians = FAINT.gaussians().map(torch.Tensor.float)
         getattr(gaussians, name).flatten()[0] = torch.nan
         with pytest.raises(ValueError, match=name):
             rasterizer.render(gaussians, FAINT.camera(), 3, torch.zeros(3))
 
 
-def test_a_camera_is_uploaded_once_and_its_copy_is_freed_with_it(library: ModuleType) -> None:
+def test_a_camera_is_uploaded_once_and_its_copy_is_freed_with_it(library):
     rasterizer = GsplatRasterizer(library=library)
     camera = FAINT.camera()
     gaussians = FAINT.gaussians().map(torch.Tensor.float)
@@ -169,13 +163,13 @@ def test_a_camera_is_uploaded_once_and_its_copy_is_freed_with_it(library: Module
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_on_a_gpu_only_radii_depart_from_the_contract() -> None:
+def test_on_a_gpu_only_radii_depart_from_the_contract():
     pytest.importorskip("gsplat")
     told = departures(GsplatRasterizer(), "cuda", cases=(FAINT,))
     assert [line for line in told if "radius" not in line] == []
 
 
-def test_square_radii_are_those_of_the_reference() -> None:
+def test_square_radii_are_those_of_the_reference():
     projected = project(random_gaussians(300, seed=4, log_scale=(-4, 0.5)), front_camera(64, 48))
     seen = torch.ones(1, len(projected.index), dtype=torch.bool)
     radii = _square_radii(projected.conics.unsqueeze(0), seen)[0]
@@ -184,7 +178,7 @@ def test_square_radii_are_those_of_the_reference() -> None:
     assert (radii == projected.radii).double().mean() > 0.99
 
 
-def test_a_gaussian_that_reaches_a_tile_of_the_reference_reaches_the_image() -> None:
+def test_a_gaussian_that_reaches_a_tile_of_the_reference_reaches_the_image():
     camera = front_camera(64, 48)
     projected = project(random_gaussians(300, seed=6, log_scale=(-4, 0)), camera)
     low, high = tile_rectangles(projected, camera)
@@ -193,7 +187,7 @@ def test_a_gaussian_that_reaches_a_tile_of_the_reference_reaches_the_image() -> 
     assert (ours | ~reached).all()
 
 
-def test_a_square_that_only_touches_the_image_does_not_reach_it() -> None:
+def test_a_square_that_only_touches_the_image_does_not_reach_it():
     means = torch.tensor(
         [[-3.0, 5], [-2.9, 5], [67, 5], [66.9, 5], [5, -3], [5, -2.9], [5, 51], [5, 50.9], [5, 5]]
     )
@@ -202,7 +196,7 @@ def test_a_square_that_only_touches_the_image_does_not_reach_it() -> None:
     assert _reaches_image(means, radii, 64, 48).tolist() == expected
 
 
-def test_the_uploaded_camera_projects_points_to_pixels() -> None:
+def test_the_uploaded_camera_projects_points_to_pixels():
     camera = front_camera(64, 48, (3.0, -2.0))
     point = torch.tensor([0.3, -0.2, 4.0], dtype=torch.float64)
     on_device = _DeviceCamera.of(camera, point)

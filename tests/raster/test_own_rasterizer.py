@@ -1,47 +1,35 @@
 """A rasterizer from a file outside gsbench: the one of docs/rasterizer.md, in the real program."""
 
-from __future__ import annotations
-
-import json
 import os
 import re
-import subprocess
 import sys
-from pathlib import Path
+from shlex import split
 
 import pytest
 import torch
 
 from gsbench.config.compose import compose_one
-from gsbench.errors import InputError
 from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.raster import create_rasterizer
-from gsbench.runs.keys import config_hash, rasterizer_inputs
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.keys import rasterizer_inputs
 from tests.config.test_schema import composed
 from tests.conftest import ROOT
+from tests.helpers import read_json, refusal
+from tests.processes import completed
 
 CPU = torch.device("cpu")
-TINY = [
-    "scene.views=10",
-    "scene.width=48",
-    "scene.height=36",
-    "init=random",
-    "init.count=150",
-    "init.size=1.2",
-]
-TINY += [
-    "scene=courtyard",
-    "train.iterations=12",
-    "eval.lpips=[]",
-    "eval.flip=false",
-    "tracking=none",
-    "device=cpu",
-]
+TINY = split(
+    "scene.views=10 scene.width=48 scene.height=36 init=random init.count=150 init.size=1.2"
+)
+TINY += split(
+    "scene=courtyard train.iterations=12 eval.lpips=[] eval.flip=false tracking=none device=cpu"
+)
 OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """A folder with the document's ``untiled.py``, from which modules can be imported."""
     blocks = re.findall(
         r"^```python\n(# untiled\.py\n.*?)^```$",
@@ -54,27 +42,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def gsbench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def gsbench(folder, *words):
     environment = os.environ | {"GSBENCH_RUNS": str(folder / "runs")}
-    return subprocess.run(
-        [sys.executable, "-m", "gsbench.cli", *words],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    return completed([sys.executable, "-m", "gsbench.cli", *words], cwd=folder, env=environment)
 
 
 @pytest.mark.slow
-def test_the_real_program_trains_with_it_and_records_its_source(folder: Path) -> None:
-    first = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
-    assert first.returncode == 0, first.stderr
+def test_the_real_program_trains_with_it_and_records_its_source(folder):
+    gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
-    assert json.loads(path.read_text())["raster"] == "untiled"
+    assert read_json(path)["raster"] == "untiled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
-    recorded = json.loads(manifest.read_text())["inputs"]["raster"]
+    recorded = read_json(manifest)["inputs"]["raster"]
     assert (recorded["class"], recorded["name"], recorded["rows"]) == (
         "untiled.Untiled",
         "untiled",
@@ -93,7 +72,7 @@ def test_the_real_program_trains_with_it_and_records_its_source(folder: Path) ->
     assert "missing" in changed.stdout
 
 
-def test_its_options_are_checked_and_are_part_of_the_key(folder: Path) -> None:
+def test_its_options_are_checked_and_are_part_of_the_key(folder):
     values = composed(*OWN, "+raster.rows=7")
     rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
@@ -106,25 +85,24 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder: Path) -> None:
         (["+raster.row=3"], r"raster\.row is not a setting; did you mean rows"),
     ):
         values = composed(*OWN, *words)
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             build_own_rasterizer(values["raster"], values["allow_targets"])
-    with pytest.raises(InputError, match=r"allow_targets=\[untiled\]"):
+    with refusal(r"allow_targets=\[untiled\]"):
         compose_one(OWN[:1])
 
 
-def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder: Path) -> None:
+def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder):
     Parts(composed(*OWN)).check(on_this_machine=False)
     parts = Parts(composed(*OWN, "densify=pixelgs"))
-    with pytest.raises(
-        InputError,
-        match=r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference",
+    with refusal(
+        r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
     ):
         parts.check(on_this_machine=False)
-    parts.own_rasterizer.has_footprint = True  # type: ignore[union-attr]
+    parts.own_rasterizer.has_footprint = True
     parts.check(on_this_machine=False)
 
 
-def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder: Path) -> None:
+def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder):
     (folder / "untiled.py").write_text(
         "from gsbench.raster.reference import ReferenceRasterizer\n"
         "class Same(ReferenceRasterizer):\n    pass\n"
@@ -140,13 +118,13 @@ def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder: 
         ("Options", {"size": 2}, "not a dataclass"),
         ("Absent", {}, "cannot be imported"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             build_own_rasterizer(
                 {"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"]
             )
 
 
-def test_its_source_is_part_of_the_hash(folder: Path) -> None:
+def test_its_source_is_part_of_the_hash(folder):
     own = config_hash(composed(*OWN))
     assert own != config_hash(composed())
     (folder / "untiled.py").write_text("changed = True\n")

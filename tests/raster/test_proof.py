@@ -9,10 +9,10 @@ import dataclasses
 import json
 import os
 import shutil
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +21,6 @@ import torch
 
 import gsbench
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.raster.contract import Case
 from gsbench.raster.cpu import CpuRasterizer
 from gsbench.raster.executors import EXECUTORS
@@ -34,6 +33,8 @@ from gsbench.train import proof as module
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.proof import create_proven, known_proof, proof_of, prove, stamp_of
 from tests.conftest import ROOT
+from tests.helpers import read_json, refusal, write
+from tests.processes import completed
 from tests.raster.conftest import interpreter_fault
 
 CPU = torch.device("cpu")
@@ -41,12 +42,12 @@ TINY = Case(7, 5, 20, sh_degree=3)
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache/gsbench/proofs"
 
 
-def passing(raster: str = "triton", failures: tuple[str, ...] = ()) -> RasterProof:
+def passing(raster="triton", failures=()):
     return RasterProof(
         raster=raster,
         device="a GPU",
@@ -57,7 +58,7 @@ def passing(raster: str = "triton", failures: tuple[str, ...] = ()) -> RasterPro
     )
 
 
-def test_the_cpu_kernels_pass_with_small_errors() -> None:
+def test_the_cpu_kernels_pass_with_small_errors():
     # messages and kept proofs name these scenes
     names = ["33x49-n50-sh3", "48x37-n120-sh2", "20x17-n700-sh1", "7x5-n20-sh0"]
     assert [str(scene) for scene in module.SCENES] == names
@@ -74,9 +75,9 @@ def test_the_cpu_kernels_pass_with_small_errors() -> None:
     assert all(error < 1e-5 for error in proof.errors.values()), proof.errors
 
 
-def test_a_departure_names_the_quantity_and_the_place() -> None:
+def test_a_departure_names_the_quantity_and_the_place():
     class Wrong(CpuRasterizer):
-        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+        def render(self, *arguments, **options):
             output = super().render(*arguments, **options)
             change = torch.zeros_like(output.image)
             change[2, 4] = 0.25
@@ -88,7 +89,7 @@ def test_a_departure_names_the_quantity_and_the_place() -> None:
     assert all(line.startswith("7x5-n20-sh3: ") for line in failures)
 
 
-def test_a_fault_of_the_loss_is_a_failure() -> None:
+def test_a_fault_of_the_loss_is_a_failure():
     proof = prove(
         CpuRasterizer(),
         CPU,
@@ -104,8 +105,8 @@ def test_a_fault_of_the_loss_is_a_failure() -> None:
     assert image.endswith(" at training step 10")
 
 
-def test_the_compared_training_follows_the_schedule_of_learning_rates(monkeypatch) -> None:
-    steps: list[int] = []
+def test_the_compared_training_follows_the_schedule_of_learning_rates(monkeypatch):
+    steps = []
     monkeypatch.setattr(
         module.TrainableGaussians, "set_step", lambda self, step: steps.append(step)
     )
@@ -114,9 +115,9 @@ def test_the_compared_training_follows_the_schedule_of_learning_rates(monkeypatc
     assert steps == [*range(1, 11)]
 
 
-def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors() -> None:
+def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors():
     class Missing(CpuRasterizer):
-        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+        def render(self, *arguments, **options):
             output = super().render(*arguments, **options)
             output.image, output.alpha = output.image * torch.nan, output.alpha[:-1]
             return output
@@ -126,14 +127,14 @@ def test_values_that_are_not_finite_fail_and_are_not_kept_as_errors() -> None:
     assert not {"image", "alpha"} & proof.errors.keys()
 
 
-@pytest.mark.parametrize(("name", "held"), [("gsplat", False), ("cpu", True)])
+@pytest.mark.parametrize("name, held", [("gsplat", False), ("cpu", True)])
 def test_an_executor_apart_from_the_contract_is_not_held_to_radii_bits_and_clamped_alphas(
-    name: str, held: bool
-) -> None:
-    opacities: list[float] = []
+    name, held
+):
+    opacities = []
 
     class Loose(CpuRasterizer):
-        def render(self, gaussians, *arguments, **options):  # type: ignore[no-untyped-def]
+        def render(self, gaussians, *arguments, **options):
             opacities.append(float(gaussians.opacities.detach().max()))
             output = super().render(gaussians, *arguments, **options)
             output.radii = output.radii + len(opacities) + 1
@@ -148,11 +149,11 @@ def test_an_executor_apart_from_the_contract_is_not_held_to_radii_bits_and_clamp
     assert "bits of a second run" not in proof.errors
 
 
-def test_a_driver_error_is_a_failure_and_a_lack_of_memory_is_raised() -> None:
+def test_a_driver_error_is_a_failure_and_a_lack_of_memory_is_raised():
     class Broken(ReferenceRasterizer):
         error: Exception = RuntimeError("CUDA error: an illegal memory access\nmore")
 
-        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+        def render(self, *arguments, **options):
             raise self.error
 
     assert prove(Broken(), CPU, (TINY,)).failures == [
@@ -163,11 +164,11 @@ def test_a_driver_error_is_a_failure_and_a_lack_of_memory_is_raised() -> None:
         prove(Broken(), CPU, (TINY,))
 
 
-def test_bits_that_differ_between_runs_are_a_failure_if_the_same_bits_are_promised() -> None:
+def test_bits_that_differ_between_runs_are_a_failure_if_the_same_bits_are_promised():
     class Restless(CpuRasterizer):
         count = 0
 
-        def render(self, *arguments, **options):  # type: ignore[no-untyped-def]
+        def render(self, *arguments, **options):
             output = super().render(*arguments, **options)
             Restless.count += 1
             output.radii = output.radii + (Restless.count == 3)
@@ -180,18 +181,16 @@ def test_bits_that_differ_between_runs_are_a_failure_if_the_same_bits_are_promis
 # ---- a proof is kept for the versions that it depends on
 
 
-def count_proofs(made: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def prove(raster: str, device: str) -> RasterProof:
+def count_proofs(made, monkeypatch):
+    def prove(raster, device):
         made.append(raster)
         return passing(raster)
 
     monkeypatch.setattr(module, "prove_apart", prove)
 
 
-def test_a_proof_is_kept_and_made_again_for_another_version(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[str] = []
+def test_a_proof_is_kept_and_made_again_for_another_version(cache, monkeypatch):
+    made = []
     count_proofs(made, monkeypatch)
     assert known_proof("cpu", CPU) is None
     for _ in range(2):
@@ -210,9 +209,7 @@ def test_a_proof_is_kept_and_made_again_for_another_version(
 @pytest.mark.parametrize(
     "source", ["raster/triton/composite.py", "raster/staged.py", "train/loss_triton.py"]
 )
-def test_a_changed_source_file_of_the_kernels_changes_the_version(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
-) -> None:
+def test_a_changed_source_file_of_the_kernels_changes_the_version(tmp_path, monkeypatch, source):
     before = module.versions_on(CPU)
     package = tmp_path / "gsbench"
     shutil.copytree(module.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -224,7 +221,7 @@ def test_a_changed_source_file_of_the_kernels_changes_the_version(
     assert {name for name in before if before[name] != changed[name]} == {"kernels"}
 
 
-def test_a_failed_proof_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_proof_is_repeated(monkeypatch):
     results = [passing("cpu", failures=("image is off",)), passing("cpu")]
     monkeypatch.setattr(module, "prove_apart", lambda *_: results.pop(0))
     assert not proof_of("cpu", CPU).passed
@@ -232,21 +229,18 @@ def test_a_failed_proof_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     assert proof_of("cpu", CPU).passed
 
 
-def test_without_a_writable_cache_each_call_proves_again_and_logs_it(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    made: list[str] = []
+def test_without_a_writable_cache_each_call_proves_again_and_logs_it(cache, monkeypatch, caplog):
+    made = []
     count_proofs(made, monkeypatch)
-    cache.parent.mkdir(parents=True)
-    cache.write_text("a file where the folder should be")
+    write(cache, "a file where the folder should be")
     for _ in range(2):
         assert proof_of("cpu", CPU).passed
     assert len(made) == 2
     assert "each process repeats it" in caplog.text
 
 
-def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    def crash(*_: object, **__: object) -> None:
+def test_a_crash_of_the_process_is_a_failure(monkeypatch):
+    def crash(*_, **__):
         raise CrashError("the proof of raster=cpu crashed (SIGSEGV); its last lines: none")
 
     monkeypatch.setattr(module, "run_isolated", crash)
@@ -256,32 +250,30 @@ def test_a_crash_of_the_process_is_a_failure(monkeypatch: pytest.MonkeyPatch) ->
     assert proof.versions == module.versions_on(CPU)
 
 
-def test_a_device_without_memory_for_a_proof_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_without_memory_for_a_proof_is_named(monkeypatch):
     asked = []
 
-    def full(*arguments: object, what: str) -> None:
+    def full(*arguments, what):
         asked.append((*arguments, what))
         raise torch.OutOfMemoryError("full")
 
     monkeypatch.setattr(module, "run_isolated", full)
-    with pytest.raises(InputError, match="device=cuda:1 has no memory left to prove raster=triton"):
+    with refusal("device=cuda:1 has no memory left to prove raster=triton"):
         module.prove_apart("triton", "cuda:1")
     assert asked == [(module._prove_by_name, "triton", "cuda:1", "the proof of raster=triton")]
 
 
-def test_a_proof_by_name_is_that_of_its_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_proof_by_name_is_that_of_its_rasterizer(monkeypatch):
     monkeypatch.setattr(module, "prove", lambda *arguments: arguments)
     rasterizer, device = module._prove_by_name("reference", "cpu")
     assert (rasterizer.name, device) == ("reference", CPU)
 
 
-def test_only_one_process_makes_a_proof_at_a_time(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_one_process_makes_a_proof_at_a_time(cache, monkeypatch):
     lock = stamp_of("cpu", CPU).with_suffix(".lock")
     held = []
 
-    def prove(raster: str, device: str) -> RasterProof:
+    def prove(raster, device):
         held.append((raster, device, is_held(lock)))
         return passing(raster)
 
@@ -292,9 +284,7 @@ def test_only_one_process_makes_a_proof_at_a_time(
     assert lock.parent == cache
 
 
-def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(monkeypatch):
     gpu = torch.device("cuda:1")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, device.index))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "GPU")
@@ -307,7 +297,7 @@ def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(
 
 
 @pytest.mark.parametrize(
-    ("known", "has_gpu", "answers", "said"),
+    "known, has_gpu, answers, said",
     [
         ("550.54\n", True, ["1"], "550.54"),
         (None, True, ["551.2", "551.2"], "551.2"),
@@ -315,10 +305,8 @@ def test_the_stamp_depends_on_the_rasterizer_and_on_the_device(
         (None, False, ["551.2"], ""),
     ],
 )
-def test_the_system_knows_the_driver_or_nvidia_smi_does(
-    known: str | None, has_gpu: bool, answers: list[str], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def read(path: Path, encoding: str) -> str:
+def test_the_system_knows_the_driver_or_nvidia_smi_does(known, has_gpu, answers, said, monkeypatch):
+    def read(path, encoding):
         if known is None:
             raise FileNotFoundError(path)
         return known
@@ -330,7 +318,7 @@ def test_the_system_knows_the_driver_or_nvidia_smi_does(
 
 
 @pytest.mark.slow
-def test_two_processes_make_one_proof(tmp_path: Path) -> None:
+def test_two_processes_make_one_proof(tmp_path):
     code = (
         "import torch; from gsbench.train.proof import proof_of; assert proof_of('cpu', "
         "torch.device('cpu')).passed"
@@ -338,15 +326,8 @@ def test_two_processes_make_one_proof(tmp_path: Path) -> None:
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     script = f"import logging; logging.basicConfig(level=logging.INFO)\n{code}"
 
-    def process(_: int) -> str:
-        done = subprocess.run(
-            [sys.executable, "-c", script],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=600,
-            check=True,
-        )
+    def process(_):
+        done = completed([sys.executable, "-c", script], env=environment)
         return done.stderr
 
     with ThreadPoolExecutor(2) as pool:
@@ -358,12 +339,12 @@ def test_two_processes_make_one_proof(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+def gpu(monkeypatch):
     """A GPU on which all executors seem to be installed.
 
     The dictionary maps executors to their failures.
     """
-    failures: dict[str, list[str]] = {}
+    failures = {}
     monkeypatch.setattr(type(EXECUTORS[0]), "is_installed", property(lambda self: True))
     monkeypatch.setattr(module, "create_rasterizer", lambda name, *_: name)
     monkeypatch.setattr(module, "_device_name", lambda device: "a GPU")
@@ -374,7 +355,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize(
-    ("failing", "taken"),
+    "failing, taken",
     [
         ([], "triton"),
         (["triton"], "gsplat"),
@@ -382,9 +363,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         (["gsplat"], "triton"),
     ],
 )
-def test_auto_takes_the_first_executor_that_passes(
-    gpu: dict[str, list[str]], failing: list[str], taken: str, caplog
-) -> None:
+def test_auto_takes_the_first_executor_that_passes(gpu, failing, taken, caplog):
     gpu |= {
         name: ["33x49-n50-sh3: image is off by up to 3.00e-01 at pixel (4, 2)", "alpha"]
         for name in failing
@@ -399,26 +378,21 @@ def test_auto_takes_the_first_executor_that_passes(
             "image is off by up to 3.00e-01 at pixel (4, 2) (and 1 more); torch 2; please report "
             "it with " in line
         )
-        assert json.loads(Path(line.split()[-1]).read_text())["failures"] == gpu["triton"]
+        assert read_json(Path(line.split()[-1]))["failures"] == gpu["triton"]
         assert line in caplog.text
 
 
-def test_a_named_executor_that_fails_is_an_error(gpu: dict[str, list[str]]) -> None:
+def test_a_named_executor_that_fails_is_an_error(gpu):
     gpu["triton"] = ["alpha is off"]
-    with pytest.raises(
-        InputError,
-        match=r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains",
-    ):
+    with refusal(r"raster=triton is not used: it departs .* alpha is off.*device=cpu trains"):
         create_proven("triton", torch.device("cuda"))
     gpu |= {name: ["alpha is off"] for name in ("gsplat", "reference")}
-    with pytest.raises(InputError, match=r"raster=triton .*raster=gsplat .*raster=reference "):
+    with refusal(r"raster=triton .*raster=gsplat .*raster=reference "):
         create_proven("auto", torch.device("cuda"))
 
 
 @pytest.mark.parametrize("fault", ["", "means has other bits after 10 recorded steps"])
-def test_direct_steps_that_fail_are_turned_off_with_a_line(
-    gpu: dict[str, list[str]], fault: str, monkeypatch: pytest.MonkeyPatch, caplog
-) -> None:
+def test_direct_steps_that_fail_are_turned_off_with_a_line(gpu, fault, monkeypatch, caplog):
     proof = dataclasses.replace(passing("triton", ()), direct_fault=fault)
     monkeypatch.setattr(module, "prove_apart", lambda *_: proof)
     made = SimpleNamespace(direct_steps=True)
@@ -429,22 +403,20 @@ def test_direct_steps_that_fail_are_turned_off_with_a_line(
     assert (line in caplog.text) == bool(fault)
 
 
-def test_nothing_is_proven_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_proven_on_a_cpu(monkeypatch):
     monkeypatch.setattr(module, "prove_apart", None)
     chosen = create_proven("auto", CPU)
     assert (chosen.rasterizer.name, chosen.proof, chosen.passed_over) == ("cpu", None, ())
 
 
-def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(monkeypatch, capsys):
     made = {"cpu": passing("cpu")}
     monkeypatch.setattr(module, "prove_apart", lambda raster, device: made[raster])
-    assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu", "--json"]) == 0
+    assert run(split("doctor --prove --raster cpu --device cpu --json")) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["raster"], told["passed"], told["seconds"]) == ("cpu", True, 1.0)
     made["cpu"] = passing("cpu", ("image is off",))
-    assert run(["doctor", "--prove", "--raster", "cpu", "--device", "cpu"]) == 1
+    assert run(split("doctor --prove --raster cpu --device cpu")) == 1
     assert (
         f"image is off\ntorch 2; please report it with {stamp_of('cpu', CPU)}"
         in capsys.readouterr().out
@@ -525,7 +497,7 @@ print(json.dumps(prove(TritonRasterizer(), torch.device("cpu"), ({SCENE},), Trit
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_planted_fault_is_found(tmp_path: Path, fault: str) -> None:
+def test_a_planted_fault_is_found(tmp_path, fault):
     triton = pytest.importorskip("triton")
     if reason := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(reason)
@@ -544,15 +516,6 @@ def test_a_planted_fault_is_found(tmp_path: Path, fault: str) -> None:
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }
     words = [sys.executable, "-c", PROVE]
-    done = subprocess.run(
-        words,
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed(words, cwd=tmp_path, env=environment, timeout=900)
     failures = json.loads(done.stdout.splitlines()[-1])
     assert bool(failures) == (fault != "none"), failures

@@ -1,22 +1,19 @@
 """The reference rasterizer against finite differences, plain loops and gsplat's torch code."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
+from torch.testing import assert_close
 
-from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import ReferenceRasterizer, project
 from gsbench.scene.types import Camera
 from tests.gaussians.helpers import front_camera, random_gaussians
 
 
-def brute_force(
-    gaussians: Gaussians, camera: Camera, background: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def brute_force(gaussians, camera, background):
     """Render pixel by pixel in plain Python from the published formulas, with colours of degree 0.
 
     Returns image, opacity and footprints [N, 3]. Over the pixels that a Gaussian is blended into, a
@@ -106,7 +103,7 @@ def brute_force(
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (5.0, -4.0)])
-def test_images_and_footprints_match_brute_force(shift: tuple[float, float]) -> None:
+def test_images_and_footprints_match_brute_force(shift):
     gaussians = random_gaussians(60, seed=3, log_scale=(-3.5, -0.5))
     # opaque ones reach both the clamp of alpha and the early stop
     gaussians.opacity_logits[:8] = 6.0
@@ -114,20 +111,20 @@ def test_images_and_footprints_match_brute_force(shift: tuple[float, float]) -> 
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     out = ReferenceRasterizer().render(gaussians, camera, 0, background)
     image, alpha, covered = brute_force(gaussians, camera, background.numpy())
-    np.testing.assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
-    np.testing.assert_allclose(out.alpha.detach().numpy(), alpha, atol=1e-10)
+    assert_allclose(out.image.detach().numpy(), image, atol=1e-10)
+    assert_allclose(out.alpha.detach().numpy(), alpha, atol=1e-10)
     assert alpha.max() > 0.999
     footprint = out.footprint(torch.arange(37) + 100 * torch.arange(21).unsqueeze(1))
     assert footprint.pixels.tolist() == covered[:, 0].tolist()
     assert footprint.values.tolist() == covered[:, 1].tolist()
-    np.testing.assert_allclose(footprint.distances, covered[:, 2], rtol=1e-12)
+    assert_allclose(footprint.distances, covered[:, 2], rtol=1e-12)
     depths = gaussians.means.numpy() @ camera.rotation[2] + camera.translation[2]
-    np.testing.assert_allclose(footprint.depths, depths)
+    assert_allclose(footprint.depths, depths)
     assert (covered[:, 0] > 0).sum() > 30
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_gradients_match_finite_differences(degree: int) -> None:
+def test_gradients_match_finite_differences(degree):
     gaussians = random_gaussians(6, seed=11, log_scale=(-2.2, -1.2))
     # below the clamp of alpha, whose gradient is passed on purpose
     gaussians.opacity_logits.clamp_(max=1.5)
@@ -137,7 +134,7 @@ def test_gradients_match_finite_differences(degree: int) -> None:
         18, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
 
-    def loss(values: Gaussians) -> torch.Tensor:
+    def loss(values):
         out = ReferenceRasterizer().render(values, camera, degree, background)
         return (out.image * weights).sum() + out.alpha.sum()
 
@@ -159,12 +156,10 @@ def test_gradients_match_finite_differences(degree: int) -> None:
             assert not numeric.any()
             continue
         assert numeric.abs().max() > 0
-        torch.testing.assert_close(
-            tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}"
-        )
+        assert_close(tensor.grad, numeric, atol=2e-6, rtol=2e-4, msg=lambda m, n=name: f"{n}: {m}")
 
 
-def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
+def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc():
     """A shift of the principal point shifts all projected means by the same distance.
 
     So the sum of the screen gradients is the derivative of the loss by the shift.
@@ -172,7 +167,7 @@ def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
     gaussians = random_gaussians(30, seed=5)
     background = torch.zeros(3, dtype=torch.float64)
 
-    def loss(shift: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def loss(shift):
         leaves = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
         out = ReferenceRasterizer().render(
             leaves, front_camera(32, 32, (shift, 0.0)), 0, background, True
@@ -190,7 +185,7 @@ def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc() -> None:
     assert (absolute > 1.01 * gradient.abs()).any()
 
 
-def test_projection_matches_gsplat() -> None:
+def test_projection_matches_gsplat():
     gsplat = pytest.importorskip(
         "gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed"
     )
@@ -215,13 +210,13 @@ def test_projection_matches_gsplat() -> None:
     )
     projected = project(gaussians, camera)
     # gsplat's first pixel centre is at 0.5
-    torch.testing.assert_close(projected.means + 0.5, means[0, projected.index])
-    torch.testing.assert_close(projected.conics, conics[0, projected.index])
-    torch.testing.assert_close(projected.depths, depths[0, projected.index])
+    assert_close(projected.means + 0.5, means[0, projected.index])
+    assert_close(projected.conics, conics[0, projected.index])
+    assert_close(projected.depths, depths[0, projected.index])
     assert len(projected.index) > 150
 
 
-def test_spherical_harmonics_match_gsplat() -> None:
+def test_spherical_harmonics_match_gsplat():
     gsplat = pytest.importorskip(
         "gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed"
     )
@@ -233,10 +228,10 @@ def test_spherical_harmonics_match_gsplat() -> None:
     for degree in range(4):
         theirs = gsplat._spherical_harmonics(degree, directions, coefficients)
         ours = colors(gaussians.sh_dc, gaussians.sh_rest, directions, degree)
-        torch.testing.assert_close(ours, (theirs + 0.5).clamp_min(0))
+        assert_close(ours, (theirs + 0.5).clamp_min(0))
 
 
-def test_the_alpha_of_the_pixel_at_a_mean_is_the_opacity() -> None:
+def test_the_alpha_of_the_pixel_at_a_mean_is_the_opacity():
     # a principal point of 20.5 is the centre of pixel 20
     camera = Camera(40, 30, 36.0, 36.0, 20.5, 15.5, np.eye(3), np.zeros(3))
     one = random_gaussians(1)
@@ -246,7 +241,7 @@ def test_the_alpha_of_the_pixel_at_a_mean_is_the_opacity() -> None:
     assert out.alpha[15, 20] == out.alpha.max()
 
 
-def test_without_visible_gaussians_the_image_is_the_background() -> None:
+def test_without_visible_gaussians_the_image_is_the_background():
     gaussians = random_gaussians(5)
     gaussians.means[:, 2] = -5.0
     out = ReferenceRasterizer().render(

@@ -4,11 +4,8 @@ The tests need a GPU; the tiny one also runs in Triton's interpreter. The first 
 the second reuses it, and the third uses new objects with new memory pools.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
-from torch import Tensor
 
 from gsbench.bench.scenes import make_scene
 from tests.raster.conftest import INTERPRETING
@@ -22,7 +19,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    ("width", "height", "count"),
+    "width, height, count",
     [
         pytest.param(32, 16, 12, id="tiny"),
         pytest.param(
@@ -34,7 +31,7 @@ pytestmark = pytest.mark.skipif(
         ),
     ],
 )
-def test_three_runs_give_the_same_bits(width: int, height: int, count: int) -> None:
+def test_three_runs_give_the_same_bits(width, height, count):
     from gsbench.raster.triton.executor import TritonRasterizer
     from gsbench.train.loss_triton import TritonLoss
 
@@ -43,7 +40,7 @@ def test_three_runs_give_the_same_bits(width: int, height: int, count: int) -> N
     target = torch.from_numpy(scene.train[0].image).to(device)
     background = torch.zeros(3, device=device)
 
-    def run(rasterizer: TritonRasterizer, loss: TritonLoss) -> dict[str, Tensor]:
+    def run(rasterizer, loss):
         leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
         output = rasterizer.render(
             leaves, scene.train[0].camera, 3, background, absolute_gradient=True

@@ -1,19 +1,14 @@
 """Splitting matrices against second derivatives by autograd, and against real splits."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 from torch.autograd.functional import hessian, jacobian
+from torch.testing import assert_close
 
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.contract import Case
-from gsbench.raster.reference import Projection, ReferenceRasterizer, project, tile_rectangles
-from gsbench.scene.types import Camera
+from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
 
 CASES = (
     Case(7, 5, 20, sh_degree=0),
@@ -23,13 +18,13 @@ CASES = (
 )
 
 
-def image_of(camera: Camera, mean: Tensor) -> Tensor:
+def image_of(camera, mean):
     """Project a point [3] to the image, [2] px."""
     x, y, z = mean.new_tensor(camera.rotation) @ mean + mean.new_tensor(camera.translation)
     return torch.stack([camera.fx * x / z + camera.cx - 0.5, camera.fy * y / z + camera.cy - 0.5])
 
 
-def heights(pixels: Tensor, mean: Tensor, conic: Tensor, opacity: Tensor) -> Tensor:
+def heights(pixels, mean, conic, opacity):
     """Opacity times density of one Gaussian at pixels [P, 2]."""
     d = pixels - mean
     return opacity * torch.exp(
@@ -44,9 +39,9 @@ class Slow:
     A height is opacity times density at a pixel. The loss weights the image with fixed numbers.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case):
         self.case, self.camera, self.gaussians = case, case.camera(), case.gaussians()
-        self.projected: Projection = project(self.gaussians, self.camera)
+        self.projected = project(self.gaussians, self.camera)
         rows, columns = torch.meshgrid(
             torch.arange(case.height), torch.arange(case.width), indexing="ij"
         )
@@ -72,7 +67,7 @@ class Slow:
             -1
         )  # [M, P] pixels in the tiles of each Gaussian
 
-    def height(self, k: int, displacement: Tensor) -> Tensor:
+    def height(self, k, displacement):
         """Heights [P] of the k-th projected Gaussian, moved by ``displacement`` [3].
 
         The movement on the image is linearised.
@@ -85,12 +80,12 @@ class Slow:
             self.gaussians.opacities[self.projected.index[k]],
         )
 
-    def all_heights(self) -> Tensor:
+    def all_heights(self):
         return torch.stack(
             [self.height(k, torch.zeros(3).double()) for k in range(len(self.projected.index))]
         )
 
-    def loss(self, s: Tensor) -> Tensor:
+    def loss(self, s):
         """The loss as a function of the heights [M, P]; the clamp to 0.99 passes the gradient."""
         colour = torch.zeros(len(self.pixels), 3).double()
         through = torch.ones(len(self.pixels)).double()
@@ -106,7 +101,7 @@ class Slow:
         image = colour + through.unsqueeze(-1) * self.background
         return (image * self.weights.reshape(-1, 3)).sum()
 
-    def matrices(self, rasterizer: str) -> Tensor:
+    def matrices(self, rasterizer):
         """The splitting matrices that the rasterizer computes, [N, 3, 3] float64."""
         dtype = torch.float64 if rasterizer == "reference" else torch.float32
         gaussians = self.gaussians.map(
@@ -115,13 +110,13 @@ class Slow:
         executor = create_rasterizer(rasterizer, torch.device("cpu"), threads=1)
         output = executor.render(
             gaussians, self.camera, 0, self.background.to(dtype), splitting_matrix=True
-        )  # type: ignore[call-arg]
+        )
         (output.image * self.weights.to(dtype)).sum().backward()
         return output.require_splitting_matrix().double()
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) -> None:
+def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case):
     """The paper's definition, computed for one Gaussian at a time with autograd."""
     slow = Slow(case)
     s = slow.all_heights().detach().requires_grad_()
@@ -130,24 +125,24 @@ def test_the_matrix_is_the_gradient_by_heights_times_their_hessians(case: Case) 
     for k, index in enumerate(slow.projected.index.tolist()):
         used = s[k].detach() >= CONSTANTS.alpha_min
 
-        def weighted(displacement: Tensor, k: int = k, used: Tensor = used) -> Tensor:
+        def weighted(displacement, k=k, used=used):
             return (gradient[k] * slow.height(k, displacement))[used].sum()
 
         expected[index] = hessian(weighted, torch.zeros(3).double())
     assert (expected.abs().amax((1, 2)) > 0).sum() > case.count / 4
     exact = slow.matrices("reference")
-    torch.testing.assert_close(exact, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    assert_close(exact, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
     compiled = slow.matrices("cpu")
     sizes = expected.abs().amax((1, 2), keepdim=True)
     # errors are relative to each Gaussian's own matrix
     assert ((compiled - expected).abs() <= 1e-3 * sizes + 1e-6 * expected.abs().max()).all()
 
 
-def second_difference(of: Callable[[float], Tensor], step: float) -> float:
+def second_difference(of, step):
     return float(of(step) - 2 * of(0.0) + of(-step)) / step**2
 
 
-def test_the_matrix_predicts_how_a_split_changes_the_loss() -> None:
+def test_the_matrix_predicts_how_a_split_changes_the_loss():
     """Two halves at the distances e and -e along v change the loss by e^2 v S v / 2."""
     slow = Slow(CASES[1])
     s, matrices = slow.all_heights(), slow.matrices("reference")
@@ -159,7 +154,7 @@ def test_the_matrix_predicts_how_a_split_changes_the_loss() -> None:
         )
         foretold = float(direction @ matrices[index] @ direction)
 
-        def split(distance: float, k: int = k, direction: Tensor = direction) -> Tensor:
+        def split(distance, k=k, direction=direction):
             halves = (
                 slow.height(k, distance * direction) + slow.height(k, -distance * direction)
             ) / 2
@@ -174,7 +169,7 @@ def test_the_matrix_predicts_how_a_split_changes_the_loss() -> None:
     assert compared >= 5
 
 
-def test_matrices_are_computed_only_on_request() -> None:
+def test_matrices_are_computed_only_on_request():
     case = CASES[0]
     plain = ReferenceRasterizer().render(
         case.gaussians(), case.camera(), 0, torch.zeros(3).double()

@@ -1,23 +1,18 @@
 """Code that executors share: checks of inputs, asynchronous reads, and the node in autograd."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from gsbench.gaussians.model import Gaussians
 from gsbench.raster import staged
 from gsbench.raster.base import Footprint
 from gsbench.raster.staged import (
     Gradients,
     Readback,
-    RenderRequest,
     StagedRasterizer,
     bad_values,
     check_inputs,
@@ -30,7 +25,7 @@ from tests.gaussians.helpers import random_gaussians
 BLACK = torch.zeros(3, dtype=torch.float64)
 
 
-def camera(width: int = 4, height: int = 3, **others: float) -> Camera:
+def camera(width=4, height=3, **others):
     values = {"fx": float(width), "fy": float(height), "cx": width / 2, "cy": height / 2} | others
     return Camera(width, height, **values, rotation=np.eye(3), translation=np.zeros(3))
 
@@ -40,21 +35,19 @@ class Recording(StagedRasterizer[str]):
 
     name = "recording"
 
-    def __init__(self) -> None:
-        self.calls: list[tuple[Any, ...]] = []
+    def __init__(self):
+        self.calls = []
 
-    def check(self, gaussians: Gaussians) -> None:
+    def check(self, gaussians):
         if len(gaussians) == 1:
             raise ValueError("one is too few")
 
-    def forward(
-        self, gaussians: Gaussians, request: RenderRequest
-    ) -> tuple[Tensor, Tensor, Tensor, str]:
+    def forward(self, gaussians, request):
         alpha = torch.full((request.camera.height, request.camera.width), 0.25, dtype=torch.float64)
         image = alpha.unsqueeze(-1).repeat(1, 1, 3)
         return image, alpha, torch.ones(len(gaussians), dtype=torch.int32), "frame"
 
-    def backward(self, *arguments: Any) -> Gradients:
+    def backward(self, *arguments):
         self.calls.append(arguments)
         _, gaussians, *_, want_splitting = arguments
         splitting = (
@@ -65,12 +58,12 @@ class Recording(StagedRasterizer[str]):
             sixes, torch.full((len(gaussians), 2), 7.0, dtype=torch.float64), splitting
         )
 
-    def footprint(self, *arguments: Any) -> Footprint:
+    def footprint(self, *arguments):
         self.calls.append(arguments)
         return Footprint(*[torch.zeros(2)] * 4)
 
 
-def test_gradients_reach_the_backward_stage_and_its_results_the_parameters() -> None:
+def test_gradients_reach_the_backward_stage_and_its_results_the_parameters():
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     background = BLACK.clone().requires_grad_()
@@ -90,7 +83,7 @@ def test_gradients_reach_the_backward_stage_and_its_results_the_parameters() -> 
     assert background.grad.tolist() == [2 * 12 * 0.75] * 3
 
 
-def test_alpha_may_be_differentiated_without_the_image() -> None:
+def test_alpha_may_be_differentiated_without_the_image():
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
@@ -103,7 +96,7 @@ def test_alpha_may_be_differentiated_without_the_image() -> None:
     assert request.absolute is None
 
 
-def test_the_footprint_stage_gets_the_frame_and_the_values() -> None:
+def test_the_footprint_stage_gets_the_frame_and_the_values():
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     view = camera()
@@ -117,7 +110,7 @@ def test_the_footprint_stage_gets_the_frame_and_the_values() -> None:
     assert passed is values
 
 
-def test_errors_of_the_checks_are_raised() -> None:
+def test_errors_of_the_checks_are_raised():
     with pytest.raises(ValueError, match="one is too few"):
         Recording().render(random_gaussians(1), camera(), 0, BLACK)
     with pytest.raises(ValueError, match="sh_degree"):
@@ -125,7 +118,7 @@ def test_errors_of_the_checks_are_raised() -> None:
 
 
 @pytest.mark.parametrize(
-    ("of", "said"),
+    "of, said",
     [
         (camera(16385), "camera: width is 16385 px, more than 16384"),
         (camera(4, 16385), "camera: height is 16385 px, more than 16384"),
@@ -137,18 +130,18 @@ def test_errors_of_the_checks_are_raised() -> None:
         (camera(cy=-300.1), "camera: cy is -300.1 px"),
     ],
 )
-def test_degenerate_cameras_are_refused(of: Camera, said: str) -> None:
+def test_degenerate_cameras_are_refused(of, said):
     with pytest.raises(ValueError, match=said):
         check_settings(random_gaussians(1), of, 0, BLACK)
 
 
-def test_the_largest_settings_are_accepted() -> None:
+def test_the_largest_settings_are_accepted():
     for degree in (0, 3):
         check_settings(random_gaussians(1), camera(16384, 16384), degree, BLACK)
     check_settings(random_gaussians(1), camera(cx=400.0, cy=-300.0, fx=0.004, fy=3e6), 0, BLACK)
 
 
-def test_an_error_names_the_setting_that_does_not_fit() -> None:
+def test_an_error_names_the_setting_that_does_not_fit():
     gaussians = random_gaussians(2)
     with pytest.raises(ValueError, match="sh_degree: must be 0 to 3, got -1"):
         check_settings(gaussians, camera(), -1, BLACK)
@@ -168,7 +161,7 @@ def test_an_error_names_the_setting_that_does_not_fit() -> None:
 
 
 @pytest.mark.parametrize("name", ["means", "opacity_logits", "sh_rest"])
-def test_the_first_gaussian_with_a_bad_value_is_named(name: str) -> None:
+def test_the_first_gaussian_with_a_bad_value_is_named(name):
     gaussians = random_gaussians(5)
     assert not bad_values(gaussians, BLACK)
     raise_for_values(gaussians, BLACK)
@@ -182,7 +175,7 @@ def test_the_first_gaussian_with_a_bad_value_is_named(name: str) -> None:
             refuse()
 
 
-def test_a_quaternion_of_length_zero_and_a_bad_background_are_named() -> None:
+def test_a_quaternion_of_length_zero_and_a_bad_background_are_named():
     gaussians = random_gaussians(4)
     gaussians.quaternions[[1, 2]] = 1e-13
     assert bad_values(gaussians, BLACK)
@@ -198,22 +191,22 @@ def test_a_quaternion_of_length_zero_and_a_bad_background_are_named() -> None:
 class Event:
     """A stand-in for a CUDA event, which completes only when ``synchronize`` is called."""
 
-    def __init__(self) -> None:
-        self.recorded: object = None
+    def __init__(self):
+        self.recorded = None
         self.happened = False
 
-    def record(self, stream: object) -> None:
+    def record(self, stream):
         self.recorded = stream
 
-    def query(self) -> bool:
+    def query(self):
         return self.happened
 
-    def synchronize(self) -> None:
+    def synchronize(self):
         assert self.recorded == "stream of cuda:1"
         self.happened = True
 
 
-def test_a_readback_waits_only_if_its_copy_has_not_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_readback_waits_only_if_its_copy_has_not_arrived(monkeypatch):
     host = SimpleNamespace(copied=[])
     host.copy_ = lambda source, non_blocking: host.copied.append((source, non_blocking))
     device = SimpleNamespace(type="cuda", index=1)
@@ -227,22 +220,22 @@ def test_a_readback_waits_only_if_its_copy_has_not_arrived(monkeypatch: pytest.M
         staged.torch.cuda, "current_stream", lambda of: f"stream of cuda:{of.index}"
     )
     monkeypatch.setattr(Readback, "waits", 0)
-    early, late = Readback(source), Readback(source)  # type: ignore[arg-type]
+    early, late = Readback(source), Readback(source)
     assert host.copied == [(source, True)] * 2
     assert not early.arrived
     event = early._event
     assert early.values() is host
-    assert event.happened  # type: ignore[union-attr] # it has waited
+    assert event.happened  # it has waited
     assert early.arrived
     assert early.values() is host
     assert Readback.waits == 1
-    late._event.happened = True  # type: ignore[union-attr]
+    late._event.happened = True
     assert late.arrived
     late.values()
     assert Readback.waits == 1
 
 
-def test_a_readback_from_the_cpu_never_waits() -> None:
+def test_a_readback_from_the_cpu_never_waits():
     readback = Readback(torch.ones(2, requires_grad=True))
     assert readback.arrived
     assert readback.values().tolist() == [1, 1]

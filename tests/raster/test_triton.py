@@ -3,15 +3,15 @@
 Each part runs in a separate process.
 """
 
-from __future__ import annotations
-
 import os
-import subprocess
 import sys
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
+
+from tests.processes import completed
 
 pytest.importorskip("triton")
 
@@ -36,7 +36,7 @@ LIMIT = 1700
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_passes_in_the_interpreter(part: str) -> None:
+def test_a_part_passes_in_the_interpreter(part):
     if fault := interpreter_fault(triton.__version__, np.__version__):
         pytest.skip(fault)
     environment = os.environ | {
@@ -46,24 +46,15 @@ def test_a_part_passes_in_the_interpreter(part: str) -> None:
     }
     words = [
         sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "--no-header",
-        "-p",
-        "no:cacheprovider",
+        *split("-m pytest -q -x --no-header -p no:cacheprovider"),
         *PARTS[part],
     ]
-    done = subprocess.run(
-        words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False
-    )
-    assert done.returncode == 0, done.stdout
+    done = completed(words, cwd=ROOT, env=environment, timeout=LIMIT)
     assert " passed" in done.stdout
 
 
 @pytest.mark.parametrize(
-    ("versions", "works"),
+    "versions, works",
     [
         (("3.6.0", "2.4.0"), False),
         (("3.6.0", "2.10.1"), False),
@@ -73,29 +64,20 @@ def test_a_part_passes_in_the_interpreter(part: str) -> None:
         (("3.10.0", "2.5.2"), True),
     ],
 )
-def test_versions_of_triton_and_numpy_that_do_not_fit_are_known(
-    versions: tuple[str, str], works: bool
-) -> None:
+def test_versions_of_triton_and_numpy_that_do_not_fit_are_known(versions, works):
     assert (interpreter_fault(*versions) is None) == works
 
 
-def test_every_test_is_in_exactly_one_part() -> None:
+def test_every_test_is_in_exactly_one_part():
     environment = os.environ | {"TRITON_INTERPRET": "1"}
 
-    def collected(arguments: list[str]) -> list[str]:
+    def collected(arguments):
         words = [
             sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            "--collect-only",
-            "-p",
-            "no:cacheprovider",
+            *split("-m pytest -q --collect-only -p no:cacheprovider"),
             *arguments,
         ]
-        done = subprocess.run(
-            words, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
-        )
+        done = completed(words, cwd=ROOT, env=environment)
         return [line for line in done.stdout.splitlines() if "::" in line]
 
     everything = [name for name in collected([CONTRACT, INTERPRETED]) if "triton" in name]

@@ -1,10 +1,6 @@
 """The Triton kernels compiled for GPUs that are not present, and how often a step waits for one."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -15,15 +11,13 @@ from torch.utils._pytree import tree_leaves
 pytest.importorskip("triton")
 
 
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import AdamState, Update
-from gsbench.raster.base import RenderOutput
 from gsbench.raster.contract import Case
 from gsbench.raster.triton import composite, executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.loss_triton import MULTIPROCESSORS, STRIP, TritonLoss, rows_of_program
-from tests.raster.ahead_of_time import TARGETS, Launch, compile_for, recorded, specialization
+from tests.raster.ahead_of_time import TARGETS, compile_for, recorded, specialization
 
 pytestmark = pytest.mark.slow
 
@@ -49,15 +43,15 @@ class Answer:
 
     asked = 0
 
-    def __init__(self, source: Tensor) -> None:
+    def __init__(self, source):
         Answer.asked += 1
 
-    def values(self) -> Tensor:
+    def values(self):
         return torch.tensor([2, 7, 0])
 
 
 @pytest.fixture
-def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
+def launches(monkeypatch):
     """The launches of kernels, which are recorded instead of run."""
     Answer.asked = 0
     monkeypatch.setattr(executor, "Readback", Answer)
@@ -65,9 +59,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
         yield record
 
 
-def step(
-    case: Case, device: str = "cpu", absolute: bool = False, footprint: bool = False
-) -> tuple[Gaussians, RenderOutput]:
+def step(case, device="cpu", absolute=False, footprint=False):
     """The render, the loss and the backward pass of one training step."""
     gaussians = case.gaussians().map(lambda tensor: tensor.float().to(device).requires_grad_())
     output = TritonRasterizer().render(
@@ -81,7 +73,7 @@ def step(
     return gaussians, output
 
 
-def adam_step(case: Case) -> None:
+def adam_step(case):
     """Adam as in a direct step, and as in a step with autograd."""
     seen = torch.zeros(case.count, dtype=torch.int32)
     for tensor in case.gaussians().map(lambda tensor: tensor.float()).tensors().values():
@@ -92,9 +84,7 @@ def adam_step(case: Case) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids="sm_{}".format)
-def test_kernels_compile_without_spills(
-    launches: list[Launch], target: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_compile_without_spills(launches, target, monkeypatch):
     step(CASE)
     step(CASE, absolute=True, footprint=True)
     adam_step(CASE)
@@ -125,7 +115,7 @@ def test_kernels_compile_without_spills(
     assert len(compiled) == (23 if target == 90 else 16) + 8
 
 
-def test_no_kernel_is_compiled_again_for_other_sizes(launches: list[Launch]) -> None:
+def test_no_kernel_is_compiled_again_for_other_sizes(launches):
     """The numbers of Gaussians, units and pixels change all the time."""
     cases = (Case(33, 49, 50, 3), Case(32, 48, 64, 3), Case(1, 16, 1, 3))
     for case in cases:
@@ -141,11 +131,11 @@ def test_no_kernel_is_compiled_again_for_other_sizes(launches: list[Launch]) -> 
 @pytest.mark.parametrize(
     "size", [(1600, 1060), (500, 375), (800, 530), (256, 192), (140, 105), (4000, 3000)], ids=str
 )
-def test_the_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> None:
+def test_the_loss_has_work_for_all_multiprocessors(size):
     """The busiest one filters fewer rows than with programs of 32 rows."""
     strips = -(-3 * size[0] // STRIP)
 
-    def counted(rows: int) -> tuple[int, int]:
+    def counted(rows):
         programs = strips * -(-size[1] // rows)
         return programs, -(-programs // MULTIPROCESSORS) * (rows + 10)
 
@@ -162,14 +152,12 @@ def test_the_loss_has_work_for_all_multiprocessors(size: tuple[int, int]) -> Non
 class Watch(TorchDispatchMode):
     """Collects the operations that wait for the device or copy between it and the host."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.waits: list[str] = []
+        self.waits = []
         self.operations = 0
 
-    def __torch_dispatch__(
-        self, operation: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
         result = operation(*args, **(kwargs or {}))
         devices = {
             leaf.device.type
@@ -182,7 +170,7 @@ class Watch(TorchDispatchMode):
         return result
 
 
-def test_a_step_waits_once_for_the_device(launches: list[Launch]) -> None:
+def test_a_step_waits_once_for_the_device(launches):
     """The step runs on torch's device "meta", whose tensors have no values.
 
     Reading a value raises an error, and `Watch` records every copy.

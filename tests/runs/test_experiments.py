@@ -1,8 +1,6 @@
 """The records of an experiment: its folder, the search for settings, and declarations."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -61,7 +59,7 @@ def test_the_folder_of_an_experiment_is_made_unless_it_is_a_link(tmp_path):
         make_home(tmp_path / "runs" / "link")
 
 
-def tuning(tmp_path: Path, **changes: Any) -> Any:
+def tuning(tmp_path, **changes):
     (tmp_path / "tuning.json").write_text(json.dumps(TUNING | changes))
     return read_typed(tmp_path / "tuning.json", TuningRecord)
 
@@ -79,7 +77,7 @@ def test_the_best_point_is_the_one_with_the_best_value(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("points", "fault"),
+    "points, fault",
     [
         ([*POINTS, {"settings": {"y": 1.0}, "value": 1.0}], "different settings"),
         ([{"settings": {"x": 0.0}, "value": 1.0}], "not above 0"),
@@ -93,7 +91,7 @@ def test_a_record_of_an_impossible_search_is_damaged(tmp_path, points, fault):
         assert tuning(tmp_path, points=points, log=[]).points
 
 
-def declared(hour: int, *metrics: str, **values: Any) -> Declaration:
+def declared(hour, *metrics, **values):
     questions = tuple(open_question(metric) for metric in metrics)
     return Declaration(time=f"1970-01-01T{hour:02d}:00:00Z", questions=questions, **values)
 

@@ -1,9 +1,6 @@
 """The ledger's file: what is read back, and which changes of the file are found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,6 @@ from gsbench.runs.ledger import (
     Confirming,
     Difference,
     Ended,
-    Entry,
     Ledger,
     Opened,
     Started,
@@ -41,7 +37,7 @@ OPENED = Opened(
 )
 
 
-def started(idea: str, against: str = "baseline") -> Started:
+def started(idea, against="baseline"):
     return Started(
         time=TIME,
         idea=idea,
@@ -53,43 +49,36 @@ def started(idea: str, against: str = "baseline") -> Started:
     )
 
 
-def ended(idea: str, result: str) -> Ended:
+def ended(idea, result):
     difference = Difference(mean=1.0, low=0.5, high=1.5)
     return Ended(
-        time=TIME,
-        idea=idea,
-        result=result,
-        reason="better",
-        seeds=3,
-        difference=difference,  # type: ignore[arg-type]
+        time=TIME, idea=idea, result=result, reason="better", seeds=3, difference=difference
     )
 
 
-ENTRIES: list[Entry] = [
+ENTRIES = [
     started("a"),
     ended("a", KEPT),
     started("b", "a"),
     ended("b", FAILED),
     Confirming(
-        time=TIME,
-        seeds=(0, 1),
-        keys={"baseline": {"park": "park/x/1"}, "a": {"park": "park/y/2"}},
+        time=TIME, seeds=(0, 1), keys={"baseline": {"park": "park/x/1"}, "a": {"park": "park/y/2"}}
     ),
     Confirmed(time=TIME, number=0, results={"a": KEPT}, differences={}),
 ]
 
 
 @pytest.fixture
-def home(tmp_path: Path) -> Path:
+def home(tmp_path):
     home = tmp_path / "runs" / "night"
     home.mkdir(parents=True)
     begin_ledger(home, OPENED)
     for entry in ENTRIES:
-        append(home, lambda ledger, entry=entry: entry)  # type: ignore[misc]
+        append(home, lambda ledger, entry=entry: entry)
     return home
 
 
-def test_a_ledger_is_read_back_as_it_was_written(home: Path) -> None:
+def test_a_ledger_is_read_back_as_it_was_written(home):
     ledger = read_ledger(home)
     assert list(ledger.entries) == [OPENED, *ENTRIES]
     assert (ledger.kept, ledger.tried) == (["a"], 1)  # "b" ended without any result
@@ -105,12 +94,12 @@ def test_a_ledger_is_read_back_as_it_was_written(home: Path) -> None:
     }
 
 
-def test_an_idea_that_failed_and_was_tried_again_has_its_last_result(home: Path) -> None:
+def test_an_idea_that_failed_and_was_tried_again_has_its_last_result(home):
     ledger = append(home, lambda ledger: ended("b", KEPT))
     assert (ledger.kept, ledger.tried) == (["a", "b"], 2)
 
 
-def test_beginning_again_keeps_the_ledger(home: Path) -> None:
+def test_beginning_again_keeps_the_ledger(home):
     assert len(begin_ledger(home, OPENED).entries) == 7
 
 
@@ -119,11 +108,11 @@ CHANGES = ("edit", "drop", "swap", "repeat", "space")
 
 
 @pytest.mark.parametrize(
-    ("number", "change"),
+    "number, change",
     [(number, change) for number in range(LAST) for change in CHANGES]
     + [(LAST, change) for change in ("edit", "repeat", "space")],
 )
-def test_a_line_that_was_changed_is_found(home: Path, number: int, change: str) -> None:
+def test_a_line_that_was_changed_is_found(home, number, change):
     path = home / LEDGER
     lines = path.read_text().splitlines(keepends=True)
     line = lines[number]
@@ -141,31 +130,31 @@ def test_a_line_that_was_changed_is_found(home: Path, number: int, change: str) 
 
 
 @pytest.mark.parametrize("text", ["", "{}\n", "not JSON\n", "[1]\n", "\x00\n", "null\n"])
-def test_a_damaged_ledger_is_refused_in_one_line(home: Path, text: str) -> None:
+def test_a_damaged_ledger_is_refused_in_one_line(home, text):
     (home / LEDGER).write_text(text)
     with pytest.raises(InputError, match="bring back the file"):
         read_ledger(home)
 
 
-def test_without_a_ledger_the_command_that_begins_one_is_named(tmp_path: Path) -> None:
+def test_without_a_ledger_the_command_that_begins_one_is_named(tmp_path):
     with pytest.raises(InputError, match="gsbench ledger new night"):
         read_ledger(tmp_path / "night")
 
 
-def test_nothing_is_appended_if_there_is_no_entry(home: Path) -> None:
+def test_nothing_is_appended_if_there_is_no_entry(home):
     before = (home / LEDGER).read_bytes()
     assert isinstance(append(home, lambda ledger: None), Ledger)
     assert (home / LEDGER).read_bytes() == before
 
 
-def test_a_lost_last_line_break_destroys_nothing(home: Path) -> None:
+def test_a_lost_last_line_break_destroys_nothing(home):
     path = home / LEDGER
     path.write_bytes(path.read_bytes().rstrip(b"\n"))
     append(home, lambda ledger: started("c"))
     assert list(read_ledger(home).entries) == [OPENED, *ENTRIES, started("c")]
 
 
-AFTER_ALL: dict[str, Entry] = {
+AFTER_ALL = {
     "begins 'a' a second time": started("a"),
     "compares with 'b', which was not kept": started("c", "b"),
     "ends 'c', which was not begun": ended("c", KEPT),
@@ -180,7 +169,7 @@ AFTER_ALL: dict[str, Entry] = {
 
 
 @pytest.mark.parametrize("fault", AFTER_ALL)
-def test_an_entry_that_cannot_follow_is_refused(home: Path, fault: str) -> None:
+def test_an_entry_that_cannot_follow_is_refused(home, fault):
     entries = [*read_ledger(home).entries, AFTER_ALL[fault]]
     (home / LEDGER).write_text(chained(map(as_json, entries)))
     with pytest.raises(InputError, match=f"line 8 .*{fault}.*bring back"):
@@ -188,7 +177,7 @@ def test_an_entry_that_cannot_follow_is_refused(home: Path, fault: str) -> None:
 
 
 @pytest.mark.parametrize("place", ["ended", "confirmed"])
-def test_a_relative_difference_that_no_number_holds_is_refused(home: Path, place: str) -> None:
+def test_a_relative_difference_that_no_number_holds_is_refused(home, place):
     huge = Difference(mean=1e30, low=0.0, high=0.0)
     entries = [
         replace(OPENED, relative=True),
@@ -196,14 +185,14 @@ def test_a_relative_difference_that_no_number_holds_is_refused(home: Path, place
         replace(ended("a", KEPT), difference=huge),
     ]
     if place == "confirmed":
-        entries[2:] = [ended("a", KEPT), ENTRIES[4], replace(ENTRIES[5], differences={"a": huge})]  # type: ignore[arg-type,list-item]
+        entries[2:] = [ended("a", KEPT), ENTRIES[4], replace(ENTRIES[5], differences={"a": huge})]
     (home / LEDGER).write_text(chained(map(as_json, entries)))
     with pytest.raises(InputError, match="difference that cannot be"):
         read_ledger(home)
 
 
-def test_results_of_ideas_that_were_not_asked_are_refused(home: Path) -> None:
-    other = replace(ENTRIES[5], results={"a": KEPT, "x": KEPT})  # type: ignore[type-var]
-    (home / LEDGER).write_text(chained(map(as_json, [OPENED, *ENTRIES[:5], other])))  # type: ignore[list-item,arg-type]
+def test_results_of_ideas_that_were_not_asked_are_refused(home):
+    other = replace(ENTRIES[5], results={"a": KEPT, "x": KEPT})
+    (home / LEDGER).write_text(chained(map(as_json, [OPENED, *ENTRIES[:5], other])))
     with pytest.raises(InputError, match="results of other ideas"):
         read_ledger(home)

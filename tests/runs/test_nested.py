@@ -2,8 +2,8 @@
 
 import doctest
 
-from gsbench.runs import keys as nested
-from gsbench.runs.keys import flatten
+from gsbench.runs import nested
+from gsbench.runs.nested import flatten
 
 
 def test_the_example_in_the_docstring_holds():

@@ -15,19 +15,19 @@ from gsbench.errors import InputError
 from gsbench.files import DiskFullError
 from gsbench.runs.keys import Stage, Step
 from gsbench.runs.layout import MANIFEST
-from gsbench.runs.store import Manifest, Store, read_manifest
+from gsbench.runs.store import Store, read_manifest
 from tests.runs.toy import TOY, expected_text, toy_inputs
 
 LETTERS = Stage("letters", 1)
 
 
-def write_letters(folder: Path) -> None:
+def write_letters(folder):
     (folder / "sub").mkdir()
     (folder / "a.txt").write_text("alpha")
     (folder / "sub" / "b.bin").write_bytes(bytes(range(256)))
 
 
-def refuse(folder: Path) -> None:
+def refuse(folder):
     raise AssertionError("built again")
 
 
@@ -36,7 +36,7 @@ FOUND = Step(LETTERS, {"x": 1}, refuse)  # the same step, which must not be buil
 
 
 @pytest.fixture
-def store(tmp_path) -> Store:
+def store(tmp_path):
     return Store(tmp_path / "store")
 
 
@@ -140,7 +140,7 @@ def test_every_flipped_bit_of_a_manifest_is_noticed_or_harmless(store):
         }
 
 
-def flip_a_bit(path: Path) -> None:
+def flip_a_bit(path):
     """Change a file as a failing disk does: its size and its times stay the same."""
     state, content = path.stat(), bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
@@ -171,7 +171,7 @@ def test_a_flipped_bit_is_found_before_a_result_becomes_an_input(store, monkeypa
     assert reader.get(step).cached
 
 
-def compare_no_checksums(folder: Path, thorough: bool = False) -> Manifest:
+def compare_no_checksums(folder, thorough=False):
     assert not thorough, "checksums were compared twice"
     return read_manifest(folder)
 
@@ -231,7 +231,7 @@ def test_a_killed_build_continues_without_its_links_and_its_torn_manifest(store)
 
 
 def test_files_are_synced_before_their_manifest_and_the_folder_after_the_rename(store, monkeypatch):
-    synced: list[tuple[str, bool]] = []
+    synced = []
     note = lambda path: synced.append((path.name, (path.parent / MANIFEST).exists()))  # noqa: E731
     monkeypatch.setattr("gsbench.runs.store.sync_to_disk", note)
     store.get(BUILD)
@@ -269,7 +269,7 @@ def test_sweep_removes_leftovers_and_keeps_what_a_build_would_continue(store):
     assert store.get(Step(long, {"x": 1}, refuse)).cached
 
 
-def toy(store: Store, number: int, *options: str) -> subprocess.Popen[str]:
+def toy(store, number, *options):
     command = [sys.executable, "-m", "tests.runs.toy", str(store.root), str(number), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -335,29 +335,12 @@ def test_a_killed_process_frees_its_lock(store):
     assert (store.folder(TOY, key) / "lines.txt").read_text() == expected_text(0)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of one MiB; skips the test if this user may not mount one."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    if mounted.returncode != 0:
-        pytest.skip("needs the right to mount a small tmpfs (root)")
-    yield disk
-    subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=False)
-    subprocess.run(["umount", str(disk)], check=True)
-
-
 def test_a_full_disk_is_reported_in_one_line_and_corrupts_nothing(small_disk):
     store = Store(small_disk / "store")
     sound = store.get(BUILD)
 
     def big(folder):
-        (folder / "big.bin").write_bytes(bytes(2 << 20))
+        (folder / "big.bin").write_bytes(bytes(4 << 20))
 
     with pytest.raises(DiskFullError, match=r"is full: free some space") as caught:
         store.get(Step(LETTERS, {"x": 2}, big))

@@ -1,11 +1,8 @@
 """A runs folder of a stranger: none of its links is followed, and nothing in it blocks a reader."""
 
 import os
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -28,7 +25,7 @@ SECRET = "what nobody else may read or change"
 
 
 @pytest.fixture
-def outside(tmp_path) -> Path:
+def outside(tmp_path):
     """A private folder beside the runs folder."""
     folder = tmp_path / "outside"
     folder.mkdir()
@@ -37,7 +34,7 @@ def outside(tmp_path) -> Path:
 
 
 @pytest.fixture
-def trial(tmp_path) -> Path:
+def trial(tmp_path):
     """A finished trial in the runs folder, with results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
     named = {
@@ -47,29 +44,29 @@ def trial(tmp_path) -> Path:
     return folder
 
 
-def _log(folder: Path) -> None:
+def _log(folder):
     with log_to(folder / "log.txt"):
         pass
 
 
-def _hold(folder: Path) -> None:
+def _hold(folder):
     with hold(folder / ".lock", "work"):
         pass
 
 
-def _forget(folder: Path) -> None:
+def _forget(folder):
     forget(folder.parents[2], [])
 
 
-def _declare(folder: Path) -> None:
-    trial: Any = SimpleNamespace(
+def _declare(folder):
+    trial = SimpleNamespace(
         files=TrialFolder(folder), values={"seed": 0, "eval": {"primary": "psnr"}}
     )
     declare([trial])
 
 
 # The file in a trial's folder that is a link, and the function that writes it.
-WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
+WRITERS = {
     "the log": ("log.txt", _log),
     "a lock": (".lock", _hold),
     "a lock's holder": (".lock.holder", _hold),
@@ -102,15 +99,15 @@ def test_trials_in_a_linked_folder_are_ignored(level, trial, outside):
     assert trial.is_dir()
 
 
-def _link(path: Path, outside: Path) -> None:
+def _link(path, outside):
     path.symlink_to(outside / "private")
 
 
-def _folder_link(path: Path, outside: Path) -> None:
+def _folder_link(path, outside):
     path.symlink_to(outside)
 
 
-def _pipe(path: Path, outside: Path) -> None:
+def _pipe(path, outside):
     os.mkfifo(path)
 
 

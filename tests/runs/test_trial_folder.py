@@ -4,7 +4,6 @@ import json
 import os
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -13,21 +12,22 @@ from gsbench.analysis.results import load_experiment
 from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import DamagedError
-from gsbench.runs import trial_folder
-from gsbench.runs.keys import config_hash, sha256_of
+from gsbench.runs import freshness
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.view.trials import model_file
 from tests.fuzz.records import EXPERIMENT, write_trial
 
 
 @pytest.fixture
-def trial(tmp_path, monkeypatch) -> Path:
+def trial(tmp_path, monkeypatch):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     write_trial(tmp_path, "adc", 1)
     return write_trial(tmp_path, "adc", 0)
 
 
-def edit(path: Path, old: str, new: str) -> None:
+def edit(path, old, new):
     """Change a file and keep its time, as somebody does who wants to hide the change."""
     state = path.stat()
     assert old in path.read_text()
@@ -77,7 +77,7 @@ def test_a_trial_with_an_edited_file_counts_nowhere(trial, name, is_large, monke
     runs, folder = trial.parents[3], TrialFolder(trial)
     (trial / "point_cloud.ply").write_bytes(b"ply 25.5 0.03")
     if is_large:
-        monkeypatch.setattr(trial_folder, "MAX_HASHED_BYTES", 4)
+        monkeypatch.setattr(freshness, "MAX_HASHED_BYTES", 4)
     folder.write_finished(folder.settings(), folder.record())
     before = len(load_experiment(runs, EXPERIMENT).trials)
     assert TrialFolder(trial).state() == "done"
@@ -95,7 +95,7 @@ def test_a_trial_with_an_edited_file_counts_nowhere(trial, name, is_large, monke
 def test_a_large_file_with_its_old_size_and_time_is_compared_before_it_is_exported(
     trial, monkeypatch
 ):
-    monkeypatch.setattr(trial_folder, "MAX_HASHED_BYTES", 4)
+    monkeypatch.setattr(freshness, "MAX_HASHED_BYTES", 4)
     model, folder = trial / "point_cloud.ply", TrialFolder(trial)
     model.write_bytes(b"ply 25.5")
     folder.write_finished(folder.settings(), folder.record())
@@ -222,7 +222,7 @@ def test_only_small_files_and_those_that_tables_read_have_digests(trial, monkeyp
     values, record = folder.settings(), folder.record()
     for name, size in (("small.png", 4), ("large.png", 5)):
         (trial / name).write_bytes(bytes(size))
-    monkeypatch.setattr(trial_folder, "MAX_HASHED_BYTES", 4)
+    monkeypatch.setattr(freshness, "MAX_HASHED_BYTES", 4)
     folder.write_finished(values, record, published=[trial / "small.png", trial / "large.png"])
     made_of = folder.made_of()
     assert made_of is not None
@@ -254,13 +254,15 @@ def test_pictures_are_sorted_by_name(trial):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "reason"),
+    "place, value, reason",
     [
         (("hashes", "config"), "0", "of another configuration"),
         (("made_of", "config"), "0", "of another configuration"),
-        (("made_of", "stages", "train"), 1, r"by version 1 of the stage train, which is now at \d"),
-        (("made_of", "stages", "gone"), 3, "by version 3 of the stage gone, which is now at None"),
-        (("made_of", "pycolmap"), "0.1", r"with pycolmap 0\.1, and .* is installed"),
+        (("made_of", "stages", "train"), 1, r"stage train was 1, it is now \d"),
+        (("made_of", "stages", "gone"), 3, "stage gone was 3, it is now none"),
+        (("made_of", "stages"), {}, "stage scene was none, it is now 1"),
+        (("code",), {"rooms": {"train": "0" * 16}}, "gsbench's train was 00000000, it is now "),
+        (("made_of", "pycolmap"), "0.1", r"pycolmap was 0\.1, it is now \d"),
         (("made_of", "sources"), {"/nowhere/a.png": [1, 2, 3]}, r"/nowhere/a\.png cannot be read"),
         (("made_of", "folders"), {"/nowhere": 1}, "files were added to /nowhere, or removed"),
         (("made_of", "published", "per_view.csv"), [1, 2], r"per_view\.csv has changed"),
@@ -276,7 +278,7 @@ def test_each_change_since_the_results_were_written_is_named(trial, place, value
     folder, path = TrialFolder(trial), trial / "results.json"
     values = folder.settings()
     folder.write_finished(values, replace(folder.record(), hashes={"config": config_hash(values)}))
-    assert folder.why_not_done(values) == ""
+    assert folder.why_not_done(values) is None
     content = json.loads(path.read_text())
     inner = content
     for key in place[:-1]:
@@ -286,23 +288,24 @@ def test_each_change_since_the_results_were_written_is_named(trial, place, value
         {key: own for key, own in content.items() if key != "made_of"}
     )
     path.write_text(json.dumps(content))
-    assert re.search(reason, folder.why_not_done(values))
+    assert re.search(reason, str(folder.why_not_done(values)))
 
 
 def test_a_missing_metric_that_can_be_computed_now_is_a_reason_to_run(trial):
     folder = TrialFolder(trial)
     values = folder.settings() | {"eval": {"primary": "x"}}
-    asked: list[dict[str, object]] = []
+    asked = []
     unavailable = lambda options: asked.append(options) or {"flip"}  # noqa: E731
     record = replace(folder.record(), hashes={"config": config_hash(values)})
     folder.write_finished(values, record)
-    assert (folder.why_not_done(values, unavailable), asked) == ("", [])  # asking loads torch
+    assert (folder.why_not_done(values, unavailable), asked) == (None, [])  # asking loads torch
     folder.write_finished(values, replace(record, awaited=["flip"]))
-    assert (folder.why_not_done(values, unavailable), asked) == ("", [values["eval"]])
+    assert (folder.why_not_done(values, unavailable), asked) == (None, [values["eval"]])
     folder.write_finished(values, replace(record, awaited=["lpips_vgg", "flip"]))
-    assert (
-        folder.why_not_done(values, unavailable) == "it lacks lpips_vgg, which can be computed now"
-    )
-    assert folder.why_not_done(values) == "it lacks lpips_vgg, flip"
+    reasons = folder.why_not_done(values, unavailable), folder.why_not_done(values)
+    assert [*map(str, reasons)] == [
+        "it lacks lpips_vgg, which can be computed now",
+        "it lacks lpips_vgg, flip",
+    ]
     (trial / "results.json").unlink()
-    assert folder.why_not_done(values) == "results.json is not there, or not complete"
+    assert str(folder.why_not_done(values)) == "results.json is not there, or not complete"

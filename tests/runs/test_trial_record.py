@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -40,7 +39,7 @@ RESULTS = {
 PATH = Path("results.json")
 
 
-def record(**changes: Any) -> Any:
+def record(**changes):
     return record_from(json.dumps(RESULTS | changes).encode(), PATH)
 
 
@@ -74,7 +73,7 @@ def test_omitted_facts_of_a_metric_or_a_failure_have_defaults():
 
 
 @pytest.mark.parametrize(
-    ("settings", "text"),
+    "settings, text",
     [
         ({"split": "every_nth", "sectors": 8}, "every_nth"),
         ({"split": "every_nth", "sectors": 8, "match_views": True}, "every_nth, matched with 8"),
@@ -93,7 +92,7 @@ def test_the_rule_of_a_split_has_a_short_text(settings, text):
 
 
 @pytest.mark.parametrize(
-    ("row", "sound"),
+    "row, sound",
     [
         ({"step": 0, "loss": 0.5}, True),
         ({"step": 7, "loss": -1e30, "reset": True, "count": 2**62}, True),
@@ -113,7 +112,7 @@ def test_a_row_has_an_iteration_and_numbers(row, sound, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("edges", "counts", "sound"),
+    "edges, counts, sound",
     [
         ([-300, 300], [1], True),
         ([-300.5, 300], [1], False),

@@ -4,14 +4,11 @@ It writes numbered lines, and continues where it was stopped. Run it as a progra
 tests.runs.toy STORE COUNT [--slow] [--ready]``. ``--ready`` prints a line when it begins.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from gsbench.runs.keys import Stage, Step
 from gsbench.runs.store import Store
@@ -20,15 +17,15 @@ TOY = Stage("toy", 1, resumable=True, scratch=("*.progress",))
 LINES = 40
 
 
-def toy_inputs(number: int) -> dict[str, Any]:
+def toy_inputs(number):
     return {"number": number}
 
 
-def expected_text(number: int) -> str:
+def expected_text(number):
     return "".join(f"{number} {line}\n" for line in range(LINES))
 
 
-def build(folder: Path, number: int, pause: float) -> None:
+def build(folder, number, pause):
     """Keep the lines so far in a file that is replaced as a whole, as a checkpoint is."""
     progress = folder / "so_far.progress"
     lines = progress.read_text().splitlines() if progress.exists() else []
@@ -41,7 +38,7 @@ def build(folder: Path, number: int, pause: float) -> None:
     (folder / "lines.txt").write_text("".join(line + "\n" for line in lines))
 
 
-def main(argv: list[str]) -> int:
+def main(argv):
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if "--ready" in argv:
         print("ready", flush=True)

@@ -1,10 +1,6 @@
 """Small COLMAP folders built with pycolmap and Pillow."""
 
-from __future__ import annotations
-
 import zlib  # noqa: F401  before pycolmap, see gsbench.scene.colmap
-from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -12,26 +8,26 @@ import pytest
 from PIL import Image
 
 
-def smooth_image(width: int, height: int, seed: int = 0) -> np.ndarray:
+def smooth_image(width, height, seed=0):
     """A smooth random picture, [H, W, 3] uint8."""
     small = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     return np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC))
 
 
 @pytest.fixture
-def make_scene(tmp_path: Path) -> Callable[..., Path]:
+def make_scene(tmp_path):
     """A function that writes ``root/images`` and ``root/sparse/0`` and returns the root."""
 
     def make(
-        names: Sequence[str] = tuple(f"{k:02d}.png" for k in range(6)),
-        size: tuple[int, int] = (40, 30),
-        camera_size: tuple[int, int] | None = None,
-        model: str = "PINHOLE",
-        params: Sequence[float] | None = None,
-        text: bool = False,
-        sparse: str = "sparse/0",
-        root: str = "scene",
-    ) -> Path:
+        names=tuple(f"{k:02d}.png" for k in range(6)),
+        size=(40, 30),
+        camera_size=None,
+        model="PINHOLE",
+        params=None,
+        text=False,
+        sparse="sparse/0",
+        root="scene",
+    ):
         folder = tmp_path / root
         camera_size = camera_size or size
         camera = pycolmap.Camera.create_from_model_name(1, model, 50.0, *camera_size)

@@ -1,30 +1,28 @@
 """Reading and shrinking images."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.scene.images import image_size, read_image, resize_image, same_up_to_rounding
 from gsbench.scene.options import check_final_size, downscaled_size
+from tests.helpers import refusal
 
 from .conftest import smooth_image
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
-def test_lossless_formats_come_back_exactly(tmp_path: Path, suffix: str):
+def test_lossless_formats_come_back_exactly(tmp_path, suffix):
     image = smooth_image(20, 14)
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(image).save(path)
-    np.testing.assert_array_equal(read_image(path), image)
+    assert_array_equal(read_image(path), image)
     assert image_size(path) == (20, 14)
 
 
-def test_all_pixel_modes_become_rgb(tmp_path: Path):
+def test_all_pixel_modes_become_rgb(tmp_path):
     path = tmp_path / "a.png"
     Image.fromarray(np.array([[[200, 100, 50, 255], [200, 100, 50, 0]]], dtype=np.uint8)).save(path)
     # transparent pixels are blended over black
@@ -34,11 +32,11 @@ def test_all_pixel_modes_become_rgb(tmp_path: Path):
     Image.fromarray(np.array([[0x1234, 0xFFFF]], dtype=np.uint16)).save(path)
     assert read_image(path).tolist() == [[[0x12] * 3, [0xFF] * 3]]
     Image.fromarray(np.zeros((2, 2), dtype=np.float32)).save(tmp_path / "f.tif")
-    with pytest.raises(InputError, match="convert it to 8-bit"):
+    with refusal("convert it to 8-bit"):
         read_image(tmp_path / "f.tif")
 
 
-def test_exif_orientation_is_ignored(tmp_path: Path):
+def test_exif_orientation_is_ignored(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(smooth_image(20, 14)).save(tmp_path / "a.jpg", exif=exif)
@@ -46,22 +44,22 @@ def test_exif_orientation_is_ignored(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_damaged_files_are_named(tmp_path: Path, suffix: str):
+def test_damaged_files_are_named(tmp_path, suffix):
     path = tmp_path / f"broken.{suffix}"
     Image.fromarray(smooth_image(200, 150)).save(path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(InputError, match=rf"broken\.{suffix}: the image is damaged"):
+    with refusal(rf"broken\.{suffix}: the image is damaged"):
         read_image(path)
     path.write_text("no image at all")
-    with pytest.raises(InputError, match=rf"broken\.{suffix}: not a readable image"):
+    with refusal(rf"broken\.{suffix}: not a readable image"):
         read_image(path)
-    with pytest.raises(InputError, match="no such image"):
+    with refusal("no such image"):
         read_image(tmp_path / "absent.png")
 
 
 # the sizes of Mip-NeRF 360's own images_4 and images_2
 @pytest.mark.parametrize(
-    ("native", "factor", "expected"),
+    "native, factor, expected",
     [
         ((4946, 3286), 4, (1237, 822)),
         ((5187, 3361), 4, (1297, 840)),
@@ -87,10 +85,10 @@ def test_sizes_never_grow_and_the_longest_side_is_exact():
 
 
 @pytest.mark.parametrize(
-    ("size", "same"),
+    "size, same",
     [((40, 26), False), ((42, 30), True), ((43, 30), False), ((40, 31), True), ((40, 32), False)],
 )
-def test_sides_may_be_rounded_by_one_pixel(size: tuple[int, int], same: bool):
+def test_sides_may_be_rounded_by_one_pixel(size, same):
     assert same_up_to_rounding(size, (40, 30)) == same
 
 
@@ -98,7 +96,7 @@ def test_a_final_side_below_sixteen_pixels_is_refused():
     check_final_size((16, 40), 1, None, "a.png")
     check_final_size((40, 32), 2, None, "a.png")
     for size, downscale, max_size in (((15, 40), 1, None), ((40, 31), 3, None), ((40, 20), 1, 30)):
-        with pytest.raises(InputError, match="at least 16 px are needed"):
+        with refusal("at least 16 px are needed"):
             check_final_size(size, downscale, max_size, "a.png")
 
 
@@ -109,6 +107,6 @@ def test_area_is_the_block_mean_and_lanczos_keeps_a_ramp():
     assert np.abs(resize_image(image, 20, 15, "area") - blocks).max() <= 1.0
     ramp = np.repeat(np.arange(0, 200, 2, dtype=np.uint8)[None, :, None], 30, 0).repeat(3, 2)
     small = resize_image(ramp, 50, 15, "lanczos")
-    np.testing.assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)
-    with pytest.raises(InputError, match="resample"):
-        resize_image(image, 20, 15, "cubic")  # type: ignore[arg-type]
+    assert_allclose(small[7, 5:-5, 0], np.arange(1, 200, 4)[5:-5], atol=1.01)
+    with refusal("resample"):
+        resize_image(image, 20, 15, "cubic")

@@ -1,32 +1,24 @@
 """From capture and model to a scene: undistortion, sizes, cache, missing poses."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.logs import no_progress
 from gsbench.scene.colmap import plain_camera, read_model
 from gsbench.scene.distortion import folded_share, largest_distortion
-from gsbench.scene.load import (
-    INTRINSICS,
-    Downscaling,
-    ImageToPrepare,
-    load_scene,
-    prepare_all,
-)
+from gsbench.scene.load import INTRINSICS, Downscaling, ImageToPrepare, load_scene, prepare_all
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
-from gsbench.scene.types import CameraModel, Scene
+from gsbench.scene.types import CameraModel
 from gsbench.scene.undistortion import check_lenses, folded_shares, undistort
+from tests.helpers import read_json, refusal
 
 WIDTH, HEIGHT = 200, 150
 UNCHANGED = Downscaling(1, None, "lanczos")
@@ -57,7 +49,7 @@ def test_every_model_of_this_pycolmap_is_tested():
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_undistorted_spots_land_where_a_pinhole_sees_them(name: str):
+def test_undistorted_spots_land_where_a_pinhole_sees_them(name):
     source = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=MODELS[name])
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     image = np.zeros((HEIGHT, WIDTH))
@@ -75,7 +67,7 @@ def test_undistorted_spots_land_where_a_pinhole_sees_them(name: str):
         window = flat[top : top + 11, left : left + 11, 0].astype(float)
         ys, xs = np.mgrid[:11, :11] + 0.5
         center = np.array([(window * xs).sum(), (window * ys).sum()]) / window.sum()
-        np.testing.assert_allclose(center, [x - left, y - top], atol=0.12)
+        assert_allclose(center, [x - left, y - top], atol=0.12)
 
 
 PERSPECTIVE = [name for name in MODELS if "FISHEYE" not in name]
@@ -84,7 +76,7 @@ PERSPECTIVE = [name for name in MODELS if "FISHEYE" not in name]
 @pytest.mark.parametrize("amount", [0.0, 1e-7, 1.0])
 @pytest.mark.parametrize("name", MODELS)
 def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
-    make_scene, tmp_path: Path, name: str, amount
+    make_scene, tmp_path, name, amount
 ):
     """With zero or tiny coefficients, perspective models keep their pixels; fisheyes do not."""
     plain = pycolmap.Camera.create_from_model_name(1, name, 150.0, WIDTH, HEIGHT)
@@ -100,7 +92,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
         image = model.find_image_with_name(view.name)
         stored = np.asarray(Image.open(capture.images / view.name))
         if amount < 1.0 and name in PERSPECTIVE:
-            np.testing.assert_array_equal(view.image, stored)
+            assert_array_equal(view.image, stored)
             wanted = source
         else:
             wanted = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
@@ -110,7 +102,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
             x, y, z = camera.rotation @ point + camera.translation
             seen = [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
             expected = wanted.img_from_cam(image.cam_from_world() * point)
-            np.testing.assert_allclose(seen, expected, atol=1e-3)
+            assert_allclose(seen, expected, atol=1e-3)
 
 
 def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not():
@@ -127,7 +119,7 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
 
 
 @pytest.mark.parametrize(
-    ("name", "params", "share"),
+    "name, params, share",
     [
         ("SIMPLE_RADIAL", (90, 80, 60, -0.35), 0.68),
         ("SIMPLE_RADIAL", (150, 80, 60, -0.1), 0.0),
@@ -143,11 +135,8 @@ def test_lenses_that_turn_back_inside_the_picture_are_refused(name, params, shar
     camera = CameraModel(name, 160, 120, tuple(map(float, params)))
     (found,) = folded_shares([camera])
     assert found == pytest.approx(share, abs=0.01)
-    if share:
-        said = rf"the camera of a.png \({name}: .*\) turns back .*: {found:.1%}"
-        with pytest.raises(InputError, match=said):
-            check_lenses({"a.png": camera})
-    else:
+    said = rf"the camera of a.png \({name}: .*\) turns back .*: {found:.1%}"
+    with refusal(said if share else None):
         check_lenses({"a.png": camera})
     assert not caplog.records
 
@@ -172,17 +161,17 @@ def test_a_small_fold_in_the_corners_is_reported(caplog):
     assert "turns back inside the picture" in caplog.text
 
 
-def test_panoramas_are_refused(tmp_path: Path):
+def test_panoramas_are_refused(tmp_path):
     camera = CameraModel("EQUIRECTANGULAR", WIDTH, HEIGHT, (float(WIDTH), float(HEIGHT)))
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):
+    with refusal("EQUIRECTANGULAR"):
         undistort(np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), camera)
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
     image = ImageToPrepare(tmp_path / "a.png", camera, tmp_path / "b.png", UNCHANGED)
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # raised in the isolated process, too
+    with refusal("EQUIRECTANGULAR"):  # raised in the isolated process, too
         prepare_all([image], no_progress)
 
 
-def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
+def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path):
     images, told, halved = [], [], Downscaling(2, None, "area")
     for width in range(20, 56):
         source, target = tmp_path / f"{width}.png", tmp_path / "made" / f"{width}.png"
@@ -198,28 +187,28 @@ def test_images_are_prepared_sixteen_at_a_time_in_their_order(tmp_path: Path):
         assert camera.cx == pytest.approx(camera.width / 2)
 
 
-def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path: Path):
+def test_views_without_changes_are_read_from_the_original_files(make_scene, tmp_path):
     root = make_scene()
     capture = read_colmap("toy", root)
     scene = load_scene(capture, capture.model, tmp_path / "cache")
     assert [view.name for view in scene.test] == ["00.png"]
     assert len(scene.train) == 5
     for view in (*scene.train, *scene.test):
-        np.testing.assert_array_equal(view.image, Image.open(root / "images" / view.name))
+        assert_array_equal(view.image, Image.open(root / "images" / view.name))
         assert (view.camera.fx, view.camera.cx, view.camera.cy) == (50.0, 20.0, 15.0)
     assert not list((tmp_path / "cache").rglob("*.png"))
     # camera k is at x = -0.1 k; training views 1..5: mean -0.3, farthest 0.2 away
     assert scene.extent == pytest.approx(1.1 * 0.2)
 
 
-def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp_path: Path):
+def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp_path):
     root = make_scene(size=(81, 60), model="SIMPLE_RADIAL", params=[70, 40, 30, 0.05])
     capture = read_colmap("toy", root)
     done = []
     options = {"downscale": 2, "progress": lambda *step: done.append(step)}
     cache = tmp_path / "cache"
 
-    def load(folder: Path = cache, **others: object) -> Scene:
+    def load(folder=cache, **others):
         return load_scene(capture, capture.model, folder, **(options | others))
 
     first = load()
@@ -229,8 +218,8 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     third = load(tmp_path / "other")
     for scene in (second, third):
         for a, b in zip(first.train, scene.train, strict=True):
-            np.testing.assert_array_equal(a.image, b.image)
-            np.testing.assert_array_equal(a.camera.rotation, b.camera.rotation)
+            assert_array_equal(a.image, b.image)
+            assert_array_equal(a.camera.rotation, b.camera.rotation)
             assert all(getattr(a.camera, key) == getattr(b.camera, key) for key in INTRINSICS)
     camera = first.train[0].camera
     assert first.train[0].image.shape == (camera.height, camera.width, 3)
@@ -252,24 +241,24 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert len(done) == 4  # pixels depend on the cameras
 
 
-def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path: Path):
+def test_images_that_were_not_selected_are_not_prepared(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(), max_images=3)
     load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
-    assert list(json.loads(file.read_text())["views"]) == ["00.png", "02.png", "04.png"]
+    assert list(read_json(file)["views"]) == ["00.png", "02.png", "04.png"]
     assert sorted(path.name for path in file.parent.glob("*.png")) == [
         f"0000{k}.png" for k in range(3)
     ]
 
 
-def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path: Path):
+def test_a_file_of_another_shape_than_its_camera_is_refused(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene())
     Image.new("RGB", (40, 26)).save(capture.images / "01.png")
-    with pytest.raises(InputError, match=r"01\.png: the image is 40x26 px but its camera .* 40x30"):
+    with refusal(r"01\.png: the image is 40x26 px but its camera .* 40x30"):
         load_scene(capture, capture.model, tmp_path / "cache")
 
 
-def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path: Path):
+def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene())
     options = {"downscale": 2, "resample": "area"}
     first = load_scene(capture, capture.model, tmp_path / "cache", **options)
@@ -278,27 +267,27 @@ def test_a_cached_set_without_its_cameras_is_prepared_again(make_scene, tmp_path
     file.unlink()
     again = load_scene(capture, capture.model, tmp_path / "cache", **options)
     assert file.read_bytes() == before
-    np.testing.assert_array_equal(first.train[0].image, again.train[0].image)
+    assert_array_equal(first.train[0].image, again.train[0].image)
     assert [folder.name for folder in (tmp_path / "cache").iterdir()] == [file.parent.name]
 
 
-def _other_focal(file: Path) -> None:
-    document = json.loads(file.read_text())
+def _other_focal(file):
+    document = read_json(file)
     for view in document["views"].values():
         view["fx"] *= 1.3
     file.write_text(json.dumps(document, indent=1))
 
 
-def _other_file(file: Path) -> None:
+def _other_file(file):
     file.write_text(file.read_text().replace('"00000.png"', '"../../../00000.png"'))
 
 
-def _other_pixels(file: Path) -> None:
+def _other_pixels(file):
     picture = file.with_name("00000.png")
     Image.new("RGB", Image.open(picture).size).save(picture)
 
 
-def _other_sums(file: Path) -> None:
+def _other_sums(file):
     file.with_name("files.json").write_text('{"files": {}}')
 
 
@@ -315,9 +304,7 @@ def _other_sums(file: Path) -> None:
         lambda file: file.with_name("files.json").unlink(),
     ],
 )
-def test_a_cached_set_that_was_changed_is_prepared_again(
-    change, make_scene, tmp_path: Path, caplog
-):
+def test_a_cached_set_that_was_changed_is_prepared_again(change, make_scene, tmp_path, caplog):
     capture = read_colmap("toy", make_scene())
     first = load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     (file,) = (tmp_path / "cache").rglob("cameras.json")
@@ -330,25 +317,25 @@ def test_a_cached_set_that_was_changed_is_prepared_again(
     assert {path.name: path.read_bytes() for path in file.parent.iterdir()} | before == {
         path.name: path.read_bytes() for path in file.parent.iterdir()
     }
-    np.testing.assert_array_equal(first.train[0].image, again.train[0].image)
+    assert_array_equal(first.train[0].image, again.train[0].image)
     caplog.clear()
     load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     assert not caplog.text
 
 
-def test_centred_moves_the_principal_point_only(make_scene, tmp_path: Path):
+def test_centred_moves_the_principal_point_only(make_scene, tmp_path):
     capture = read_colmap("toy", make_scene(params=[50, 51, 18, 16]))
     used = load_scene(capture, capture.model, tmp_path)
     centred = load_scene(capture, capture.model, tmp_path, principal_point="centred")
     assert (used.train[0].camera.cx, used.train[0].camera.cy) == (18, 16)
     assert (centred.train[0].camera.cx, centred.train[0].camera.cy) == (20, 15)
     assert centred.train[0].camera.fy == 51
-    np.testing.assert_array_equal(used.train[0].image, centred.train[0].image)
-    with pytest.raises(InputError, match="principal_point"):
-        load_scene(capture, capture.model, tmp_path, principal_point="center")  # type: ignore[arg-type]
+    assert_array_equal(used.train[0].image, centred.train[0].image)
+    with refusal("principal_point"):
+        load_scene(capture, capture.model, tmp_path, principal_point="center")
 
 
-def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path, caplog):
+def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path, caplog):
     capture = read_colmap("toy", make_scene(), split=SplitRule(test_every=3))
     small = make_scene(names=("00.png", "01.png", "02.png", "04.png"), root="partial")
     with caplog.at_level(logging.WARNING):
@@ -358,32 +345,30 @@ def test_views_without_pose_are_left_out_with_a_count(make_scene, tmp_path: Path
     assert "1 of 4 training views" in caplog.text
     assert "1 of 2 test views have no pose and are left out: 03.png" in caplog.text
     two = make_scene(names=("00.png", "01.png"), root="two")
-    with pytest.raises(InputError, match="2 of 6 images have a pose"):
+    with refusal("2 of 6 images have a pose"):
         load_scene(capture, two / "sparse/0", tmp_path / "cache")
     only_test = replace(capture, test_names=("00.png", "01.png", "02.png", "04.png"))
-    with pytest.raises(InputError, match="no training view"):
+    with refusal("no training view"):
         load_scene(only_test, small / "sparse/0", tmp_path / "cache2")
 
 
-def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path: Path):
+def test_a_truncated_photo_is_named_and_leaves_no_cache(make_scene, tmp_path):
     root = make_scene(size=(80, 60))
     path = root / "images/03.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     capture = read_colmap("toy", root)
-    with pytest.raises(InputError, match=r"03\.png: the image is damaged"):
+    with refusal(r"03\.png: the image is damaged"):
         load_scene(capture, capture.model, tmp_path / "cache", downscale=2)
     assert not list((tmp_path / "cache").iterdir())
 
 
 @pytest.mark.shared
-def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(
-    shared: Path, tmp_path: Path
-):
+def test_real_photos_of_a_distorted_camera_are_undistorted_and_keep_their_poses(shared, tmp_path):
     capture = read_colmap("herz", shared / "data/herz_jesus_p25", max_images=4)
     scene = load_scene(capture, capture.model, tmp_path, max_size=300)
     assert {max(view.camera.width, view.camera.height) for view in scene.train} == {300}
     model = pycolmap.Reconstruction(capture.model)
     view = scene.train[0]
-    np.testing.assert_allclose(
+    assert_allclose(
         view.camera.center, model.find_image_with_name(view.name).projection_center(), atol=1e-9
     )

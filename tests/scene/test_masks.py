@@ -1,18 +1,13 @@
 """Masks: to which image they belong, which files are refused, and how ignored pixels are filled."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.pipeline.steps.scene import masking_step
 from gsbench.scene.images import (
     fill_ignored,
@@ -26,28 +21,27 @@ from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
+from tests.helpers import refusal
 
-MakeScene = Callable[..., Path]
 
-
-def save(path: Path, pixels: np.ndarray, **options: object) -> Path:
+def save(path, pixels, **options):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, **options)
     return path
 
 
-def half(width: int = 40, height: int = 30) -> np.ndarray:
+def half(width=40, height=30):
     """A mask [H, W] that ignores the left half."""
     mask = np.full((height, width), 255, dtype=np.uint8)
     mask[:, : width // 2] = 0
     return mask
 
 
-def noise(*shape: int) -> np.ndarray:
+def noise(*shape):
     return np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
 
 
-def with_masks(root: Path) -> Path:
+def with_masks(root):
     for path in sorted((root / "images").rglob("*.*")):
         name = path.relative_to(root / "images").as_posix()
         save(root / "masks" / f"{name}.png", half(*Image.open(path).size))
@@ -55,7 +49,7 @@ def with_masks(root: Path) -> Path:
 
 
 @pytest.mark.parametrize("read", [read_colmap, read_photos])
-def test_masks_are_found_by_the_names_of_colmap(make_scene: MakeScene, read) -> None:
+def test_masks_are_found_by_the_names_of_colmap(make_scene, read):
     names = tuple(f"cam/{k}.jpg" for k in range(4))
     capture = read("toy", with_masks(make_scene(names=names)), masks="masks")
     root = capture.images.parent
@@ -63,7 +57,7 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene: MakeScene, read) -> 
     assert capture.image_names == names
 
 
-def test_photographs_are_prepared_again_for_another_backdrop(make_scene: MakeScene) -> None:
+def test_photographs_are_prepared_again_for_another_backdrop(make_scene):
     capture = read_photos("toy", with_masks(make_scene()), masks="masks")
     steps = {behind: masking_step(capture, behind) for behind in ("black", "white")}
     assert all(steps.values())
@@ -71,47 +65,45 @@ def test_photographs_are_prepared_again_for_another_backdrop(make_scene: MakeSce
     assert steps["white"].inputs["behind"] == "white"
 
 
-def test_a_mask_file_with_another_name_is_not_used(tmp_path: Path) -> None:
+def test_a_mask_file_with_another_name_is_not_used(tmp_path):
     for name in ("a.jpg.png", "b.png"):
         save(tmp_path / name, half())
     save(tmp_path / "images" / "a.jpg", half())
     assert find_masks(tmp_path, tmp_path / "images", ["a.jpg"]) == {"a.jpg": tmp_path / "a.jpg.png"}
-    with pytest.raises(InputError, match=r"no mask of b\.jpg in .*: add b\.jpg\.png"):
+    with refusal(r"no mask of b\.jpg in .*: add b\.jpg\.png"):
         find_masks(tmp_path, tmp_path / "images", ["a.jpg", "b.jpg"])
 
 
-def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(
-    make_scene: MakeScene,
-) -> None:
+def test_masks_in_the_folder_of_bare_photographs_are_not_read_as_photographs(make_scene):
     root = with_masks(make_scene()) / "images"
     (root.parent / "masks").rename(root / "masks")
     capture = read_photos("toy", root, masks="masks")
     assert capture.image_names == tuple(f"{k:02d}.png" for k in range(6))
-    with pytest.raises(InputError, match="is the folder of the images"):
+    with refusal("is the folder of the images"):
         read_photos("toy", root, images=".", masks=".")
 
 
-def test_a_missing_mask_and_a_missing_folder_are_named(make_scene: MakeScene) -> None:
+def test_a_missing_mask_and_a_missing_folder_are_named(make_scene):
     root = with_masks(make_scene())
     (root / "masks" / "03.png.png").unlink()
     for folder, said in (
         ("masks", r"^[^\n]*no mask of 03\.png in .*masks: add 03\.png\.png \(all white[^\n]*$"),
-        ("mask", r"no such folder; set scene\.masks to one of: images, masks, sparse"),
+        ("mask", r"no such folder; set scene\.masks to one of: images, masks$"),
     ):
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             read_colmap("toy", root, masks=folder)
 
 
-def test_a_mask_of_another_size_is_refused(make_scene: MakeScene) -> None:
+def test_a_mask_of_another_size_is_refused(make_scene):
     root = with_masks(make_scene())
     path = save(root / "masks" / "02.png.png", half(20, 15))
     said = rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         read_colmap("toy", root, masks="masks")
 
 
-def test_masks_for_the_courtyard_are_refused() -> None:
-    with pytest.raises(InputError, match="courtyard"):
+def test_masks_for_the_courtyard_are_refused():
+    with refusal("courtyard"):
         SceneConfig(name="courtyard", kind="courtyard", masks="masks")
 
 
@@ -127,19 +119,19 @@ def test_masks_for_the_courtyard_are_refused() -> None:
         np.full((5, 7), 1, np.uint8),
     ],
 )
-def test_black_is_ignored_and_all_else_counts(tmp_path: Path, pixels) -> None:
+def test_black_is_ignored_and_all_else_counts(tmp_path, pixels):
     counts = pixels.reshape(*pixels.shape[:2], -1).max(axis=2) > 0
-    np.testing.assert_array_equal(read_mask(save(tmp_path / "m.png", pixels)), counts)
+    assert_array_equal(read_mask(save(tmp_path / "m.png", pixels)), counts)
 
 
-def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path: Path) -> None:
+def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path):
     for mode in ("P", "RGBA"):
         Image.fromarray(half()).convert(mode).save(tmp_path / "m.png")
-        np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), half() > 0)
+        assert_array_equal(read_mask(tmp_path / "m.png"), half() > 0)
 
 
 @pytest.mark.parametrize(
-    ("pixels", "said"),
+    "pixels, said",
     [
         (np.zeros((5, 7), np.uint8), "black all over"),
         (noise(20, 30, 3), "in colours, and no mask"),
@@ -147,52 +139,52 @@ def test_a_mask_in_a_palette_or_with_opaque_alpha_is_read(tmp_path: Path) -> Non
         (np.stack([half()] * 4, -1), "not by transparency"),
     ],
 )
-def test_a_file_that_is_no_mask_is_refused_in_one_line(tmp_path: Path, pixels, said) -> None:
+def test_a_file_that_is_no_mask_is_refused_in_one_line(tmp_path, pixels, said):
     path = save(tmp_path / "m.png", pixels)
-    with pytest.raises(InputError, match=said) as caught:
+    with refusal(said) as caught:
         read_mask(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
 
-def test_a_damaged_mask_is_refused(tmp_path: Path) -> None:
+def test_a_damaged_mask_is_refused(tmp_path):
     path = save(tmp_path / "m.png", noise(64, 64) // 128 * 255)
     path.write_bytes(path.read_bytes()[:-60])
-    with pytest.raises(InputError, match=r"m\.png: the mask is damaged"):
+    with refusal(r"m\.png: the mask is damaged"):
         read_mask(path)
     path.write_text("white")
-    with pytest.raises(InputError, match=r"m\.png: not a readable image"):
+    with refusal(r"m\.png: not a readable image"):
         read_mask(path)
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 23), st.integers(1, 23), st.integers(0, 2**32 - 1))
-def test_filled_pixels_depend_only_on_counted_pixels(height: int, width: int, seed: int) -> None:
+def test_filled_pixels_depend_only_on_counted_pixels(height, width, seed):
     rng = np.random.default_rng(seed)
     counts = rng.random((height, width)) < rng.random()
     counts[rng.integers(height), rng.integers(width)] = True
     one, other = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
     other[counts] = one[counts]
     filled = fill_ignored(one, counts)
-    np.testing.assert_array_equal(filled, fill_ignored(other, counts))
-    np.testing.assert_array_equal(filled[counts], one[counts])
+    assert_array_equal(filled, fill_ignored(other, counts))
+    assert_array_equal(filled[counts], one[counts])
     low, high = one[counts].min(axis=0), one[counts].max(axis=0)
     assert ((filled >= low) & (filled <= high)).all(), "means of what counts"
 
 
-def test_a_hole_in_one_colour_gets_that_colour_and_a_hole_in_a_ramp_has_no_step() -> None:
+def test_a_hole_in_one_colour_gets_that_colour_and_a_hole_in_a_ramp_has_no_step():
     plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
     counts = np.ones((50, 60), bool)
     counts[10:40, 15:45] = False
     holed = np.where(counts[..., None], plain, 0).astype(np.uint8)
-    np.testing.assert_array_equal(fill_ignored(holed, counts), plain)
+    assert_array_equal(fill_ignored(holed, counts), plain)
     ramp = np.broadcast_to(np.linspace(0, 240, 60)[:, None], (50, 60, 3)).astype(np.uint8)
     filled = fill_ignored(ramp, counts).astype(int)
     # filling with black would make a step of 180
     assert np.abs(np.diff(filled[25, :, 0])).max() < 60
 
 
-def test_filling_between_two_pixels_is_linear() -> None:
+def test_filling_between_two_pixels_is_linear():
     """Blocks of two pixels are 0 and 100; a pixel's centre is a quarter block from its block's."""
     row = np.array([[0, 7, 9, 100]], dtype=np.uint8)[..., None].repeat(3, 2)
     counts = np.array([[True, False, False, True]])
@@ -201,7 +193,7 @@ def test_filling_between_two_pixels_is_linear() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mask", "alpha", "backdrop", "copied"),
+    "mask, alpha, backdrop, copied",
     [
         (None, 255, "black", True),
         (None, 9, "black", True),  # since reading blends it over black anyway
@@ -213,9 +205,7 @@ def test_filling_between_two_pixels_is_linear() -> None:
         (half(8, 6), 255, "white", False),
     ],
 )
-def test_a_photograph_without_changes_is_copied(
-    tmp_path: Path, mask, alpha, backdrop, copied
-) -> None:
+def test_a_photograph_without_changes_is_copied(tmp_path, mask, alpha, backdrop, copied):
     pixels = np.full((6, 8, 4), (200, 100, 50, alpha), np.uint8)
     original = save(tmp_path / "in" / "a.png", pixels if alpha < 255 else pixels[..., :3])
     masks = {} if mask is None else {"a.png": save(tmp_path / "a.png", mask)}
@@ -227,16 +217,16 @@ def test_a_photograph_without_changes_is_copied(
         shade = 255 if alpha == 9 else 0
         expected = np.rint((alpha * pixels[0, 0, :3].astype(float) + (255 - alpha) * shade) / 255)
         with Image.open(made) as picture:
-            np.testing.assert_allclose(picture, np.broadcast_to(expected, (6, 8, 3)), atol=1)
+            assert_allclose(picture, np.broadcast_to(expected, (6, 8, 3)), atol=1)
 
 
-@pytest.mark.parametrize(("width", "height"), [(25, 18), (10, 9), (20, 12), (17, 13)])
-def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width: int, height: int) -> None:
+@pytest.mark.parametrize("width, height", [(25, 18), (10, 9), (20, 12), (17, 13)])
+def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width, height):
     """A pixel belongs to the area that its centre is in; on an edge, to either side."""
     counts = np.random.default_rng(1).random((36, 50)) > 0.05
     found = resize_mask(counts, width, height)
 
-    def centres(place: int, sides: int, of: int, slack: float) -> list[int]:
+    def centres(place, sides, of, slack):
         low, high = place * of / sides - slack, (place + 1) * of / sides + slack
         return [k for k in range(of) if low < k + 0.5 < high]
 
@@ -250,28 +240,28 @@ def test_a_resized_pixel_counts_if_all_pixels_in_its_area_count(width: int, heig
             assert at_least <= found[row, column] <= at_most
 
 
-def prepared(root: Path, folder: Path, **options: object) -> Capture:
+def prepared(root, folder, **options):
     """The capture with photographs and masks prepared as in the pipeline."""
-    capture = read_colmap("toy", root, masks="masks", **options)  # type: ignore[arg-type]
+    capture = read_colmap("toy", root, masks="masks", **options)
     for name in capture.image_names:
         prepare_photograph(folder, capture.images, capture.masks, name)
     masks = {name: prepared_mask(folder, name) for name in capture.masks}
     return Capture(**(vars(capture) | {"images": folder / "images", "masks": masks}))
 
 
-def test_views_have_their_masks_at_the_final_size(make_scene: MakeScene, tmp_path: Path) -> None:
+def test_views_have_their_masks_at_the_final_size(make_scene, tmp_path):
     capture = prepared(with_masks(make_scene()), tmp_path / "made")
     for downscale, mask in (
         (1, half()),
         (2, half(20, 15)),
         (2, half(20, 15)),
     ):  # the second time from the cache
-        scene = load_scene(capture, capture.model, tmp_path / "cache", downscale)  # type: ignore[arg-type]
-        np.testing.assert_array_equal(scene.train[0].mask, mask > 0)
+        scene = load_scene(capture, capture.model, tmp_path / "cache", downscale)
+        assert_array_equal(scene.train[0].mask, mask > 0)
         assert scene.train[0].counted == 0.5
 
 
-def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_path: Path) -> None:
+def test_a_mask_is_undistorted_with_its_photograph(make_scene, tmp_path):
     """The photograph equals its mask, so after undistortion exactly its white pixels count."""
     root = make_scene(size=(120, 90), model="SIMPLE_RADIAL", params=(100, 60, 45, 0.15))
     for k, path in enumerate((root / "images").iterdir()):
@@ -279,26 +269,23 @@ def test_a_mask_is_undistorted_with_its_photograph(make_scene: MakeScene, tmp_pa
         save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
         save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
     raw = read_colmap("toy", root, masks="masks")
-    scene = load_scene(raw, raw.model, tmp_path / "cache")  # type: ignore[arg-type]
+    scene = load_scene(raw, raw.model, tmp_path / "cache")
     view = scene.train[0]
-    assert view.mask is not None
     assert view.mask.shape != (90, 120), "undistorting changes the size"
-    np.testing.assert_array_equal(view.mask, view.image[..., 0] == 255)
+    assert_array_equal(view.mask, view.image[..., 0] == 255)
 
 
-def test_a_mask_without_counted_pixels_at_the_final_size_is_named(
-    make_scene: MakeScene, tmp_path: Path
-) -> None:
+def test_a_mask_without_counted_pixels_at_the_final_size_is_named(make_scene, tmp_path):
     root = with_masks(make_scene(size=(320, 240)))
     mask = np.zeros((240, 320), np.uint8)
     mask[100:103, 100:103] = 255
     save(root / "masks" / "04.png.png", mask)
     capture = read_colmap("toy", root, masks="masks")
-    with pytest.raises(InputError, match=r"04\.png\.png: no pixel is left that counts at 32x24 px"):
-        load_scene(capture, capture.model, tmp_path / "cache", downscale=10)  # type: ignore[arg-type]
+    with refusal(r"04\.png\.png: no pixel is left that counts at 32x24 px"):
+        load_scene(capture, capture.model, tmp_path / "cache", downscale=10)
 
 
-def test_masks_change_the_fingerprint_only_if_they_are_used(make_scene: MakeScene) -> None:
+def test_masks_change_the_fingerprint_only_if_they_are_used(make_scene):
     root = make_scene()
     before = read_colmap("toy", root).fingerprint
     with_masks(root)
@@ -308,7 +295,7 @@ def test_masks_change_the_fingerprint_only_if_they_are_used(make_scene: MakeScen
     assert read_colmap("toy", root).fingerprint == before
 
 
-def test_colmap_reads_the_same_focal_length_from_a_prepared_photograph(tmp_path: Path) -> None:
+def test_colmap_reads_the_same_focal_length_from_a_prepared_photograph(tmp_path):
     exif = Image.Exif()
     exif[0x010F], exif[0x0110] = "Canon", "Canon EOS"
     exif.get_ifd(0x8769)[0xA405] = 35  # focal length in 35 mm film

@@ -1,7 +1,5 @@
 """Contiguous parts of cameras, and how far a view is from the training views."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -17,7 +15,7 @@ from tests.scene import cameras
 looking = partial(cameras.looking, size=(40, 30), focal=50.0)
 
 
-def ring(degrees: list[float], radius: float = 3.0) -> list[Camera]:
+def ring(degrees, radius=3.0):
     angles = np.radians(degrees)
     return [
         looking(np.array([radius * np.cos(a), radius * np.sin(a), 1.5]), np.zeros(3))
@@ -25,29 +23,27 @@ def ring(degrees: list[float], radius: float = 3.0) -> list[Camera]:
     ]
 
 
-def turned(camera: Camera, rotation: np.ndarray, shift: np.ndarray, scale: float) -> Camera:
+def turned(camera, rotation, shift, scale):
     """The camera after the world was scaled, turned and shifted."""
     world = camera.rotation @ rotation.T
     center = scale * rotation @ camera.center + shift
     return Camera(40, 30, 50.0, 50.0, 20.0, 15.0, world, -world @ center)
 
 
-def some_rotation(seed: int) -> np.ndarray:
+def some_rotation(seed):
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q @ np.diag(np.sign(np.diag(r)))
     return q * np.sign(np.linalg.det(q))
 
 
-def is_cyclic_run(found: set[int], order: list[int]) -> bool:
+def is_cyclic_run(found, order):
     """Whether ``found`` is one contiguous run of the cyclic ``order``."""
     inside = [index in found for index in order]
     return sum(a != b for a, b in zip(inside, inside[1:] + inside[:1], strict=True)) <= 2
 
 
 @given(st.integers(0, 99), st.integers(2, 6), st.booleans())
-def test_a_ring_is_cut_by_azimuth_in_any_order_and_coordinates(
-    seed: int, sectors: int, far: bool
-) -> None:
+def test_a_ring_is_cut_by_azimuth_in_any_order_and_coordinates(seed, sectors, far):
     rng = np.random.default_rng(seed)
     degrees = list(rng.permutation(np.arange(24) * 15.0))
     rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
@@ -63,7 +59,7 @@ def test_a_ring_is_cut_by_azimuth_in_any_order_and_coordinates(
     assert all(is_cyclic_run(part, around) for part in parts)
 
 
-def test_azimuths_do_not_depend_on_heights_and_are_rounded() -> None:
+def test_azimuths_do_not_depend_on_heights_and_are_rounded():
     angles = np.radians([*range(0, 360, 20), -3e-7])
     eyes = [
         np.array([3 * np.cos(a), 3 * np.sin(a), 1.0 + (k % 2) * (k < 18)])
@@ -74,19 +70,19 @@ def test_azimuths_do_not_depend_on_heights_and_are_rounded() -> None:
     assert "gaps up to 20 degrees" in found.description
 
 
-def test_an_open_ring_starts_after_its_gap() -> None:
+def test_an_open_ring_starts_after_its_gap():
     degrees = [100.0, 60.0, 20.0, 140.0, 180.0, 220.0, 260.0]  # nothing from 260 to 380
     assert [degrees[k] for k in arrange_cameras(ring(degrees)).order] == sorted(degrees)
 
 
-def test_cameras_on_one_side_are_cut_by_planes_in_order() -> None:
+def test_cameras_on_one_side_are_cut_by_planes_in_order():
     arc = ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0])
     found = arrange_cameras(arc)
     assert "one side" in found.description
     assert found.order == (0, 1, 2, 3, 4, 5)
 
 
-def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
+def test_parallel_and_outward_looking_cameras_are_cut_by_planes():
     places = [np.array([x, 0.0, 0.0]) for x in (0.0, 3.0, 1.0, 2.0)]
     row = [looking(place, place + np.array([0.0, 5.0, 0.0])) for place in places]
     assert "one direction" in arrange_cameras(row).description
@@ -102,7 +98,7 @@ def test_parallel_and_outward_looking_cameras_are_cut_by_planes() -> None:
     assert "do not look at one place" in arrange_cameras(outward).description
 
 
-def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
+def test_nine_of_ten_cameras_must_look_towards_the_centre():
     """The cameras that look away have the centre exactly behind them."""
     for away, surrounds in ((1, True), (2, False)):
         around = ring([36.0 * k for k in range(10)])
@@ -111,7 +107,7 @@ def test_nine_of_ten_cameras_must_look_towards_the_centre() -> None:
         assert ("surround" in arrange_cameras(around).description) == surrounds
 
 
-def test_a_first_camera_straight_above_the_centre_is_accepted() -> None:
+def test_a_first_camera_straight_above_the_centre_is_accepted():
     """The poses of the cameras above are exact, so they have no azimuth to the last digit."""
     around = np.array([[3.0, 0, 0], [0, 3, 0], [-3, 0, 0], [0, -3, 0]])
     level = [looking(place, np.zeros(3)) for place in around]
@@ -122,7 +118,7 @@ def test_a_first_camera_straight_above_the_centre_is_accepted() -> None:
     assert sorted(found.order) == list(range(6))
 
 
-def test_rounding_errors_do_not_change_the_order_of_a_ring() -> None:
+def test_rounding_errors_do_not_change_the_order_of_a_ring():
     cameras = [ring_camera(k * 2 * np.pi / 48, 40, 30) for k in range(48)]
     noise = np.random.default_rng(0).normal(scale=1e-12, size=(48, 3))
     shaken = [
@@ -133,9 +129,7 @@ def test_rounding_errors_do_not_change_the_order_of_a_ring() -> None:
 
 
 @given(st.integers(3, 60), st.integers(2, 9))
-def test_sector_sizes_differ_by_at_most_one_and_matched_sizes_are_equal(
-    count: int, sectors: int
-) -> None:
+def test_sector_sizes_differ_by_at_most_one_and_matched_sizes_are_equal(count, sectors):
     sizes = [len(sector_range(count, part, sectors)) for part in range(sectors)]
     assert sum(sizes) == count
     assert max(sizes) - min(sizes) <= 1
@@ -145,7 +139,7 @@ def test_sector_sizes_differ_by_at_most_one_and_matched_sizes_are_equal(
     assert all(set(part) <= set(range(count)) for part in matched)
 
 
-def test_nearest_cameras_have_the_least_angle_and_the_least_distance() -> None:
+def test_nearest_cameras_have_the_least_angle_and_the_least_distance():
     training, test = ring([0.0, 40.0, 90.0]), ring([10.0, 75.0])
     found = nearest_training_cameras(test, training, 2.0)
     for camera, entry in zip(test, found, strict=True):

@@ -3,8 +3,6 @@
 Needs a running Slurm: ``scripts/slurm_one_node.sh start`` sets one up on this machine.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -63,7 +61,7 @@ CLUSTER = [
 
 
 @pytest.fixture(scope="session", autouse=True)
-def slurm() -> None:
+def slurm():
     if shutil.which("sinfo") is None:
         pytest.skip(
             "no Slurm here: scripts/slurm_one_node.sh start (root, Debian or Ubuntu) sets one up"
@@ -79,7 +77,7 @@ def slurm() -> None:
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Path:
+def place(tmp_path):
     (tmp_path / "slow.py").write_text(SLOW)
     (tmp_path / "conf" / "densify").mkdir(parents=True)
     for name, target in (("slow", "slow.Slow"), ("broken", "slow.Broken")):
@@ -88,9 +86,7 @@ def place(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def start(
-    place: Path, environment: dict[str, str], runs: Path, *words: str, pause: float = 0
-) -> subprocess.Popen[str]:
+def start(place, environment, runs, *words, pause=0):
     variables = environment | {"GSBENCH_RUNS": str(runs), "PAUSE": str(pause)}
     command = [sys.executable, "-m", "gsbench.cli", *words]
     return subprocess.Popen(
@@ -103,26 +99,24 @@ def start(
     )
 
 
-def models(runs: Path) -> dict[str, bytes]:
+def models(runs):
     return {
         path.parent.name: path.read_bytes() for path in runs.glob("cluster/*/*/*/point_cloud.ply")
     }
 
 
-def job_logs(runs: Path) -> str:
+def job_logs(runs):
     return "\n".join(path.read_text() for path in sorted(runs.glob(".jobs/cluster/*_log.*")))
 
 
-def queue() -> list[str]:
+def queue():
     listing = subprocess.run(
         ["squeue", "--me", "-h", "-r", "-o", "%i"], capture_output=True, text=True, check=True
     )
     return listing.stdout.split()
 
 
-def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(
-    place: Path, environment: dict[str, str]
-) -> None:
+def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, environment):
     whole = start(place, environment, place / "whole", *SWEEP, "seed=0,1")
     output, _ = whole.communicate(timeout=300)
     assert whole.returncode == 0, output
@@ -163,9 +157,7 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(
     assert logs.count("going on from iteration") >= 2, logs
 
 
-def gsbench(
-    place: Path, environment: dict[str, str], *words: str, pause: float = 0
-) -> subprocess.CompletedProcess[str]:
+def gsbench(place, environment, *words, pause=0):
     """Run the program to its end; its output is in stdout, its log lines in stderr."""
     variables = environment | {"GSBENCH_RUNS": str(place / "runs"), "PAUSE": str(pause)}
     command = [sys.executable, "-m", "gsbench.cli", *words]
@@ -174,7 +166,7 @@ def gsbench(
     )
 
 
-def states(place: Path, environment: dict[str, str]) -> dict[str, str]:
+def states(place, environment):
     """The state of each arm by ``gsbench status``."""
     listing = json.loads(gsbench(place, environment, "status", "cluster", "--json").stdout)
     return {
@@ -183,16 +175,14 @@ def states(place: Path, environment: dict[str, str]) -> dict[str, str]:
     }
 
 
-def wait_for_states(place: Path, environment: dict[str, str], **wanted: str) -> None:
+def wait_for_states(place, environment, **wanted):
     deadline = time.monotonic() + 240
     while (found := states(place, environment)) != wanted:
         assert time.monotonic() < deadline, (found, job_logs(place / "runs"))
         time.sleep(1)
 
 
-def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(
-    place: Path, environment: dict[str, str]
-) -> None:
+def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environment):
     (place / "broken").touch()
     sweep = [
         *SWEEP,
@@ -236,9 +226,7 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(
     assert not list(place.glob("runs/cluster/*/*/*/.submitted.json"))
 
 
-def test_a_cancelled_job_is_missing_and_can_run_without_slurm(
-    place: Path, environment: dict[str, str]
-) -> None:
+def test_a_cancelled_job_is_missing_and_can_run_without_slurm(place, environment):
     later = [*CLUSTER, "launch.wait=false", "launch.sbatch={begin: now+1hour}"]
     done = gsbench(place, environment, *SWEEP, *later)
     assert done.returncode == 0, done.stderr
@@ -256,7 +244,7 @@ def test_a_cancelled_job_is_missing_and_can_run_without_slurm(
     assert states(place, environment) == {"slow": "done"}
 
 
-def test_failed_trial_and_killed_job_are_reported(place: Path, environment: dict[str, str]) -> None:
+def test_failed_trial_and_killed_job_are_reported(place, environment):
     runs = place / "runs"
     slow = start(
         place, environment, runs, *SWEEP, "seed=0", *CLUSTER, "launch.timeout_min=10", pause=PAUSE

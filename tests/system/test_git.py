@@ -1,27 +1,20 @@
 """The facts of a checkout, which git finds without starting programs that the repository names."""
 
-from __future__ import annotations
-
 import os
 import subprocess
-from pathlib import Path
 
 import pytest
 
 from gsbench.system.install import checkout_of
+from tests.helpers import write
+from tests.processes import completed
 
 MARK = "#!/bin/sh\ntouch '{mark}'\ncat\n"
 
 
 @pytest.fixture
-def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def repository(plain_git, tmp_path, monkeypatch):
     """A repository with one commit as the current folder; ``run.sh`` beside it leaves a mark."""
-    for name, value in {
-        "GIT_CONFIG_GLOBAL": "/dev/null",
-        "GIT_CONFIG_NOSYSTEM": "1",
-        "HOME": str(tmp_path),
-    }.items():
-        monkeypatch.setenv(name, value)
     folder = tmp_path / "capture"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -34,31 +27,26 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def git(*words: str) -> str:
-    return subprocess.run(
-        ["git", *words], check=True, capture_output=True, text=True
-    ).stdout.strip()
+def git(*words):
+    return completed(["git", *words]).stdout.strip()
 
 
-def test_commit_and_changes_are_reported(repository: Path) -> None:
+def test_commit_and_changes_are_reported(repository):
     assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": False}
     (repository / "a.txt").write_text("two")
     assert checkout_of(repository, "a.txt") == {"commit": git("rev-parse", "HEAD"), "edited": True}
 
 
-def test_an_untracked_folder_is_no_checkout(repository: Path) -> None:
+def test_an_untracked_folder_is_no_checkout(repository):
     inner = repository / ".venv" / "site-packages"
-    inner.mkdir(parents=True)
-    (inner / "b.py").touch()
+    write(inner / "b.py", b"")
     assert checkout_of(inner, "b.py") == {}
 
 
 @pytest.mark.parametrize(
     "setting", ["core.fsmonitor", "filter.x.clean", "filter.x.process", "Filter.y.CLEAN"]
 )
-def test_programs_in_a_repositorys_configuration_are_not_started(
-    repository: Path, tmp_path: Path, setting: str
-) -> None:
+def test_programs_in_a_repositorys_configuration_are_not_started(repository, tmp_path, setting):
     name = setting.split(".")[1]
     (repository / ".gitattributes").write_text(f"*.txt filter={name}\n")
     (repository / "a.txt").write_text("two")
@@ -73,7 +61,7 @@ def test_programs_in_a_repositorys_configuration_are_not_started(
     assert not (tmp_path / "exploded").exists()
 
 
-def test_hooks_of_a_repository_are_not_started(repository: Path, tmp_path: Path) -> None:
+def test_hooks_of_a_repository_are_not_started(repository, tmp_path):
     hook = repository / ".git" / "hooks" / "post-index-change"
     hook.write_text(MARK.format(mark=tmp_path / "exploded"))
     hook.chmod(0o755)

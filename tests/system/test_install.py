@@ -1,21 +1,18 @@
 """The name under which gsbench is installed, and the commands that hints give."""
 
-from __future__ import annotations
-
 import re
 import shutil
-import subprocess
 import tomllib
-from pathlib import Path
 
 import pytest
 
 from gsbench.system import install
 from gsbench.system.install import DISTRIBUTION, checkout, install_command
 from tests.conftest import ROOT
+from tests.processes import completed
 
 
-def test_the_name_is_that_of_the_project_file() -> None:
+def test_the_name_is_that_of_the_project_file():
     content = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = content["project"]
     assert project["name"] == DISTRIBUTION
@@ -23,9 +20,7 @@ def test_the_name_is_that_of_the_project_file() -> None:
     assert f"{DISTRIBUTION}[dim,search,tensorboard,view]" in content["dependency-groups"]["dev"]
 
 
-def test_from_a_checkout_the_hint_installs_the_checkout(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_from_a_checkout_the_hint_installs_the_checkout(tmp_path, monkeypatch):
     assert checkout() == ROOT
     monkeypatch.chdir(ROOT)
     assert install_command("view") == "pip install -e '.[view]'"
@@ -33,7 +28,7 @@ def test_from_a_checkout_the_hint_installs_the_checkout(
     assert install_command("view") == f"pip install -e '{ROOT}[view]'"
 
 
-def test_elsewhere_the_hint_names_the_distribution(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_elsewhere_the_hint_names_the_distribution(monkeypatch):
     monkeypatch.setattr(install, "__file__", "/usr/lib/python3/site-packages/gsbench/install.py")
     monkeypatch.setattr(install, "installed_from", lambda: None)
     assert install_command() == "pip install 'gsbench-3dgs'"
@@ -41,7 +36,7 @@ def test_elsewhere_the_hint_names_the_distribution(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("record", "found"),
+    "record, found",
     [
         ('{"dir_info": {}, "url": "file://FOLDER"}', True),
         ('{"dir_info": {}, "url": "file://FOLDER/gone"}', False),
@@ -49,11 +44,9 @@ def test_elsewhere_the_hint_names_the_distribution(monkeypatch: pytest.MonkeyPat
         (None, False),
     ],
 )
-def test_installed_from_a_folder_the_hint_names_the_folder(
-    record: str | None, found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_installed_from_a_folder_the_hint_names_the_folder(record, found, tmp_path, monkeypatch):
     class Known:
-        def read_text(self, name: str) -> str | None:
+        def read_text(self, name):
             assert name == "direct_url.json"
             return record and record.replace("FOLDER", tmp_path.as_posix())
 
@@ -63,7 +56,7 @@ def test_installed_from_a_folder_the_hint_names_the_folder(
     assert install_command("view") == f"pip install '{tmp_path if found else DISTRIBUTION}[view]'"
 
 
-def test_no_text_tells_to_install_the_foreign_project_gsbench() -> None:
+def test_no_text_tells_to_install_the_foreign_project_gsbench():
     foreign = re.compile(r"pip install [^`\n]*\bgsbench(?!-3dgs)(\[|['\"`\s]|$)", re.MULTILINE)
     assert foreign.search("pip install 'gsbench[view]'")
     assert not foreign.search("pip install 'gsbench-3dgs[view]'")
@@ -77,15 +70,12 @@ def test_no_text_tells_to_install_the_foreign_project_gsbench() -> None:
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
-def test_the_dockerfile_calls_existing_make_targets() -> None:
+def test_the_dockerfile_calls_existing_make_targets():
     """Docker builds what the README's two commands build."""
     targets = re.findall(r"RUN make (\S+)", (ROOT / "Dockerfile").read_text())
     assert {"demo", "test"} < set(targets)
     for target in targets:
-        done = subprocess.run(
-            ["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
+        completed(["make", "-n", target], cwd=ROOT)
     # In .dockerignore, names without a wildcard match in the root only.
     ignored = (ROOT / ".dockerignore").read_text().split()
     assert {name.lstrip("/") for name in (ROOT / ".gitignore").read_text().split()} < set(

@@ -1,7 +1,5 @@
 """The isolated call: results, exceptions and crashes come back as what they are."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -14,11 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
+from numpy.testing import assert_array_equal
 
 import gsbench
 from gsbench.errors import InputError
 from gsbench.system import isolate
 from gsbench.system.isolate import CrashError, run_isolated
+from tests.helpers import refusal
 from tests.processes import heed_interrupts
 
 PATIENCE = 120.0  # seconds; a slow machine needs fewer
@@ -65,7 +65,7 @@ def beat(path):
 
 
 @pytest.fixture
-def functions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def functions(tmp_path, monkeypatch):
     (tmp_path / "isolated_functions.py").write_text(FUNCTIONS)
     monkeypatch.syspath_prepend(tmp_path)
     sys.modules.pop("isolated_functions", None)
@@ -80,7 +80,7 @@ def test_result_comes_back_from_another_process(functions):
     array = np.arange(1_000_000.0).reshape(1000, 1000)
     doubled, pid = run_isolated(functions.double, array)
     assert pid != os.getpid()
-    np.testing.assert_array_equal(doubled, array * 2)
+    assert_array_equal(doubled, array * 2)
 
 
 def test_child_imports_neither_torch_nor_the_main_module(functions):
@@ -91,14 +91,14 @@ def test_child_imports_neither_torch_nor_the_main_module(functions):
 
 
 def test_exception_keeps_type_text_and_traceback(functions):
-    with pytest.raises(InputError, match="the folder is empty: add photos") as caught:
+    with refusal("the folder is empty: add photos") as caught:
         run_isolated(functions.refuse, what="reading")
     assert "in refuse" in "".join(caught.value.__notes__)
     with pytest.raises(RuntimeError, match="Unpicklable: x-1"):
         run_isolated(functions.odd)
 
 
-def test_crash_is_one_line_with_the_reason(functions, tmp_path: Path):
+def test_crash_is_one_line_with_the_reason(functions, tmp_path):
     log = tmp_path / "log.txt"
     log.write_text("what() of an earlier call\n")
     with pytest.raises(CrashError) as caught:
@@ -117,7 +117,7 @@ def test_early_exit_without_output(functions):
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL])
-def test_child_ends_with_its_parent(functions, tmp_path: Path, sign: signal.Signals):
+def test_child_ends_with_its_parent(functions, tmp_path, sign):
     beats, script = tmp_path / "beats.txt", tmp_path / "main.py"
     script.write_text(
         textwrap.dedent(f"""
@@ -152,7 +152,7 @@ def test_child_ends_with_its_parent(functions, tmp_path: Path, sign: signal.Sign
 
 
 @pytest.mark.parametrize(
-    ("output", "said"),
+    "output, said",
     [
         (b"", "(no output)"),
         (b"\n  \n", "(no output)"),
@@ -162,20 +162,20 @@ def test_child_ends_with_its_parent(functions, tmp_path: Path, sign: signal.Sign
         (b"e1 error\ne2 error\ne3 error\ne4 error", "e2 error | e3 error | e4 error"),
     ],
 )
-def test_the_last_lines_that_tell_a_reason_are_quoted(output: bytes, said: str, tmp_path: Path):
+def test_the_last_lines_that_tell_a_reason_are_quoted(output, said, tmp_path):
     assert isolate.error_lines(output) == said
     (tmp_path / "log").write_bytes(b"Error: earlier\n" + output)
     assert isolate.error_tail(tmp_path / "log", 15) == said
 
 
-def test_only_the_end_of_a_long_output_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_only_the_end_of_a_long_output_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(isolate, "_TAIL_BYTES", 8)
     (tmp_path / "log").write_text("Error: a\nError: b")
     assert isolate.error_tail(tmp_path / "log") == "Error: b"
 
 
 @pytest.mark.parametrize(
-    ("code", "said"),
+    "code, said",
     [
         (-9, "crashed (SIGKILL, perhaps out of memory)"),
         (-11, "crashed (SIGSEGV)"),
@@ -184,18 +184,18 @@ def test_only_the_end_of_a_long_output_is_read(tmp_path: Path, monkeypatch: pyte
         (7, "ended early (exit code 7)"),
     ],
 )
-def test_the_end_of_a_process_is_described(code: int, said: str):
+def test_the_end_of_a_process_is_described(code, said):
     assert isolate.describe_exit(code) == said
 
 
-def test_progress_comes_from_a_file_line_by_line(tmp_path: Path):
+def test_progress_comes_from_a_file_line_by_line(tmp_path):
     channel, told = isolate.ProgressFile(tmp_path / "progress"), []
     channel("a", 1, None)
     channel("b", 2, 3, "note")
     waits = iter([False, False, True])
 
     class Ended:
-        def wait(self, seconds: float) -> bool:
+        def wait(self, seconds):
             assert seconds == 0.25
             if len(told) == 2:
                 with channel.path.open("a") as file:  # the rest of the line comes later
@@ -206,7 +206,7 @@ def test_progress_comes_from_a_file_line_by_line(tmp_path: Path):
                     file.write("5\t\tend\n")
             return next(waits)
 
-    def progress(*given: object) -> None:
+    def progress(*given):
         told.append(given)
         raise BrokenPipeError  # a closed terminal stops nothing
 
@@ -214,14 +214,14 @@ def test_progress_comes_from_a_file_line_by_line(tmp_path: Path):
     assert told == [("a", 1, None, ""), ("b", 2, 3, "note"), "half", ("c", 45, None, "end")]
 
 
-def test_the_progress_of_a_function_is_forwarded_to_the_end(monkeypatch: pytest.MonkeyPatch):
-    told: list[tuple] = []
+def test_the_progress_of_a_function_is_forwarded_to_the_end(monkeypatch):
+    told = []
 
     def run_isolated(function, *arguments, what, log):
         assert (what, log) == ("work", None)
         return function(*arguments)
 
-    def work(job: int, progress) -> int:
+    def work(job, progress):
         progress("a", job, 5)
         if job == 3:
             raise ValueError("three")
@@ -236,7 +236,7 @@ def test_the_progress_of_a_function_is_forwarded_to_the_end(monkeypatch: pytest.
     assert told == [("a", 2, 5, ""), ("a", 3, 5, "")]
 
 
-def test_a_fresh_interpreter_gets_this_search_path(monkeypatch: pytest.MonkeyPatch):
+def test_a_fresh_interpreter_gets_this_search_path(monkeypatch):
     monkeypatch.setattr(sys, "path", ["a"])
     monkeypatch.setattr(isolate, "allowed_modules", lambda: {"mine": "/there"})
     command = isolate.python_command("m.n", "f", "1", "2")
@@ -245,29 +245,29 @@ def test_a_fresh_interpreter_gets_this_search_path(monkeypatch: pytest.MonkeyPat
     assert command[4:] == ['[["a"], {"mine": "/there"}]', "1", "2"]
 
 
-def test_descendants_are_killed_until_none_is_left(monkeypatch: pytest.MonkeyPatch):
-    did: list[object] = []
+def test_descendants_are_killed_until_none_is_left(monkeypatch):
+    did = []
     rounds = iter([["runs", "zombie", "gone"], ["runs"], ["zombie"]])
 
     class Process:
-        def __init__(self, state: str = "") -> None:
+        def __init__(self, state=""):
             self.state = state
 
-        def children(self, recursive: bool) -> list[Process]:
+        def children(self, recursive):
             assert recursive
             return [Process(state) for state in next(rounds)]
 
-        def status(self) -> str:
+        def status(self):
             if self.state == "gone":
                 raise psutil.NoSuchProcess(1)
             return psutil.STATUS_ZOMBIE if self.state == "zombie" else "running"
 
-        def kill(self) -> None:
+        def kill(self):
             did.append("kill")
 
     reaped = iter([(5, 0), (0, 0)])
 
-    def waitpid(pid: int, options: int) -> tuple[int, int]:
+    def waitpid(pid, options):
         assert (pid, options) == (-1, os.WNOHANG)
         if (found := next(reaped, None)) is None:
             raise ChildProcessError
@@ -282,7 +282,7 @@ def test_descendants_are_killed_until_none_is_left(monkeypatch: pytest.MonkeyPat
     assert list(reaped) == []
 
 
-def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch: pytest.MonkeyPatch):
+def test_descendants_that_cannot_be_killed_are_given_up(monkeypatch):
     now = iter([100.0, 104.9, 105.0])
     asked = []
     monkeypatch.setattr(time, "monotonic", lambda: next(now))

@@ -1,14 +1,10 @@
 """Compiled kernels on disk are used only with the sources that they were made from."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
-from typing import Any
 
 import numba
 import pytest
@@ -24,14 +20,14 @@ KERNEL_MODULES = sorted(
 
 
 @pytest.fixture
-def package(tmp_path: Path) -> Path:
+def package(tmp_path):
     """A copy of gsbench's sources."""
     return Path(
         shutil.copytree(PACKAGE, tmp_path / "gsbench", ignore=shutil.ignore_patterns("__pycache__"))
     )
 
 
-def functions_of(value: Any, seen: set[int]) -> Iterator[FunctionType]:
+def functions_of(value, seen):
     """The Python function behind a compiled one, and those that it calls."""
     function = getattr(value, "py_func", value)
     if not isinstance(function, FunctionType) or id(function) in seen:
@@ -46,21 +42,21 @@ def functions_of(value: Any, seen: set[int]) -> Iterator[FunctionType]:
             yield from functions_of(candidate, seen)
 
 
-def _names(code: Any) -> Iterator[str]:
+def _names(code):
     yield from code.co_names
     for constant in code.co_consts:
         if inspect.iscode(constant):
             yield from _names(constant)
 
 
-def test_modules_with_kernels_are_found() -> None:
+def test_modules_with_kernels_are_found():
     assert len(KERNEL_MODULES) >= 5
 
 
 @pytest.mark.parametrize("module", KERNEL_MODULES)
-def test_sources_include_every_function_that_kernels_call(module: str) -> None:
+def test_sources_include_every_function_that_kernels_call(module):
     loaded = importlib.import_module("gsbench." + module.removesuffix(".py").replace("/", "."))
-    seen: set[int] = set()
+    seen = set()
     reached = [
         function
         for value in vars(loaded).values()
@@ -74,7 +70,7 @@ def test_sources_include_every_function_that_kernels_call(module: str) -> None:
     assert not missing
 
 
-def sources(package: Path) -> set[Path]:
+def sources(package):
     places = [package / source for source in SOURCES]
     return {
         path for place in places for path in (place.rglob("*.py") if place.is_dir() else [place])
@@ -82,7 +78,7 @@ def sources(package: Path) -> set[Path]:
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -> None:
+def test_a_change_in_any_source_changes_the_folder(package, source):
     before = cache_folder.__wrapped__(package)
     assert before == cache_folder()  # the same sources elsewhere
     place = package / source
@@ -95,7 +91,7 @@ def test_a_change_in_any_source_changes_the_folder(package: Path, source: str) -
     assert cache_folder.__wrapped__(package) == before
 
 
-def test_sources_include_every_module_that_kernels_import() -> None:
+def test_sources_include_every_module_that_kernels_import():
     """Modules that only prepare calls of kernels are exceptions."""
     known = {path.relative_to(PACKAGE).as_posix() for path in sources(PACKAGE)}
     around = {
@@ -114,9 +110,7 @@ def test_sources_include_every_module_that_kernels_import() -> None:
             assert not strange, f"{name} imports {strange}"
 
 
-def test_the_cache_is_in_the_configured_folder_or_another_writable_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cache_is_in_the_configured_folder_or_another_writable_one(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
     assert cache_base.__wrapped__() == tmp_path / "given"
@@ -127,7 +121,7 @@ def test_the_cache_is_in_the_configured_folder_or_another_writable_one(
     assert cache_base.__wrapped__().name.startswith("gsbench-numba-")
 
 
-def test_processors_do_not_share_a_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processors_do_not_share_a_folder(monkeypatch):
     """Machines of two kinds may have one home folder, and write there at once."""
     folders = {cache_folder.__wrapped__()}
     for name, features in (("bonnell", ""), ("haswell", "+avx2"), ("haswell", "+avx2,+fma")):
@@ -138,7 +132,7 @@ def test_processors_do_not_share_a_folder(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_compiling_is_announced_once_and_only_for_own_kernels(caplog):
-    def event(module: str) -> Any:
+    def event(module):
         function = SimpleNamespace(__module__=module)
         return SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=function)})
 

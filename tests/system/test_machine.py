@@ -1,18 +1,13 @@
 """The record of the machine that a result was computed on."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-from gsbench.errors import InputError
 from gsbench.system import machine
 from gsbench.system.machine import (
     cpu_name,
@@ -22,6 +17,8 @@ from gsbench.system.machine import (
     load_numba,
     x86_level,
 )
+from tests.helpers import refusal
+from tests.processes import completed
 
 ARM_64 = (
     "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU "
@@ -33,7 +30,7 @@ XEON = (
 )
 
 
-def test_record_is_plain_text_and_full() -> None:
+def test_record_is_plain_text_and_full():
     record = describe_machine(torch.device("cpu"))
     assert json.loads(json.dumps(record)) == record
     assert set(record) == {"cpu", "architecture", "kernels", "torch", "device"}
@@ -43,16 +40,14 @@ def test_record_is_plain_text_and_full() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "name"),
+    "content, name",
     [
         (XEON, "Intel(R) Xeon(R)"),
         (ARM_64, "ARM implementer 0x41 part 0xd40"),
         ("Model : Raspberry Pi 5", "Raspberry Pi 5"),
     ],
 )
-def test_names_of_processors_on_linux(
-    content: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_of_processors_on_linux(content, name, tmp_path, monkeypatch):
     (tmp_path / "cpuinfo").write_text(content)
     monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "cpuinfo")
     monkeypatch.setattr(sys, "platform", "linux")
@@ -60,9 +55,7 @@ def test_names_of_processors_on_linux(
 
 
 @pytest.mark.parametrize("system", ["linux", "darwin", "win32", "sunos"])
-def test_a_processor_without_a_name_is_called_by_its_architecture(
-    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_processor_without_a_name_is_called_by_its_architecture(system, tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "missing")
     monkeypatch.setenv("PATH", str(tmp_path))  # no program of the system
     monkeypatch.delenv("PROCESSOR_IDENTIFIER", raising=False)
@@ -71,7 +64,7 @@ def test_a_processor_without_a_name_is_called_by_its_architecture(
     assert cpu_name.__wrapped__() == platform.machine()
 
 
-def test_levels_follow_the_psabi() -> None:
+def test_levels_follow_the_psabi():
     v2 = {"sse3", "ssse3", "sse4.1", "sse4.2", "popcnt", "cx16", "sahf", "sse2"}
     v3 = v2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"}
     v4 = v3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
@@ -82,38 +75,31 @@ def test_levels_follow_the_psabi() -> None:
     assert x86_level(v4 - {"sse4.2"}) == "x86-64-v1"
 
 
-def test_the_target_of_kernels_follows_numba_cpu_name() -> None:
+def test_the_target_of_kernels_follows_numba_cpu_name():
     code = "from gsbench.system.machine import kernel_target; print(kernel_target())"
     changed = dict(os.environ) | {"NUMBA_CPU_NAME": "generic"}
-    asked = subprocess.run(
-        [sys.executable, "-c", code], env=changed, capture_output=True, text=True, check=True
-    )
+    asked = completed([sys.executable, "-c", code], env=changed)
     assert asked.stdout.startswith("generic")
     if "NUMBA_CPU_NAME" not in os.environ:
         assert not kernel_target().startswith("generic")
 
 
 @pytest.mark.parametrize(
-    ("variable", "least"),
+    "variable, said",
     [
-        *((f"NUMBA_NUM_THREADS={value}", 1) for value in ("0", "-1", "", "²", "1.5")),
-        *((f"NUMBA_DISABLE_JIT={value}", 0) for value in ("x", "-1")),
+        *((f"NUMBA_NUM_THREADS={value}", "from 1 on") for value in ("0", "-1", "", "²", "1.5")),
+        *((f"NUMBA_DISABLE_JIT={value}", "from 0 on") for value in ("x", "-1")),
         ("NUMBA_NUM_THREADS=1", None),
         ("NUMBA_DISABLE_JIT=0", None),
     ],
 )
-def test_a_variable_that_numba_cannot_read_is_refused(
-    variable: str, least: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variable_that_numba_cannot_read_is_refused(variable, said, monkeypatch):
     monkeypatch.setenv(*variable.split("="))
-    if least is None:
+    with refusal(said and rf"^{variable}: .* a whole number {said}"):
         load_numba()
-    else:
-        with pytest.raises(InputError, match=rf"^{variable}: .* a whole number from {least} on"):
-            load_numba()
 
 
-def test_kernels_are_for_the_processor_and_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_for_the_processor_and_its_level(monkeypatch):
     features = "+" + ",+".join(machine.X86_LEVELS["x86-64-v2"]) + ",-avx"
     monkeypatch.setattr(machine, "numba_target", lambda: ("haswell", features))
     for system, target in (
@@ -128,13 +114,11 @@ def test_kernels_are_for_the_processor_and_its_level(monkeypatch: pytest.MonkeyP
     assert kind_of_machine(record | {"device": "H100"}) == "H100, A (B, torch C)"
 
 
-def test_numba_reads_no_settings_of_the_current_folder(tmp_path: Path) -> None:
+def test_numba_reads_no_settings_of_the_current_folder(tmp_path):
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\nopt: 0\n")
     code = (
         "import gsbench.raster.cpu\nfrom numba.core import config\nconfig.reload_config()\n"
         "print(config.DISABLE_JIT, int(config.OPT))"
     )
-    asked = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+    asked = completed([sys.executable, "-c", code], cwd=tmp_path)
     assert asked.stdout == "0 3\n"

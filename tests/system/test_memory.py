@@ -1,11 +1,7 @@
 """Peak memory of a process, on systems that count it differently."""
 
-from __future__ import annotations
-
-import subprocess
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,17 +9,18 @@ import torch
 
 from gsbench.system import resources as memory
 from gsbench.system.resources import peak_memory_mb, peak_resident_mb, reset_peak_memory
+from tests.processes import completed
 
 CPU = torch.device("cpu")
 MIB = 1_048_576
 LARGE_MB = 200
 
 
-def touch(megabytes: int) -> None:
+def touch(megabytes):
     np.ones(megabytes * MIB, np.uint8).sum()
 
 
-def test_the_peak_includes_memory_that_was_freed_again() -> None:
+def test_the_peak_includes_memory_that_was_freed_again():
     before = peak_resident_mb()
     reset_peak_memory(CPU)
     touch(LARGE_MB)
@@ -31,16 +28,14 @@ def test_the_peak_includes_memory_that_was_freed_again() -> None:
 
 
 @pytest.mark.skipif(not memory.CLEAR_REFS.exists(), reason="only Linux starts the count anew")
-def test_the_peak_can_be_reset() -> None:
+def test_the_peak_can_be_reset():
     touch(2 * LARGE_MB)
     high = peak_memory_mb(CPU)
     reset_peak_memory(CPU)
     assert peak_memory_mb(CPU) < high - LARGE_MB
 
 
-def test_systems_without_proc_have_other_sources(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_systems_without_proc_have_other_sources(tmp_path, monkeypatch):
     counted = peak_resident_mb()
     monkeypatch.setattr(memory, "STATUS", tmp_path / "missing")
     if memory.resource is not None:
@@ -51,7 +46,7 @@ def test_systems_without_proc_have_other_sources(
     assert peak_resident_mb() == 3
 
 
-def test_on_a_gpu_the_peak_is_that_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_gpu_the_peak_is_that_of_torch(monkeypatch):
     gpu, reset = torch.device("cuda:1"), []
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset.append)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", {gpu: 3 * MIB}.get)
@@ -59,11 +54,10 @@ def test_on_a_gpu_the_peak_is_that_of_torch(monkeypatch: pytest.MonkeyPatch) -> 
     assert (reset, peak_memory_mb(gpu)) == ([gpu], 3)
 
 
-def test_the_pipeline_can_be_imported_without_the_resource_module() -> None:
+def test_the_pipeline_can_be_imported_without_the_resource_module():
     """Windows has no such module; psutil does without it."""
     code = (
         "import sys, psutil; sys.modules['resource'] = None; import gsbench.runs.keys, "
         "gsbench.bench"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    completed([sys.executable, "-c", code])

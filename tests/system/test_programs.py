@@ -1,13 +1,12 @@
 """Every place where gsbench starts a process is listed here, with the folder where it starts."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 
 import pytest
 
 from gsbench.system import install, programs, resources
+from tests.helpers import write
 
 SRC = Path(programs.__file__).parents[1]
 
@@ -30,7 +29,7 @@ MODULES = ("subprocess", "os", "pty", "webbrowser", "asyncio", "multiprocessing"
 OF_OS = ("system", "popen", "spawn", "exec", "posix_spawn", "startfile")
 
 
-def starts_of(file: Path) -> dict[tuple[str, str, str], ast.Call]:
+def starts_of(file):
     """The calls in ``file`` that start processes."""
     found = {}
     tree = ast.parse(file.read_text(encoding="utf-8"))
@@ -56,7 +55,7 @@ def starts_of(file: Path) -> dict[tuple[str, str, str], ast.Call]:
     return found
 
 
-def test_every_start_of_a_process_is_listed_with_its_folder() -> None:
+def test_every_start_of_a_process_is_listed_with_its_folder():
     found = {key: call for file in SRC.rglob("*.py") for key, call in starts_of(file).items()}
     assert found.keys() == STARTS.keys()
     for key, where in STARTS.items():
@@ -69,7 +68,7 @@ def test_every_start_of_a_process_is_listed_with_its_folder() -> None:
             assert "env" in words
 
 
-def test_nobody_imports_a_starter_by_its_own_name() -> None:
+def test_nobody_imports_a_starter_by_its_own_name():
     """`starts_of` sees ``subprocess.run``, not ``from subprocess import run``."""
     for file in SRC.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -79,17 +78,16 @@ def test_nobody_imports_a_starter_by_its_own_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "start"),
+    "name, start",
     [
         ("git", lambda folder: install._git(folder, "rev-parse", "HEAD")),
         ("nvidia-smi", lambda folder: resources.nvidia_smi("index")),
     ],
 )
 @pytest.mark.parametrize("entry", [".", "", "bin"])
-def test_no_program_of_the_current_folder_starts(name, start, entry, tmp_path, monkeypatch) -> None:
+def test_no_program_of_the_current_folder_starts(name, start, entry, tmp_path, monkeypatch):
     for folder in (tmp_path, tmp_path / "bin"):
-        folder.mkdir(exist_ok=True)
-        (folder / name).write_text(f"#!/bin/sh\ntouch {tmp_path}/exploded\n")
+        write(folder / name, f"#!/bin/sh\ntouch {tmp_path}/exploded\n")
         (folder / name).chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", entry)

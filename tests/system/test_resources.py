@@ -1,13 +1,10 @@
 """Slots for trials that run at once, and each trial's GPU and threads."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
-from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -24,7 +21,7 @@ from gsbench.system.resources import (
 )
 
 
-def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slots_gpus_and_threads(tmp_path, monkeypatch):
     with take_slot(tmp_path, 2) as first, take_slot(tmp_path, 2) as second:
         assert (first, second) == (0, 1)
     with take_slot(tmp_path, 2) as slot:
@@ -51,19 +48,19 @@ def test_slots_gpus_and_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture(autouse=True)
-def _own_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def _own_threads(monkeypatch):
     for name in THREAD_VARIABLES:
         monkeypatch.setenv(name, os.environ.get(name, "1"))
 
 
-def test_a_taken_slot_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pauses: list[float] = []
+def test_a_taken_slot_is_waited_for(tmp_path, monkeypatch):
+    pauses = []
     folder = tmp_path / ".slots" / socket.gethostname()
     folder.mkdir(parents=True)
     other = FileLock(folder / "0.lock")
     other.acquire()
 
-    def sleep(seconds: float) -> None:
+    def sleep(seconds):
         pauses.append(seconds)
         if len(pauses) == 2:
             other.release()
@@ -78,21 +75,21 @@ def test_a_taken_slot_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         pass
 
 
-def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Any] = []
+def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch):
+    asked = []
 
-    def smi(command: list[str], **how: Any) -> Any:
+    def smi(command, **how):
         asked.append(command)
         if error:
             raise error
         return SimpleNamespace(stdout="0\n1\n")
 
-    error: Exception | None = None
+    error = None
     monkeypatch.setattr("subprocess.run", smi)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assign_gpu(3, None)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
-    assert asked == [["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]]
+    assert asked == [split("nvidia-smi --query-gpu=index --format=csv,noheader")]
     assign_gpu(0, " 7 , ")
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "7"
     for error in (  # noqa: B007 - raised by the driver's program
@@ -106,7 +103,7 @@ def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("cores", "gigabytes", "most", "gpus", "expected"),
+    "cores, gigabytes, most, gpus, expected",
     [
         (2, 16, None, 0, 2),
         (1, 16, None, 0, 1),
@@ -122,13 +119,8 @@ def test_the_driver_tells_the_gpus_that_a_trial_may_get(monkeypatch: pytest.Monk
     ],
 )
 def test_trials_at_once_suit_cores_memory_and_gpus(
-    cores: int,
-    gigabytes: int,
-    most: int | None,
-    gpus: int,
-    expected: int,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    cores, gigabytes, most, gpus, expected, monkeypatch
+):
     monkeypatch.setattr("gsbench.system.resources.available_cores", lambda: cores)
     monkeypatch.setattr("gsbench.system.resources.installed_gpus", lambda: ["0"] * gpus)
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=gigabytes * 10**9))

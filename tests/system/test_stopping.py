@@ -1,15 +1,10 @@
 """Signals stop the program at once or at the end of a step; locks are held by one process."""
 
-from __future__ import annotations
-
-import json
 import logging
 import os
 import signal
 import sys
 import threading
-from pathlib import Path
-from typing import Any
 
 import pytest
 from filelock import FileLock, Timeout
@@ -27,9 +22,10 @@ from gsbench.system.stopping import (
     requested,
     stop_on_signals,
 )
+from tests.helpers import read_json
 
 
-def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back() -> None:
+def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back():
     before = [signal.getsignal(number) for number in SIGNALS]
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2):
         with pytest.raises(Stopped) as stop, stop_on_signals():
@@ -50,7 +46,7 @@ def test_each_signal_stops_the_block_and_the_earlier_handlers_come_back() -> Non
     assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
-def test_a_deferred_signal_stops_at_the_end_of_the_block_and_a_second_one_at_once() -> None:
+def test_a_deferred_signal_stops_at_the_end_of_the_block_and_a_second_one_at_once():
     with stop_on_signals():
         with pytest.raises(Stopped, match="SIGTERM"), deferred():  # noqa: PT012
             with deferred():
@@ -69,7 +65,7 @@ def test_a_deferred_signal_stops_at_the_end_of_the_block_and_a_second_one_at_onc
             signal.raise_signal(signal.SIGUSR2)
 
 
-def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers() -> None:
+def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers():
     before = signal.getsignal(signal.SIGINT)
     with interrupts_ignored():
         signal.raise_signal(signal.SIGINT)
@@ -77,7 +73,7 @@ def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers() -
     assert signal.getsignal(signal.SIGINT) is before
     ran = []
 
-    def work() -> None:
+    def work():
         with stop_on_signals(), interrupts_ignored(), deferred():
             ran.append(signal.getsignal(signal.SIGINT) is before)
 
@@ -90,16 +86,13 @@ def test_ctrl_c_is_ignored_within_a_block_and_other_threads_have_no_handlers() -
 # ---- locks
 
 
-def test_a_lock_names_its_holder_as_long_as_it_is_held(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_names_its_holder_as_long_as_it_is_held(tmp_path, monkeypatch):
     lock = tmp_path / "a.lock"
     monkeypatch.setenv("SLURM_JOB_ID", "5")
     monkeypatch.setattr("time.time", lambda: 12.5)
     assert describe_holder(lock) == "another process"
     with hold(lock, "the work"):
         holder = read_holder(lock)
-        assert holder is not None
         assert (holder.pid, holder.since, holder.what) == (os.getpid(), 12.5, "the work")
         assert describe_holder(lock) == f"process {os.getpid()} on {holder.host}, Slurm job 5"
     assert read_holder(lock) is None
@@ -107,29 +100,27 @@ def test_a_lock_names_its_holder_as_long_as_it_is_held(
     (tmp_path / "target").write_text("kept")
     (tmp_path / "a.lock.holder").symlink_to(tmp_path / "target")
     with hold(lock, "the work"):
-        assert json.loads((tmp_path / "a.lock.holder").read_text())["what"] == "the work"
+        assert read_json(tmp_path / "a.lock.holder")["what"] == "the work"
     assert (tmp_path / "target").read_text() == "kept"
     with pytest.raises(KeyError), hold(lock, "the work"):
         raise KeyError
     assert not is_held(lock)
 
 
-def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(tmp_path, monkeypatch, caplog):
     caplog.set_level(logging.INFO, "gsbench")
-    asked: list[Any] = []
+    asked = []
 
     class Held:
-        def __init__(self, path: Path) -> None:
+        def __init__(self, path):
             pass
 
-        def acquire(self, **how: Any) -> None:
+        def acquire(self, **how):
             asked.append(how)
             if how == {"timeout": 0}:
                 raise Timeout("x")
 
-        def release(self) -> None:
+        def release(self):
             asked.append("released")
 
     monkeypatch.setattr(locks, "FileLock", Held)
@@ -142,9 +133,7 @@ def test_a_held_lock_is_waited_for_with_a_word_or_is_an_error(
 
 
 @pytest.mark.parametrize("system", ["with flock", "without"])
-def test_whether_a_lock_is_held_is_seen_on_every_system(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
-) -> None:
+def test_whether_a_lock_is_held_is_seen_on_every_system(tmp_path, monkeypatch, system):
     if system == "without":
         monkeypatch.setattr(locks, "fcntl", None)
     lock = tmp_path / "a"
@@ -160,9 +149,7 @@ def test_whether_a_lock_is_held_is_seen_on_every_system(
 # ---- a user's modules
 
 
-def test_only_allowed_modules_are_found_in_their_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_allowed_modules_are_found_in_their_folder(tmp_path, monkeypatch):
     finder = AllowedModules()
     monkeypatch.setattr(own_modules, "_allowed", finder)
     monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
@@ -176,7 +163,6 @@ def test_only_allowed_modules_are_found_in_their_folder(
     assert sys.meta_path.count(finder) == 1
     assert sys.meta_path[-1] is finder  # installed modules come first
     found = finder.find_spec("mine")
-    assert found is not None
     assert found.origin == str(tmp_path / "mine.py")
     assert finder.find_spec("other") is None
     assert finder.find_spec("mine", ["/package"]) is None

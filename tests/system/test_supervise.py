@@ -1,14 +1,11 @@
 """No process outlives the function that started it; on Linux this includes daemons."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
 import textwrap
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -47,7 +44,7 @@ SIGNALS = (
 FORKS = "import os, time; [os.fork() for _ in range(4)]; time.sleep(600)"
 
 
-def is_gone(mark: Path) -> bool:
+def is_gone(mark):
     """Return whether the process whose id is in the file ``mark`` ends within `PATIENCE`."""
     pid, deadline = int(mark.read_text()), time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
@@ -64,7 +61,7 @@ def is_gone(mark: Path) -> bool:
 @pytest.mark.parametrize(
     "end", ["", "raise SystemExit(3)", "os.kill(os.getpid(), 9)", "time.sleep(600)"]
 )
-def test_a_daemon_of_a_trainer_ends_with_it(tmp_path: Path, end: str, code: str) -> None:
+def test_a_daemon_of_a_trainer_ends_with_it(tmp_path, end, code):
     program = f"{DAEMON}\ndaemon('mark', {code!r})\n{end}"
     try:
         command = [sys.executable, "-c", program]
@@ -85,7 +82,7 @@ def test_a_daemon_of_a_trainer_ends_with_it(tmp_path: Path, end: str, code: str)
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_daemon_ends_with_gsbench_however_that_ends(tmp_path: Path, sign: signal.Signals) -> None:
+def test_a_daemon_ends_with_gsbench_however_that_ends(tmp_path, sign):
     (tmp_path / "main.py").write_text(
         textwrap.dedent(f"""
         import os, sys

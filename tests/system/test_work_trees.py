@@ -1,34 +1,24 @@
 """Work trees of a stranger's repository: its programs do not run, its checkout does not change."""
 
-from __future__ import annotations
-
-import subprocess
-from collections.abc import Callable
-from pathlib import Path
+from shlex import split
 
 import pytest
 
 from gsbench.errors import InputError
 from gsbench.system.install import WorkTrees
-
-Git = Callable[..., str]
+from tests.helpers import refusal
+from tests.processes import completed
 
 
 @pytest.fixture
-def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Git:
+def git(plain_git, tmp_path):
     """git in the folder ``theirs``, which is a repository with three commits of a file."""
-    for name, value in {
-        "GIT_CONFIG_GLOBAL": "/dev/null",
-        "GIT_CONFIG_NOSYSTEM": "1",
-        "HOME": str(tmp_path),
-    }.items():
-        monkeypatch.setenv(name, value)
     folder = tmp_path / "theirs"
     (folder / "inner").mkdir(parents=True)
 
-    def run(*words: str) -> str:
-        command = ["git", "-C", str(folder), "-c", "user.name=x", "-c", "user.email=x@y", *words]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    def run(*words):
+        command = [*split(f"git -C {folder} -c user.name=x -c user.email=x@y"), *words]
+        return completed(command).stdout.strip()
 
     run("init", "-q", "-b", "main")
     (folder / ".gitattributes").write_text("*.py filter=theirs\n")
@@ -39,12 +29,12 @@ def git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Git:
     return run
 
 
-def trees(tmp_path: Path, name: str = "place") -> WorkTrees:
+def trees(tmp_path, name="place"):
     (tmp_path / name).mkdir()
     return WorkTrees(tmp_path / "theirs" / "inner", tmp_path / name)
 
 
-def test_commits_and_their_trees(tmp_path: Path, git: Git) -> None:
+def test_commits_and_their_trees(tmp_path, git):
     found = trees(tmp_path)
     assert found.prefix == "inner/"
     commits = found.commits("HEAD~2", "main")
@@ -57,7 +47,7 @@ def test_commits_and_their_trees(tmp_path: Path, git: Git) -> None:
     assert git("status", "--porcelain") == ""
 
 
-def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path: Path, git: Git) -> None:
+def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path, git):
     ran = tmp_path / "ran"
     program = tmp_path / "program"
     program.write_text(f"#!/bin/sh\ntouch {ran}\ncat\n")
@@ -83,7 +73,7 @@ def test_neither_hooks_nor_filters_of_the_repository_run(tmp_path: Path, git: Gi
     assert not ran.exists()
 
 
-def test_wrong_and_reversed_commits_are_refused(tmp_path: Path, git: Git) -> None:
+def test_wrong_and_reversed_commits_are_refused(tmp_path, git):
     found = trees(tmp_path)
     for first, last, message in (
         ("nosuch", "HEAD", "rev-parse"),
@@ -92,15 +82,13 @@ def test_wrong_and_reversed_commits_are_refused(tmp_path: Path, git: Git) -> Non
         ("HEAD", "HEAD", "does not come after"),
         ("HEAD^{tree}", "HEAD", "rev-parse"),
     ):
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match=message):  # git's message has its own lines
             found.commits(first, last)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"git rev-parse: .*not a git repository"):
+    with refusal(r"git rev-parse: .*not a git repository"):
         WorkTrees(tmp_path / "empty", tmp_path)
 
 
-def test_git_variables_of_a_hook_are_ignored(
-    tmp_path: Path, git: Git, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_git_variables_of_a_hook_are_ignored(tmp_path, git, monkeypatch):
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "nowhere"))  # as in a hook
     assert len(trees(tmp_path).commits("HEAD~1", "HEAD")) == 2

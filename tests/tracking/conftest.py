@@ -1,11 +1,8 @@
 """A runs folder with a database, and a PostgreSQL server for one test."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +12,7 @@ from tests.tracking.helpers import free_port
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Path:
+def runs(tmp_path_factory):
     """A runs folder with a database; making one takes MLflow seconds."""
     folder = tmp_path_factory.mktemp("runs")
     ensure_experiment(connect(None, folder), "tracked", folder)
@@ -23,7 +20,7 @@ def runs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def postgresql(tmp_path) -> Iterator[str]:
+def postgresql(tmp_path):
     """The address of an empty database in a new PostgreSQL server; skips without PostgreSQL."""
     pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
     homes = (

@@ -1,15 +1,11 @@
 """Trials as files, and what MLflow shows of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
@@ -20,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
 
 
-def options(uri: str | None = None, patience: float = 30.0) -> dict[str, Any]:
+def options(uri=None, patience=30.0):
     return {
         "enabled": True,
         "uri": uri,
@@ -30,7 +26,7 @@ def options(uri: str | None = None, patience: float = 30.0) -> dict[str, Any]:
     }
 
 
-def trial_values(runs: Path, seed: int = 0, name: str = "tracked") -> dict[str, Any]:
+def trial_values(runs, seed=0, name="tracked"):
     named = {group: {"name": f"a_{group}"} for group in ("scene", "init", "densify")}
     return {
         "name": name,
@@ -41,9 +37,7 @@ def trial_values(runs: Path, seed: int = 0, name: str = "tracked") -> dict[str, 
     }
 
 
-def begin_trial(
-    values: dict[str, Any], uri: str | None = None, patience: float = 30.0, **more: Any
-) -> Path:
+def begin_trial(values, uri=None, patience=30.0, **more):
     """The folder of a trial that has written its configuration, as the mirror finds it."""
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True, exist_ok=True)
@@ -54,21 +48,19 @@ def begin_trial(
 
 
 @contextmanager
-def following(settings: dict[str, Any], folder: Path) -> Iterator[None]:
+def following(settings, folder):
     """Mirror the trial in ``folder``, which runs while the block does."""
     with Mirror() as mirror, hold(folder / ".lock", "a trial"):
         mirror.follow(folder, settings)
         yield
 
 
-def mirror_trial(settings: dict[str, Any], folder: Path, values: dict[str, Any]) -> bool:
+def mirror_trial(settings, folder, values):
     """Mirror an ended trial; False if nothing was missing. Raises any error of the tracker."""
     return mirror_ended(TrialFolder(folder), settings, values)
 
 
-def write_trial(
-    folder: Path, values: dict[str, Any], records: int = RECORDS, psnr: float = 20.0
-) -> None:
+def write_trial(folder, values, records=RECORDS, psnr=20.0):
     folder.mkdir(parents=True, exist_ok=True)
     seed = values["seed"]
     lines = [
@@ -108,12 +100,12 @@ def write_trial(
     (folder / "results.json").write_text(json.dumps(results))
 
 
-def found_runs(client: Any, name: str) -> list[Any]:
+def found_runs(client, name):
     experiment = client.get_experiment_by_name(name)
     return [] if experiment is None else client.search_runs([experiment.experiment_id])
 
 
-def run_of(client: Any, seed: int) -> Any:
+def run_of(client, seed):
     """The only run of the experiment ``tracked`` with this seed."""
     (run,) = [run for run in found_runs(client, "tracked") if run.data.tags["seed"] == str(seed)]
     return run
@@ -131,21 +123,21 @@ with following(options(uri, patience), folder):
 """
 
 
-def mirror_command(runs: Path, uri: str | None, seed: int, patience: float = 30.0) -> list[str]:
+def mirror_command(runs, uri, seed, patience=30.0):
     """The command of a process that writes and mirrors a trial."""
     return [sys.executable, "-c", MIRROR, str(runs), uri or "", str(seed), str(patience)]
 
 
-def history(client: Any, run_id: str, key: str) -> list[tuple[int, float]]:
+def history(client, run_id, key):
     return [(metric.step, metric.value) for metric in client.get_metric_history(run_id, key)]
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         return int(server.getsockname()[1])
 
 
-def child_environment() -> dict[str, str]:
+def child_environment():
     places = [str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
     return dict(os.environ) | {"PYTHONPATH": os.pathsep.join(place for place in places if place)}

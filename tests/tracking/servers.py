@@ -1,12 +1,9 @@
 """Trackers on loopback that behave badly."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time
 from contextlib import suppress
-from typing import Literal
 
 BUFFER = 1 << 16
 ANSWER = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
@@ -16,24 +13,24 @@ BACKLOG = 64
 class Listener:
     """A server that accepts every connection, and answers each after ``seconds``; None: never."""
 
-    def __init__(self, seconds: float | None = None) -> None:
+    def __init__(self, seconds=None):
         self.seconds = seconds
         self._socket = socket.create_server(("127.0.0.1", 0), backlog=BACKLOG)
-        self.port: int = self._socket.getsockname()[1]
-        self.connections: list[socket.socket] = []
+        self.port = self._socket.getsockname()[1]
+        self.connections = []
         self.threads = 1  # number of threads that were started here
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def __enter__(self) -> Listener:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *reason: object) -> None:
+    def __exit__(self, *reason):
         for connection in [self._socket, *self.connections]:
             with suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
 
-    def _accept(self) -> None:
+    def _accept(self):
         with suppress(OSError):
             while True:
                 connection, _ = self._socket.accept()
@@ -41,7 +38,7 @@ class Listener:
                 self.threads += 1
                 threading.Thread(target=self.serve, args=(connection,), daemon=True).start()
 
-    def serve(self, connection: socket.socket) -> None:
+    def serve(self, connection):
         if self.seconds is not None:
             time.sleep(self.seconds)
             with suppress(OSError):
@@ -55,21 +52,21 @@ class Gate(Listener):
     it is `mended`.
     """
 
-    def __init__(self, target: int) -> None:
+    def __init__(self, target):
         self.target = target
         self.passed = 0
-        self.limit: int | None = None
-        self.then: Literal["close", "hang"] = "close"
+        self.limit = None
+        self.then = "close"
         super().__init__()
 
-    def mended(self) -> None:
+    def mended(self):
         self.limit = None
 
     @property
-    def _broken(self) -> bool:
+    def _broken(self):
         return self.limit is not None and self.passed >= self.limit
 
-    def serve(self, connection: socket.socket) -> None:
+    def serve(self, connection):
         if self._broken and self.then == "close":
             connection.close()
             return
@@ -84,7 +81,7 @@ class Gate(Listener):
         ).start()
         self._pass_on(connection, server, True)
 
-    def _pass_on(self, source: socket.socket, goal: socket.socket, counted: bool) -> None:
+    def _pass_on(self, source, goal, counted):
         with suppress(OSError):
             while data := source.recv(BUFFER):
                 if counted:

@@ -7,9 +7,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
@@ -50,11 +48,11 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> Path:
+def runs(tmp_path_factory):
     return tmp_path_factory.mktemp("bad-trackers")
 
 
-def start(runs: Path, *words: str) -> subprocess.Popen[str]:
+def start(runs, *words):
     kept = {
         key: value
         for key, value in child_environment().items()
@@ -77,7 +75,7 @@ def start(runs: Path, *words: str) -> subprocess.Popen[str]:
     )
 
 
-def check_complete(runs: Path, name: str, code: int, errors: str) -> None:
+def check_complete(runs, name, code, errors):
     assert code == 0, errors
     said = [line for line in errors.splitlines() if "tracking" in line or "MLflow" in line]
     assert len(said) == 1, errors
@@ -153,11 +151,11 @@ def test_sync_can_be_stopped_while_the_tracker_hangs(runs):
     assert "Traceback" not in errors
 
 
-def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
+def mirrors_of(program):
     """The mirror processes of a program, once there are any."""
-    found: list[psutil.Process] = []
+    found = []
 
-    def look() -> bool:
+    def look():
         with suppress(psutil.NoSuchProcess):
             children = psutil.Process(program.pid).children(recursive=True)
             found[:] = [
@@ -171,7 +169,7 @@ def mirrors_of(program: subprocess.Popen[str]) -> list[psutil.Process]:
     return found
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition):
     deadline = time.monotonic() + SECONDS
     while not condition():
         assert time.monotonic() < deadline
@@ -179,7 +177,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(params=["http", "postgresql"])
-def tracker(request, tmp_path_factory) -> Iterator[tuple[Gate, str]]:
+def tracker(request, tmp_path_factory):
     """A gate before a working tracker, and the address of the tracker through the gate."""
     with ExitStack() as stack:
         if request.param == "http":
@@ -227,7 +225,7 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
         assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
 
 
-def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
+def mirror_a_trial(runs, uri, seed, patience):
     """Mirror a trial in a process of its own, which must succeed; returns its stderr."""
     words = mirror_command(runs, uri, seed, patience)
     done = subprocess.run(
@@ -238,7 +236,7 @@ def mirror_a_trial(runs: Path, uri: str, seed: int, patience: float) -> str:
 
 
 @contextmanager
-def mlflow_server(folder: Path) -> Iterator[int]:
+def mlflow_server(folder):
     port = free_port()
     words = [
         "server",
@@ -268,7 +266,7 @@ def mlflow_server(folder: Path) -> Iterator[int]:
         stderr=subprocess.DEVNULL,
     )
 
-    def answers() -> bool:
+    def answers():
         with (
             suppress(OSError),
             urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer,

@@ -7,7 +7,6 @@ import time
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import mlflow
 import numpy as np
@@ -18,13 +17,7 @@ from PIL import Image
 from gsbench.analysis.results import read_experiment
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, publish
-from gsbench.tracking.comparison import (
-    MAX_TAG,
-    OWN_NOTE,
-    _set,
-    addresses,
-    description,
-)
+from gsbench.tracking.comparison import MAX_TAG, OWN_NOTE, _set, addresses, description
 from gsbench.tracking.mirror import sync
 from gsbench.verbs import servers
 from tests.tracking.helpers import (
@@ -42,9 +35,7 @@ from tests.view.browser import Browser
 NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.gsbench"
 
 
-def write_sweep(
-    runs: Path, arms: tuple[str, ...] = ("adc", "volumetric"), name: str = "swept"
-) -> list[TrialFolder]:
+def write_sweep(runs, arms=("adc", "volumetric"), name="swept"):
     """Trials of arms, on two scenes with two seeds; later arms have a larger PSNR."""
     folders = []
     for number, arm in enumerate(arms):
@@ -60,11 +51,11 @@ def write_sweep(
     return folders
 
 
-def tags_of(client: Any, name: str = "swept") -> dict[str, str]:
+def tags_of(client, name="swept"):
     return dict(client.get_experiment_by_name(name).tags)
 
 
-def unpacked(tag: str) -> dict[str, Any]:
+def unpacked(tag):
     kind, _, data = tag.partition(";")
     assert kind == "deflate"
     return dict(json.loads(zlib.decompress(base64.b64decode(data))))
@@ -105,9 +96,9 @@ def test_a_users_description_is_kept(runs):
 
 
 def test_only_new_tags_are_sent_and_too_long_ones_are_left_out():
-    sent: dict[str, str] = {}
+    sent = {}
     present = {VIEW: "same", NOTE: OWN_NOTE}
-    client: Any = SimpleNamespace(
+    client = SimpleNamespace(
         get_experiment=lambda experiment: SimpleNamespace(tags=present),
         set_experiment_tag=lambda experiment, key, value: sent.update({key: value}),
     )
@@ -191,7 +182,7 @@ def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path, monkeypatch):
     page = addresses(f"http://127.0.0.1:{port}", publish(runs / "swept", None), mlflow.__version__)[
         "arms"
     ]
-    started: list[Any] = []
+    started = []
     popen = servers.subprocess.Popen
     monkeypatch.setattr(
         servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
 from typing import Any
@@ -30,35 +29,35 @@ class Process:
 
     code, takes, errors = 0, 0.0, b""
 
-    def __init__(self, made: list["Process"], command: list[str], stderr: Any, **how: Any) -> None:
+    def __init__(self, made, command, stderr, **how):
         made.append(self)
         self.command, self.stderr, self.how = command, stderr, how
         self.stdin, self.did = io.BytesIO(), list[Any]()
-        self.returncode: int | None = None
+        self.returncode = None
 
-    def __enter__(self) -> "Process":
+    def __enter__(self):
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         self.did.append("closed")
 
-    def poll(self) -> int | None:
+    def poll(self):
         return self.returncode
 
-    def communicate(self, timeout: float) -> None:
+    def communicate(self, timeout):
         self.did.append(timeout)
         if self.takes > timeout:
             raise subprocess.TimeoutExpired("mirror", timeout)
         self.stderr.write(self.errors)
         self.returncode = self.code
 
-    def kill(self) -> None:
+    def kill(self):
         self.did.append("killed")
 
 
 @pytest.fixture
-def processes(monkeypatch, caplog) -> list[Process]:
-    made: list[Process] = []
+def processes(monkeypatch, caplog):
+    made = []
     monkeypatch.setattr(subprocess, "Popen", lambda command, **how: Process(made, command, **how))
     return made
 
@@ -82,14 +81,14 @@ def test_one_process_gets_the_folders_of_all_trials(processes, tmp_path, caplog)
 
 
 @pytest.mark.parametrize(
-    ("error", "seconds"), [(None, 7.0), (ValueError(), 7.0), (KeyboardInterrupt(), 3.0)]
+    "error, seconds", [(None, 7.0), (ValueError(), 7.0), (KeyboardInterrupt(), 3.0)]
 )
 def test_a_stopped_sweep_waits_less_for_a_slow_tracker(
     processes, tmp_path, caplog, monkeypatch, error, seconds
 ):
     monkeypatch.setattr(Process, "takes", 7.5)
 
-    def sweep() -> None:
+    def sweep():
         with Mirror() as one:
             one.follow(tmp_path, options(patience=7.0) | {"sink": "wandb"})
             if error is not None:
@@ -111,7 +110,7 @@ REST = "; the files are complete, `gsbench sync` mirrors them later"
 
 
 @pytest.mark.parametrize(
-    ("code", "errors", "said"),
+    "code, errors, said",
     [
         (3, b"Traceback\n  File\nMLflow does not take x\n", "MLflow does not take x"),
         (
@@ -142,7 +141,7 @@ def test_a_failed_mirror_is_reported_once_and_the_next_trial_gets_another(
 
 
 def test_a_mirror_that_cannot_start_harms_nothing(tmp_path, caplog, monkeypatch):
-    def fail(*words: Any, **how: Any) -> None:
+    def fail(*words, **how):
         raise OSError("no memory")
 
     monkeypatch.setattr(subprocess, "Popen", fail)
@@ -161,33 +160,33 @@ class Tracker:
     told: list[Any]
     refuses = ""
 
-    def __init__(self, settings: dict[str, Any], trial: Any) -> None:
+    def __init__(self, settings, trial):
         pass
 
-    def open(self, state: MirrorState, results: str | None) -> MirrorState:
+    def open(self, state, results):
         self.told.append(("open", state.complete, results))
         return MirrorState(logged=dict(state.logged), complete=state.complete, token="t")
 
-    def log(self, scalars: Any) -> None:
+    def log(self, scalars):
         if self.refuses:
             raise ValueError(self.refuses)
         self.told.append(("log", {scalar.key.split("/")[1] for scalar in scalars}, len(scalars)))
 
-    def complete(self, summary: Any) -> None:
+    def complete(self, summary):
         self.told.append(("complete", len(summary.pictures), [name for _, name in summary.files]))
 
-    def stop(self, status: str, reason: str | None) -> None:
+    def stop(self, status, reason):
         self.told.append((status, reason))
 
 
 @pytest.fixture
-def told(monkeypatch) -> list[Any]:
+def told(monkeypatch):
     monkeypatch.setattr(Tracker, "told", [], raising=False)
     monkeypatch.setitem(mirror.SINKS, "mlflow", Tracker)
     return Tracker.told
 
 
-def words(told: list[Any]) -> list[str]:
+def words(told):
     return [word for word, *_ in told]
 
 
@@ -275,10 +274,10 @@ def test_sync_mirrors_ended_trials_and_counts_them(told, tmp_path, monkeypatch):
 
 
 def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypatch):
-    published: list[Any] = []
+    published = []
     monkeypatch.setattr(mirror, "publish", lambda home, uri: published.append((home, uri)))
     folder = TrialFolder.of(trial_values(tmp_path))
-    pages: Any = {
+    pages = {
         (folder.home, "u"): (folder, options("u")),
         (folder.home, "w"): (folder, options("w") | {"sink": "wandb"}),
     }
@@ -286,7 +285,7 @@ def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypa
     assert published == [(folder.home, "u")]
     assert pages == {}
 
-    def refuse(home: Path, uri: str) -> None:
+    def refuse(home, uri):
         raise KeyError("no page")
 
     monkeypatch.setattr(mirror, "publish", refuse)
@@ -303,12 +302,12 @@ class Followed:
     made: list["Followed"]
     error: Exception | None = None
 
-    def __init__(self, folder: TrialFolder) -> None:
+    def __init__(self, folder):
         self.folder, self.options, self.has_ended = folder, options("u"), False
-        self.calls: list[bool] = []
+        self.calls = []
         self.made.append(self)
 
-    def catch_up(self, last: bool) -> None:
+    def catch_up(self, last):
         self.calls.append(last)
         if self.error:
             raise self.error
@@ -316,7 +315,7 @@ class Followed:
 
 
 @pytest.fixture
-def followed(monkeypatch) -> list[Followed]:
+def followed(monkeypatch):
     monkeypatch.setattr(Followed, "made", [], raising=False)
     monkeypatch.setattr(mirror, "_FollowedTrial", Followed)
     return Followed.made
@@ -325,26 +324,26 @@ def followed(monkeypatch) -> list[Followed]:
 class Lines:
     """The lines of stdin: between two lists of lines nothing comes for a while."""
 
-    def __init__(self, *parts: list[str | None]) -> None:
+    def __init__(self, *parts):
         self.parts, self.queue, self.pauses = list(parts), Queue[str | None](), list[float]()
 
-    def get(self, timeout: float) -> str | None:
+    def get(self, timeout):
         self.pauses.append(timeout)
         for line in self.parts.pop(0):
             self.queue.put(line)
         return self.queue.get_nowait()
 
-    def get_nowait(self) -> str | None:
+    def get_nowait(self):
         return self.queue.get_nowait()
 
 
 def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
-    renewed: list[Any] = []
+    renewed = []
     now = iter([100.0, 100.0, 159.0, 160.5, 160.5, 170.0, 170.0])
     monkeypatch.setattr(mirror, "_renew", lambda pages: renewed.append(sorted(map(str, pages))))
     monkeypatch.setattr(time, "monotonic", lambda: next(now))
     lines = Lines(["a/b/c/d", "a/b/c/e"], [], ["a/b/c/f"], [None])
-    mirror._follow(lines, 0.5)  # type: ignore[arg-type]
+    mirror._follow(lines, 0.5)
     assert [str(one.folder.path) for one in followed] == ["a/b/c/d", "a/b/c/e", "a/b/c/f"]
     # the first two ended at the second reading; the last one is read once more at the end
     assert [one.calls for one in followed] == [[False, False], [False, False], [False, True]]
@@ -360,10 +359,10 @@ def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
     monkeypatch.setattr(mirror, "_renew", lambda pages: None)
     lines = Lines(["a/b/c/d"], [], [None])
     if isinstance(error, BusyError):
-        mirror._follow(lines, 0)  # type: ignore[arg-type]
+        mirror._follow(lines, 0)
     else:
         with pytest.raises(MirrorError, match=r"could not be sent to MLflow \(ValueError: down\)"):
-            mirror._follow(lines, 0)  # type: ignore[arg-type]
+            mirror._follow(lines, 0)
     assert followed[0].calls == [False, False, True]
 
 
@@ -411,10 +410,10 @@ def test_a_trial_that_ended_before_it_was_seen_is_mirrored(told, tmp_path, name)
 
 @pytest.mark.parametrize("error", [None, ValueError("tracker\n down")])
 def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, capsys, error):
-    ended: list[int] = []
-    given: list[Any] = []
+    ended = []
+    given = []
 
-    def follow(lines: Any, pause: float) -> None:
+    def follow(lines, pause):
         given.append(pause)
         if error:
             raise error
@@ -423,7 +422,7 @@ def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, 
     monkeypatch.setattr(mirror, "_follow", follow)
     monkeypatch.setattr(mirror, "_read_input", lambda lines, patience: given.append(patience))
     monkeypatch.setattr(os, "_exit", ended.append)
-    signals: list[Any] = []
+    signals = []
     monkeypatch.setattr(signal, "signal", lambda *what: signals.append(what))
     mirror.follow()
     assert sorted(given) == [0.5, 30.0]
@@ -434,10 +433,10 @@ def test_the_process_ends_at_once_with_the_reason_in_its_last_line(monkeypatch, 
 
 
 def test_a_process_whose_parent_is_gone_ends_after_some_patience(monkeypatch):
-    did: list[Any] = []
+    did = []
     monkeypatch.setattr(sys, "stdin", io.StringIO("a\nb\n"))
     monkeypatch.setattr(time, "sleep", did.append)
     monkeypatch.setattr(os, "_exit", lambda code: did.append(f"exit {code}"))
-    lines: Any = SimpleNamespace(put=did.append)
+    lines = SimpleNamespace(put=did.append)
     mirror._read_input(lines, 30.0)
     assert did == ["a", "b", None, 40.0, "exit 1"]

@@ -5,8 +5,6 @@ import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -29,7 +27,7 @@ from tests.tracking.helpers import (
 pytestmark = pytest.mark.slow
 
 
-def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
+def mirrored(runs, seed, **more):
     """A client, and the run of a finished trial."""
     values = trial_values(runs, seed)
     folder = TrialFolder.of(values).path
@@ -41,7 +39,7 @@ def mirrored(runs: Path, seed: int, **more: Any) -> tuple[Any, Any]:
     return client, run
 
 
-def artifacts(client: Any, run: Any) -> set[str]:
+def artifacts(client, run):
     return {item.path for item in client.list_artifacts(run.info.run_id)}
 
 

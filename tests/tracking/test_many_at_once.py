@@ -1,8 +1,6 @@
 """Many processes, one tracker: nothing is lost, doubled or mixed."""
 
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,7 +22,7 @@ pytestmark = pytest.mark.slow
 JOBS = 8
 
 
-def run_jobs(runs: Path, uri: str | None) -> None:
+def run_jobs(runs, uri):
     """Run eight trials at once, each in its own process, all new to the tracker."""
     commands = [mirror_command(runs, uri, seed) for seed in range(JOBS)]
     jobs = [
@@ -45,7 +43,7 @@ def run_jobs(runs: Path, uri: str | None) -> None:
         mirror_trial(options(uri), TrialFolder.of(values).path, values)
 
 
-def check_jobs(client: Any) -> None:
+def check_jobs(client):
     found = found_runs(client, "tracked")
     assert sorted(run.data.tags["seed"] for run in found) == [str(seed) for seed in range(JOBS)]
     for run in found:

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -85,7 +84,7 @@ def test_changed_results_replace_the_run(runs):
     assert run.data.metrics["eval/psnr_dB"] == 33.0
 
 
-def wait_for_run(folder: Path) -> None:
+def wait_for_run(folder):
     """Wait until the trial's folder records its run."""
     deadline = time.monotonic() + SECONDS
     while "token" not in (

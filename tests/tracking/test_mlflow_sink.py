@@ -1,10 +1,7 @@
 """What is asked of MLflow's client for an experiment and at the end of a run; no tracker runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,12 +21,12 @@ from gsbench.tracking.sinks import MirrorState, Scalar, Summary
 class Client:
     """Stands in for MLflow's client: notes calls, and answers with the attributes of ``known``."""
 
-    def __init__(self, uri: str = "sqlite:///x.db", **known: Any) -> None:
+    def __init__(self, uri="sqlite:///x.db", **known):
         self.tracking_uri, self.known = uri, known
-        self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
+        self.calls = []
 
-    def __getattr__(self, name: str) -> Any:
-        def call(*given: Any, **named: Any) -> Any:
+    def __getattr__(self, name):
+        def call(*given, **named):
             self.calls.append((name, given, named))
             answer = self.known.get(name)
             if isinstance(answer, list):
@@ -40,23 +37,22 @@ class Client:
 
         return call
 
-    def called(self, name: str) -> list[tuple[Any, ...]]:
+    def called(self, name):
         return [given for called, given, _ in self.calls if called == name]
 
 
-def experiment(stage: str = "active", **tags: str) -> Any:
+def experiment(stage="active", **tags):
     return SimpleNamespace(experiment_id=7, lifecycle_stage=stage, tags=tags)
 
 
 @pytest.mark.parametrize(
-    ("uri", "served"),
-    [("sqlite:///x.db", False), ("http://there", True), ("https://there", True)],
+    "uri, served", [("sqlite:///x.db", False), ("http://there", True), ("https://there", True)]
 )
 def test_a_new_experiment_keeps_its_artifacts_in_the_runs_folder_unless_served(
     tmp_path, uri, served
 ):
     client = Client(uri, create_experiment=5)
-    assert ensure_experiment(client, "x", tmp_path) == "5"  # type: ignore[arg-type]
+    assert ensure_experiment(client, "x", tmp_path) == "5"
     ((_, given, named),) = [call for call in client.calls if call[0] == "create_experiment"]
     place = None if served else (tmp_path / "mlartifacts" / "x").as_uri()
     assert (given, named) == (("x",), {"artifact_location": place, "tags": KIND})
@@ -67,19 +63,19 @@ def test_an_experiment_that_another_machine_created_meanwhile_is_used(tmp_path):
         create_experiment=MlflowException("exists"),
         get_experiment_by_name=[None, experiment(**KIND)],
     )
-    assert ensure_experiment(client, "x", tmp_path) == "7"  # type: ignore[arg-type]
+    assert ensure_experiment(client, "x", tmp_path) == "7"
     client = Client(create_experiment=MlflowException("full"))
     with pytest.raises(RuntimeError, match="MLflow could not create the experiment x"):
-        ensure_experiment(client, "x", tmp_path)  # type: ignore[arg-type]
+        ensure_experiment(client, "x", tmp_path)
 
 
 def test_a_deleted_experiment_is_restored_and_a_foreign_one_gets_the_missing_tags(tmp_path):
     client = Client(get_experiment_by_name=experiment("deleted", **KIND))
-    ensure_experiment(client, "x", tmp_path)  # type: ignore[arg-type]
+    ensure_experiment(client, "x", tmp_path)
     assert client.called("restore_experiment") == [(7,)]
     assert client.called("set_experiment_tag") == []
     client = Client(get_experiment_by_name=experiment())
-    ensure_experiment(client, "x", tmp_path)  # type: ignore[arg-type]
+    ensure_experiment(client, "x", tmp_path)
     assert client.called("restore_experiment") == []
     assert client.called("set_experiment_tag") == [(7, *item) for item in KIND.items()]
 
@@ -87,23 +83,23 @@ def test_a_deleted_experiment_is_restored_and_a_foreign_one_gets_the_missing_tag
 def test_artifacts_of_the_own_database_stay_in_the_runs_folder(tmp_path):
     own, other = Client(default_uri(tmp_path)), Client("http://there")
     inside = tmp_path / "mlartifacts" / "x" / "run"
-    require_own_artifacts(own, inside.as_uri(), tmp_path)  # type: ignore[arg-type]
+    require_own_artifacts(own, inside.as_uri(), tmp_path)
     (tmp_path / "mlartifacts").mkdir()
     (tmp_path / "mlartifacts" / "link").symlink_to("/tmp")
     for place in (tmp_path / "elsewhere", inside / ".." / ".." / "..", Path("/tmp")):
         with pytest.raises(InputError, match="would send artifacts to "):
-            require_own_artifacts(own, f"file://{place}", tmp_path)  # type: ignore[arg-type]
+            require_own_artifacts(own, f"file://{place}", tmp_path)
     with pytest.raises(InputError):
-        require_own_artifacts(own, f"file://{inside.parents[1]}/link/a", tmp_path)  # type: ignore[arg-type]
-    require_own_artifacts(other, "s3://bucket/x", tmp_path)  # type: ignore[arg-type]
+        require_own_artifacts(own, f"file://{inside.parents[1]}/link/a", tmp_path)
+    require_own_artifacts(other, "s3://bucket/x", tmp_path)
 
 
 @pytest.fixture
-def sink(tmp_path: Path) -> Any:
+def sink(tmp_path):
     made = MlflowSink.__new__(MlflowSink)
-    made.client, made.run_id, made._started = Client(), "r", 1_000_000  # type: ignore[assignment]
+    made.client, made.run_id, made._started = Client(), "r", 1_000_000
     params = {"short": "a", "long": "b" * 600}
-    made._trial = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), params=lambda: params)  # type: ignore[assignment]
+    made._trial = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), params=lambda: params)
     return made
 
 
@@ -148,7 +144,7 @@ def test_a_run_that_failed_before_and_is_complete_now_has_no_error(sink):
 
 
 @pytest.mark.parametrize(
-    ("refusals", "lengths"), [(0, [600]), (1, [600, 500]), (2, [600, 500, 250]), (3, None)]
+    "refusals, lengths", [(0, [600]), (1, [600, 500]), (2, [600, 500, 250]), (3, None)]
 )
 def test_long_settings_are_shortened_for_servers_that_refuse_them(sink, refusals, lengths):
     full = MlflowException("too long")
@@ -183,9 +179,9 @@ def test_the_state_names_the_own_database_without_its_folder(tmp_path, own):
     )
     client = Client(uri, create_run=run, get_experiment_by_name=experiment(**KIND))
     sink = MlflowSink.__new__(MlflowSink)
-    sink.client = client  # type: ignore[assignment]
-    folder: Any = SimpleNamespace(path=tmp_path, runs=tmp_path)
-    sink._trial = SimpleNamespace(folder=folder, values={"name": "x"}, label="l", tags=dict)  # type: ignore[assignment]
+    sink.client = client
+    folder = SimpleNamespace(path=tmp_path, runs=tmp_path)
+    sink._trial = SimpleNamespace(folder=folder, values={"name": "x"}, label="l", tags=dict)
     state = sink.open(MirrorState(), None)
     assert state.uri == ("runs/mlflow.db" if own else "http://there")
     assert client.called("search_runs") == []  # no run is known yet

@@ -4,7 +4,6 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -32,7 +31,7 @@ from tests.tracking.helpers import (
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 
 
-def finished_trial(runs: Path, seed: int) -> tuple[Path, dict[str, Any]]:
+def finished_trial(runs, seed):
     """A finished trial with a picture, which was also measured at iteration 50."""
     values = trial_values(runs, seed)
     folder = begin_trial(values)

@@ -1,14 +1,9 @@
 """A scene small enough to train on in a second."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from gsbench.gaussians.model import Gaussians
 from gsbench.raster import create_rasterizer
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera, Scene, View
@@ -16,7 +11,7 @@ from tests.gaussians.helpers import random_gaussians
 from tests.train.lab import CPU, Lab
 
 
-def orbit_camera(angle: float, width: int = 40, height: int = 32) -> Camera:
+def orbit_camera(angle, width=40, height=32):
     """A camera on a circle of radius 4 around (0, 0, 4) that looks at its centre."""
     center = np.array([4 * np.sin(angle), 0.0, 4 - 4 * np.cos(angle)])
     forward = (np.array([0.0, 0.0, 4.0]) - center) / 4
@@ -26,7 +21,7 @@ def orbit_camera(angle: float, width: int = 40, height: int = 32) -> Camera:
 
 
 @pytest.fixture(scope="session")
-def truth() -> Gaussians:
+def truth():
     gaussians = random_gaussians(
         80, seed=2, dtype=torch.float32, log_scale=(-2.5, -1.0), depth=(3.0, 5.0)
     )
@@ -35,7 +30,7 @@ def truth() -> Gaussians:
 
 
 @pytest.fixture(scope="session")
-def tiny_scene(truth: Gaussians) -> Scene:
+def tiny_scene(truth):
     """Ten views of ``truth`` at 40x32; the first and the ninth are held out."""
     views = []
     for i, angle in enumerate(np.linspace(-0.6, 0.6, 10)):
@@ -54,5 +49,5 @@ def tiny_scene(truth: Gaussians) -> Scene:
 
 
 @pytest.fixture
-def lab(tiny_scene: Scene, truth: Gaussians, tmp_path: Path) -> Lab:
+def lab(tiny_scene, truth, tmp_path):
     return Lab(tiny_scene, truth, create_rasterizer("cpu", CPU, threads=1), tmp_path)

@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from gsbench.densify import ADC, GNS, MCMC, MRNF, Densifier, FastGS, SteepGS
+from gsbench.densify import ADC, GNS, MCMC, MRNF, FastGS, SteepGS
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import Rasterizer
 from gsbench.scene.types import Scene
 from gsbench.train.options import TrainConfig
-from gsbench.train.trainer import Status, Trainer
+from gsbench.train.trainer import Trainer
 
 CPU = torch.device("cpu")
 EVENTS, METRICS = "events.jsonl", "metrics.jsonl"
 
 
-def cloud(truth: Gaussians) -> Gaussians:
+def cloud(truth):
     colors = torch.full((len(truth), 3), 127, dtype=torch.uint8)
     return gaussians_from_cloud(truth.means.double().numpy(), colors.numpy())
 
 
-def options(**changes: Any) -> TrainConfig:
+def options(**changes):
     values = {
         "name": "test",
         "iterations": 120,
@@ -39,13 +37,13 @@ def options(**changes: Any) -> TrainConfig:
     return TrainConfig(**(values | changes))
 
 
-def small(kind: type[ADC] = ADC, **changes: Any) -> ADC:
+def small(kind=ADC, **changes):
     window = {"start": 20, "stop": 110, "interval": 20, "opacity_reset_interval": 60}
     return kind(**(window | changes))
 
 
 # Densifiers whose own state a resumed training must restore.
-STATEFUL: dict[str, Callable[[], Densifier]] = {
+STATEFUL = {
     "adc": small,
     "mcmc": lambda: MCMC(start=20, stop=110, interval=20),
     "mrnf": lambda: MRNF(start=0, stop=110, interval=20, decay_until=120),
@@ -57,7 +55,7 @@ STATEFUL: dict[str, Callable[[], Densifier]] = {
 }
 
 
-def same(a: Gaussians, b: Gaussians) -> bool:
+def same(a, b):
     pairs = zip(a.tensors().values(), b.tensors().values(), strict=True)
     return len(a) == len(b) and all(torch.equal(x, y) for x, y in pairs)
 
@@ -66,8 +64,8 @@ class StopError(Exception):
     """Stands for a kill: nothing is saved when it is raised."""
 
 
-def stop_at(step: int) -> Callable[[Status], None]:
-    def stop(status: Status) -> None:
+def stop_at(step):
+    def stop(status):
         if status.step == step:
             raise StopError
 
@@ -83,35 +81,27 @@ class Lab:
     rasterizer: Rasterizer
     folder: Path
 
-    def new(
-        self, densifier: Densifier, seed: int = 0, snapshot_at: Sequence[int] = (), **changes: Any
-    ) -> Trainer:
+    def new(self, densifier, seed=0, snapshot_at=(), **changes):
         parts = (self.scene, cloud(self.truth), densifier, self.rasterizer)
         return Trainer(*parts, options(**changes), seed, snapshot_at)
 
-    def train(
-        self,
-        densifier: Densifier,
-        name: str = "",
-        on_status: Callable[[Status], None] = lambda status: None,
-        **changes: Any,
-    ) -> Gaussians:
+    def train(self, densifier, name="", on_status=lambda status: None, **changes):
         (self.folder / name).mkdir(exist_ok=True)
         return self.new(densifier, **changes).run(self.folder / name, on_status)
 
-    def text(self, file: str, name: str = "") -> str:
+    def text(self, file, name=""):
         return (self.folder / name / file).read_text()
 
-    def records(self, file: str, name: str = "") -> list[dict[str, Any]]:
+    def records(self, file, name=""):
         return [json.loads(line) for line in self.text(file, name).splitlines()]
 
-    def steps(self, file: str, name: str = "") -> list[int]:
+    def steps(self, file, name=""):
         return [record["step"] for record in self.records(file, name)]
 
-    def checkpoints(self, name: str = "") -> list[int]:
+    def checkpoints(self, name=""):
         """The iterations of the checkpoints."""
         found = (self.folder / name).glob("checkpoint-*.pt")
         return sorted(int(path.stem.removeprefix("checkpoint-")) for path in found)
 
-    def with_views(self, **changes: Any) -> Lab:
+    def with_views(self, **changes):
         return replace(self, scene=replace(self.scene, **changes))

@@ -5,8 +5,6 @@ interpreter (``TRITON_INTERPRET=1``). No read-back has arrived before it is wait
 that is behind. Prints one JSON object for each densifier.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -14,6 +12,7 @@ from pathlib import Path
 import torch
 
 import tests.raster.conftest  # noqa: F401 - makes the interpreter faster
+from benchmarks.counters import counting_waits
 from gsbench.bench.measure import NEVER, constant_scene_options
 from gsbench.bench.scenes import make_scene
 from gsbench.densify import ADC, MCMC
@@ -21,7 +20,6 @@ from gsbench.raster import create_rasterizer, staged
 from gsbench.raster.staged import Readback
 from gsbench.train.loss import torch_photometric_loss
 from gsbench.train.trainer import Trainer
-from tests.benchmarks.counters import counting_waits
 
 DENSIFIERS = {
     "adc": ADC(start=NEVER - 1, stop=NEVER, opacity_reset_interval=NEVER),
@@ -30,15 +28,15 @@ DENSIFIERS = {
 }
 
 
-def main(raster: str) -> None:
-    Readback.arrived = property(lambda self: False)  # type: ignore[assignment, method-assign]
+def main(raster):
+    Readback.arrived = property(lambda self: False)
     # On a GPU, this check does not read the values.
     staged._check_background = lambda background: None
     gaussians, scene = make_scene("trained", 20, 20, 12)
     for name, densifier in DENSIFIERS.items():
         rasterizer = create_rasterizer(raster, torch.device("cpu"))
         trainer = Trainer(scene, gaussians, densifier, rasterizer, constant_scene_options(), 0)
-        trainer.loss = torch_photometric_loss  # type: ignore[assignment] # no kernel of the CPU
+        trainer.loss = torch_photometric_loss  # no kernel of the CPU
         for _ in range(2):  # afterwards, all memory is allocated
             trainer.iterate(Path())
         with counting_waits(pretend=True) as counts:

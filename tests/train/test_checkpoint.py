@@ -1,7 +1,5 @@
 """Checkpoints are loaded as they were saved, or not at all; and signals to stop."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal
@@ -9,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -22,7 +19,7 @@ from gsbench.train.checkpoint import CheckpointWriter, load_checkpoint, save_che
 from tests.gaussians.helpers import random_gaussians
 
 
-def state(step: int) -> dict[str, object]:
+def state(step):
     rng = torch.Generator().manual_seed(step)
     return {
         "step": step,
@@ -32,22 +29,22 @@ def state(step: int) -> dict[str, object]:
     }
 
 
-def kept(folder: Path) -> list[int]:
+def kept(folder):
     """The iterations of the checkpoints in ``folder``; fails if it has other files."""
     return sorted(int(path.name[len("checkpoint-") : -len(".pt")]) for path in folder.iterdir())
 
 
-def equal(first: object, second: object) -> bool:
+def equal(first, second):
     if isinstance(first, torch.Tensor):
-        return torch.equal(first, second)  # type: ignore[arg-type]
+        return torch.equal(first, second)
     if isinstance(first, dict):
         return first.keys() == second.keys() and all(
             equal(first[key], second[key]) for key in first
-        )  # type: ignore
+        )
     return first == second
 
 
-def test_the_newest_checkpoint_is_loaded_and_two_are_kept(tmp_path: Path) -> None:
+def test_the_newest_checkpoint_is_loaded_and_two_are_kept(tmp_path):
     assert load_checkpoint(tmp_path) is None
     for step in (10, 20, 30):
         save_checkpoint(tmp_path, step, state(step))
@@ -56,9 +53,7 @@ def test_the_newest_checkpoint_is_loaded_and_two_are_kept(tmp_path: Path) -> Non
     assert equal(loaded, state(30))
 
 
-def test_the_folder_is_synced_and_the_thread_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_folder_is_synced_and_the_thread_ends(tmp_path, monkeypatch):
     synced = []
     monkeypatch.setattr(checkpoint, "sync_to_disk", synced.append)
     writer = CheckpointWriter(tmp_path, background=True)
@@ -68,14 +63,12 @@ def test_the_folder_is_synced_and_the_thread_ends(
     assert not any(thread.name.startswith("gsbench-checkpoint") for thread in threading.enumerate())
 
 
-def test_torch_load_reads_a_checkpoint_file(tmp_path: Path) -> None:
+def test_torch_load_reads_a_checkpoint_file(tmp_path):
     save_checkpoint(tmp_path, 1, state(1))
     assert equal(torch.load(tmp_path / "checkpoint-00000001.pt", weights_only=True), state(1))
 
 
-def test_a_damaged_checkpoint_is_detected_and_the_one_before_is_loaded(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_checkpoint_is_detected_and_the_one_before_is_loaded(tmp_path, caplog):
     save_checkpoint(tmp_path, 10, state(10))
     save_checkpoint(tmp_path, 20, state(20))
     newest = tmp_path / "checkpoint-00000020.pt"
@@ -96,15 +89,15 @@ def test_a_damaged_checkpoint_is_detected_and_the_one_before_is_loaded(
     assert equal(load_checkpoint(tmp_path), state(20))
 
 
-def test_nothing_is_loaded_if_all_checkpoints_are_damaged(tmp_path: Path) -> None:
+def test_nothing_is_loaded_if_all_checkpoints_are_damaged(tmp_path):
     save_checkpoint(tmp_path, 10, state(10))
     (tmp_path / "checkpoint-00000010.pt").write_bytes(b"")
     assert load_checkpoint(tmp_path) is None
 
 
-def test_loading_a_checkpoint_runs_no_code_from_it(tmp_path: Path) -> None:
+def test_loading_a_checkpoint_runs_no_code_from_it(tmp_path):
     class Evil:
-        def __reduce__(self) -> object:
+        def __reduce__(self):
             return os.mkdir, (str(tmp_path / "hacked"),)
 
     save_checkpoint(tmp_path, 10, {"evil": Evil()})
@@ -112,13 +105,11 @@ def test_loading_a_checkpoint_runs_no_code_from_it(tmp_path: Path) -> None:
     assert not (tmp_path / "hacked").exists()
 
 
-def full(*arguments: object) -> None:
+def full(*arguments):
     raise OSError(28, "No space left on device")
 
 
-def test_a_failed_write_leaves_the_old_checkpoint_and_no_temporary_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_leaves_the_old_checkpoint_and_no_temporary_file(tmp_path, monkeypatch):
     save_checkpoint(tmp_path, 10, state(10))
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OSError, match="No space left"):
@@ -126,7 +117,7 @@ def test_a_failed_write_leaves_the_old_checkpoint_and_no_temporary_file(
     assert kept(tmp_path) == [10]
 
 
-def test_in_the_background_the_state_at_the_call_of_save_is_written(tmp_path: Path) -> None:
+def test_in_the_background_the_state_at_the_call_of_save_is_written(tmp_path):
     """Training continues and changes tensors in place while the thread writes."""
     writer = CheckpointWriter(tmp_path, background=True)
     live = {
@@ -136,21 +127,18 @@ def test_in_the_background_the_state_at_the_call_of_save_is_written(tmp_path: Pa
     }
     for step in (1, 2, 3):
         live["step"] = step
-        live["nested"][0]["tensor"].fill_(step)  # type: ignore[index]
+        live["nested"][0]["tensor"].fill_(step)
         writer.save(step, live)
-        live["nested"][0]["tensor"].fill_(-1)  # type: ignore[index]
+        live["nested"][0]["tensor"].fill_(-1)
     writer.close()
     assert kept(tmp_path) == [2, 3]
     loaded = load_checkpoint(tmp_path)
-    assert loaded is not None
     assert loaded["step"] == 3
     assert bool((loaded["nested"][0]["tensor"] == 3).all())
-    assert torch.equal(loaded["view"], live["view"])  # type: ignore[arg-type]
+    assert torch.equal(loaded["view"], live["view"])
 
 
-def test_an_error_in_the_background_is_raised_by_the_next_save(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_in_the_background_is_raised_by_the_next_save(tmp_path, monkeypatch):
     writer = CheckpointWriter(tmp_path, background=True)
     writer.save(10, state(10))
     writer.finish()
@@ -164,7 +152,7 @@ def test_an_error_in_the_background_is_raised_by_the_next_save(
     assert kept(tmp_path) == [10, 40]
 
 
-def test_a_state_is_loaded_completely_on_another_device() -> None:
+def test_a_state_is_loaded_completely_on_another_device():
     """All tensors of a loaded state are on the device of the model."""
     rates = LearningRates()
     gaussians = TrainableGaussians(random_gaussians(5, seed=0, dtype=torch.float32), rates, 1.0)
@@ -180,9 +168,7 @@ def test_a_state_is_loaded_completely_on_another_device() -> None:
 
 
 @pytest.mark.parametrize("background", [False, True])
-def test_a_kill_during_a_write_leaves_a_readable_checkpoint(
-    background: bool, tmp_path: Path
-) -> None:
+def test_a_kill_during_a_write_leaves_a_readable_checkpoint(background, tmp_path):
     code = (
         "import sys, torch; from pathlib import Path; from gsbench.train.checkpoint import "
         "CheckpointWriter\n"
@@ -202,13 +188,12 @@ def test_a_kill_during_a_write_leaves_a_readable_checkpoint(
     process.send_signal(signal.SIGKILL)
     process.wait()
     loaded = load_checkpoint(tmp_path)
-    assert loaded is not None
     assert loaded["step"] >= last
     assert bool((loaded["tensor"] == loaded["step"]).all())
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGUSR2])
-def test_a_signal_stops_at_once_or_at_the_next_deferred_check(signum: signal.Signals) -> None:
+def test_a_signal_stops_at_once_or_at_the_next_deferred_check(signum):
     earlier = signal.getsignal(signum)
     with stop_on_signals():
         with pytest.raises(Stopped) as stop:

@@ -1,18 +1,13 @@
 """Trainings under the governor end at one count, with equal rounds and recorded thresholds."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 
 from gsbench.densify import ADC, MCMC, PixelGS, Volumetric
-from gsbench.densify.budget import Budgeted
-from tests.train.lab import EVENTS, Lab
+from tests.train.lab import EVENTS
 
 LIMIT = 400
 WINDOW = {"start": 20, "stop": 240, "interval": 20, "max_gaussians": LIMIT, "cap": "governor"}
-ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
+ARMS = {
     "adc": (ADC, {}),
     "adc, a loose threshold": (ADC, {"gradient_threshold": 2e-5}),
     "absgrad": (ADC, {"gradient": "absolute", "gradient_threshold": 8e-4}),
@@ -29,11 +24,11 @@ ARMS: dict[str, tuple[type[Budgeted], dict[str, object]]] = {
 
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.slow
-def test_trainings_end_within_two_percent_of_one_count(arm: str, lab: Lab) -> None:
+def test_trainings_end_within_two_percent_of_one_count(arm, lab):
     kind, own = ARMS[arm]
     if kind is not MCMC:
         own = own | {"opacity_reset_interval": 120}  # in the middle of the window
-    trained = lab.train(kind(**(WINDOW | own)), iterations=260)  # type: ignore[arg-type]
+    trained = lab.train(kind(**(WINDOW | own)), iterations=260)
     assert len(trained) == pytest.approx(LIMIT, rel=0.02)
     rounds = [event for event in lab.records(EVENTS) if "target" in event]
     assert [event["step"] for event in rounds] == list(range(40, 240, 20))
@@ -43,12 +38,12 @@ def test_trainings_end_within_two_percent_of_one_count(arm: str, lab: Lab) -> No
     assert all(1e-3 <= factor <= 1e3 for factor in strictness)
 
 
-def rounds_of(lab: Lab, densifier: Budgeted) -> list[dict[str, Any]]:
+def rounds_of(lab, densifier):
     lab.train(densifier, iterations=260)
     return [event for event in lab.records(EVENTS) if event["step"] % 20 == 0]
 
 
-def test_if_the_strictest_growth_is_too_much_faint_gaussians_are_culled(lab: Lab) -> None:
+def test_if_the_strictest_growth_is_too_much_faint_gaussians_are_culled(lab):
     """The threshold is in other units than the scene's.
 
     The strictness is between 0.001 and 1000; at both ends, the threshold selects all Gaussians.
@@ -59,7 +54,7 @@ def test_if_the_strictest_growth_is_too_much_faint_gaussians_are_culled(lab: Lab
         "opacity_reset_interval": 1000,
         "max_gaussians": 120,
     }
-    rounds = rounds_of(lab, Volumetric(**(WINDOW | own)))  # type: ignore[arg-type]
+    rounds = rounds_of(lab, Volumetric(**(WINDOW | own)))
     culled = [event for event in rounds if event["cull"] > 1]
     assert culled
     for event in culled:
@@ -71,7 +66,7 @@ def test_if_the_strictest_growth_is_too_much_faint_gaussians_are_culled(lab: Lab
         assert event["after"] == event["before"] + grown - pruned
 
 
-def test_a_frozen_training_changes_no_gaussian_after_the_limit(lab: Lab) -> None:
+def test_a_frozen_training_changes_no_gaussian_after_the_limit(lab):
     """Only the first round beyond the limit acts; later rounds record what they would add."""
     own = {
         "cap": "freeze",
@@ -79,7 +74,7 @@ def test_a_frozen_training_changes_no_gaussian_after_the_limit(lab: Lab) -> None
         "gradient_threshold": 1e-6,
         "opacity_reset_interval": 1000,
     }
-    rounds = rounds_of(lab, ADC(**(WINDOW | own)))  # type: ignore[arg-type]
+    rounds = rounds_of(lab, ADC(**(WINDOW | own)))
     beyond = [event for event in rounds if event["before"] > 100]
     assert len(beyond) > 3
     counts = {event[when] for event in beyond for when in ("before", "after")}

@@ -8,7 +8,7 @@ from gsbench.events import RefineEvent
 from gsbench.train.growth import BLOCKED_ITERATIONS, RUNAWAY_ROUNDS, GrowthWatch
 
 
-def warnings(caplog: pytest.LogCaptureFixture, events: list[RefineEvent]) -> list[str]:
+def warnings(caplog, events):
     watch = GrowthWatch()
     with caplog.at_level(logging.WARNING):
         for event in events:
@@ -16,11 +16,11 @@ def warnings(caplog: pytest.LogCaptureFixture, events: list[RefineEvent]) -> lis
     return [record.getMessage() for record in caplog.records]
 
 
-def rounds(number: int, **counts: int) -> list[RefineEvent]:
+def rounds(number, **counts):
     return [RefineEvent(step=100 * k, before=10_000, **counts) for k in range(1, number + 1)]
 
 
-def test_splits_that_split_again_are_named_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_splits_that_split_again_are_named_once(caplog):
     found = warnings(caplog, rounds(3 * RUNAWAY_ROUNDS, split_volume=500, isotropic_resplit=400))
     assert len(found) == 1
     assert f"iteration {100 * RUNAWAY_ROUNDS}: in {RUNAWAY_ROUNDS} refinements" in found[0]
@@ -39,13 +39,11 @@ def test_splits_that_split_again_are_named_once(caplog: pytest.LogCaptureFixture
         rounds(9, blocked_by_cap=5) + rounds(1, cloned=5) + rounds(9, blocked_by_cap=5),
     ],
 )
-def test_ordinary_growth_is_not_warned_about(
-    caplog: pytest.LogCaptureFixture, events: list[RefineEvent]
-) -> None:
+def test_ordinary_growth_is_not_warned_about(caplog, events):
     assert warnings(caplog, events) == []
 
 
-def test_a_limit_that_blocks_for_long_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_limit_that_blocks_for_long_is_named_once(caplog):
     events = rounds(40, cloned=1, blocked_by_cap=5)
     # an opacity reset between two rounds says nothing about growth
     events.insert(6, RefineEvent(step=650, before=10_000, opacity_reset=True))

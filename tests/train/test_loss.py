@@ -1,13 +1,13 @@
 """The photometric loss compared with scikit-image, float64 autograd, and itself on more threads."""
 
-from __future__ import annotations
-
 import sys
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from skimage.metrics import structural_similarity
 
 from gsbench.eval.ssim import ssim_map, window
@@ -18,7 +18,33 @@ from gsbench.train.loss_cpu import CompiledLoss
 SIZES = [(3, 4), (11, 16), (37, 53), (64, 65), (100, 21)]
 
 
-def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+def check_loss(loss, image, target, weight):
+    """Compare a loss and its gradient with float64 for targets of both types; return the values."""
+    found = []
+    for wanted in (target, target / 255):
+        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
+        values = loss(leaf, wanted)
+        expected = torch_photometric_loss(precise, target.double() / 255, weight)
+        for value, reference in zip(values, expected, strict=True):
+            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
+        (3 * values[0]).backward()
+        (3 * expected[0]).backward()
+        assert (leaf.grad - precise.grad).abs().max() < 1e-4 * precise.grad.abs().max()
+        found.append(values)
+    return found
+
+
+def check_equal_images(loss, image):
+    """Equal images have no loss and no gradient."""
+    leaf = image.clone().requires_grad_()
+    value, l1, similarity = loss(leaf, image)
+    assert l1 == 0
+    assert similarity.item() == pytest.approx(1, abs=1e-6)
+    value.backward()
+    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+
+
+def images(height, width):
     """A smooth image with noise and, as target, the smooth image in 8 bits."""
     generator = torch.Generator().manual_seed(height)
     y, x = torch.meshgrid(torch.arange(height) / 9, torch.arange(width) / 7, indexing="ij")
@@ -27,15 +53,15 @@ def _images(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     return image, (smooth.clamp(0, 1) * 255).to(torch.uint8)
 
 
-def test_the_window_has_eleven_weights_of_a_gaussian() -> None:
+def test_the_window_has_eleven_weights_of_a_gaussian():
     taps = window().numpy()
     assert len(taps) == 11
     assert taps.sum() == pytest.approx(1)
     assert taps[6] / taps[5] == pytest.approx(np.exp(-1 / (2 * 1.5**2)))
 
 
-def test_ssim_matches_scikit_image_in_the_interior() -> None:
-    image, target = _images(40, 50)
+def test_ssim_matches_scikit_image_in_the_interior():
+    image, target = images(40, 50)
     target = target / 255
     _, expected = structural_similarity(
         image.double().numpy(),
@@ -48,10 +74,10 @@ def test_ssim_matches_scikit_image_in_the_interior() -> None:
         full=True,
     )
     ours = ssim_map(image.double(), target.double()).permute(1, 2, 0).numpy()
-    np.testing.assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
+    assert_allclose(ours[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-7)
 
 
-def test_ssim_pads_images_with_zeros() -> None:
+def test_ssim_pads_images_with_zeros():
     """The value at a corner, for constant pictures of 1 and 0.5, is computed by hand."""
     ones = torch.ones(30, 30, 3, dtype=torch.float64)
     share = window()[:6].sum().item() ** 2  # share of the window inside the image at a corner
@@ -61,8 +87,8 @@ def test_ssim_pads_images_with_zeros() -> None:
     assert ssim_map(ones, ones / 2)[0, 0, 0].item() == pytest.approx(expected, rel=1e-9)
 
 
-def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise() -> None:
-    loss, (image, target) = PhotometricLoss(0.3, threads=1), _images(12, 13)
+def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise():
+    loss, (image, target) = PhotometricLoss(0.3, threads=1), images(12, 13)
     expected, _, _ = loss(image.double(), target)
     assert not loss._compiled
     assert float(loss(image, target)[0]) == pytest.approx(float(expected), rel=1e-5)
@@ -71,7 +97,7 @@ def test_kernels_are_used_for_float32_on_a_cpu_and_torch_otherwise() -> None:
     assert loss._compiled["meta"](image.double(), target)[0] == expected
 
 
-def test_tritons_loss_is_taken_where_triton_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tritons_loss_is_taken_where_triton_runs(monkeypatch):
     stand_in = SimpleNamespace(TritonLoss=lambda weight: lambda *images: (weight, *images))
     monkeypatch.setitem(sys.modules, "gsbench.train.loss_triton", stand_in)
     obstacles = {"meta": None, "mps": "runs on device=cuda"}
@@ -87,32 +113,16 @@ def test_tritons_loss_is_taken_where_triton_runs(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("weight", [0.2, 0.0, 1.0])
-def test_the_compiled_loss_matches_float64(size: tuple[int, int], weight: float) -> None:
-    image, target = _images(*size)
-    for wanted in (target, target / 255):
-        leaf, precise = image.clone().requires_grad_(), image.double().requires_grad_()
-        values = photometric_loss(leaf, wanted, weight)
-        expected = torch_photometric_loss(precise, target.double() / 255, weight)
-        for value, reference in zip(values, expected, strict=True):
-            assert value.item() == pytest.approx(reference.item(), abs=2e-6)
-        (3 * values[0]).backward()
-        (3 * expected[0]).backward()
-        error = (leaf.grad - precise.grad).abs().max() / precise.grad.abs().max()
-        assert error < 1e-4
+def test_the_compiled_loss_matches_float64(size, weight):
+    check_loss(partial(photometric_loss, ssim_weight=weight), *images(*size), weight)
 
 
-def test_equal_images_have_no_loss_and_no_gradient() -> None:
-    image, _ = _images(20, 33)
-    leaf = image.clone().requires_grad_()
-    loss, l1, similarity = photometric_loss(leaf, image)
-    assert l1 == 0
-    assert similarity.item() == pytest.approx(1, abs=1e-6)
-    loss.backward()
-    assert leaf.grad.abs().max() < 1e-6  # L1's gradient at 0 is 0, SSIM is at its maximum
+def test_equal_images_have_no_loss_and_no_gradient():
+    check_equal_images(photometric_loss, images(20, 33)[0])
 
 
-def test_any_number_of_threads_gives_the_same_bits() -> None:
-    image, target = _images(64, 65)
+def test_any_number_of_threads_gives_the_same_bits():
+    image, target = images(64, 65)
     results = []
     for threads in (1, 1, 2, 4):
         loss = PhotometricLoss(threads=threads)
@@ -124,8 +134,8 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     assert len(set(results)) == 1
 
 
-def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images() -> None:
-    image, target = _images(16, 18)
+def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images():
+    image, target = images(16, 18)
     loss = PhotometricLoss(threads=1)
     with torch.no_grad():
         value = loss(image, target)[0]
@@ -134,8 +144,8 @@ def test_the_loss_is_equal_without_gradient_in_float64_and_for_strided_images() 
     assert loss(image.transpose(0, 1).contiguous().transpose(0, 1), target)[0] == value
 
 
-def test_inputs_that_do_not_fit_are_refused() -> None:
-    image, target = _images(16, 18)
+def test_inputs_that_do_not_fit_are_refused():
+    image, target = images(16, 18)
     with pytest.raises(ValueError, match="shape"):
         photometric_loss(image, target[:-1])
     for wrong in (image[..., :2], image[0], image[None]):

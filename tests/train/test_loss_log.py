@@ -1,31 +1,27 @@
 """The log of losses, also from a device that is behind; records; and histograms of volumes."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from gsbench.raster.staged import Readback
 from gsbench.train.trainer import LossLog, append, volume_histogram
 
 
-def scalars(step: int, total: float | None = None) -> Tensor:
+def scalars(step, total=None):
     return torch.tensor([1 / (step + 1), 0.5 * step, 0.25 * step, 2.0 if total is None else total])
 
 
 @pytest.fixture(params=["at once", "late"])
-def late(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+def late(request, monkeypatch):
     """Whether the device is behind: then no readback has arrived before it is waited for."""
     if request.param == "late":
         monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
     return bool(request.param == "late")
 
 
-def test_the_latest_loss_and_the_smoothed_loss_are_exact(late: bool) -> None:
+def test_the_latest_loss_and_the_smoothed_loss_are_exact(late):
     losses = LossLog()
     assert math.isnan(losses.smoothed)
     expected = math.nan
@@ -42,9 +38,7 @@ def test_the_latest_loss_and_the_smoothed_loss_are_exact(late: bool) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_the_first_iteration_with_a_loss_that_is_not_finite_is_named(
-    late: bool, bad: float
-) -> None:
+def test_the_first_iteration_with_a_loss_that_is_not_finite_is_named(late, bad):
     losses = LossLog()
     losses.add(1, scalars(1))
     with pytest.raises(FloatingPointError, match=f"the loss became {bad} at iteration 2"):  # noqa: PT012
@@ -54,7 +48,7 @@ def test_the_first_iteration_with_a_loss_that_is_not_finite_is_named(
         losses.wait()
 
 
-def test_without_a_regulariser_the_loss_is_the_total(late: bool) -> None:
+def test_without_a_regulariser_the_loss_is_the_total(late):
     losses = LossLog()
     losses.add(1, scalars(1)[:3])
     assert losses.wait() == {"step": 1, "loss": 0.5, "l1": 0.5, "ssim": 0.25}
@@ -63,13 +57,13 @@ def test_without_a_regulariser_the_loss_is_the_total(late: bool) -> None:
         losses.wait()
 
 
-def test_readers_see_a_record_at_once(tmp_path: Path) -> None:
+def test_readers_see_a_record_at_once(tmp_path):
     with (tmp_path / "events.jsonl").open("a") as stream:
         append(stream, {"step": 1})
         assert (tmp_path / "events.jsonl").read_text() == '{"step": 1}\n'
 
 
-def test_volumes_are_counted_in_bins_of_a_quarter_decade() -> None:
+def test_volumes_are_counted_in_bins_of_a_quarter_decade():
     """Volumes beyond the range count in the outermost bins."""
     log_scales = (
         torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4 - 4

@@ -3,12 +3,11 @@
 The other pixels have the same weight as without a mask.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
+from torch.testing import assert_close
 
 from gsbench.eval.images import replace_ignored
 from gsbench.raster import create_rasterizer
@@ -23,7 +22,7 @@ CAMERA = Camera(
 
 
 @pytest.fixture
-def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def picture():
     """A render, a photograph, and a mask [H, W, 1] that ignores a disc and the right margin."""
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
@@ -33,7 +32,7 @@ def picture() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return image, target, mask[..., None]
 
 
-def test_the_loss_with_a_mask_matches_its_definition(picture) -> None:
+def test_the_loss_with_a_mask_matches_its_definition(picture):
     """L1 is a sum over the pixels that count, divided by all pixels.
 
     SSIM is that of scikit-image over all pixels, for pictures that are equal under the mask.
@@ -62,23 +61,20 @@ def test_the_loss_with_a_mask_matches_its_definition(picture) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(
-    picture, dtype: torch.dtype
-) -> None:
+def test_ignored_pixels_change_neither_the_loss_nor_its_gradient(picture, dtype):
     image, target, mask = picture
     results = []
     for noise in (0.0, 5.0):
         drawn = (image + noise * ~mask).to(dtype).requires_grad_()
         loss, *_ = PhotometricLoss(threads=1)(replace_ignored(drawn, target, mask), target)
         loss.backward()
-        assert drawn.grad is not None
         assert (drawn.grad[~mask.expand(-1, -1, 3)] == 0).all()
         results.append((loss.detach(), drawn.grad))
     assert torch.equal(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
 
 
-def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture) -> None:
+def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture):
     """Thresholds on gradients keep their meaning, because the loss is divided by all pixels.
 
     Far means at least 11 px: the gradient has two windows of SSIM, each of radius 5.
@@ -91,11 +87,11 @@ def test_far_from_ignored_pixels_the_gradient_is_that_without_a_mask(picture) ->
         drawn = image.clone().requires_grad_()
         PhotometricLoss(threads=1)(replace_ignored(drawn, target, chosen), target)[0].backward()
         gradients.append(drawn.grad)
-    torch.testing.assert_close(gradients[0][:, :19], gradients[1][:, :19], rtol=0, atol=0)
+    assert_close(gradients[0][:, :19], gradients[1][:, :19], rtol=0, atol=0)
     assert not torch.equal(gradients[0][:, 20:30], gradients[1][:, 20:30])
 
 
-def test_densifiers_get_no_error_at_ignored_pixels(picture) -> None:
+def test_densifiers_get_no_error_at_ignored_pixels(picture):
     from gsbench.gaussians.initial import gaussians_from_cloud
 
     _, target, mask = picture
@@ -122,7 +118,7 @@ def test_densifiers_get_no_error_at_ignored_pixels(picture) -> None:
     assert (scene.dissimilarity(0, image)[inside] < 1e-6).all()
 
 
-def test_masks_are_reduced_with_their_images(picture) -> None:
+def test_masks_are_reduced_with_their_images(picture):
     from gsbench.train.resolution import ScaledViews
 
     _, target, mask = picture
@@ -135,7 +131,6 @@ def test_masks_are_reduced_with_their_images(picture) -> None:
     for scale in (1, 2, 5):
         cameras, targets = pictures.at(scale)
         small = targets.mask(0)
-        assert small is not None
         assert small.shape == (cameras[0].height, cameras[0].width, 1)
         assert small.shape[:2] == targets.get(0).shape[:2]
         assert targets.mask(1) is None

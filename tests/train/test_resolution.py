@@ -1,20 +1,17 @@
 """Training on small pictures: the schedule of sizes, the limit on the count, and resuming."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from gsbench.analysis.differences import ingredients
 from gsbench.densify import EdgeAware, Refinement
 from gsbench.events import RefineEvent
-from gsbench.runs.keys import config_hash
-from gsbench.scene.types import Scene, View
+from gsbench.runs.config_hash import config_hash
+from gsbench.scene.types import View
 from gsbench.train.options import TrainConfig
 from gsbench.train.resolution import (
     Resolution,
@@ -26,24 +23,13 @@ from gsbench.train.resolution import (
 from gsbench.train.views import Targets
 from tests.config.test_schema import composed
 from tests.train.conftest import orbit_camera
-from tests.train.lab import (
-    CPU,
-    EVENTS,
-    METRICS,
-    STATEFUL,
-    Lab,
-    StopError,
-    options,
-    same,
-    small,
-    stop_at,
-)
+from tests.train.lab import CPU, EVENTS, METRICS, STATEFUL, StopError, options, same, small, stop_at
 
 SHORT = {"densify_start": 20, "densify_stop": 100, "densify_interval": 20}
 BOTH = "pictures_and_count"
 
 
-def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArray[np.uint8]]:
+def soft_pictures(count, height, width, seed):
     """Noise whose amplitude falls with the frequency, as in photographs."""
     rng = np.random.default_rng(seed)
     frequency = (
@@ -59,17 +45,17 @@ def soft_pictures(count: int, height: int, width: int, seed: int) -> list[NDArra
     return pictures
 
 
-def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
+def stated_again(pictures, until):
     """The scale of each iteration from 0 to ``until``, found by bisection; for even sides."""
     height, width, _ = pictures[0].shape
 
-    def window(spectrum: NDArray[np.float64], scale: float) -> float:
+    def window(spectrum, scale):
         tall, wide = int(height / scale) // 2, int(width / scale) // 2
         return float(
             spectrum[height // 2 - tall :, width // 2 - wide :][: 2 * tall, : 2 * wide].sum()
         )
 
-    def solve(spectrum: NDArray[np.float64], share: float) -> float:
+    def solve(spectrum, share):
         low, high = 0.0, 1.0
         for _ in range(64):
             middle = (low + high) / 2
@@ -98,10 +84,8 @@ def stated_again(pictures: list[NDArray[np.uint8]], until: int) -> list[int]:
     return [*answers, 1]
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "until"), [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)]
-)
-def test_the_schedule_of_sizes_matches_a_restatement(height: int, width: int, until: int) -> None:
+@pytest.mark.parametrize("height, width, until", [(48, 64, 1000), (90, 60, 15_000), (40, 40, 300)])
+def test_the_schedule_of_sizes_matches_a_restatement(height, width, until):
     pictures = soft_pictures(3, height, width, height)
     found = scale_schedule(pictures, until)
     expected = stated_again(pictures, until)
@@ -111,7 +95,7 @@ def test_the_schedule_of_sizes_matches_a_restatement(height: int, width: int, un
     assert found.at(10 * until) == 1
 
 
-def test_pictures_of_several_shapes_and_without_content_have_a_schedule() -> None:
+def test_pictures_of_several_shapes_and_without_content_have_a_schedule():
     mixed = [*soft_pictures(2, 47, 63, 1), *soft_pictures(1, 64, 31, 2)]
     found = scale_schedule(mixed, 500)
     assert found.scales[-1] == 1
@@ -124,7 +108,7 @@ def test_pictures_of_several_shapes_and_without_content_have_a_schedule() -> Non
     assert grey.at(500) == 1
 
 
-def weights(size: int, smaller: int) -> NDArray[np.float64]:
+def weights(size, smaller):
     """Weights [smaller, size] of a triangular filter, one small pixel wide on each side."""
     scale = size / smaller
     centres = (np.arange(smaller) + 0.5) * scale
@@ -132,10 +116,8 @@ def weights(size: int, smaller: int) -> NDArray[np.float64]:
     return triangle / triangle.sum(1, keepdims=True)
 
 
-@pytest.mark.parametrize(("scale", "height", "width"), [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
-def test_a_small_picture_is_filtered_and_its_camera_is_resized(
-    scale: int, height: int, width: int
-) -> None:
+@pytest.mark.parametrize("scale, height, width", [(2, 16, 20), (3, 10, 13), (8, 4, 5)])
+def test_a_small_picture_is_filtered_and_its_camera_is_resized(scale, height, width):
     camera = orbit_camera(0.3)
     (image,) = soft_pictures(1, camera.height, camera.width, 5)
     view = View("a.png", camera, image)
@@ -152,8 +134,8 @@ def test_a_small_picture_is_filtered_and_its_camera_is_resized(
     assert (small.fy * y / z + small.cy) / height == pytest.approx(down)
 
 
-@pytest.mark.parametrize(("height", "width"), [(7, 5), (8, 5), (6, 4)])
-def test_the_energy_of_a_window_is_the_sum_over_its_frequencies(height: int, width: int) -> None:
+@pytest.mark.parametrize("height, width", [(7, 5), (8, 5), (6, 4)])
+def test_the_energy_of_a_window_is_the_sum_over_its_frequencies(height, width):
     """A window has the same number of pixels on both sides of frequency zero.
 
     The last window is the whole spectrum.
@@ -172,26 +154,25 @@ def test_the_energy_of_a_window_is_the_sum_over_its_frequencies(height: int, wid
     assert found[-1] == pytest.approx(float(spectrum.sum()))
 
 
-def test_a_picture_keeps_at_least_one_pixel() -> None:
+def test_a_picture_keeps_at_least_one_pixel():
     view = View("a.png", orbit_camera(0.0, 5, 3), np.full((3, 5, 3), 7, np.uint8))
     cameras, targets = ScaledViews([view], Targets([view], CPU), CPU, None).at(8)
     assert (cameras[0].width, cameras[0].height) == (1, 1)
     assert targets.get(0).tolist() == [[[7, 7, 7]]]
 
 
-def test_each_round_is_reported_to_the_resolution(lab: Lab) -> None:
+def test_each_round_is_reported_to_the_resolution(lab):
     training, told = lab.new(small(), resolution_schedule=BOTH, iterations=50, **SHORT), []
-    assert training.resolution is not None
-    training.resolution.observe = told.append  # type: ignore[method-assign]
+    training.resolution.observe = told.append
     training.run(lab.folder)
     assert [event.step for event in told] == [40]
 
 
-def scheduled(scene: Scene) -> Resolution:
+def scheduled(scene):
     return Resolution(options(resolution_schedule=BOTH, **SHORT), scene.train, 100)
 
 
-def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_scene: Scene) -> None:
+def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_scene):
     resolution = scheduled(tiny_scene)
     scales = [resolution.scale(step) for step in range(1, 121)]
     assert scales[0] >= 2
@@ -203,18 +184,18 @@ def test_sizes_change_after_rounds_and_position_rates_wait_for_full_size(tiny_sc
     assert 0 < wait < 100
     assert resolution.position_step(wait) == resolution.position_step(1) == 0
     assert resolution.position_step(120) == 120
-    assert resolution.position_step((120 + wait) / 2) == pytest.approx(60)  # type: ignore[arg-type]
+    assert resolution.position_step((120 + wait) / 2) == pytest.approx(60)
     resolution.options.position_steps = wait  # no iteration is left for the schedule
     assert resolution.position_step(wait + 1) == wait
 
 
-def test_the_limit_on_the_count_and_the_momentum_follow_their_formulas(tiny_scene: Scene) -> None:
+def test_the_limit_on_the_count_and_the_momentum_follow_their_formulas(tiny_scene):
     resolution = scheduled(tiny_scene)
-    resolution.scale = lambda step: 3  # type: ignore[method-assign]
+    resolution.scale = lambda step: 3
 
-    def limit(step: int, before: int, most: int | None = None) -> int:
+    def limit(step, before, most=None):
         event = RefineEvent(step=step, before=before)
-        return resolution.limit(Refinement(step, None, torch.Generator(), event), most)  # type: ignore[arg-type]
+        return resolution.limit(Refinement(step, None, torch.Generator(), event), most)
 
     assert limit(40, 10_000) == 100 + int(500 / 3 ** (2 - 0.4))
     assert limit(60, 10_000, most=4100) == 100 + int(4000 / 3 ** (2 - 0.6))
@@ -234,7 +215,7 @@ def test_the_limit_on_the_count_and_the_momentum_follow_their_formulas(tiny_scen
 
 @pytest.mark.parametrize("kind", [*STATEFUL, "edgeaware"])
 @pytest.mark.slow
-def test_an_interrupted_training_ends_with_the_same_bits(kind: str, lab: Lab) -> None:
+def test_an_interrupted_training_ends_with_the_same_bits(kind, lab):
     make = STATEFUL.get(kind, lambda: small(EdgeAware, max_gaussians=200, cap="root"))
     settings = {"resolution_schedule": BOTH, "checkpoint_every": 30, **SHORT}
     whole = lab.train(make(), "whole", **settings)
@@ -247,7 +228,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(kind: str, lab: Lab) ->
     assert max(sizes) >= 2
 
 
-def test_masks_are_as_small_as_their_pictures(lab: Lab) -> None:
+def test_masks_are_as_small_as_their_pictures(lab):
     """In small pictures, too, the content of ignored pixels does not change the training."""
     trained = []
     for value in (0, 255):
@@ -262,17 +243,15 @@ def test_masks_are_as_small_as_their_pictures(lab: Lab) -> None:
         training = own.new(
             small(), resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT
         )
-        assert training.resolution is not None
         training.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))
         mask = training.scaled_views.at(2)[1].mask(0)
-        assert mask is not None
         assert mask.shape == (16, 20, 1)
         (lab.folder / str(value)).mkdir()
         trained.append(training.run(lab.folder / str(value)))
     assert same(*trained)
 
 
-def test_a_schedule_of_pictures_alone_does_not_limit_the_count(lab: Lab) -> None:
+def test_a_schedule_of_pictures_alone_does_not_limit_the_count(lab):
     counts = {}
     for kind in ("none", "pictures", BOTH):
         lab.train(small(), kind, resolution_schedule=kind, **SHORT)
@@ -284,7 +263,7 @@ def test_a_schedule_of_pictures_alone_does_not_limit_the_count(lab: Lab) -> None
     assert "scale" not in lab.records(METRICS, "none")[0]
 
 
-def test_the_schedule_is_an_ingredient_and_part_of_the_hash() -> None:
+def test_the_schedule_is_an_ingredient_and_part_of_the_hash():
     without, with_it = composed(), composed("train.resolution_schedule=pictures")
     assert config_hash(without) != config_hash(with_it)
     plain = {"densify._target_": "gsbench.densify.ADC", "train.resolution_schedule": "none"}
@@ -293,16 +272,16 @@ def test_the_schedule_is_an_ingredient_and_part_of_the_hash() -> None:
     )
 
 
-def test_an_unknown_schedule_is_refused() -> None:
+def test_an_unknown_schedule_is_refused():
     with pytest.raises(
         ValueError,
         match=r"train\.resolution_schedule must be 'none', 'pictures' or 'pictures_and_count'",
     ):
-        TrainConfig(name="x", resolution_schedule="spectrum")  # type: ignore[arg-type]
+        TrainConfig(name="x", resolution_schedule="spectrum")
 
 
 @pytest.mark.parametrize(
-    ("scales", "full"),
+    "scales, full",
     [
         ((8.0, 4.0, 2.0, 1.0), 200),
         ((8.0, 2.5, 1.9, 1.0), 100),
@@ -310,7 +289,5 @@ def test_an_unknown_schedule_is_refused() -> None:
         ((3.0, 1.0, 1.0, 1.0), 0),
     ],
 )
-def test_full_size_begins_at_the_last_point_with_a_scale_of_two_or_more(
-    scales: tuple[float, ...], full: int
-) -> None:
+def test_full_size_begins_at_the_last_point_with_a_scale_of_two_or_more(scales, full):
     assert ScaleSchedule((0, 100, 200, 300), scales).full_from == full

@@ -1,24 +1,20 @@
 """A training that is stopped anywhere, any number of times, ends with the same bits."""
 
-from __future__ import annotations
-
 import json
 import random
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
-from gsbench.densify import Densifier, EdgeAware, PixelGS, ResGS, Taming, Volumetric
+from gsbench.densify import EdgeAware, PixelGS, ResGS, Taming, Volumetric
 from gsbench.system.stopping import Stopped, stop_on_signals
-from gsbench.train.trainer import Status, drop_after
-from tests.train.lab import EVENTS, METRICS, STATEFUL, Lab, StopError, same, small
+from gsbench.train.trainer import drop_after
+from tests.train.lab import EVENTS, METRICS, STATEFUL, StopError, same, small
 
 ITERATIONS = 120
-MAKERS: dict[str, Callable[[], Densifier]] = STATEFUL | {
+MAKERS = STATEFUL | {
     "volumetric": lambda: small(Volumetric, volume_threshold=0.01),
     "capped": lambda: small(max_gaussians=120, cap="hard"),
     "pixelgs": lambda: small(PixelGS, max_gaussians=150, cap="hard"),
@@ -29,9 +25,7 @@ MAKERS: dict[str, Callable[[], Densifier]] = STATEFUL | {
 
 
 @pytest.mark.parametrize("name", list(MAKERS))
-def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(
-    name: str, lab: Lab
-) -> None:
+def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(name, lab):
     make = MAKERS[name]
     whole = lab.train(make(), "whole", log_every=1)
     rng = random.Random(name)
@@ -39,11 +33,9 @@ def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(
     for attempt in range(12):
         moment = rng.randrange(1, 45)
         crash = attempt % 2 == 0
-        seen: list[int] = []
+        seen = []
 
-        def interrupt(
-            status: Status, moment: int = moment, crash: bool = crash, seen: list[int] = seen
-        ) -> None:
+        def interrupt(status, moment=moment, crash=crash, seen=seen):
             seen.append(status.step)
             if len(seen) == moment:
                 if crash:
@@ -74,10 +66,10 @@ def test_crashes_and_signals_at_random_iterations_do_not_change_the_result(
     assert timeless[0] == timeless[1]
 
 
-def test_a_stop_in_the_last_iteration_loses_nothing(lab: Lab) -> None:
+def test_a_stop_in_the_last_iteration_loses_nothing(lab):
     whole = lab.train(small(), "whole")
 
-    def stop(status: Status) -> None:
+    def stop(status):
         if status.step == ITERATIONS:
             signal.raise_signal(signal.SIGTERM)
 
@@ -86,7 +78,7 @@ def test_a_stop_in_the_last_iteration_loses_nothing(lab: Lab) -> None:
     assert same(whole, lab.train(small(), "broken"))
 
 
-def test_records_after_the_checkpoint_and_an_incomplete_line_are_removed(tmp_path: Path) -> None:
+def test_records_after_the_checkpoint_and_an_incomplete_line_are_removed(tmp_path):
     file = tmp_path / "metrics.jsonl"
     lines = [json.dumps({"step": step}) + "\n" for step in range(1, 8)]
     for torn in ("", '{"step": 3, "lo', '{"loss": 1}\n', "5\n"):
@@ -102,7 +94,7 @@ def test_records_after_the_checkpoint_and_an_incomplete_line_are_removed(tmp_pat
 )
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
 @pytest.mark.slow
-def test_a_kill_while_records_are_removed_loses_no_record(share: float, tmp_path: Path) -> None:
+def test_a_kill_while_records_are_removed_loses_no_record(share, tmp_path):
     """The system kills the process as soon as it has written ``share`` of the file."""
     file = tmp_path / "events.jsonl"
     lines = [json.dumps({"step": step, "cloned": step}) + "\n" for step in range(1, 5001)]

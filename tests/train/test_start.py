@@ -1,7 +1,5 @@
 """The checks of initial points and cameras, in a scene whose points and colours are known."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math
@@ -13,23 +11,23 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.normalization import Normalization
-from gsbench.runs.trial_record import InitialCloud
 from gsbench.scene.types import Scene, View
 from gsbench.train import start
 from gsbench.train.start import _agreement, check_start, odd_lenses
+from tests.helpers import refusal
 from tests.train.conftest import orbit_camera
 
 WALL_Z = 4.0
 
 
-def wall_color(points: np.ndarray) -> np.ndarray:
+def wall_color(points):
     """The colours [P, 3] of points on the wall z = 4, which has a smooth pattern."""
     waves = [np.sin(1.1 * points[:, 0] + k) + np.cos(0.9 * points[:, 1] - k) for k in range(3)]
     return (127 + 60 * np.stack(waves, axis=1)).clip(0, 255).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     """Nine views of the wall: the ray of each pixel is intersected with it."""
     views = []
     for index, angle in enumerate(np.linspace(-0.6, 0.6, 9)):
@@ -49,15 +47,13 @@ def scene() -> Scene:
 
 
 @pytest.fixture
-def cloud() -> tuple[np.ndarray, np.ndarray]:
+def cloud():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-1.2, 1.2, (600, 2)), np.full(600, WALL_Z)])
     return points, wall_color(points)
 
 
-def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(scene, cloud, caplog):
     facts = check_start(*cloud, scene)
     centers = [view.camera.center for view in scene.train]
     around, within = (
@@ -75,7 +71,7 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    "change, said",
     [  # the views are 40x32 px; 20 px / tan(75 deg) = 5.36 px
         ({"fx": 5.3, "fy": 5.3}, "a focal length of 5.3 px for a width of 40 px"),
         ({"fx": 5.4, "fy": 5.4}, ""),
@@ -92,13 +88,7 @@ def test_a_correct_cloud_is_in_view_agrees_and_causes_no_warning(
         ({"cx": 4.1, "cy": 3.3}, ""),
     ],
 )
-def test_intrinsics_that_no_lens_has_cause_one_warning(
-    scene: Scene,
-    cloud: tuple[np.ndarray, np.ndarray],
-    change: dict[str, float],
-    said: str,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_intrinsics_that_no_lens_has_cause_one_warning(scene, cloud, change, said, caplog):
     train = tuple(replace(view, camera=replace(view.camera, **change)) for view in scene.train)
     changed = replace(scene, train=train)
     lines = odd_lenses(changed)
@@ -113,9 +103,7 @@ def test_intrinsics_that_no_lens_has_cause_one_warning(
 
 
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
-def test_a_cloud_of_one_colour_causes_a_warning(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], level: int
-) -> None:
+def test_a_cloud_of_one_colour_causes_a_warning(scene, cloud, level):
     points, colors = cloud
     plain = np.full_like(colors, level)
     plain[1:, 2] ^= 1  # the first point is named
@@ -126,7 +114,7 @@ def test_a_cloud_of_one_colour_causes_a_warning(
     assert f"the colour ({level}, {level}, {level})" in line
 
 
-def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
+def seen_by_brute_force(points, scene):
     """The share of points that two views see, point by point and view by view."""
     shares = []
     for point in points:
@@ -141,7 +129,7 @@ def seen_by_brute_force(points: np.ndarray, scene: Scene) -> float:
     return float(np.mean(shares))
 
 
-def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene: Scene) -> None:
+def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene):
     points = np.random.default_rng(1).uniform(-4, 8, (300, 3))
     colors = np.random.default_rng(2).integers(0, 256, points.shape, dtype=np.uint8)
     assert check_start(points, colors, scene, random_points=True).seen == seen_by_brute_force(
@@ -150,7 +138,7 @@ def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene: Sc
 
 
 @pytest.mark.parametrize(
-    ("change", "doubt"),
+    "change, doubt",
     [
         (lambda points: points - [1.4, 0.3, 0], "hardly agree"),
         (lambda points: (points - [0, 0, 4]) * [-1, -1, 1] + [0, 0, 4], "hardly agree"),
@@ -168,12 +156,8 @@ def test_the_share_in_view_equals_that_of_a_loop_over_points_and_views(scene: Sc
     ],
 )
 def test_a_wrong_cloud_causes_a_warning_and_a_random_one_none_about_colours_or_views(
-    scene: Scene,
-    cloud: tuple[np.ndarray, np.ndarray],
-    caplog: pytest.LogCaptureFixture,
-    change,
-    doubt: str,
-) -> None:
+    scene, cloud, caplog, change, doubt
+):
     points, colors = cloud
     facts = check_start(change(points), colors, scene)
     assert any(doubt in line for line in facts.warnings), facts
@@ -182,9 +166,7 @@ def test_a_wrong_cloud_causes_a_warning_and_a_random_one_none_about_colours_or_v
     assert not any("agree" in line or "in view" in line for line in at_random.warnings)
 
 
-def test_colour_agreement_is_relative_to_all_pairs_of_points(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_colour_agreement_is_relative_to_all_pairs_of_points(scene, cloud):
     points, colors = cloud
     swapped = colors[:, ::-1]
     facts, right = check_start(points, swapped, scene), check_start(points, colors, scene)
@@ -197,7 +179,7 @@ def test_colour_agreement_is_relative_to_all_pairs_of_points(
 
 
 @pytest.mark.parametrize(
-    ("points", "error"),
+    "points, error",
     [
         (np.array([[0, 0, 4.0]] * 9), r"all at one place, \(0, 0, 4\)"),
         (
@@ -210,29 +192,25 @@ def test_colour_agreement_is_relative_to_all_pairs_of_points(
         ),
     ],
 )
-def test_a_start_from_which_nothing_can_be_learnt_is_refused(
-    scene: Scene, points: np.ndarray, error: str
-) -> None:
+def test_a_start_from_which_nothing_can_be_learnt_is_refused(scene, points, error):
     colors = np.zeros(points.shape, dtype=np.uint8)
-    with pytest.raises(InputError, match=error):
+    with refusal(error):
         check_start(points, colors, scene)
 
 
-def test_messages_have_the_scenes_own_coordinates(scene: Scene) -> None:
+def test_messages_have_the_scenes_own_coordinates(scene):
     points, colors = np.array([[0, 0, 4.0]] * 9), np.zeros((9, 3), dtype=np.uint8)
-    with pytest.raises(InputError, match=r"\(500000, 5400000, 308\)"):
+    with refusal(r"\(500000, 5400000, 308\)"):
         check_start(points, colors, scene, normalization=Normalization((5e5, 5.4e6, 300.0), 0.5))
 
 
-def test_cameras_at_one_place_are_refused_and_a_far_camera_causes_a_warning(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_cameras_at_one_place_are_refused_and_a_far_camera_causes_a_warning(scene, cloud):
     first = scene.train[0]
-    with pytest.raises(InputError, match="all training cameras stand at one place"):
+    with refusal("all training cameras stand at one place"):
         check_start(*cloud, Scene("still", (first, first, first), ()))
     far_off = first.camera.translation + np.array([3e3, 0, 0])
     away = replace(first, camera=replace(first.camera, translation=far_off))
-    facts: InitialCloud = check_start(*cloud, Scene("wall", (away, *scene.train[1:]), ()))
+    facts = check_start(*cloud, Scene("wall", (away, *scene.train[1:]), ()))
     (line,) = facts.warnings  # other facts do not depend on the far camera
     assert line.startswith("the camera of 1.png is ")
     centers = np.stack([away.camera.center, *(view.camera.center for view in scene.train[1:])])
@@ -241,9 +219,7 @@ def test_cameras_at_one_place_are_refused_and_a_far_camera_causes_a_warning(
     assert "sets the scene extent to" in line
 
 
-def test_ignored_pixels_have_no_effect_on_the_agreement(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_ignored_pixels_have_no_effect_on_the_agreement(scene, cloud):
     noise = np.random.default_rng(3).integers(0, 256, scene.train[0].image.shape, dtype=np.uint8)
     right = np.arange(noise.shape[1]) >= 20
     masked = [
@@ -258,7 +234,7 @@ def test_ignored_pixels_have_no_effect_on_the_agreement(
     assert facts.color_agreement > 0.8
 
 
-def test_black_pixels_count_in_the_agreement_and_points_that_no_photograph_shows_do_not() -> None:
+def test_black_pixels_count_in_the_agreement_and_points_that_no_photograph_shows_do_not():
     colors = np.array([[0, 0, 0]] * 10 + [[200, 100, 50]] * 10 + [[90, 90, 90]] * 5, dtype=np.uint8)
     shown = colors.astype(np.int16)
     shown[20:] = -1
@@ -270,9 +246,7 @@ def test_black_pixels_count_in_the_agreement_and_points_that_no_photograph_shows
     assert _agreement(pair[:1], pair[1:].astype(np.int16)) is None
 
 
-def test_most_cameras_may_stand_at_one_place(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_most_cameras_may_stand_at_one_place(scene, cloud):
     """Lengths are then compared with the scene's extent."""
     first, last = scene.train[0], scene.train[-1]
     still = Scene("still", (first, first, first, last), ())
@@ -282,19 +256,17 @@ def test_most_cameras_may_stand_at_one_place(
     assert facts.warnings == []
 
 
-def test_of_a_large_cloud_evenly_spaced_points_are_measured(
-    scene: Scene, cloud: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_large_cloud_evenly_spaced_points_are_measured(scene, cloud, monkeypatch):
     monkeypatch.setattr(start, "MAX_POINTS", 3)
     points, colors = cloud[0][:5].copy(), cloud[1][:5]
     points[[1, 3], 2] = -50.0  # behind the cameras
     assert check_start(points, colors, scene, random_points=True).seen == 1.0
     points[[0, 2, 4], 2], points[[1, 3], 2] = -50.0, WALL_Z
-    with pytest.raises(InputError, match="no training view has one of the initial points in view"):
+    with refusal("no training view has one of the initial points in view"):
         check_start(points, colors, scene)
 
 
-def test_a_view_shows_the_points_beyond_its_near_plane_from_its_first_to_its_last_pixel() -> None:
+def test_a_view_shows_the_points_beyond_its_near_plane_from_its_first_to_its_last_pixel():
     camera = orbit_camera(0.0)
     image = np.arange(32 * 40 * 3, dtype=np.int64).reshape(32, 40, 3).astype(np.uint8)
     pixels = {(0.1, 0.1): (0, 0), (39.9, 0.1): (0, 39), (0.1, 31.9): (31, 0), (20.5, 8.5): (8, 20)}
@@ -317,7 +289,7 @@ def test_a_view_shows_the_points_beyond_its_near_plane_from_its_first_to_its_las
         assert shown.tolist() == [image[16, 20].tolist(), [7, 7, 7]]
 
 
-def test_lengths_are_compared_with_the_median_distance_of_the_cameras(scene: Scene) -> None:
+def test_lengths_are_compared_with_the_median_distance_of_the_cameras(scene):
     """The cameras are at x = -10, 0 and 10, so the unit of distances is 10."""
     view = replace(scene.train[0], camera=orbit_camera(0.0))
     views = [
@@ -329,5 +301,5 @@ def test_lengths_are_compared_with_the_median_distance_of_the_cameras(scene: Sce
     colors = np.zeros((4, 3), np.uint8)
     assert check_start(points, colors, wide, random_points=True).far == 1
     points[3, 2] = 1.1e8
-    with pytest.raises(InputError, match=r"initial point 3 of 4 is 1\.1e\+07 times as far"):
+    with refusal(r"initial point 3 of 4 is 1\.1e\+07 times as far"):
         check_start(points, colors, wide)

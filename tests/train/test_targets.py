@@ -1,7 +1,5 @@
 """Training images stay on the device if they fit; if not, they are copied unchanged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,7 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture
-def views() -> list[View]:
+def views():
     """Seven images of different sizes and content."""
     rng = np.random.default_rng(3)
     sizes = [(12, 9), (5, 7), (12, 9), (3, 30), (8, 8), (1, 1), (12, 10)]
@@ -22,7 +20,7 @@ def views() -> list[View]:
     return [View(f"{k}.png", front_camera(i.shape[1], i.shape[0]), i) for k, i in enumerate(images)]
 
 
-def test_images_that_fit_stay_on_the_device(views: list[View]) -> None:
+def test_images_that_fit_stay_on_the_device(views):
     size = sum(view.image.size for view in views)
     for budget in (None, size):
         targets = Targets(views, CPU, budget)
@@ -33,7 +31,7 @@ def test_images_that_fit_stay_on_the_device(views: list[View]) -> None:
     assert not Targets(views, CPU, size - 1).resident
 
 
-def test_images_that_do_not_fit_are_copied_unchanged(views: list[View]) -> None:
+def test_images_that_do_not_fit_are_copied_unchanged(views):
     targets = Targets(views, CPU, budget=0)
     for index, view in enumerate(views):
         assert np.array_equal(targets.get(index).numpy(), view.image)

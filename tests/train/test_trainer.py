@@ -1,12 +1,9 @@
 """The training loop: it learns, follows the schedule, is repeatable, and can be resumed."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import time
 from dataclasses import asdict
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,19 +12,17 @@ import torch
 
 from gsbench.densify import ADC, NoDensifier, Volumetric
 from gsbench.errors import TrainingError
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import read_ply
-from gsbench.raster.base import RenderOutput
 from gsbench.raster.staged import Readback
 from gsbench.train import trainer
 from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
-from gsbench.train.trainer import Status, snapshot_file
+from gsbench.train.trainer import snapshot_file
 from gsbench.train.views import STREAMS, CameraOrder, generators
-from tests.train.lab import EVENTS, METRICS, STATEFUL, Lab, StopError, same, small, stop_at
+from tests.train.lab import EVENTS, METRICS, STATEFUL, StopError, same, small, stop_at
 
 
-def test_training_learns_the_scene(lab: Lab) -> None:
+def test_training_learns_the_scene(lab):
     lab.train(NoDensifier(), iterations=500, position_steps=500)
     metrics = lab.records(METRICS)
     first = sum(r["l1"] for r in metrics[:3]) / 3
@@ -38,13 +33,13 @@ def test_training_learns_the_scene(lab: Lab) -> None:
     assert [degrees[step] for step in (30, 40, 80, 120, 500)] == [0, 1, 2, 3, 3]
 
 
-def test_only_the_same_seed_gives_the_same_bits(lab: Lab) -> None:
+def test_only_the_same_seed_gives_the_same_bits(lab):
     runs = [lab.train(small(), str(i), seed=i // 2) for i in range(3)]
     assert same(runs[0], runs[1])
     assert not same(runs[0], runs[2])
 
 
-def test_counts_in_events_add_up_to_the_trained_gaussians(lab: Lab) -> None:
+def test_counts_in_events_add_up_to_the_trained_gaussians(lab):
     densifier = small(Volumetric, volume_threshold=0.01)
     trained = lab.train(densifier)
     events = lab.records(EVENTS)
@@ -59,30 +54,28 @@ def test_counts_in_events_add_up_to_the_trained_gaussians(lab: Lab) -> None:
     assert living["split_volume"] > 0
 
 
-def test_nothing_is_refined_in_the_last_iteration(lab: Lab) -> None:
+def test_nothing_is_refined_in_the_last_iteration(lab):
     """3DGS saves its model before it refines and steps."""
     lab.train(small(), iterations=100)
     assert lab.steps(EVENTS) == [40, 60, 80]
 
 
 class Explode(NoDensifier):
-    def __init__(self, at: int) -> None:
+    def __init__(self, at):
         self.left = at
 
-    def regularizer(self, gaussians: Gaussians) -> torch.Tensor | None:
+    def regularizer(self, gaussians):
         self.left -= 1
         return None if self.left else torch.tensor(float("inf"))
 
 
-def test_a_loss_that_is_not_finite_is_an_error_with_the_iteration(lab: Lab) -> None:
+def test_a_loss_that_is_not_finite_is_an_error_with_the_iteration(lab):
     with pytest.raises(TrainingError, match=r"iteration 57.*last good state"):
         lab.train(Explode(57))
     assert lab.checkpoints() == [50]
 
 
-def test_no_checkpoint_is_written_after_a_loss_that_is_not_finite(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_checkpoint_is_written_after_a_loss_that_is_not_finite(lab, monkeypatch):
     """On a device that is behind, a loss arrives only when the host waits for it."""
 
     monkeypatch.setattr(Readback, "arrived", property(lambda self: False))
@@ -91,9 +84,9 @@ def test_no_checkpoint_is_written_after_a_loss_that_is_not_finite(
     assert lab.checkpoints()[-1] == 2
 
 
-def test_the_error_of_a_full_device_names_the_checkpoint_and_a_remedy(lab: Lab) -> None:
+def test_the_error_of_a_full_device_names_the_checkpoint_and_a_remedy(lab):
     class Full(NoDensifier):
-        def observe(self, step: int, render: RenderOutput) -> None:
+        def observe(self, step, render):
             if step == 57:
                 raise torch.OutOfMemoryError(
                     "CUDA out of memory. Tried to allocate 2 GiB\nand more"
@@ -110,9 +103,7 @@ def test_the_error_of_a_full_device_names_the_checkpoint_and_a_remedy(lab: Lab) 
 
 
 @pytest.mark.parametrize("kind", ["adc", "mcmc"])
-def test_a_device_that_is_behind_gives_the_same_bits(
-    kind: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_that_is_behind_gives_the_same_bits(kind, lab, monkeypatch):
     """Losses arrive late, images do not fit on the device, and a thread writes checkpoints."""
 
     make = STATEFUL[kind]
@@ -129,14 +120,14 @@ def test_a_device_that_is_behind_gives_the_same_bits(
     assert lab.text(EVENTS, "broken") == lab.text(EVENTS, "whole")
 
 
-def test_every_view_is_used_once_before_any_is_used_again() -> None:
+def test_every_view_is_used_once_before_any_is_used_again():
     order = CameraOrder(7, generators(0)["cameras"])
     drawn = [order.next() for _ in range(21)]
     assert [sorted(drawn[i : i + 7]) for i in (0, 7, 14)] == [list(range(7))] * 3
     assert drawn[:7] != drawn[7:14]
 
 
-def test_the_learning_rate_of_the_means_is_log_linear() -> None:
+def test_the_learning_rate_of_the_means_is_log_linear():
     rates = TrainConfig(name="x")
     assert rates.position(0) == pytest.approx(1.6e-4)
     assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
@@ -144,9 +135,7 @@ def test_the_learning_rate_of_the_means_is_log_linear() -> None:
     assert rates.position(99_000) == pytest.approx(1.6e-6)
 
 
-def test_too_few_rounds_of_a_densifier_cause_a_warning(
-    lab: Lab, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_too_few_rounds_of_a_densifier_cause_a_warning(lab, caplog):
     lab.train(ADC(start=500), "adc", iterations=15)
     assert "ADC: 0 rounds of refinement in 15 iterations are too few" in caplog.text
     caplog.clear()
@@ -154,14 +143,14 @@ def test_too_few_rounds_of_a_densifier_cause_a_warning(
     assert "refinement" not in caplog.text
 
 
-def test_a_snapshot_equals_the_model_of_a_training_that_ends_there(lab: Lab) -> None:
+def test_a_snapshot_equals_the_model_of_a_training_that_ends_there(lab):
     """Iteration 60 is due for a refinement and an opacity reset: 3DGS saves before both."""
     lab.train(small(), "long", snapshot_at=[60])
     short = lab.train(small(), "short", iterations=60)
     assert same(read_ply(lab.folder / "long" / snapshot_file(60)), short)
 
 
-def test_defaults_are_those_of_3dgs() -> None:
+def test_defaults_are_those_of_3dgs():
     """The source is ``arguments/__init__.py`` of the 2023 code of 3DGS."""
     published = {
         "iterations": 30_000,
@@ -198,15 +187,15 @@ def test_defaults_are_those_of_3dgs() -> None:
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_the_optimiser_steps_after_or_before_a_refinement(before: bool, lab: Lab) -> None:
+def test_the_optimiser_steps_after_or_before_a_refinement(before, lab):
     seen = []
 
     class Watching(NoDensifier):
-        def refine(self, step: int, gaussians: object, rng: torch.Generator) -> None:
-            seen.append(gaussians.values.means.detach().clone())  # type: ignore[attr-defined]
+        def refine(self, step, gaussians, rng):
+            seen.append(gaussians.values.means.detach().clone())
 
-        def after_step(self, step: int, gaussians: object, rng: torch.Generator) -> None:
-            seen.append(gaussians.values.means.detach().clone())  # type: ignore[attr-defined]
+        def after_step(self, step, gaussians, rng):
+            seen.append(gaussians.values.means.detach().clone())
 
     training = lab.new(Watching(), step_after_refine=before)
     first = training.gaussians.values.means.detach().clone()
@@ -220,38 +209,32 @@ def test_the_optimiser_steps_after_or_before_a_refinement(before: bool, lab: Lab
 
 
 @pytest.mark.parametrize("visible_adam", [False, True])
-def test_visible_adam_updates_only_visible_gaussians(visible_adam: bool, lab: Lab) -> None:
+def test_visible_adam_updates_only_visible_gaussians(visible_adam, lab):
     training = lab.new(NoDensifier(), visible_adam=visible_adam, sh_interval=1)
     given = []
-    training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)  # type: ignore[method-assign]
+    training.gaussians.optimizer_step = lambda *arguments: given.append(arguments)
     training.iterate(lab.folder)
     ((degree, visible),) = given
     assert degree == 1
     assert (visible is not None) is visible_adam
 
 
-@pytest.mark.parametrize(
-    ("background", "white"), [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)]
-)
-def test_the_context_of_a_densifier_knows_a_white_background(
-    background: list[float], white: bool, lab: Lab
-) -> None:
+@pytest.mark.parametrize("background, white", [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)])
+def test_the_context_of_a_densifier_knows_a_white_background(background, white, lab):
     context = lab.new(NoDensifier(), background=background).context
     assert context.white_background is white
     assert context.extent == lab.scene.extent
     assert context.limit is None
 
 
-@pytest.mark.parametrize(("spare", "resident"), [(0, True), (-2, False)])
-def test_images_may_use_half_of_the_free_memory(
-    spare: int, resident: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("spare, resident", [(0, True), (-2, False)])
+def test_images_may_use_half_of_the_free_memory(spare, resident, lab, monkeypatch):
     size = sum(view.image.size for view in lab.scene.train)
     monkeypatch.setattr(trainer, "free_bytes", lambda _: 2 * size + spare)
     assert lab.new(NoDensifier()).targets.resident is resident
 
 
-def clocked(monkeypatch: pytest.MonkeyPatch) -> None:
+def clocked(monkeypatch):
     """Give the trainer a clock that advances by a second each time it is read."""
     seconds = itertools.count(0.0, 1.00004)  # the last digit is not written
     monkeypatch.setattr(
@@ -261,13 +244,11 @@ def clocked(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_seconds_and_rates_continue_from_a_checkpoint(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_seconds_and_rates_continue_from_a_checkpoint(lab, monkeypatch):
     """The trainer reads the clock twice in an iteration that is logged."""
     settings, shown = {"iterations": 5, "log_every": 1, "checkpoint_every": 2}, []
 
-    def look(status: Status) -> None:
+    def look(status):
         shown.append((status.step, status.num_gaussians, status.iterations_per_second))
         if len(shown) == 3:
             raise KeyboardInterrupt
@@ -284,9 +265,7 @@ def test_seconds_and_rates_continue_from_a_checkpoint(
     assert shown == [(k, 80, pytest.approx(0.5, rel=1e-3)) for k in (1, 2, 3, 3, 4, 5)]
 
 
-def test_a_checkpoint_is_written_some_minutes_after_the_last(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_checkpoint_is_written_some_minutes_after_the_last(lab, monkeypatch):
     """The clock advances by half a minute each time it is read.
 
     The trainer reads it at the start, in each iteration, and after each checkpoint.
@@ -295,29 +274,27 @@ def test_a_checkpoint_is_written_some_minutes_after_the_last(
     clock.monotonic = lambda: 30.0 * next(looks)
     monkeypatch.setattr(trainer, "time", clock)
     settings = {"iterations": 8, "checkpoint_every": 100, "checkpoint_minutes": 1.5}
-    lab.train(NoDensifier(), **settings)  # type: ignore[arg-type]
+    lab.train(NoDensifier(), **settings)
     assert lab.checkpoints() == [3, 6]
 
 
 def test_a_training_ends_with_the_iteration_that_reaches_the_time_budget_and_logs_it(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    lab, monkeypatch
+):
     clocked(monkeypatch)
     lab.train(NoDensifier(), max_seconds=3.0, log_every=100)
     assert lab.steps(METRICS) == [3]
 
 
-def test_on_a_cpu_checkpoints_are_written_without_a_thread(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[object] = []
+def test_on_a_cpu_checkpoints_are_written_without_a_thread(lab, monkeypatch):
+    calls = []
 
     class Writer(CheckpointWriter):
-        def __init__(self, folder: Path, background: bool) -> None:
+        def __init__(self, folder, background):
             calls.append(background)
             super().__init__(folder, background)
 
-        def close(self) -> None:
+        def close(self):
             calls.append("close")
             super().close()
 
@@ -326,16 +303,16 @@ def test_on_a_cpu_checkpoints_are_written_without_a_thread(
     assert calls == [False, "close"]
 
 
-def test_the_last_iteration_is_always_logged(lab: Lab) -> None:
+def test_the_last_iteration_is_always_logged(lab):
     lab.train(NoDensifier(), iterations=7, log_every=3)
     assert lab.steps(METRICS) == [3, 6, 7]
 
 
-def test_a_model_without_gaussians_or_with_invalid_values_is_an_error(lab: Lab) -> None:
+def test_a_model_without_gaussians_or_with_invalid_values_is_an_error(lab):
     class Emptying(NoDensifier):
         left = 0
 
-        def rules(self, refinement: object) -> list:
+        def rules(self, refinement):
             return [
                 lambda refinement: self.remove(
                     refinement, torch.arange(len(lab.truth)) >= self.left
@@ -344,7 +321,7 @@ def test_a_model_without_gaussians_or_with_invalid_values_is_an_error(lab: Lab) 
 
     last = Emptying()
     last.left = 1
-    assert lab.new(last).iterate(lab.folder).after == 1  # type: ignore[union-attr]
+    assert lab.new(last).iterate(lab.folder).after == 1
     with pytest.raises(TrainingError, match="no Gaussian was left after iteration 1"):
         lab.new(Emptying()).iterate(lab.folder)
     broken = lab.new(NoDensifier())
@@ -355,7 +332,7 @@ def test_a_model_without_gaussians_or_with_invalid_values_is_an_error(lab: Lab) 
         broken.iterate(lab.folder)
 
 
-def test_every_random_stream_has_a_seed_from_numpys_seed_sequence() -> None:
+def test_every_random_stream_has_a_seed_from_numpys_seed_sequence():
     for stream, name in enumerate(STREAMS):
         seed = int(np.random.SeedSequence([3, stream]).generate_state(1, np.uint64)[0]) // 2
         assert generators(3)[name].initial_seed() == seed

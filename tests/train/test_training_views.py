@@ -1,23 +1,18 @@
 """Densifiers get the training views as the training renders and measures them."""
 
-from __future__ import annotations
-
 import torch
+from torch.testing import assert_close
 
 from gsbench.densify import NoDensifier
 from gsbench.densify.scores import blended_sums
 from gsbench.eval.ssim import ssim_map
-from gsbench.gaussians.model import Gaussians
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.scene.types import Scene
 from gsbench.train.loss import photometric_loss
 from gsbench.train.trainer import Trainer
 from tests.train.lab import cloud, options
 
 
-def test_views_are_rendered_and_measured_as_in_training(
-    tiny_scene: Scene, truth: Gaussians
-) -> None:
+def test_views_are_rendered_and_measured_as_in_training(tiny_scene, truth):
     settings = options(background=[0.2, 0.4, 0.6])
     trainer = Trainer(tiny_scene, cloud(truth), NoDensifier(), ReferenceRasterizer(), settings, 0)
     views, gaussians = trainer.context.training_views, trainer.gaussians.values
@@ -36,21 +31,17 @@ def test_views_are_rendered_and_measured_as_in_training(
         assert not views.loss(index, own).requires_grad
         photograph = torch.from_numpy(view.image) / 255
         dissimilar = views.dissimilarity(index, own.detach())
-        torch.testing.assert_close(
-            dissimilar, (1 - ssim_map(own.detach(), photograph).mean(0)).clamp_min(0)
-        )
+        assert_close(dissimilar, (1 - ssim_map(own.detach(), photograph).mean(0)).clamp_min(0))
         assert dissimilar.shape == view.image.shape[:2]
         assert float(views.dissimilarity(index, photograph).abs().max()) < 1e-6
 
 
-def test_rendering_a_view_for_scores_leaves_no_gradient(
-    tiny_scene: Scene, truth: Gaussians
-) -> None:
+def test_rendering_a_view_for_scores_leaves_no_gradient(tiny_scene, truth):
     trainer = Trainer(tiny_scene, cloud(truth), NoDensifier(), ReferenceRasterizer(), options(), 0)
     views, gaussians = trainer.context.training_views, trainer.gaussians.values
     with torch.no_grad():
         sums, render = blended_sums(views, 0, gaussians, 100, torch.ones(*views.image(0).shape))
     assert torch.equal(sums[:, 0], sums[:, 2])
     # the sum of all blending weights
-    torch.testing.assert_close(sums[:, 0].sum(), render.alpha.sum())
+    assert_close(sums[:, 0].sum(), render.alpha.sum())
     assert all(tensor.grad is None for tensor in gaussians.tensors().values())

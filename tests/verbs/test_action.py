@@ -1,12 +1,8 @@
 """The GitHub action of the gate: its script, run with a stand-in for gsbench."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -16,13 +12,13 @@ from tests.conftest import ROOT
 pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 
 
-def steps() -> list[dict[str, Any]]:
+def steps():
     action = yaml.safe_load((ROOT / "action.yml").read_text(encoding="utf-8"))
-    found: list[dict[str, Any]] = action["runs"]["steps"]
+    found = action["runs"]["steps"]
     return found
 
 
-def ended(tmp_path: Path, code: int, **inputs: str) -> tuple[int, list[str]]:
+def ended(tmp_path, code, **inputs):
     """Run the script with a gsbench that ends with the exit code ``code``.
 
     Returns the script's exit code, and the words that gsbench was given.
@@ -55,7 +51,7 @@ def ended(tmp_path: Path, code: int, **inputs: str) -> tuple[int, list[str]]:
 ENDS = [(0, "fail", 0), (1, "pass", 1), (2, "pass", 2), (3, "fail", 3), (3, "pass", 0)]
 
 
-@pytest.mark.parametrize(("code", "undecided", "expected"), ENDS)
+@pytest.mark.parametrize("code, undecided, expected", ENDS)
 def test_the_step_has_the_exit_code_of_the_gate(tmp_path, code, undecided, expected):
     found, words = ended(tmp_path, code, UNDECIDED=undecided)
     assert found == expected

@@ -1,14 +1,9 @@
 """``gsbench plan`` and ``ablate``, with made-up results."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 
-from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.verbs import claims
 from gsbench.verbs.claims import plan
@@ -17,7 +12,7 @@ from tests.finished import write_results
 
 
 @pytest.fixture
-def pilots(tmp_path) -> Path:
+def pilots(tmp_path):
     """The runs folder of three experiments: on three scenes, on one, and with a single arm."""
     write_runs(tmp_path, Plan(scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2))
     write_runs(tmp_path, Plan(experiment="one", scenes=("a",), trial_noise=0.3))
@@ -51,7 +46,7 @@ def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, ca
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["exp", "--metric", "psn"], "unknown metric"),
         (["exp", "--metric", "gaussians"], "not counts"),
@@ -75,11 +70,11 @@ SWITCH = ["+densify.switches.size.off.split_size=0.5", "--switches", "size"]
 
 
 @pytest.fixture
-def trained(runs, monkeypatch) -> list[Trial]:
+def trained(runs, monkeypatch):
     """The trials that ``ablate`` would train; their results are made up."""
-    trained: list[Trial] = []
+    trained = []
 
-    def run_trials(trials: Sequence[Trial]) -> int:
+    def run_trials(trials):
         for trial in trials:
             trained.append(trial)
             off = trial.values["densify"]["split_size"] == 0.5
@@ -119,11 +114,8 @@ def test_failed_trials_of_ablate_are_not_judged(runs, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (["densify=adc", "densify=taming/mine"], "ablate_taming_mine"),
-        (["seed=1"], "ablate"),
-    ],
+    "words, name",
+    [(["densify=adc", "densify=taming/mine"], "ablate_taming_mine"), (["seed=1"], "ablate")],
 )
 def test_the_experiment_is_named_after_the_chosen_densifier(words, name):
     assert claims._default_name(words) == name

@@ -8,7 +8,6 @@ import torch
 from gsbench import cli
 from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs import exchange
@@ -19,7 +18,7 @@ from tests.gaussians.helpers import random_gaussians
 pytestmark = pytest.mark.usefixtures("runs")
 
 
-def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
+def finished_trial(runs, gaussians):
     """Write a complete trial with a model and an initial cloud in the store; returns its folder."""
     values = compose_one(["name=x", "densify=adc"]).values
     folder = TrialFolder.of(values).path
@@ -32,19 +31,17 @@ def finished_trial(runs: Path, gaussians: Gaussians) -> Path:
 
 
 @pytest.fixture
-def gaussians() -> Gaussians:
+def gaussians():
     return random_gaussians(60, seed=3, dtype=torch.float32)
 
 
-def test_results_of_an_experiment_without_trials_are_not_exported(runs: Path) -> None:
+def test_results_of_an_experiment_without_trials_are_not_exported(runs):
     (runs / "empty").mkdir(parents=True)
     with pytest.raises(InputError, match="'empty' has no complete trial among 0 folders"):
         exchange.export_results("empty", runs, None)
 
 
-def test_export_of_the_model_and_the_initial_cloud(
-    runs: Path, gaussians: Gaussians, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_of_the_model_and_the_initial_cloud(runs, gaussians, tmp_path, capsys):
     folder = finished_trial(runs, gaussians)
     assert cli.run(["export", "x:courtyard:adc:0", "--out", "new/model.ply"]) == 0
     assert (tmp_path / "new" / "model.ply").read_bytes() == (
@@ -69,7 +66,7 @@ def test_the_archive_of_results_gets_the_name_of_the_experiment_or_of_out(runs, 
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--results", "exp", "a:b:c"], "takes an experiment, --out and --pictures alone"),
         (["--results", "a/b"], "'a/b' is not the name of an experiment"),
@@ -85,7 +82,7 @@ def test_words_that_do_not_go_together_are_refused(refused, words, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "good"),
+    "name, good",
     [("m.ply", True), ("M.PLY", True), ("m.compressed.ply", False), ("m.splat", False)],
 )
 def test_only_the_3dgs_form_is_written(name, good):
@@ -103,7 +100,7 @@ def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, ref
 
 
 @pytest.mark.parametrize(
-    ("words", "file"),
+    "words, file",
     [
         (["export", "--results", "exp"], "exp.zip"),
         (["export", "--results", "exp", "--out", "."], "exp.zip"),

@@ -1,13 +1,9 @@
 """``gsbench ledger`` with made-up trainings: results by idea, seed and scene."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +11,6 @@ import pytest
 from gsbench.analysis.results import read_experiment
 from gsbench.claims.archive import _shared_ledger, without_private_words
 from gsbench.cli import run
-from gsbench.config.compose import Trial
 from gsbench.runs import ledger as records
 from gsbench.runs.layout import LEDGER
 from gsbench.runs.ledger import Ended, Started, read_ledger
@@ -32,14 +27,14 @@ SPLIT = "densify.split_size"  # its value chooses a made-up effect
 class Trainings:
     """Writes the results of trials in place of training them."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.effects = {0.01: 0.0, 0.02: 3.0, 0.03: 6.0, 0.04: -3.0, 0.05: 0.1, 0.06: 0.0}  # dB
         self.noise = 0.2
-        self.fails: set[float] = set()
-        self.trained: list[Path] = []
+        self.fails = set()
+        self.trained = []
         self.data = ""
 
-    def __call__(self, trials: Sequence[Trial]) -> int:
+    def __call__(self, trials):
         code = 0
         for trial in trials:
             size, seed = trial.values["densify"]["split_size"], trial.values["seed"]
@@ -60,7 +55,7 @@ class Trainings:
 
 
 @pytest.fixture
-def trainings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trainings:
+def trainings(monkeypatch, tmp_path):
     made = Trainings()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
@@ -70,28 +65,26 @@ def trainings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Trainings:
     return made
 
 
-def _finished(home: Path, trials: Sequence[Trial]) -> list[Any]:
+def _finished(home, trials):
     folders = {trial.folder for trial in trials}
     return [one for one in read_experiment(home).trials if one.path in folders]
 
 
 @pytest.fixture
-def home(trainings: Trainings, tmp_path: Path) -> Path:
+def home(trainings, tmp_path):
     assert run(["ledger", *NEW]) == 0
     return tmp_path / "runs" / "night"
 
 
-def attempt(*words: str) -> int:
+def attempt(*words):
     return run(["ledger", "try", "night", *words])
 
 
-def entries(home: Path, kind: type) -> list[Any]:
+def entries(home, kind):
     return [one for one in read_ledger(home).entries if isinstance(one, kind)]
 
 
-def test_a_good_idea_is_kept_and_a_bad_one_is_dropped(
-    home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_good_idea_is_kept_and_a_bad_one_is_dropped(home, capsys):
     assert attempt(f"{SPLIT}=0.02") == 0
     assert "adc: kept: better; psnr +3" in capsys.readouterr().out
     assert attempt(f"{SPLIT}=0.04") == 1
@@ -104,21 +97,19 @@ def test_a_good_idea_is_kept_and_a_bad_one_is_dropped(
     assert good.gaussians == pytest.approx(1.02 / 1.01, abs=1e-3)
 
 
-def test_an_idea_stops_at_the_first_look_that_decides(home: Path, trainings: Trainings) -> None:
+def test_an_idea_stops_at_the_first_look_that_decides(home, trainings):
     attempt(f"{SPLIT}=0.04")
     assert len(trainings.trained) == 2 * 2  # two seeds of both
 
 
-def test_an_equal_idea_is_neither_trained_nor_entered_twice(
-    home: Path, trainings: Trainings
-) -> None:
+def test_an_equal_idea_is_neither_trained_nor_entered_twice(home, trainings):
     attempt(f"{SPLIT}=0.02")
     before = len(trainings.trained), (home / LEDGER).read_bytes()
     assert attempt(f"{SPLIT}=0.02", "densify.name=another") == 0
     assert (len(trainings.trained), (home / LEDGER).read_bytes()) == before
 
 
-def test_a_kept_idea_may_be_the_next_baseline(home: Path) -> None:
+def test_a_kept_idea_may_be_the_next_baseline(home):
     attempt(f"{SPLIT}=0.02", "--as", "one")
     assert attempt(f"{SPLIT}=0.03", "--as", "two", "--against", "one") == 0
     assert entries(home, Ended)[1].difference.mean == pytest.approx(3, abs=0.5)
@@ -127,9 +118,7 @@ def test_a_kept_idea_may_be_the_next_baseline(home: Path) -> None:
     assert entries(home, Ended)[2].difference.mean == pytest.approx(6, abs=0.5)
 
 
-def test_an_idea_whose_trials_fail_does_not_count_as_tried(
-    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_idea_whose_trials_fail_does_not_count_as_tried(home, trainings, capsys):
     trainings.fails = {0.02}
     assert attempt(f"{SPLIT}=0.02", "--json") == 1
     shown = json.loads(capsys.readouterr().out)
@@ -140,13 +129,11 @@ def test_an_idea_whose_trials_fail_does_not_count_as_tried(
     assert len(entries(home, Started)) == 1
 
 
-def test_an_idea_that_fails_after_a_result_counts_as_tried(
-    home: Path, trainings: Trainings, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_an_idea_that_fails_after_a_result_counts_as_tried(home, trainings, monkeypatch, capsys):
     trainings.noise = 30.0  # undecided at the first look
     whole, calls = trainings.__call__, []
 
-    def second_look_fails(trials: Sequence[Trial]) -> int:
+    def second_look_fails(trials):
         calls.append(len(trials))
         return whole(trials) if len(calls) == 1 else 1
 
@@ -157,16 +144,14 @@ def test_an_idea_that_fails_after_a_result_counts_as_tried(
     assert read_ledger(home).tried == 1
 
 
-def test_an_idea_may_be_tried_again_if_its_baseline_fails(home: Path, trainings: Trainings) -> None:
+def test_an_idea_may_be_tried_again_if_its_baseline_fails(home, trainings):
     trainings.fails = {0.01, 0.02}
     assert attempt(f"{SPLIT}=0.02") == 1
     # nothing was measured, so it may be tried again
     assert entries(home, Ended)[0].result == "failed"
 
 
-def test_after_all_planned_ideas_no_further_idea_is_tried(
-    trainings: Trainings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, capsys):
     run(["ledger", *NEW, "--ideas", "1"])
     assert attempt(f"{SPLIT}=0.04") == 1
     assert attempt(f"{SPLIT}=0.02") == 2
@@ -175,7 +160,7 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    "words, reason",
     [
         (["scene.views=12"], "scene.views: an idea may change densify, init, train and raster"),
         (["seed=7"], "seed: an idea may change"),
@@ -190,9 +175,7 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(
         (["densify=nothing_like_it"], "nothing_like_it"),
     ],
 )
-def test_settings_that_are_no_idea_are_refused_and_leave_no_line(
-    home: Path, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, reason, capsys):
     before = (home / LEDGER).read_bytes()
     assert attempt(*words) == 2
     assert reason in capsys.readouterr().err
@@ -200,7 +183,7 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    "words, reason",
     [
         (["seed=0"], "needs at least 2 seeds"),
         (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
@@ -213,17 +196,13 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(
         (["seed=0,1", "launch.wait=false"], "launch.wait=false"),
     ],
 )
-def test_a_ledger_that_could_not_decide_is_refused(
-    trainings: Trainings, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ledger_that_could_not_decide_is_refused(trainings, words, reason, capsys):
     assert run(["ledger", "new", "night", *SETTINGS, *words]) == 2
     assert reason in capsys.readouterr().err
     assert not Path("runs/night").exists()
 
 
-def test_a_ledger_is_declared_once(
-    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ledger_is_declared_once(home, trainings, capsys):
     assert run(["ledger", *NEW]) == 0
     assert run(["ledger", *NEW, "--fdr", "0.2"]) == 2
     assert "is another ledger already" in capsys.readouterr().err
@@ -231,9 +210,7 @@ def test_a_ledger_is_declared_once(
     assert "has no ledger" in capsys.readouterr().err
 
 
-def test_trials_that_the_ledger_does_not_know_are_refused(
-    home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trials_that_the_ledger_does_not_know_are_refused(home, capsys):
     attempt(f"{SPLIT}=0.02")
     whole = (home / LEDGER).read_text().splitlines(keepends=True)
     (home / LEDGER).write_text(whole[0])  # the end is cut off
@@ -241,17 +218,13 @@ def test_trials_that_the_ledger_does_not_know_are_refused(
     assert "the ledger does not know 1 configuration with trials" in capsys.readouterr().err
 
 
-def test_edited_code_of_the_baseline_is_noticed(
-    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_edited_code_of_the_baseline_is_noticed(home, monkeypatch, capsys):
     monkeypatch.setattr("gsbench.runs.trial_folder.config_hash", lambda values: "f" * 64)
     assert attempt(f"{SPLIT}=0.02") == 2
     assert "the code of baseline have changed" in capsys.readouterr().err
 
 
-def test_a_ledger_cannot_allow_code_to_run(
-    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ledger_cannot_allow_code_to_run(home, tmp_path, capsys):
     (tmp_path / "mine.py").write_text("from gsbench.densify import ADC\nclass Mine(ADC): pass\n")
     own = ["densify._target_=mine.Mine", "densify.name=mine", "allow_targets=[mine]"]
     assert attempt(*own, f"{SPLIT}=0.02") == 0
@@ -260,13 +233,11 @@ def test_a_ledger_cannot_allow_code_to_run(
     assert attempt(f"{SPLIT}=0.03", "--against", "mine", "allow_targets=[mine]") == 0
 
 
-def test_a_kill_between_any_two_lines_changes_nothing(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_between_any_two_lines_changes_nothing(home, monkeypatch):
     """The same command continues; the ledger is that of a night without kills."""
     write = records._write
 
-    def commands() -> None:
+    def commands():
         for size in (0.02, 0.04, 0.05):
             attempt(f"{SPLIT}={size}")
         run(["ledger", "confirm", "night", "scene=photos", "scene.path=/park", "seed=0,1,2"])
@@ -275,7 +246,7 @@ def test_a_kill_between_any_two_lines_changes_nothing(
     for allowed in range(9):
         left = [allowed]
 
-        def killed(*arguments: Any, left: list[int] = left) -> None:
+        def killed(*arguments, left=left):
             if not left[0]:
                 raise KeyboardInterrupt
             left[0] -= 1
@@ -299,16 +270,14 @@ def test_a_kill_between_any_two_lines_changes_nothing(
 # ---- confirmation
 
 
-def confirm(*words: str) -> int:
+def confirm(*words):
     return run(["ledger", "confirm", "night", *words])
 
 
 PARK = ["scene=photos", "scene.path=/captures/park", "seed=5,6,7"]
 
 
-def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(
-    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, trainings, capsys):
     for size in (0.02, 0.04, 0.03):
         attempt(f"{SPLIT}={size}")
     trainings.effects[0.03] = 0.0  # its gain was luck
@@ -330,25 +299,21 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    "words, reason",
     [
         (["seed=5,6"], "needs captures that no idea has seen"),
         (["scene=courtyard", "seed=5,6"], "courtyard was seen by the ideas"),
         ([*PARK, "--only", "adc-2"], "kept were adc"),
     ],
 )
-def test_a_confirmation_that_confirms_nothing_is_refused(
-    home: Path, words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_confirmation_that_confirms_nothing_is_refused(home, words, reason, capsys):
     attempt(f"{SPLIT}=0.02")
     attempt(f"{SPLIT}=0.04")
     assert confirm(*words) == 2
     assert reason in capsys.readouterr().err
 
 
-def test_a_copy_of_a_capture_under_another_name_is_not_fresh(
-    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_copy_of_a_capture_under_another_name_is_not_fresh(home, trainings, capsys):
     attempt(f"{SPLIT}=0.02")
     trainings.data = "courtyard"  # the same photographs
     before = len(trainings.trained)
@@ -357,7 +322,7 @@ def test_a_copy_of_a_capture_under_another_name_is_not_fresh(
     assert len(trainings.trained) == before + 1  # one training showed it
 
 
-def test_a_second_confirmation_needs_other_captures(home: Path, capsys: Any) -> None:
+def test_a_second_confirmation_needs_other_captures(home, capsys):
     attempt(f"{SPLIT}=0.02")
     assert confirm(*PARK) == 0
     assert confirm(*PARK[:2], "seed=8,9") == 2
@@ -367,7 +332,7 @@ def test_a_second_confirmation_needs_other_captures(home: Path, capsys: Any) -> 
 # ---- the report, the archive, and the simulated rule
 
 
-def test_report_and_archive_have_the_ledger(home: Path, trainings: Trainings) -> None:
+def test_report_and_archive_have_the_ledger(home, trainings):
     attempt(f"{SPLIT}=0.02", "--as", "larger splits")
     assert run(["report", "night"]) == 0
     page = (home / "report.html").read_text()
@@ -379,9 +344,7 @@ def test_report_and_archive_have_the_ledger(home: Path, trainings: Trainings) ->
     assert "the ledger&#39;s tests decide (gsbench ledger show night)" in page
 
 
-def test_a_kept_idea_with_more_gaussians_says_so(
-    home: Path, trainings: Trainings, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_kept_idea_with_more_gaussians_says_so(home, trainings, capsys):
     trainings.effects[0.8] = 3.0  # of 1,800 Gaussians
     assert attempt(f"{SPLIT}=0.8") == 0
     words = "better; with 1.78 times the Gaussians, so not at equal counts"
@@ -390,9 +353,7 @@ def test_a_kept_idea_with_more_gaussians_says_so(
     assert words in capsys.readouterr().out
 
 
-def test_an_archived_ledger_names_no_folder_and_no_server(
-    home: Path, trainings: Trainings, tmp_path: Path
-) -> None:
+def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_path):
     words = ["scene.path='/home/me/a b',/home/me/c", "+x.y=[/home/me/d]", "tracking.uri=http://u@h"]
     assert without_private_words(words) == ["scene.path='a b',c", "+x.y=[d]"]
     attempt(f"{SPLIT}=0.02")
@@ -404,7 +365,7 @@ def test_an_archived_ledger_names_no_folder_and_no_server(
     assert "tracking=none" not in shared.opened.words
 
 
-def test_show_prints_all_for_programs(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_show_prints_all_for_programs(home, capsys):
     attempt(f"{SPLIT}=0.02")
     capsys.readouterr()
     assert run(["ledger", "show", "night", "--json"]) == 0
@@ -413,7 +374,7 @@ def test_show_prints_all_for_programs(home: Path, capsys: pytest.CaptureFixture[
     assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
 
 
-def test_show_prints_the_rule_and_a_row_for_each_idea(home: Path, said: Any) -> None:
+def test_show_prints_the_rule_and_a_row_for_each_idea(home, said):
     attempt(f"{SPLIT}=0.02", "--as", "good")
     attempt(f"{SPLIT}=0.04", "--as", "bad")
     lines = said("ledger", "show", "night").splitlines()
@@ -427,9 +388,7 @@ def test_show_prints_the_rule_and_a_row_for_each_idea(home: Path, said: Any) -> 
     assert "2 of 40 planned ideas were tried, and 1 kept" in " ".join(lines)
 
 
-def test_names_of_ledgers_and_ideas_are_not_given_twice(
-    home: Path, trainings: Trainings, refused: Any
-) -> None:
+def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused):
     attempt(f"{SPLIT}=0.02", "--as", "mine")
     for name in ("mine", "baseline"):
         line = refused("ledger", "try", "night", f"{SPLIT}=0.04", "--as", name)
@@ -440,19 +399,15 @@ def test_names_of_ledgers_and_ideas_are_not_given_twice(
     assert "used has trials already" in refused("ledger", "new", "used", *NEW[2:])
 
 
-@pytest.mark.parametrize(("code", "kind"), [(1, 1), (2, 2)])
-def test_nothing_is_confirmed_if_trials_fail(
-    home: Path, monkeypatch: pytest.MonkeyPatch, code: int, kind: int, capsys: Any
-) -> None:
+@pytest.mark.parametrize("code, kind", [(1, 1), (2, 2)])
+def test_nothing_is_confirmed_if_trials_fail(home, monkeypatch, code, kind, capsys):
     attempt(f"{SPLIT}=0.02")
     monkeypatch.setattr(verb, "run_trials", lambda trials: code)
     assert run(["ledger", "confirm", "night", "scene=photos", "scene.path=x"]) == kind
     assert "trials fail: nothing is confirmed" in capsys.readouterr().err
 
 
-def test_the_simulated_rule_decides_as_the_ledger_does(
-    trainings: Trainings, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, tmp_path):
     """The rates in docs/night.md hold for the program: equal draws give equal decisions."""
     monkeypatch.setattr(ledger_rates, "SCENES", 1)
     run(["ledger", *NEW[:-1], "seed=0,1,2,3,4,5"])
@@ -461,7 +416,7 @@ def test_the_simulated_rule_decides_as_the_ledger_does(
         size = 0.1 + 0.01 * number
         values = dict(enumerate(20 + row))
 
-        def training(trials: Sequence[Trial], size: float = size, values: Any = values) -> int:
+        def training(trials, size=size, values=values):
             for trial in trials:
                 own = trial.values["densify"]["split_size"] == pytest.approx(size)
                 psnr = values[trial.values["seed"]] if own else 20.0
@@ -483,9 +438,7 @@ def test_the_simulated_rule_decides_as_the_ledger_does(
 HOME_OF_ANOTHER = "http://203.0.113.5:5000"
 
 
-def test_an_address_that_only_the_ledger_names_gets_no_results(
-    trainings: Trainings, refused: Any, tmp_path: Path
-) -> None:
+def test_an_address_that_only_the_ledger_names_gets_no_results(trainings, refused, tmp_path):
     settings = [word for word in NEW if word != "tracking=none"]
     assert run(["ledger", *settings, f"tracking.uri={HOME_OF_ANOTHER}"]) == 0
     for words in (
@@ -503,7 +456,7 @@ def test_an_address_that_only_the_ledger_names_gets_no_results(
     assert attempt(f"{SPLIT}=0.03", "tracking=none") == 0
 
 
-def test_a_result_that_its_trials_deny_is_shown(home: Path, caplog: Any) -> None:
+def test_a_result_that_its_trials_deny_is_shown(home, caplog):
     attempt(f"{SPLIT}=0.04", "--as", "worse")
     attempt(f"{SPLIT}=0.02", "--as", "good")
     run(["ledger", "show", "night"])

@@ -1,44 +1,39 @@
 """``gsbench doctor`` on made-up machines: with GPUs, without GPUs, and as this one is."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 
 from gsbench.errors import InputError
 from gsbench.verbs import machine
-from gsbench.verbs.machine import Finding
 from tests.conftest import ROOT
 
 GB = 10**9
 
 
-def said(findings: Iterable[Finding]) -> list[tuple[str, str]]:
+def said(findings):
     return [(finding.verdict, finding.text) for finding in findings]
 
 
-def of_devices(topic: str) -> list[Finding]:
+def of_devices(topic):
     return [finding for finding in machine.check_devices() if finding.topic == topic]
 
 
 @pytest.fixture
-def no_gpu(monkeypatch) -> None:
+def no_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setattr(machine, "installed_gpus", list)
 
 
 @pytest.fixture
-def gpus(monkeypatch) -> None:
+def gpus(monkeypatch):
     """Two GPUs, as torch reports them."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
@@ -105,9 +100,7 @@ def test_doctor_on_this_machine_covers_all_topics(tmp_path, capsys):
         assert ("not installed" in line) == (importlib.util.find_spec(module) is None)
 
 
-def test_doctor_names_the_packages_that_triton_compiles_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_doctor_names_the_packages_that_triton_compiles_with(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "version_of", lambda package: "3.7.1")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
@@ -127,7 +120,7 @@ def test_doctor_names_the_packages_that_triton_compiles_with(
     assert "CC is nosuchcc -O2, which is not there" in finding.text
 
 
-def test_doctor_on_a_runs_folder(runs: Path) -> None:
+def test_doctor_on_a_runs_folder(runs):
     assert next(machine.check_runs(runs)).verdict in ("ok", "note")
     assert next(machine.check_runs(Path("/proc/nowhere"))).verdict == "bad"
 
@@ -154,7 +147,7 @@ def test_a_full_disk_is_noted(tmp_path, monkeypatch):
 
 
 def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monkeypatch):
-    def known(name: str, device: torch.device) -> Any:
+    def known(name, device):
         if name == "triton" and device.index == 0:
             errors = {"image": 1e-6}
             return SimpleNamespace(
@@ -180,7 +173,7 @@ def test_proofs_are_listed_and_rasterizers_of_a_gpu_without_one_noted(gpus, monk
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--json"], "belong to --prove"),
         (["--raster", "cpu"], "belong to --prove"),
@@ -193,7 +186,7 @@ def test_options_of_a_proof_need_prove(tmp_path, words, message):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--size", "15x20"], "a size is WIDTHxHEIGHT"),
         (["--size", "500"], "a size is WIDTHxHEIGHT"),
@@ -210,11 +203,11 @@ def test_bad_words_of_bench_are_refused(words, message):
 
 
 def test_bench_times_what_the_words_name(monkeypatch, capsys):
-    asked: list[Any] = []
+    asked = []
     row = {"raster": "cpu", "size": "16x32", "count": 7, "step_ms": 1.234, "step_ratio": 0.5}
     row |= {"peak_mb": None} | dict.fromkeys(machine.NOT_SHOWN, 0)
 
-    def run_bench(*given: Any, **named: Any) -> list[dict[str, Any]]:
+    def run_bench(*given, **named):
         asked.append((*given, named))
         return [row]
 

@@ -1,16 +1,14 @@
 """``gsbench tables``, ``report`` and ``explain`` with made-up results."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.runs.keys import AS_RELEASED
+from gsbench.runs.freshness import Change
+from gsbench.runs.package_code import AS_RELEASED
 from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
 from tests.analysis.synthetic import Plan, write_runs
 
@@ -47,7 +45,7 @@ def test_missing_trials_and_metrics_are_reported(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("address", "words"),
+    "address, words",
     [
         ("exp:garden:psnr", "is not EXPERIMENT:SCENE:METRIC:ARM"),
         ("nope:garden:psnr:adc", "no experiment 'nope'"),
@@ -70,7 +68,7 @@ def test_bad_addresses_are_explained(tmp_path, address, words):
 
 
 @pytest.fixture
-def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def made(tmp_path, monkeypatch):
     """The runs folder of an experiment with two arms on one scene, and of one with a single arm."""
     write_runs(tmp_path / "runs", Plan(scenes=("garden",)))
     write_runs(tmp_path / "runs", Plan(experiment="alone", densifiers=("adc",)))
@@ -85,7 +83,7 @@ def test_tables_alone_lists_the_experiments(made, capsys):
     assert "no experiment in" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("values", "seeds"), [("0,2", 2), ("1", 1), ("2,7", 1), ("0,1,2", 3)])
+@pytest.mark.parametrize("values, seeds", [("0,2", 2), ("1", 1), ("2,7", 1), ("0,1,2", 3)])
 def test_where_takes_several_values(made, capsys, values, seeds):
     assert tables(["exp", "--where", f"seed={values}", "--format", "trials"], made) == 0
     assert len(capsys.readouterr().out.splitlines()) == 1 + 2 * seeds
@@ -97,7 +95,7 @@ FAIR = ["--layout", "fairness"]
 
 
 @pytest.mark.parametrize(
-    ("words", "files", "begins"),
+    "words, files, begins",
     [
         (["--out", "new/t.csv"], ["new/t.csv"], "scene,"),
         (["--out", "T.TeX"], ["T.TeX"], "% "),
@@ -159,7 +157,7 @@ def test_trials_that_are_left_out_are_named_on_the_error_stream(made, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "file"),
+    "words, file",
     [
         ([], "{runs}/exp/report.html"),
         (["--out", "r.HTML"], "r.HTML"),
@@ -195,14 +193,15 @@ def test_an_origin_names_program_machine_and_code():
         code=SimpleNamespace(commit="", edited=False, rooms={"init": AS_RELEASED}),
         versions={"torch": "2.13.0"},
     )
-    trial: Any = SimpleNamespace(
+    trial = SimpleNamespace(
         record=record,
         path=Path("runs/x"),
         from_renders=False,
         program=None,
         conditions={"data": 1},
         machine="",
-        code={},
+        code_texts=[],
+        edits=[],
     )
     own = {"folder": "runs/x", "Gaussians": "12,345 from 0 points", "views": "7 for testing"}
     assert _origin(trial) == own | {"train": "t", "versions": "torch 2.13.0"}
@@ -212,17 +211,19 @@ def test_an_origin_names_program_machine_and_code():
     trial.program = "nerfstudio"
     assert _origin(trial)["Gaussians"] == "its own renders"
     record.trained_by = SimpleNamespace(version="brush 1", command=["brush", "a"])
-    trial.machine, trial.code = "a CPU", {"code:mine": "f" * 64}
+    trial.machine, trial.code_texts = "a CPU", ["code of mine ffff", "stage train 2"]
+    trial.edits = [Change("code", "mine", "f" * 64, "e" * 64)]
     record.code.commit, record.code.edited = "abc", True
     found = _origin(trial)
     assert found["program"] == "brush 1: brush a"
     assert found["machine"] == "a CPU"
-    assert found["code"].startswith("code:mine ffff")
+    assert found["code"] == "code of mine ffff, stage train 2"
+    assert found["since"] == "mine was ffffffff, it is now eeeeeeee"
     assert found["commit"] == "abc, edited"
     assert "edited" not in found
     record.code.rooms["eval"] = "1" * 64
     assert _origin(trial)["edited"] == "since the last release: eval"
-    del record.code.rooms["init"]  # all rooms count as edited before the first release
+    del record.code.rooms["init"]  # all packages count as edited before the first release
     assert "edited" not in _origin(trial)
 
 

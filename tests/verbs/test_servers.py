@@ -1,7 +1,5 @@
 """Verbs that serve pages end all their processes and import no module of the current folder."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -12,7 +10,6 @@ import urllib.request
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import psutil
 import pytest
@@ -67,16 +64,16 @@ def test_ui_needs_a_database(runs, refused):
     assert "no MLflow database" in refused("ui")
 
 
-def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    commands: list[list[str]] = []
+def test_ui_serves_on_this_machine_only(monkeypatch):
+    commands = []
 
     class Server:
-        def __init__(self, command: list[str], cwd: Any, env: dict[str, str]) -> None:
+        def __init__(self, command, cwd, env):
             commands.append(command)
             assert env["MLFLOW_SERVER_ENABLE_JOB_EXECUTION"] == "false"
             assert not list(Path(cwd).iterdir())
 
-        def wait(self) -> int:
+        def wait(self):
             return 0
 
     monkeypatch.setattr(subprocess, "Popen", Server)
@@ -86,15 +83,15 @@ def test_ui_serves_on_this_machine_only(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.fixture
-def served(runs, monkeypatch) -> list[Any]:
+def served(runs, monkeypatch):
     """The servers that ``ui`` would start, and the pages that it would open."""
-    served: list[Any] = []
+    served = []
 
     class Thread:
-        def __init__(self, target: Any, args: Any, daemon: bool) -> None:
+        def __init__(self, target, args, daemon):
             self.args, self.daemon = args, daemon
 
-        def start(self) -> None:  # the server answers at once
+        def start(self):  # the server answers at once
             server, lines, page = self.args
             print(lines)
             served.extend([(server, page, self.daemon)] * bool(page))
@@ -144,7 +141,7 @@ def test_no_second_server_is_started(runs, served, said, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "words, message",
     [
         (["--uri", "file"], "--uri file is not an address"),
         (["none"], "no experiment 'none'"),
@@ -154,7 +151,7 @@ def test_no_second_server_is_started(runs, served, said, monkeypatch):
 def test_what_the_dashboard_cannot_show_is_refused(
     runs, served, refused, monkeypatch, words, message
 ):
-    def full(*_: Any) -> str:
+    def full(*_):
         raise OSError("full")
 
     make_home(runs / "ab")
@@ -165,10 +162,10 @@ def test_what_the_dashboard_cannot_show_is_refused(
 
 def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
     page = f"{LOCAL}/#/experiments/12/runs"
-    answers: list[Any] = [{"experiment": {"experiment_id": "12"}}, {"experiment": {}}, [], None]
+    answers = [{"experiment": {"experiment_id": "12"}}, {"experiment": {}}, [], None]
     answers += [{"experiment": {"experiment_id": "1"}}]
 
-    def get(place: str, params: dict[str, str], timeout: float) -> Any:
+    def get(place, params, timeout):
         assert place == f"{LOCAL}/api/2.0/mlflow/experiments/get-by-name"
         assert params == {"experiment_name": "x"}
         assert timeout == servers.SECONDS_TO_ANSWER
@@ -180,11 +177,11 @@ def test_a_server_is_asked_whether_it_has_the_experiment(monkeypatch):
 
 
 def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, capsys):
-    waits: list[str] = []
-    opened: list[str] = []
+    waits = []
+    opened = []
     failures = [True, True, False, False]
 
-    def get(server: str, timeout: float) -> None:
+    def get(server, timeout):
         assert server == LOCAL
         if failures.pop(0):
             raise servers.requests.ConnectionError
@@ -202,7 +199,7 @@ def test_addresses_are_printed_and_opened_once_the_server_answers(monkeypatch, c
 
 
 @pytest.mark.parametrize(
-    ("platform", "variables", "found"),
+    "platform, variables, found",
     [
         ("linux", {}, False),
         ("linux", {"DISPLAY": ":0"}, True),
@@ -223,22 +220,22 @@ def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch, platform,
 
 
 def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, capsys, refused):
-    made: list[Any] = []
+    made = []
 
     class Viewer:
         url = "http://127.0.0.1:8080"
 
-        def __init__(self, painters: Any, port: int) -> None:
+        def __init__(self, painters, port):
             made.append((painters, port))
 
-        def stop(self) -> None:
+        def stop(self):
             made.append("stopped")
 
     class Event:
-        def wait(self) -> None:
+        def wait(self):
             raise KeyboardInterrupt
 
-    def check_port(port: int) -> None:
+    def check_port(port):
         made.append(port)
 
     monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: object())

@@ -1,17 +1,14 @@
 """``gsbench status``, ``retry`` and ``sync``, without a training."""
 
-from __future__ import annotations
-
 import io
 import json
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
 
-from gsbench.config.compose import Trial, compose_one
+from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.progress import Progress
 from gsbench.launch.record import add_to_plan, read_plan
@@ -26,7 +23,7 @@ from tests.finished import write_results
 pytestmark = pytest.mark.usefixtures("runs")
 
 
-def begin(trial: Trial) -> Path:
+def begin(trial):
     """Write the configuration of a trial that has begun; returns its folder."""
     trial.folder.mkdir(parents=True)
     (trial.folder / "config.yaml").write_text(trial.yaml)
@@ -34,7 +31,7 @@ def begin(trial: Trial) -> Path:
 
 
 @pytest.fixture
-def folders(runs: Path) -> list[Path]:
+def folders(runs):
     """Three planned trials: the first is done, the second failed, the third never started."""
     planned = composed(["name=x", "densify=adc", "seed=0,1,2"])
     add_to_plan(planned)
@@ -44,9 +41,9 @@ def folders(runs: Path) -> list[Path]:
 
 
 @pytest.fixture
-def ran(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
+def ran(monkeypatch):
     """The trials that a verb would run."""
-    given: list[Trial] = []
+    given = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: given.extend(trials) or 0)
     return given
 
@@ -77,7 +74,7 @@ def test_status_of_an_empty_runs_folder_says_so(runs, said):
 
 
 def test_finished_trials_are_listed_with_all_or_with_a_note():
-    def state(name: str, kind: Any, note: str = "") -> TrialState:
+    def state(name, kind, note=""):
         return TrialState(Path("runs/x/courtyard/sfm-adc", f"{name}-seed0"), kind, None, note)
 
     listed = [state("a", "done"), state("b", "done", "in doubt"), state("c", "missing")]
@@ -90,8 +87,7 @@ def test_finished_trials_are_listed_with_all_or_with_a_note():
 
 
 @pytest.mark.parametrize(
-    ("state", "words"),
-    [("running", "for 2 min"), ("queued", "for 2 min"), ("failed", "2 min ago")],
+    "state, words", [("running", "for 2 min"), ("queued", "for 2 min"), ("failed", "2 min ago")]
 )
 def test_a_lasting_state_has_a_duration_and_a_final_one_an_age(state, words):
     assert trials._age(TrialState(Path("x"), state, time.time() - 120, "")) == words
@@ -116,21 +112,15 @@ def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch,
 def test_user_modules_are_looked_up_where_the_command_of_each_trial_was_given(
     folders, monkeypatch, tmp_path
 ):
-    asked: list[Any] = []
-
-    def find(results: Any, present: Any) -> dict[Path, str]:
-        asked.append(present("mine", results[0]))
-        return {}
-
-    monkeypatch.setattr(trials, "find_superseded", find)
-    monkeypatch.setattr(trials, "module_digest", lambda module, folder: (module, folder))
+    asked = []
+    monkeypatch.setattr(
+        trials, "find_superseded", lambda trials, folders: asked.append(folders) or {}
+    )
     trials.progress_with_superseded(folders[0].parents[2])
-    trials.forget(folders[0].parents[2], [folders[0]])
-    trials.progress_with_superseded(folders[0].parents[2])
-    assert asked == [("mine", str(tmp_path)), None]
+    assert asked == [dict.fromkeys(folders, str(tmp_path))]
 
 
-def shown(progress: Progress) -> list[str]:
+def shown(progress):
     """The lines of the watched table, without the frame of the table."""
     console = Console(width=100, record=True, file=io.StringIO())
     console.print(trials._progress_view("x", progress))
@@ -139,7 +129,7 @@ def shown(progress: Progress) -> list[str]:
 
 
 def test_the_watched_table_has_arms_scenes_speed_time_left_and_leader():
-    def cell(**counts: int) -> dict[str, int]:
+    def cell(**counts):
         return dict.fromkeys(("done", "running", "failed", "waiting"), 0) | counts
 
     progress = Progress(
@@ -165,7 +155,7 @@ def test_watching_looks_again_until_all_trials_have_ended(folders, monkeypatch, 
     counts = {"done": 0, "running": 1, "failed": 0, "waiting": 0}
     ended = {"done": 1, "running": 0, "failed": 0, "waiting": 0}
     looks = [Progress({("adc", "yard"): one}, {}, None, "") for one in (counts, counts, ended)]
-    waited: list[float] = []
+    waited = []
     monkeypatch.setattr(trials, "progress_of", lambda home: looks.pop(0))
     monkeypatch.setattr(time, "sleep", waited.append)
     trials._watch(folders[0].parents[2])
@@ -174,7 +164,7 @@ def test_watching_looks_again_until_all_trials_have_ended(folders, monkeypatch, 
 
 
 def test_ctrl_c_ends_only_the_watching(folders, monkeypatch):
-    def interrupted(_: float) -> None:
+    def interrupted(_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(time, "sleep", interrupted)
@@ -223,7 +213,7 @@ def test_planned_settings_of_a_launcher_go_with_it_unless_it_stays(runs, ran, sa
 def test_a_trial_whose_configuration_has_changed_takes_the_place_of_the_old_one(
     folders, monkeypatch, ran, said, caplog
 ):
-    def changed(folder: Path, *_: Any) -> Trial:
+    def changed(folder, *_):
         seed = f"seed={folder.name[-1]}"
         return composed(["name=x", "densify=adc", seed, "train.sh_interval=2"])[0]
 
@@ -256,9 +246,9 @@ def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
 
 def test_a_second_retry_without_a_plan_runs_the_same_trial(folders, runs, monkeypatch):
     (runs / "x" / "plan.json").unlink()
-    ran: list[Path] = []
+    ran = []
 
-    def killed(given: list[Trial]) -> int:
+    def killed(given):
         add_to_plan(given)
         ran.extend(trial.folder for trial in given)
         return 1
@@ -273,9 +263,9 @@ def test_a_second_retry_without_a_plan_runs_the_same_trial(folders, runs, monkey
 
 def test_sync_sends_the_begun_trials_of_one_or_all_experiments(folders, runs, monkeypatch, said):
     begin(composed(["name=y", "densify=adc"])[0])
-    sent: list[tuple[str, str | None]] = []
+    sent = []
 
-    def send(given: list[TrialFolder], uri: str | None) -> list[str]:
+    def send(given, uri):
         sent.extend((one.path.parents[2].name, uri) for one in given)
         return [f"sent {len(given)}"]
 
@@ -288,7 +278,7 @@ def test_sync_sends_the_begun_trials_of_one_or_all_experiments(folders, runs, mo
 
 @pytest.mark.parametrize("error", [MirrorError("no answer"), ConnectionError("no answer")])
 def test_a_failed_sync_says_that_nothing_is_lost(folders, runs, monkeypatch, error):
-    def send(*_: Any) -> list[str]:
+    def send(*_):
         raise error
 
     monkeypatch.setattr(trials, "send_missing", send)

@@ -1,12 +1,8 @@
 """The search of ``gsbench bisect`` over commits with made-up trainings."""
 
-from __future__ import annotations
-
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,19 +26,12 @@ class Trainings:
     ``fails`` names a commit that does not train.
     """
 
-    def __init__(self, fails: str = "") -> None:
+    def __init__(self, fails=""):
         self.fails = fails
-        self.done: list[tuple[str, str]] = []
-        self.environments: list[Mapping[str, str]] = []
+        self.done = []
+        self.environments = []
 
-    def __call__(
-        self,
-        command: Sequence[str],
-        log: Path,
-        folder: Path,
-        environment: Mapping[str, str],
-        _: Any,
-    ) -> None:
+    def __call__(self, command, log, folder, environment, _):
         commit = folder.parent.name[0]
         if commit == self.fails:
             raise TrainingError("it broke")
@@ -57,7 +46,7 @@ class Trainings:
             write_trial(Path(environment["GSBENCH_RUNS"]), data, views)
 
 
-def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainings: Trainings) -> CommitSearch:
+def begun(tmp_path, monkeypatch, trainings):
     monkeypatch.setattr(versions, "run_program", trainings)
     arms = {"courtyard": ("sfm-adc", "sfm-adc")}
     declaration = declare_gate("psnr", "0.1", arms, range(3), {"eval": {"extra": {}}})
@@ -65,7 +54,7 @@ def begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainings: Trainings)
         (tmp_path / commit / "sub").mkdir(parents=True)
     (tmp_path / COMMITS[1][0] / "src" / "gsbench").mkdir(parents=True)
     (tmp_path / COMMITS[1][0] / "src" / "gsbench" / "__init__.py").touch()
-    trees: Any = SimpleNamespace(tree=lambda commit: tmp_path / commit, prefix="sub")
+    trees = SimpleNamespace(tree=lambda commit: tmp_path / commit, prefix="sub")
     return CommitSearch(
         tmp_path / "runs" / "search",
         ["scene=courtyard"],
@@ -123,9 +112,9 @@ def test_the_same_question_continues_the_same_search(monkeypatch, tmp_path):
     monkeypatch.setattr(versions, "one_trial_per_scene", lambda *_: {"courtyard": example})
     settings = ["scene=courtyard", "densify=adc"]
 
-    def begin(commits: Sequence[str], *words: str, seeds: int = 3) -> CommitSearch:
+    def begin(commits, *words, seeds=3):
         options = Namespace(metric="psnr", least="0.1", settings=[*settings, *words], seeds=seeds)
-        named: Any = [(commit * 40, "2026-01-01", "a change") for commit in commits]
+        named = [(commit * 40, "2026-01-01", "a change") for commit in commits]
         return versions._begin(options, SimpleNamespace(), named)
 
     first = begin("abc")

@@ -4,8 +4,6 @@ Chromium's own ``--screenshot`` waits in virtual time, which runs ahead while no
 socket is open: on a busy machine the picture was taken before the server had drawn.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import itertools
@@ -14,25 +12,17 @@ import shutil
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from shlex import split
 
 import numpy as np
 import pytest
 from PIL import Image
 
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-    "--no-first-run",
-    "--disable-sync",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--remote-debugging-port=0",
-]
+FLAGS = split(
+    "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --no-first-run "
+    "--disable-sync --disable-background-networking --disable-component-update "
+    "--remote-debugging-port=0"
+)
 SECONDS = 300  # a limit for a page that never changes; a slow machine needs less
 SECONDS_BETWEEN_LOOKS = 0.5
 
@@ -40,7 +30,7 @@ SECONDS_BETWEEN_LOOKS = 0.5
 class Browser:
     """A window of ``size`` on the page ``url``; the test is skipped where there is no Chromium."""
 
-    def __init__(self, url: str, profile: Path, size: tuple[int, int] = (1200, 600)) -> None:
+    def __init__(self, url, profile, size=(1200, 600)):
         found = map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))
         chromium = next(filter(None, found), None)
         if chromium is None:
@@ -60,26 +50,26 @@ class Browser:
             self._process.kill()
             raise
 
-    def __enter__(self) -> Browser:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *reason: object) -> None:
+    def __exit__(self, *reason):
         self._socket.close()
         self._process.kill()
         self._process.wait()
 
-    def wait_until(self, condition: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
+    def wait_until(self, condition, what):
         """The first picture of the page, [H, W, 3] in [0, 255], that fulfils ``condition``."""
         return self.wait_for(
             lambda: picture if condition(picture := self.picture()) else None, what
         )
 
-    def picture(self) -> np.ndarray:
+    def picture(self):
         """A screenshot of the window, [H, W, 3] in [0, 255]."""
         data = base64.b64decode(self.call("Page.captureScreenshot")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def call(self, method, **parameters):
         """The result of a DevTools ``method``."""
         number = next(self._ids)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
@@ -89,7 +79,7 @@ class Browser:
                 assert "error" not in answer, answer
                 return dict(answer["result"])
 
-    def _page(self, profile: Path) -> str | None:
+    def _page(self, profile):
         """The web socket address of the page; None if there is no page yet."""
         try:
             port = (profile / "DevToolsActivePort").read_text().split()[0]
@@ -99,7 +89,7 @@ class Browser:
             return None
         return str(pages[0]["webSocketDebuggerUrl"]) if pages else None
 
-    def wait_for(self, look: Callable[[], Any], what: str) -> Any:
+    def wait_for(self, look, what):
         """The first result of ``look`` that is not None."""
         deadline = time.monotonic() + SECONDS
         while time.monotonic() < deadline:

@@ -1,9 +1,5 @@
 """Small finished trials for the viewer to show."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -20,7 +16,7 @@ POINTS = np.array([[0, 0, z] for z in (-3.0, 0.1, 4, 5, 8)])  # two are not befo
 
 
 @pytest.fixture(scope="session")
-def small_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_runs(tmp_path_factory):
     """A runs folder with the experiment ``small``: ADC and volumetric with two seeds, made up.
 
     The cameras look along z, and their model is twice the size of the photographs.

@@ -1,7 +1,5 @@
 """``gsbench export TRIAL --out page.html``: its cameras, and the command where npx fails."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace
@@ -14,6 +12,7 @@ from gsbench.cli import run
 from gsbench.normalization import Normalization
 from gsbench.view.page import page_settings
 from gsbench.view.trials import find_trial
+from tests.helpers import read_json, write
 from tests.view.conftest import VIEWS
 
 ADDRESS = "small:courtyard:adc"
@@ -26,20 +25,18 @@ case "$*" in *"{works}"*) (echo "<head></head>"; cat "$settings") > "$previous";
 """
 
 
-def stand_in(folder: Path, works: str, fails: str, works_too: str = ":") -> Path:
+def stand_in(folder, works, fails, works_too=":"):
     """Write an npx that copies its settings to the page if its words contain ``works``."""
-    folder.mkdir()
-    (folder / "npx").write_text(
-        NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too)
+    write(
+        folder / "npx",
+        NPX.replace("{works}", works).replace("{fails}", fails).replace("{works_too}", works_too),
     )
     (folder / "npx").chmod(0o755)
     return folder
 
 
 @pytest.mark.parametrize("works", ["splat-transform", "-g cpu"], ids=["with a GPU", "without"])
-def test_the_page_has_every_test_view(
-    works: str, small_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_has_every_test_view(works, small_runs, tmp_path, monkeypatch):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     npx = stand_in(tmp_path / "bin", works, "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
@@ -71,7 +68,7 @@ def test_the_page_has_every_test_view(
         assert value == np.ravel([stop[key] for stop in (*shown, shown[0])]).tolist()
 
 
-def test_the_page_is_in_the_models_own_coordinates(small_runs: Path) -> None:
+def test_the_page_is_in_the_models_own_coordinates(small_runs):
     trial = find_trial(ADDRESS, small_runs)
     moved = replace(trial.record, normalization=Normalization((7.0, 0.0, 3.0), 2.0))
     first, _ = page_settings(replace(trial, record=moved))["annotations"]
@@ -80,7 +77,7 @@ def test_the_page_is_in_the_models_own_coordinates(small_runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fails", "cause"),
+    "fails, cause",
     [
         ("echo first; echo 'no device' >&2; exit 1", "failed (no device)"),
         ("echo first; echo last; exit 1", "failed (last)"),
@@ -90,13 +87,8 @@ def test_the_page_is_in_the_models_own_coordinates(small_runs: Path) -> None:
     ],
 )
 def test_without_npx_the_error_names_the_command_to_type(
-    fails: str,
-    cause: str,
-    small_runs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    fails, cause, small_runs, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     place = f"{stand_in(tmp_path / 'bin', 'never', fails)}:/bin" if fails else str(tmp_path)
     for suffix in ("ply", "json"):
@@ -113,22 +105,21 @@ def test_without_npx_the_error_names_the_command_to_type(
     assert said.endswith(f" {model} -E {settings} {page}\n")
     assert said.count("\n") == 1
     assert model.read_bytes()[:3] == b"ply"
-    assert json.loads(settings.read_text())["version"] == 2
+    assert read_json(settings)["version"] == 2
     assert not page.exists()
 
 
-def hostile_capture(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def hostile_capture(folder, monkeypatch):
     """Go to a folder whose own npx, packages and settings would run if npm read them."""
     for name in ("node_modules/.bin/npx", ".npmrc", "package.json", "npx"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(f"#!/bin/sh\ntouch {folder}/exploded\n")
+        write(folder / name, f"#!/bin/sh\ntouch {folder}/exploded\n")
         (folder / name).chmod(0o755)
     monkeypatch.chdir(folder)
 
 
 def test_npx_starts_where_no_package_of_the_current_folder_is_found(
-    small_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    small_runs, tmp_path, monkeypatch
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     seen = "(pwd; ls -A; echo $PATH) > $SEEN; d=$(pwd); while [ $d != / ]; do d=$(dirname $d); ls -A $d >> $SEEN; done"
     npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1", seen)
@@ -151,12 +142,8 @@ def test_npx_starts_where_no_package_of_the_current_folder_is_found(
 
 @pytest.mark.parametrize("name", ["node_modules", ".npmrc", "package.json"])
 def test_a_temporary_folder_below_packages_is_refused(
-    name: str,
-    small_runs: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    name, small_runs, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     npx = stand_in(tmp_path / "bin", "splat-transform", "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")

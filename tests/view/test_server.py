@@ -1,7 +1,5 @@
 """The viewer on finished trials: what it draws, and how its page starts and stops."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re
@@ -9,29 +7,27 @@ import socket
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
-from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.raster import create_rasterizer
-from gsbench.scene.types import Camera
 from gsbench.system.install import install_command
 from gsbench.verbs import servers
 from gsbench.view import server
 from gsbench.view.server import Session, Viewer, check_port
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
+from tests.helpers import refusal
 from tests.view.browser import Browser
 
 
 @pytest.fixture(scope="module")
-def painters(small_runs: Path) -> list[TrialPainter]:
+def painters(small_runs):
     cpu = torch.device("cpu")
     trials = [find_trial(f"small:courtyard:{name}:0", small_runs) for name in ("adc", "volumetric")]
     rasterizer = create_rasterizer("reference", cpu)
@@ -39,33 +35,33 @@ def painters(small_runs: Path) -> list[TrialPainter]:
 
 
 @pytest.fixture
-def viewer(painters: list[TrialPainter]) -> Iterator[Viewer]:
+def viewer(painters):
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     viewer = Viewer(painters, 0)
     yield viewer
     viewer.stop()
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition):
     deadline = time.monotonic() + 20
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.005)
 
 
-def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:
+def test_page_answers_until_it_is_stopped(painters):
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     viewer = Viewer(painters[:1], 0)
     assert viewer.url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(viewer.url, timeout=20) as answer:
         assert answer.status == 200
         assert b"<html" in answer.read().lower()
-    stopped: list[str] = []
-    viewer._sessions[3] = SimpleNamespace(stop=lambda: stopped.append("page"))  # type: ignore[assignment]
+    stopped = []
+    viewer._sessions[3] = SimpleNamespace(stop=lambda: stopped.append("page"))
     viewer.stop()
     assert stopped == ["page"]
 
-    def is_gone() -> bool:
+    def is_gone():
         try:
             urllib.request.urlopen(viewer.url, timeout=2).close()
         except OSError:  # refused, or cut
@@ -75,9 +71,7 @@ def test_page_answers_until_it_is_stopped(painters: list[TrialPainter]) -> None:
     wait_until(is_gone)
 
 
-def test_two_trials_and_their_photograph_share_one_camera(
-    viewer: Viewer, painters: list[TrialPainter], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_trials_and_their_photograph_share_one_camera(viewer, painters, monkeypatch):
     view = painters[0].trial.views[1]
     picture = viewer.draw(view.camera, Layers(), view)
     height, width = view.image.shape[:2]
@@ -86,16 +80,16 @@ def test_two_trials_and_their_photograph_share_one_camera(
     for place, pane in enumerate(panes):
         # below the label, right of the dividing line
         shown = picture[20:, place * width + 2 : (place + 1) * width]
-        np.testing.assert_array_equal(shown, pane[20:, 2:])
+        assert_array_equal(shown, pane[20:, 2:])
     monkeypatch.setattr(server, "side_by_side", dict)
     labels = [f"courtyard random-{name} seed 0: 40 Gaussians" for name in ("adc", "volumetric")]
     assert list(viewer.draw(view.camera, Layers(), None)) == labels
     assert list(viewer.draw(view.camera, Layers(), view)) == ["photograph view001.png", *labels]
 
 
-def test_controls_choose_what_is_drawn_and_wake_the_pages(viewer: Viewer) -> None:
-    woken: list[int] = []
-    page: Any = SimpleNamespace(wake=lambda: woken.append(1), stop=lambda: None)
+def test_controls_choose_what_is_drawn_and_wake_the_pages(viewer):
+    woken = []
+    page = SimpleNamespace(wake=lambda: woken.append(1), stop=lambda: None)
     viewer._sessions[7] = page
     first, second = viewer.views.values()
     assert viewer.layers() == Layers(3, 100.0, False, -1.523, False)
@@ -126,7 +120,7 @@ def test_controls_choose_what_is_drawn_and_wake_the_pages(viewer: Viewer) -> Non
     assert len(woken) == 12  # once for each change
 
 
-def test_the_legend_counts_the_large_gaussians_of_each_trial_by_cause(viewer: Viewer) -> None:
+def test_the_legend_counts_the_large_gaussians_of_each_trial_by_cause(viewer):
     one, other = (painter.trial for painter in viewer.painters)
     one.causes[:], other.causes[:] = Cause.CLONE, Cause.CLONE
     threshold = round(float(np.sort(one.log10_volumes)[-4]) - 5e-4, 3)  # four of one are larger
@@ -139,9 +133,9 @@ def test_the_legend_counts_the_large_gaussians_of_each_trial_by_cause(viewer: Vi
     )
 
 
-def make_page(shown: list[Any], **camera: Any) -> Any:
+def make_page(shown, **camera):
     """A stand-in for a browser page; ``moves`` are called when its camera moves."""
-    moves: list[Callable[[object], None]] = []
+    moves = []
     seen = {"wxyz": (1, 0, 0, 0), "position": (0, 0, -3), "fov": 0.9, "aspect": 1.5} | camera
     return SimpleNamespace(
         client_id=5,
@@ -152,15 +146,13 @@ def make_page(shown: list[Any], **camera: Any) -> Any:
     )
 
 
-def test_a_page_is_drawn_coarsely_while_it_moves_and_sharply_once_at_rest(
-    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_is_drawn_coarsely_while_it_moves_and_sharply_once_at_rest(viewer, monkeypatch):
     monkeypatch.setattr(server, "REST_SECONDS", 0.01)
-    shown: list[tuple[int, int]] = []
-    drawn: list[tuple[int, int]] = []
+    shown = []
+    drawn = []
     page = make_page(shown)
 
-    def draw(camera: Camera, *chosen: object) -> tuple[int, int]:
+    def draw(camera, *chosen):
         assert chosen == (viewer.layers(), viewer.photograph())
         drawn.append((camera.width, camera.height))
         if len(drawn) == 1:
@@ -181,14 +173,14 @@ def test_a_page_is_drawn_coarsely_while_it_moves_and_sharply_once_at_rest(
     viewer._disconnect(page)  # of a page that is not known
 
 
-def test_a_page_moves_to_the_view_that_it_chooses(viewer: Viewer) -> None:
+def test_a_page_moves_to_the_view_that_it_chooses(viewer):
     page = make_page([])
     session = viewer._sessions[5] = Session(viewer, page)
     session.go_to(viewer.views["view000.png"])
     camera = page.camera
-    np.testing.assert_allclose(camera.position, [1, 2, 0])
-    np.testing.assert_allclose(camera.look_at, [1, 2, 0.5])  # the cameras' distance from their mean
-    np.testing.assert_allclose(camera.up_direction, [0, -1, 0])
+    assert_allclose(camera.position, [1, 2, 0])
+    assert_allclose(camera.look_at, [1, 2, 0.5])  # the cameras' distance from their mean
+    assert_allclose(camera.up_direction, [0, -1, 0])
     # the picture reaches 33.5 px beside its principal point, and its focal length is 50 px
     assert math.tan(camera.fov / 2) == pytest.approx(33.5 / 50 / (1.5 / 3))
     camera.aspect = None  # not known yet
@@ -202,8 +194,8 @@ def test_a_page_moves_to_the_view_that_it_chooses(viewer: Viewer) -> None:
     assert camera.position[0] == 2
 
 
-def test_nonsense_of_a_page_is_not_drawn_and_nothing_is_once_it_is_closed(viewer: Viewer) -> None:
-    shown: list[np.ndarray] = []
+def test_nonsense_of_a_page_is_not_drawn_and_nothing_is_once_it_is_closed(viewer):
+    shown = []
     page = make_page(shown, wxyz=(0, 0, 0, 0), position=(np.nan, 0, 0), aspect=1e6)
     session = Session(viewer, page)
     session._show(24)
@@ -213,40 +205,40 @@ def test_nonsense_of_a_page_is_not_drawn_and_nothing_is_once_it_is_closed(viewer
     assert [picture.shape for picture in shown] == [(24, 3 * 12, 3)]
     draw = viewer.draw
 
-    def closing(*words: Any) -> np.ndarray:
+    def closing(*words):
         session.stop()
         return draw(*words)
 
-    viewer.draw = closing  # type: ignore[method-assign]
+    viewer.draw = closing
     session._show(24)
-    viewer.draw = pytest.fail  # type: ignore[method-assign, assignment]
+    viewer.draw = pytest.fail
     session._show(24)
     assert len(shown) == 1
 
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_page_shows_the_trials_in_a_browser(viewer: Viewer, tmp_path: Path) -> None:
+def test_page_shows_the_trials_in_a_browser(viewer, tmp_path):
     with Browser(viewer.url, tmp_path) as browser:
         # Without the controls and the browser's own notes.
         browser.wait_until(lambda page: bool(page[150:, :800].std() > 20), "the trials")
 
 
-def test_without_viser_the_error_names_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_viser_the_error_names_the_install_command(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=re.escape(install_command("view"))):
+    with refusal(re.escape(install_command("view"))):
         servers.view(["a:b:c"], Path())
-    with pytest.raises(InputError, match="one or two"):
+    with refusal("one or two"):
         servers.view(["a:b:c"] * 3, Path())
 
 
-def test_a_port_in_use_is_refused_and_one_that_was_just_left_is_not() -> None:
+def test_a_port_in_use_is_refused_and_one_that_was_just_left_is_not():
     with socket.socket() as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port} cannot be used .*--port"):
+        with refusal(f"port {port} cannot be used .*--port"):
             check_port(port)
         with socket.create_connection(("127.0.0.1", port)):
             taken.accept()[0].close()  # the server ends first, so the port stays in TIME_WAIT

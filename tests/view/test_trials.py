@@ -1,8 +1,5 @@
 """Photographs and the page's camera, against the cameras that they come from."""
 
-from __future__ import annotations
-
-import json
 import math
 import shutil
 from dataclasses import replace
@@ -11,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageFont
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
-from gsbench.analysis.results import Configurations, TrialResult
-from gsbench.errors import InputError
+from gsbench.analysis.results import Configurations
 from gsbench.events import Cause
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians
 from gsbench.init.base import PointCloud
 from gsbench.normalization import Normalization
 from gsbench.raster import create_rasterizer
@@ -39,27 +36,28 @@ from gsbench.view.trials import (
     side_by_side,
 )
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import read_json, refusal, write
 from tests.view.conftest import POINTS
 
 
-def smooth_image(height: int, width: int) -> np.ndarray:
+def smooth_image(height, width):
     noise = np.random.default_rng(0).uniform(0, 255, (height, width, 3))
     blurred = gaussian_filter(noise, (4, 4, 0))
     return np.uint8(255 * (blurred - blurred.min()) / np.ptp(blurred))
 
 
-def make_view(x: float = 0.0) -> View:
+def make_view(x=0.0):
     camera = Camera(80, 60, 70.0, 70.0, 38.0, 31.0, np.eye(3), np.array([-x, 0.0, 0.0]))
     return View("a.png", camera, smooth_image(60, 80))
 
 
-def test_photograph_in_its_own_camera_is_itself() -> None:
+def test_photograph_in_its_own_camera_is_itself():
     view = make_view()
-    np.testing.assert_array_equal(photograph_at(view.camera, view), view.image)
+    assert_array_equal(photograph_at(view.camera, view), view.image)
 
 
 @pytest.mark.parametrize("scale", [2, 0.5])
-def test_photograph_follows_the_focal_length_and_the_principal_point(scale: float) -> None:
+def test_photograph_follows_the_focal_length_and_the_principal_point(scale):
     view = make_view()
     width, height = round(80 * scale), round(60 * scale)
     camera = view.camera.resized(width, height)
@@ -71,7 +69,7 @@ def test_photograph_follows_the_focal_length_and_the_principal_point(scale: floa
 
 
 @pytest.mark.parametrize("stripes", [np.s_[::2], np.s_[:, ::2]], ids=["rows", "columns"])
-def test_fine_stripes_become_grey_in_a_smaller_picture(stripes: object) -> None:
+def test_fine_stripes_become_grey_in_a_smaller_picture(stripes):
     view = make_view()
     view.image[:] = 0
     view.image[stripes] = 255
@@ -79,7 +77,7 @@ def test_fine_stripes_become_grey_in_a_smaller_picture(stripes: object) -> None:
     assert np.abs(small[1:-1, 1:-1].astype(int) - 127).max() < 30
 
 
-def test_panes_stand_side_by_side_with_labels() -> None:
+def test_panes_stand_side_by_side_with_labels():
     left, right = np.full((50, 60, 3), 40, np.uint8), np.full((50, 60, 3), 80, np.uint8)
     row = side_by_side([("a label far too long for such a small pane", left), ("b", right)])
     assert row.shape == (50, 120, 3)
@@ -97,7 +95,7 @@ def test_panes_stand_side_by_side_with_labels() -> None:
     assert 104 <= inked[1][inked[1] > 101].min() <= 106
 
 
-def test_page_camera_projects_as_the_page_does() -> None:
+def test_page_camera_projects_as_the_page_does():
     turn = Rotation.from_euler("xyz", [0.3, -0.5, 1.1])
     x, y, z, w = turn.as_quat()
     position, fov, aspect = np.array([1.0, 2.0, -3.0]), 0.9, 1.6
@@ -105,14 +103,14 @@ def test_page_camera_projects_as_the_page_does() -> None:
     assert (camera.height, camera.width) == (200, 160)
     ahead = position + turn.apply([0, 0, 2.0])
     seen = camera.rotation @ ahead + camera.translation
-    np.testing.assert_allclose(seen, [0, 0, 2], atol=1e-12)
+    assert_allclose(seen, [0, 0, 2], atol=1e-12)
     top = position + turn.apply([0, -math.tan(fov / 2) * 2, 2.0])  # y is down
     seen = camera.rotation @ top + camera.translation
     assert camera.fy * seen[1] / seen[2] + camera.cy == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("aspect", [0.4, 1.0, 3.0])
-def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float) -> None:
+def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect):
     view = make_view()
     fov = fitting_fov(view.camera, aspect)
     pane = page_camera(np.array([1.0, 0, 0, 0]), np.zeros(3), fov, aspect, 1000, 1)
@@ -127,39 +125,37 @@ def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect: float
 
 
 @pytest.mark.parametrize("roll", [0.0, 0.4, math.pi])
-def test_page_stands_upright_where_the_photograph_was_taken(roll: float) -> None:
+def test_page_stands_upright_where_the_photograph_was_taken(roll):
     """The page builds its camera from forward and upward directions, as look-at cameras do."""
     turn = Rotation.from_euler("YXZ", [0.7, -0.5, roll]).as_matrix()
     camera = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, turn.T, np.zeros(3))
     up = level_up(camera, np.array([0.0, -1.0, 0.0]))
     forward = camera.rotation[2]
     right = np.cross(forward, up)
-    np.testing.assert_allclose(right / np.linalg.norm(right), camera.rotation[0], atol=1e-12)
+    assert_allclose(right / np.linalg.norm(right), camera.rotation[0], atol=1e-12)
     assert np.linalg.norm(up) == pytest.approx(1)
     if roll == 0:
-        np.testing.assert_allclose(up, [0, -1, 0], atol=1e-12)
+        assert_allclose(up, [0, -1, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (1, 0, 0)])
-def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(
-    up: tuple[float, ...],
-) -> None:
+def test_without_an_upward_direction_in_the_picture_the_cameras_own_is_taken(up):
     """The camera looks straight up, or the direction is to its right."""
-    np.testing.assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
+    assert_array_equal(level_up(make_view().camera, np.array(up, float)), [0, -1, 0])
 
 
-def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction() -> None:
+def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction():
     views = [make_view(x) for x in (0.0, 3.0, 9.0)]  # 4, 1 and 5 from their middle
-    np.testing.assert_allclose(mean_up(views), [0, -1, 0])
+    assert_allclose(mean_up(views), [0, -1, 0])
     assert orbit_distance(views) == pytest.approx(10 / 3)
     assert orbit_distance(views[:1]) == 1e-3
     camera = views[0].camera
     opposite = replace(views[0], camera=replace(camera, rotation=np.diag([-1.0, -1, 1])))
-    np.testing.assert_array_equal(mean_up([views[0], opposite]), [0, 0, 1])
+    assert_array_equal(mean_up([views[0], opposite]), [0, 0, 1])
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "name, value",
     [
         ("wxyz", (1e-7, 0, 0, 0)),
         ("wxyz", (math.nan, 0, 0, 1)),
@@ -168,16 +164,16 @@ def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction(
         *(("aspect", value) for value in (1e6, 0.0, math.nan)),
     ],
 )
-def test_impossible_cameras_of_a_page_are_refused(name: str, value: object) -> None:
+def test_impossible_cameras_of_a_page_are_refused(name, value):
     sound = {"wxyz": (1, 0, 0, 0), "position": (1, 2, 3), "fov": 0.9, "aspect": 1.6}
     for aspect, width in ((0.11, 1), (1.6, 4), (9.9, 25)):
-        pane = page_camera(**(sound | {"aspect": aspect}), height=5, panes=2)  # type: ignore[arg-type]
+        pane = page_camera(**(sound | {"aspect": aspect}), height=5, panes=2)
         assert (pane.width, pane.height) == (width, 5)
     with pytest.raises(ValueError, match=r"no camera|is not drawn"):
-        page_camera(**(sound | {name: value}), height=540, panes=1)  # type: ignore[arg-type]
+        page_camera(**(sound | {name: value}), height=540, panes=1)
 
 
-def painter() -> TrialPainter:
+def painter():
     """A model of 40 Gaussians in front of `make_view`, nine of them large, and four points."""
     gaussians = random_gaussians(40, seed=1, dtype=torch.float32)
     volumes = np.linspace(-3.0, 0.9, 40)
@@ -188,14 +184,14 @@ def painter() -> TrialPainter:
     return TrialPainter(trial, create_rasterizer("reference", torch.device("cpu")))
 
 
-def rendered(painter: TrialPainter, gaussians: Gaussians, degree: int = 3) -> np.ndarray:
+def rendered(painter, gaussians, degree=3):
     camera = make_view().camera
     with torch.no_grad():
         image = painter.rasterizer.render(gaussians, camera, degree, torch.zeros(3)).image
     return np.round(255 * image.clamp(0, 1).numpy())
 
 
-def test_layers_choose_what_is_drawn() -> None:
+def test_layers_choose_what_is_drawn():
     shown, camera = painter(), make_view().camera
     gaussians = shown.trial.gaussians
     assert rendered(shown, gaussians).max() > 50
@@ -208,20 +204,20 @@ def test_layers_choose_what_is_drawn() -> None:
         (Layers(share=1), rendered(shown, opaque.map(lambda tensor: tensor[:1]))),
         (Layers(cloud=True, share=1), rendered(shown, cloud)),
     ):
-        np.testing.assert_allclose(shown.draw(camera, layers), wanted, atol=1)
+        assert_allclose(shown.draw(camera, layers), wanted, atol=1)
     assert list(shown.above(0.05)) == list(range(31, 40))
     counts = shown.counts_above(0.05)
     assert (counts[Cause.CLONE], counts[Cause.SPLIT_VOLUME], sum(counts.values())) == (4, 5, 9)
     plain = shown.draw(camera, Layers()).astype(float)
     none_large = shown.draw(camera, Layers(causes=True, log10_volume=99.0))
-    np.testing.assert_array_equal(none_large, plain)
+    assert_array_equal(none_large, plain)
     marked = shown.draw(camera, Layers(causes=True, log10_volume=0.05)).astype(float)
     with torch.no_grad():
         large = gaussians.select(torch.arange(31, 40))
         alpha = shown.rasterizer.render(large, camera, 0, torch.zeros(3)).alpha.numpy()
     outside = (alpha == 0) & (plain.max(-1) < 255)  # brighter pixels were cut off
     assert outside.any()
-    np.testing.assert_allclose(marked[outside], 0.35 * plain[outside], atol=1)
+    assert_allclose(marked[outside], 0.35 * plain[outside], atol=1)
     inside, share = alpha > 0.2, alpha[..., None].clip(1e-6)
     colors = ((marked - 0.35 * (1 - share) * plain) / share)[inside]
     hues = np.array([Cause.CLONE.color, Cause.SPLIT_VOLUME.color])  # they mix where they overlap
@@ -229,7 +225,7 @@ def test_layers_choose_what_is_drawn() -> None:
     assert (colors < hues.max(0) + 8).all()
 
 
-def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word() -> None:
+def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word():
     length = ImageFont.load_default(10.0).getlength
     # half a text size stays free on either side
     assert _fitted("ab cd ef", 10.0, math.ceil(length("ab cd ef")) + 10) == ("ab cd ef", 10.0)
@@ -238,12 +234,12 @@ def test_a_label_breaks_where_it_does_not_fit_and_shrinks_for_a_long_word() -> N
     assert (text, size) == ("i\nwwwwwwww", pytest.approx(10 * 30 / length("wwwwwwww")))
 
 
-def configured(trial: TrialResult, **settings: object) -> TrialResult:
+def configured(trial, **settings):
     values = {key.replace("__", "."): value for key, value in settings.items()}
     return replace(trial, settings=Configurations({trial.key: values}))
 
 
-def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs: Path) -> None:
+def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):
     trial = find_trial("small:courtyard:volumetric", small_runs)
     moved = replace(trial.record, normalization=Normalization((1.0, 2.0, 3.0), 2.0))
     viewed, there = (
@@ -254,22 +250,22 @@ def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs: Path) -> None:
     assert load_viewed(trial, torch.device("cpu")).background == (0, 0, 0)
     assert viewed.causes.tolist() == [k % 6 for k in range(10, 50)]
     volumes = 4 / 3 * np.pi * viewed.gaussians.scales.double().prod(-1).numpy()
-    np.testing.assert_allclose(10**viewed.log10_volumes, volumes, rtol=1e-5)
-    np.testing.assert_array_equal(viewed.cloud.points, POINTS)
+    assert_allclose(10**viewed.log10_volumes, volumes, rtol=1e-5)
+    assert_array_equal(viewed.cloud.points, POINTS)
     own = 2 * (viewed.gaussians.means - torch.tensor([1.0, 2, 3]))
-    torch.testing.assert_close(there.gaussians.means, own)
+    assert_close(there.gaussians.means, own)
     first, second = viewed.views
     camera = first.camera  # of a photograph of half the model's size
     assert (first.name, camera.width, camera.height) == ("view000.png", 64, 48)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 55, 33.5, 23)
-    np.testing.assert_allclose(second.camera.center, [2, 2, 0])
+    assert_allclose(second.camera.center, [2, 2, 0])
     folder = small_runs / "store" / "init" / "init-courtyard-random" / "sparse" / "0"
     centred = configured(trial, scene__principal_point="centred")
     camera = read_test_views(centred, folder)[1].camera
     assert (camera.cx, camera.cy) == (24, 32)
 
 
-def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs: Path, tmp_path: Path) -> None:
+def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs, tmp_path):
     first = find_trial("small:courtyard:adc", small_runs)
     assert (first.seed, first.densify) == (0, "adc")
     assert find_trial("small:courtyard:random-adc:1", small_runs).seed == 1
@@ -285,34 +281,34 @@ def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs: Path, tmp_
         "nothing:courtyard:adc": "nothing",
         str(first.path.parent): "is not a trial's folder",
     }.items():
-        with pytest.raises(InputError, match=words):
+        with refusal(words):
             find_trial(address, small_runs)
     copy = Path(shutil.copytree(small_runs, tmp_path / "runs")) / first.path.relative_to(small_runs)
-    results = json.loads((copy / "results.json").read_text())
-    (copy / "results.json").write_text(json.dumps(results | {"status": "running"}))
-    with pytest.raises(InputError, match="is not a complete trial"):
+    results = read_json(copy / "results.json")
+    write(copy / "results.json", results | {"status": "running"})
+    with refusal("is not a complete trial"):
         find_trial(str(copy), tmp_path / "runs")
 
 
-def test_what_is_gone_from_a_trial_is_named(small_runs: Path, tmp_path: Path) -> None:
+def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
     shutil.copytree(small_runs, tmp_path / "runs")
     trial = find_trial("small:courtyard:adc", tmp_path / "runs")
     renders = replace(trial.record, evaluated_from="renders")
-    with pytest.raises(InputError, match="was evaluated from renders: it has no model"):
+    with refusal("was evaluated from renders: it has no model"):
         model_file(replace(trial, record=renders))
-    with pytest.raises(InputError, match="is of 40 Gaussians, the model has 1: run"):
+    with refusal("is of 40 Gaussians, the model has 1: run"):
         read_causes(trial.path / "lineage.npz", 1)
     for folder, words in (
         (trial.path / "ground_truth", "holds no picture of a test view"),
         (tmp_path / "runs" / "store", "is gone, and it had the cameras of small/courtyard"),
     ):
         shutil.rmtree(folder)
-        with pytest.raises(InputError, match=words):
+        with refusal(words):
             load_viewed(trial, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no zip", b"no zip at all"])
-def test_a_damaged_record_of_causes_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_record_of_causes_is_refused(tmp_path, content):
     (tmp_path / "lineage.npz").write_bytes(content)
-    with pytest.raises(InputError, match=r"lineage\.npz cannot be read"):
+    with refusal(r"lineage\.npz cannot be read"):
         read_causes(tmp_path / "lineage.npz", 1)

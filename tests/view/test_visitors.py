@@ -1,10 +1,6 @@
 """The viewer answers requests of its own page and of programs, and of no other page."""
 
-from __future__ import annotations
-
 import http.client
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
@@ -39,13 +35,13 @@ UNWELCOME = [
 ]
 
 
-@pytest.mark.parametrize(("hosts", "origins"), WELCOME + UNWELCOME)
-def test_only_the_own_page_and_programs_are_accepted(hosts, origins) -> None:
+@pytest.mark.parametrize("hosts, origins", WELCOME + UNWELCOME)
+def test_only_the_own_page_and_programs_are_accepted(hosts, origins):
     assert is_own_page(hosts, origins) == ((hosts, origins) in WELCOME)
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Any]:
+def server():
     viser = pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     with refuse_other_pages():
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -53,7 +49,7 @@ def server() -> Iterator[Any]:
     server.stop()
 
 
-def answer(server: Any, hosts: list[str], origins: list[str], upgrade: bool) -> int:
+def answer(server, hosts, origins, upgrade):
     """The status that a server gives to a request with these headers."""
     connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=60)
     connection.putrequest("GET", "/", skip_host=True)
@@ -72,13 +68,13 @@ def answer(server: Any, hosts: list[str], origins: list[str], upgrade: bool) -> 
 
 
 @pytest.mark.parametrize("upgrade", [False, True], ids=["page", "connection"])
-def test_the_running_server_accepts_the_same_requests(server: Any, upgrade: bool) -> None:
+def test_the_running_server_accepts_the_same_requests(server, upgrade):
     for headers in WELCOME + UNWELCOME:
         allowed = {101 if upgrade else 200} if headers in WELCOME else {400, 403}
         assert answer(server, *headers, upgrade) in allowed, headers
 
 
-def test_an_unguarded_server_is_refused() -> None:
+def test_an_unguarded_server_is_refused():
     pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
     with (
         pytest.raises(GsbenchError, match="other web pages could reach the viewer"),

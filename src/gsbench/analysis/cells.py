@@ -20,7 +20,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Configured, Experiment, TrialResult, group_by
 from gsbench.errors import InputError
-from gsbench.runs.keys import is_hashed
+from gsbench.runs.config_hash import is_hashed
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,14 +7,20 @@ arms, and a line for each arm and trial that no verdict uses.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import Note, texts
-from gsbench.analysis.pairing import BASELINE, choose_pairs, controls_of, uncompared
+from gsbench.analysis.pairing import (
+    BASELINE,
+    baseline_settings,
+    choose_pairs,
+    controls_of,
+    pair_trials,
+    uncompared,
+)
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
@@ -43,7 +49,14 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
         return Pairing(trials, (), ())
     by_arm = group_by(trials, lambda trial: trial.arm)
     arms, settings = sorted(by_arm), {arm: own[0].config for arm, own in by_arm.items()}
-    pairs = choose_pairs(arms, baseline, controls_of(trials), settings)
+    ages = {arm: min(trial.measured for trial in own) for arm, own in by_arm.items()}
+    pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
+    pairs += [
+        pair
+        for pair in baseline_settings(arms, ages, baseline)
+        # settings under which no two trials can be paired, such as budgets, give no verdict
+        if pair not in pairs and pair_trials(trials, *pair)
+    ]
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
 
 
@@ -73,11 +86,10 @@ class Comparison:
     def unused(self) -> list[Note]:
         """A note with the reason for each arm and each trial that no verdict uses."""
         verdicts = [verdict for one in self.answers for verdict in one.verdicts]
-        notes = {(one.first, one.second): one.notes for one in self.answers}
         # Where an arm has no verdict at all, its sentence says why.
         asked = {arm for one in self.answers if one.verdicts for arm in (one.first, one.second)}
         trials = [trial for trial in self.trials if trial.arm in asked]
-        return [*self.arms.uncompared, *unused_trials(trials, verdicts, notes)]
+        return [*self.arms.uncompared, *unused_trials(trials, verdicts)]
 
     @cached_property
     def declaration_lines(self) -> list[str]:
@@ -104,23 +116,14 @@ class Comparison:
         return {"pairs": [_as_json(one) for one in self.answers], "left_out": left_out}
 
 
-def unused_trials(
-    trials: Sequence[TrialResult],
-    verdicts: Sequence[Verdict],
-    notes: Mapping[tuple[Arm, Arm], Sequence[Note]] = MappingProxyType({}),
-) -> list[Note]:
-    """A note with the reasons for the trials of each arm that are in none of ``verdicts``.
-
-    ``notes`` are further reasons for two arms.
-    """
+def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) -> list[Note]:
+    """A note with the reasons for the trials of each arm that are in none of ``verdicts``."""
     used = {trial.path for verdict in verdicts for trial in verdict.pairs.trials}
     left_out = [trial for trial in trials if trial.path not in used]
     found = []
     for own in group_by(left_out, lambda trial: trial.arm).values():
         asked = [one for one in verdicts if any(_asks(one.question, trial) for trial in own)]
         reasons = [reason for verdict in asked for reason in _reasons(verdict)]
-        for arms, lines in notes.items():
-            reasons += [note.sentence for note in lines if own[0].arm in arms]
         if not reasons:
             reasons = [Note.of("not planned" if asked else "not asked").sentence]
         labels = [trial.label for trial in own]

@@ -11,24 +11,26 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import (
-    CODE,
     Arm,
     Configured,
     TrialPair,
     TrialResult,
     canonical,
     group_by,
-    seeds_words,
+    seeds_text,
 )
 from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
-from gsbench.runs.keys import DECLARED, NOT_HASHED, SHOWN
+from gsbench.runs.config_hash import DECLARED, NOT_HASHED
+from gsbench.runs.freshness import Change, Part, code_changes, present_version
+from gsbench.runs.nested import SHOWN
 from gsbench.system.install import conf_dir
 from gsbench.words import counted, listed, some_of
 
@@ -115,7 +117,7 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
         for key, value in trial.conditions.items():
             values_by_condition[key].add(value)
     for part, versions in (differing_code(trials) if code else {}).items():
-        values_by_condition[part] = {short_version(version) for version in versions}
+        values_by_condition[str(part)] = {version[:SHOWN] for version in versions}
     if not any(trial.budget_acted for trial in trials):
         values_by_condition.pop("budget", None)
     return {key: sorted(values) for key, values in values_by_condition.items() if len(values) > 1}
@@ -198,7 +200,7 @@ def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
             for key, by_value in differing.items():
                 values = [f"{value} on {some_of(scenes)}" for value, scenes in by_value.items()]
                 texts.append(f"{key} ({some_of(values)})")
-            texts += [f"the version of {part.removeprefix(CODE)}" for part in differing_code(own)]
+            texts += [f"the version of {part.short}" for part in differing_code(own)]
             if texts:
                 arms_by_text.setdefault(some_of(texts), []).append(str(arm))
     return [
@@ -207,55 +209,41 @@ def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
     ]
 
 
-def differing_code(trials: Iterable[TrialResult]) -> dict[str, Versions]:
+def differing_code(trials: Iterable[TrialResult]) -> dict[Part, Versions]:
     """The parts of the code of which the trials used several versions, with these versions.
 
-    Parts are a user's modules, and gsbench's stages and rooms. If several rooms differ, the
-    first stands for all of them, under a name that counts the others.
+    If several packages of gsbench differ, the first stands for all of them, under a name that
+    counts the others.
     """
-    trials = list(trials)
-    differing = _with_several_versions(trials, lambda trial: trial.code)
-    rooms = list(_with_several_versions(trials, lambda trial: trial.rooms).items())
-    if rooms:
-        part, versions = rooms[0]
-        differing[
-            part if len(rooms) == 1 else f"{part} and {counted(len(rooms) - 1, 'more room')}"
-        ] = versions
+    by_part: dict[Part, Versions] = defaultdict(lambda: defaultdict(list))
+    for trial in trials:
+        for part, version in trial.code.items():
+            by_part[part][version].append(trial)
+    differing = {part: dict(versions) for part, versions in by_part.items() if len(versions) > 1}
+    packages = {part: differing.pop(part) for part in [*differing] if part.kind == "package"}
+    for first, versions in [*packages.items()][:1]:
+        more = f" and {counted(len(packages) - 1, 'more package')}" if len(packages) > 1 else ""
+        differing[Part("package", f"{first.name}{more}")] = versions
     return differing
 
 
-def _with_several_versions(
-    trials: Iterable[TrialResult], versions_of: Callable[[TrialResult], Mapping[str, str]]
-) -> dict[str, Versions]:
-    by_part: dict[str, Versions] = defaultdict(lambda: defaultdict(list))
-    for trial in trials:
-        for part, version in versions_of(trial).items():
-            by_part[part][version].append(trial)
-    return {part: dict(versions) for part, versions in by_part.items() if len(versions) > 1}
-
-
-def describe_code(part: str, versions: Mapping[str, Sequence[TrialResult]]) -> str:
+def describe_code(part: Part, versions: Mapping[str, Sequence[TrialResult]]) -> str:
     """The versions of a part of the code in one line, the oldest first.
 
     For example ``mine.Patient: 3fa9c1d2 (garden seeds 0, 1; 2026-11-21 18:40) | …``.
     """
     ordered = sorted(versions.items(), key=lambda item: max(trial.finished for trial in item[1]))
     texts = [
-        f"{short_version(version)} ({_scenes_and_seeds(own)}; {_when(own)})"
-        for version, own in ordered
+        f"{version:.{SHOWN}} ({_scenes_and_seeds(trials)}; {_when(trials)})"
+        for version, trials in ordered
     ]
-    return f"{part.removeprefix(CODE)}: {' | '.join(texts)}"
-
-
-def short_version(version: str) -> str:
-    """The first characters of a version, which is a hash or short anyway."""
-    return version[:SHOWN]
+    return f"{part.short}: {' | '.join(texts)}"
 
 
 def _scenes_and_seeds(trials: Sequence[TrialResult]) -> str:
     """``garden seeds 0, 1; room seed 0``"""
     by_scene = sorted(group_by(trials, lambda trial: trial.scene).items())
-    return "; ".join(f"{scene} {seeds_words(own)}" for scene, own in by_scene)
+    return "; ".join(f"{scene} {seeds_text(own)}" for scene, own in by_scene)
 
 
 def _when(trials: Sequence[TrialResult]) -> str:
@@ -266,28 +254,27 @@ def _when(trials: Sequence[TrialResult]) -> str:
 
 
 def find_superseded(
-    trials: Sequence[TrialResult],
-    present: Callable[[str, TrialResult], str | None] = lambda module, trial: None,
-) -> dict[Path, str]:
+    trials: Sequence[TrialResult], folders: Mapping[Path, str] = MappingProxyType({})
+) -> dict[Path, Change]:
     """The folders of trials that older code made, each with the reason.
 
-    ``present(module, trial)`` is the present hash of a user's module, None if it cannot be found.
-    In this case, and for gsbench's own stages and rooms, the version of the trial that finished
-    last counts as the present one.
+    The user's modules are compared with those in the folder of the trial's command (``folders``).
+    If that is unknown, and for gsbench's own code, the version of the trial that finished last
+    counts as the present one.
     """
-    reasons: dict[Path, str] = {}
     ordered = sorted(trials, key=lambda trial: trial.finished)
-    latest = {
-        part: version for trial in ordered for part, version in (trial.code | trial.rooms).items()
-    }
+    latest = {part: version for trial in ordered for part, version in trial.code.items()}
+    present, reasons = cache(present_version), {}
     for trial in trials:
-        for part, version in (trial.code | trial.rooms).items():
-            name = part.removeprefix(CODE)
-            now = present(name, trial) if part.startswith(CODE) else None
-            if version != (now or latest[part]):
-                words = "it is now" if now else "later trials have"
-                newer = short_version(now or latest[part])
-                reasons[trial.path] = f"{name} was {short_version(version)}, {words} {newer}"
+        folder = folders.get(trial.path)
+        here = {part: present(part, folder) for part in trial.code if part.kind == "module"}
+        unknown = {part: made for part, made in trial.code.items() if here.get(part) is None}
+        changes = [
+            *code_changes(trial.code, here.get),
+            *code_changes(unknown, latest.get, "later code"),
+        ]
+        if changes:
+            reasons[trial.path] = changes[0]
     return reasons
 
 
@@ -342,7 +329,7 @@ def ingredients_between(trials: Sequence[TrialResult], first: Arm, second: Arm) 
     for one, other in compared_trials(trials, first, second):
         if one.made_elsewhere or other.made_elsewhere:
             return (ELSEWHERE,)
-        names += [*ingredients(one.config, other.config), *differing_code((one, other))]
+        names += [*ingredients(one.config, other.config), *map(str, differing_code((one, other)))]
     return tuple(dict.fromkeys(names))
 
 

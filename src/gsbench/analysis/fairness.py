@@ -17,11 +17,10 @@ from gsbench.analysis.differences import (
     ingredients_between,
     ingredients_sentence,
     is_mixed,
-    short_version,
 )
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import CODE, Arm, TrialResult, canonical, group_by, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
@@ -164,10 +163,7 @@ def budget_words(trial: TrialResult) -> str | None:
 
 
 def _code(trial: TrialResult) -> str | None:
-    parts = [
-        f"{part.removeprefix(CODE)} {short_version(version)}"
-        for part, version in sorted(trial.code.items())
-    ]
+    parts = sorted(text.removeprefix("code of ") for text in trial.code_texts)
     release = trial.record.versions.get("gsbench")
     program = f"{trial.program} {trial.trainer_version}".strip()
     return (

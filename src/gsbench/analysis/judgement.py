@@ -122,8 +122,10 @@ class Verdict:
 
     @property
     def equal(self) -> bool:
-        """Return whether all pairs have a difference of exactly 0."""
-        return bool(self.pairs.rows) and not self.pairs.differences.any()
+        """Return whether all pairs have a difference of exactly 0; False without a pair."""
+        # Before the first look, the rows of a sweep in looks have no pairs yet.
+        differences = self.pairs.differences
+        return differences.size > 0 and not differences.any()
 
     @property
     def loss_excluded(self) -> bool:

@@ -266,13 +266,16 @@ def choose_pairs(
     baseline: str = BASELINE,
     controls: Mapping[str, str] = MappingProxyType({}),
     settings: Mapping[Arm, Mapping[str, Any]] = MappingProxyType({}),
+    ages: Mapping[Arm, float] = MappingProxyType({}),
 ) -> list[tuple[Arm, Arm]]:
     """The pairs (baseline, arm) of arms to compare: those with the baseline, then with controls.
 
     An arm is compared with every arm that has the baseline densifier, the same initialiser, and
     the same values of the swept settings that both have. If there is none, it is compared with
     those that share most of these values. So a further arm never takes another arm's baseline
-    away. If no arm can be compared in this way, all are compared with the first of ``arms``.
+    away. If no arm can be compared in this way, all are compared with the oldest of ``arms`` by
+    ``ages``, the times of their first results; of equal ones, with the first.
+
     ``controls`` maps a densifier to a further one that it is compared with (`controls_of`).
     ``settings`` are the arms' configurations, for swept settings that are not in an arm's name.
     """
@@ -285,11 +288,29 @@ def choose_pairs(
     pairs = [
         (one, arm) for arm in arms if arm.densify != baseline for one in partners(arm, baseline)
     ]
-    pairs = pairs or [(arms[0], arm) for arm in arms[1:]]
+    if not pairs and arms:
+        oldest = min(arms, key=lambda arm: ages.get(arm, 0.0))
+        pairs = [(oldest, arm) for arm in arms if arm != oldest]
     for arm in arms:
         control = controls.get(arm.densify, arm.densify)
         if control != arm.densify:
             pairs += [(one, arm) for one in partners(arm, control) if (one, arm) not in pairs]
+    return pairs
+
+
+def baseline_settings(
+    arms: Sequence[Arm], ages: Mapping[Arm, float], baseline: str = BASELINE
+) -> list[tuple[Arm, Arm]]:
+    """The pairs of the baseline's own settings: the oldest of each initialiser, and each other.
+
+    They are compared whatever other arms there are, so that a further arm takes no verdict away.
+    """
+    pairs = []
+    for own in group_by(
+        [arm for arm in arms if arm.densify == baseline], lambda arm: arm.init
+    ).values():
+        oldest = min(own, key=lambda arm: ages.get(arm, 0.0))
+        pairs += [(oldest, arm) for arm in own if arm != oldest]
     return pairs
 
 

@@ -7,20 +7,23 @@ tables over thousands of trials start quickly.
 
 import json
 import math
+import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
+from gsbench.runs.config_hash import is_hashed
 from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.keys import SHOWN, flatten, is_hashed, present_digest
+from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
+from gsbench.runs.nested import SHOWN, flatten
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
 from gsbench.system.machine import kind_of_machine
@@ -29,7 +32,6 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
-CODE = "code of "  # prefix of a user's modules among the keys of ``TrialResult.code``
 # settings in which repetitions of a trial may differ
 UNCOUNTED = ("eval.primary", "eval.controls", "densify.switches", "scene.path", "hydra.")
 GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
@@ -198,31 +200,21 @@ class TrialResult:
         return TrialFolder(self.path)
 
     @cached_property
-    def code(self) -> dict[str, str]:
-        """The versions of the code that made the trial; empty if another program made it.
+    def code(self) -> dict[Part, str]:
+        """The versions of the code that made the trial; empty if another program made it."""
+        return code_of(self.record.code)
 
-        ``code of <module>`` is the hash of a user's module, ``stage <name>`` the version of a stage
-        of gsbench.
-        """
-        code = self.record.code
-        return {f"{CODE}{module}": digest for module, digest in code.sources.items()} | {
-            f"stage {name}": str(version) for name, version in code.stages.items()
-        }
+    @property
+    def code_texts(self) -> list[str]:
+        """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
+        shown = [part for part in self.code if part.kind != "package"]
+        return [f"{part} {self.code[part]:.{SHOWN}}" for part in shown]
 
-    @cached_property
-    def edited(self) -> tuple[str, ...]:
-        """The user's modules that were edited since; those that are not found are left out."""
-        present = {name: present_digest(name) for name in self.record.code.sources}
-        return tuple(
-            name
-            for name, digest in self.record.code.sources.items()
-            if present[name] not in (None, digest)
-        )
-
-    @cached_property
-    def rooms(self) -> dict[str, str]:
-        """The rooms (parts of gsbench) that made the trial, with their states then."""
-        return {f"gsbench's {room}": state for room, state in self.record.code.rooms.items()}
+    @property
+    def edits(self) -> list[Change]:
+        """The user's modules that were edited since, as far as they are found from here."""
+        modules = {part: made for part, made in self.code.items() if part.kind == "module"}
+        return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
 
     @property
     def finished(self) -> float:
@@ -345,7 +337,7 @@ def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
-def seeds_words(trials: Iterable[TrialResult]) -> str:
+def seeds_text(trials: Iterable[TrialResult]) -> str:
     """``seed 0`` or ``seeds 0, 1``"""
     seeds = sorted(trial.seed for trial in trials)
     return f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
@@ -403,20 +395,20 @@ def newest_code(experiment: Experiment) -> Experiment:
     """
     older: list[TrialResult] = []
     lines: list[str] = []
-    for own in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
-        if len({canonical(trial.code | trial.rooms) for trial in own}) < 2:
+    for of_arm in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
+        if len({frozenset(trial.code.items()) for trial in of_arm}) < 2:
             continue
         # eval.primary, switches and the place of the photographs do not tell trials apart
-        for same in group_by(own, lambda trial: settings_text(trial.config)).values():
-            versions = group_by(same, lambda trial: canonical(trial.code | trial.rooms))
+        for same in group_by(of_arm, lambda trial: settings_text(trial.config)).values():
+            versions = group_by(same, lambda trial: frozenset(trial.code.items()))
             newest = max(
                 versions.values(),
-                key=lambda made: (not made[0].edited, max(trial.finished for trial in made)),
+                key=lambda made: (not made[0].edits, max(trial.finished for trial in made)),
             )
             for made in versions.values():
                 if made is not newest:
                     older += made
-                    lines.append(_left_out_words(made, newest[0]))
+                    lines.append(_left_out_line(made, newest[0]))
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
@@ -438,15 +430,14 @@ def settings_text(config: Mapping[str, Any]) -> str:
     )
 
 
-def _left_out_words(made: Sequence[TrialResult], newest: TrialResult) -> str:
+def _left_out_line(made: Sequence[TrialResult], newest: TrialResult) -> str:
     """``sw/garden/sfm-mine seeds 0, 1: left out, made by an earlier mine (3fa9c1d2, now …)``"""
-    one, now = made[0].code | made[0].rooms, newest.code | newest.rooms
-    part = next(part for part in {**now, **one} if one.get(part) != now.get(part))
-    versions = [version.get(part, "none")[:SHOWN] for version in (one, now)]
+    parts = dict.fromkeys([*newest.code, *made[0].code], "none")
+    change = next(code_changes(parts | made[0].code, (parts | newest.code).get))
     cell = f"{made[0].experiment}/{made[0].scene}/{made[0].init}-{made[0].densify}"
     return (
-        f"{cell} {seeds_words(made)}: left out, made by an earlier "
-        f"{part.removeprefix(CODE)} ({versions[0]}; the trials that count have {versions[1]})"
+        f"{cell} {seeds_text(made)}: left out, made by an earlier {change.name} "
+        f"({change.made:.{SHOWN}}; the trials that count have {change.now:.{SHOWN}})"
     )
 
 

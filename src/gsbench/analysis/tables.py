@@ -27,12 +27,12 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.fairness import caveats
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_words
+from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.eval.facts import find_metric
 from gsbench.events import FEWEST_ROUNDS, few_rounds
-from gsbench.runs.keys import SHOWN
 from gsbench.runs.layout import EVENTS
+from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted, some_of
 
@@ -381,8 +381,8 @@ def edited_notes(trials: Sequence[TrialResult]) -> list[str]:
     """A line for each of the user's modules that was edited after it made some of the trials."""
     of_module: dict[str, list[TrialResult]] = {}
     for trial in trials:
-        for module in trial.edited:
-            of_module.setdefault(module, []).append(trial)
+        for edit in trial.edits:
+            of_module.setdefault(edit.name, []).append(trial)
     return [
         f"{module} was edited since: {counted(len(own), 'trial')} of "
         f"{some_of(sorted({f'{one.init}-{one.densify}' for one in own}))} are of the old code. "
@@ -519,4 +519,4 @@ def _points_from(trial: TrialResult) -> str:
 def _arms(trials: Sequence[TrialResult]) -> str:
     """``adc seeds 0, 1; volumetric seed 0``"""
     groups = group_by(trials, lambda trial: trial.densify)
-    return "; ".join(f"{densify} {seeds_words(own)}" for densify, own in groups.items())
+    return "; ".join(f"{densify} {seeds_text(own)}" for densify, own in groups.items())

@@ -199,7 +199,7 @@ def sentence(judged: PairVerdicts) -> str:
     first = verdicts[0]
     if judged.role(first) == DECLARED:
         if first.interval is None:
-            return f"{against}: no verdict yet, {first.untestable or TOO_FEW.format(where)}."
+            return f"{against}: no verdict yet, {first.untestable or _too_few(judged, first)}."
         waits = "" if first.final else "not decided yet, "
         details = [line for line in (like_these_words(first), outlying_words(first)) if line]
         words = "; ".join([in_words(first), *details])
@@ -214,6 +214,16 @@ def sentence(judged: PairVerdicts) -> str:
 
 
 TOO_FEW = "one trial of each on {}; run more seeds"
+BEFORE_LOOKS = (
+    "not all of the first {} seeds are there in both arms; give the sweep's command again"
+)
+
+
+def _too_few(judged: PairVerdicts, verdict: Verdict) -> str:
+    standing = judged.standing
+    if verdict.question.seeds and standing is not None and standing.declaration.looks:
+        return BEFORE_LOOKS.format(standing.declaration.looks[0])
+    return TOO_FEW.format(_scope(verdict))
 
 
 def no_pairs(judged: PairVerdicts) -> str:

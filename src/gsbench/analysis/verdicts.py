@@ -138,7 +138,11 @@ def _judge_families(
         standing = standings.get(pair)
         if standing is None or not standing.beforehand:
             return pair
-        return standing.declaration.time, standing.declaration.hash, bool(question.seeds)
+        # The baseline's own settings are a family of their own: questions about ideas pay nothing
+        # for them.
+        is_setting = pair[0].densify == pair[1].densify
+        named = standing.declaration
+        return named.time, named.hash, bool(question.seeds), is_setting
 
     verdicts: dict[int, Verdict] = {}
     for own in group_by(enumerate(asked), family).values():

@@ -41,8 +41,8 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home, metric_and_question
-from gsbench.runs.keys import flatten
 from gsbench.runs.layout import TUNING
+from gsbench.runs.nested import flatten
 from gsbench.settings import check_settings, check_values
 from gsbench.system.install import install_command
 from gsbench.words import counted, did_you_mean, listed

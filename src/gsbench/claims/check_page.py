@@ -10,7 +10,7 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.charts import ForestRow, forest_plot
-from gsbench.analysis.results import TrialResult, group_by, seeds_words
+from gsbench.analysis.results import TrialResult, group_by, seeds_text
 from gsbench.analysis.statistics import plan_looks
 from gsbench.analysis.table_formats import Table, fill
 from gsbench.analysis.tables import cloud_notes, machine_notes
@@ -169,7 +169,7 @@ def _chart(one: ClaimVerdict) -> str:
 def _folders(trials: Sequence[TrialResult]) -> tuple[tuple[str, str], ...]:
     """``("exp/garden/sfm-adc/1a2b3c4d", "seeds 0, 1, 2")`` for each scene and arm."""
     groups = group_by(trials, lambda trial: trial.label.rpartition(SEED)[0])
-    return tuple((folder, seeds_words(own)) for folder, own in groups.items())
+    return tuple((folder, seeds_text(own)) for folder, own in groups.items())
 
 
 def _number(value: float) -> str:

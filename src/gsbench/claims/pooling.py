@@ -27,7 +27,7 @@ from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Question
-from gsbench.runs.keys import sha256_of
+from gsbench.runs.nested import sha256_of
 
 MIN_STUDIES = 2
 

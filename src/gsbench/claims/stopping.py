@@ -30,8 +30,8 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric
 from gsbench.runs.experiments import Declaration, Question, declared_now, trial_key
-from gsbench.runs.keys import flatten
 from gsbench.runs.layout import SEED
+from gsbench.runs.nested import flatten
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from hydra.errors import HydraException
 from gsbench.config.schema import COMPONENTS
 from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
-from gsbench.runs.keys import DECLARED, NOT_HASHED, WITHOUT_EFFECT
+from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.system.install import conf_dir
 from gsbench.words import did_you_mean
 

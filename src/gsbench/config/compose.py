@@ -44,7 +44,7 @@ from gsbench.config.trust import (
 )
 from gsbench.errors import GsbenchError, InputError
 from gsbench.parsing import MAX_VALUES
-from gsbench.runs.keys import targets_in
+from gsbench.runs.nested import targets_in
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import check_values
 from gsbench.system.install import conf_dir

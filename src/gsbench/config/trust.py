@@ -22,7 +22,7 @@ from omegaconf.grammar_parser import parse
 
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
-from gsbench.runs.keys import TARGET, entries_of, targets_in
+from gsbench.runs.nested import TARGET, entries_of, targets_in
 from gsbench.system.own_modules import allowed_modules
 from gsbench.words import did_you_mean
 

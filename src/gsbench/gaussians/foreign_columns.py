@@ -14,12 +14,16 @@ from gsbench.errors import InputError
 log = logging.getLogger(__name__)
 
 FILTER = "filter_3D"
-# Names of columns, and why a model with them is no set of 3D Gaussians that stand still.
+MOVING = "its Gaussians move with time"
+# Names of columns in lower case, and why a model with them is no set of 3D Gaussians that stand
+# still.
 REFUSED = {
     r"beta|sb_params_\d+": "Beta Splatting's kernels are no Gaussians",
     r"nu_degree|nu": "kernels of Student Splatting are no Gaussians",
     r"shapes?(_\d+)?": "generalised exponentials (GES) are no Gaussians",
-    r"t|scale_t|rot_r_\d|trbf_\w+|motion_\d+|omega_\d+": "its Gaussians move with time",
+    r"t|time|t_\w+|scale_t|rot_[rt]_\d|trbf_\w+|motion_\d+|omega_\d+|velocity_\w+": MOVING,
+    r"f_anchor_feat_\d+|f_offset_\d+": "Scaffold-GS computes its Gaussians by networks",
+    r"f_asg_\d+": "Spec-Gaussian computes its colours by networks",
 }
 # Found so in exports, and without effect on a render of f_dc and f_rest.
 HARMLESS = re.compile("red|green|blue")
@@ -28,10 +32,14 @@ HARMLESS = re.compile("red|green|blue")
 def check_columns(names: Collection[str], known: Collection[str], path: Path) -> None:
     """Raise InputError for a column that changes what is drawn; log those that are not known."""
     unknown = [
-        name for name in names if name not in {*known, FILTER} and not HARMLESS.fullmatch(name)
+        name
+        for name in names
+        if name not in known and not HARMLESS.fullmatch(name) and not is_filter(name)
     ]
     for name in unknown:
-        if reason := next((REFUSED[key] for key in REFUSED if re.fullmatch(key, name)), None):
+        if reason := next(
+            (REFUSED[key] for key in REFUSED if re.fullmatch(key, name.lower())), None
+        ):
             raise InputError(
                 f"{path}: it has the column {name}: {reason}, and gsbench draws Gaussians alone"
             )
@@ -41,6 +49,11 @@ def check_columns(names: Collection[str], known: Collection[str], path: Path) ->
         log.warning("%s: the %s %s %s not known and not used", path, noun, listed, verb)
 
 
+def is_filter(name: str) -> bool:
+    """Return whether a column holds the sizes of Mip-Splatting's 3D filter."""
+    return name.lower() == FILTER.lower()
+
+
 def with_filter_applied(vertices: NDArray[Any], path: Path, largest_logit: float) -> NDArray[Any]:
     """Apply Mip-Splatting's 3D filter, if there is one: to scales and opacities, with a log line.
 
@@ -48,9 +61,10 @@ def with_filter_applied(vertices: NDArray[Any], path: Path, largest_logit: float
     multiplied by the ratio of the volumes before and after (Yu et al. 2024, equation 7). Logits
     are limited to ``largest_logit``.
     """
-    if FILTER not in (vertices.dtype.names or ()):
+    column = next(filter(is_filter, vertices.dtype.names or ()), None)
+    if column is None:
         return vertices
-    sizes = vertices[FILTER].astype(np.float64)  # [N]
+    sizes = vertices[column].astype(np.float64)  # [N]
     if not (np.isfinite(sizes) & (sizes >= 0)).all():
         raise InputError(f"{path}: {FILTER} is negative or not a finite number: export it again")
     log.warning("%s: Mip-Splatting's %s is applied to scales and opacities", path, FILTER)

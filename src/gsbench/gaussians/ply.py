@@ -204,6 +204,7 @@ def read_ply(
     with _checked(path):
         content = read_ply_data(path)
         vertices = content["vertex"].data
+    check_columns(vertices.dtype.names or (), COLUMNS, path)
     present = set(vertices.dtype.names or ())
     present_rest = {name for name in present if name.startswith(REST)}
     rest = [f"{REST}{i}" for i in range(len(present_rest))]
@@ -220,8 +221,15 @@ def read_ply(
         listed = ", ".join(missing) or "all, since it is empty"
         is_cloud = present >= set(POSITION) and "f_dc_0" in missing
         hint = ": it is a point cloud, which init=points reads" if is_cloud else ""
+        if missing == ["scale_2"]:
+            hint = ": it has flat Gaussians (2DGS), and gsbench draws 3D Gaussians alone"
         raise InputError(f"{path}: not a 3DGS PLY; missing or odd properties: {listed}{hint}")
-    check_columns(vertices.dtype.names or (), COLUMNS, path)
+    for name in (*required, *rest):
+        if name not in POSITION and vertices.dtype[name].kind in "iu":
+            raise InputError(
+                f"{path}: {name} has whole numbers, as in a compressed model: export it with "
+                "floating-point numbers"
+            )
     vertices = _with_finite_opacities(vertices, path)
     for name in (*required, *rest):
         _check_finite(vertices[name], name, path)

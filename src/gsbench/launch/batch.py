@@ -15,8 +15,10 @@ from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, stor
 from gsbench.launch.dry_run import unavailable_now
 from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial, run_slurm
 from gsbench.launch.record import add_to_plan, declare, declared_metrics
-from gsbench.runs.keys import OWN, STAGES
+from gsbench.runs.freshness import Change
+from gsbench.runs.keys import STAGES
 from gsbench.runs.layout import STORE
+from gsbench.runs.nested import GSBENCH
 from gsbench.runs.store import Store
 from gsbench.system.install import install_command
 from gsbench.system.stopping import stop_on_signals
@@ -87,7 +89,7 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
     return outcomes, unfinished
 
 
-def _why_not_done(trial: Trial) -> str:
+def _why_not_done(trial: Trial) -> Change | None:
     return trial.files.why_not_done(
         trial.values, lambda options: unavailable_now(json.dumps(options, sort_keys=True))
     )
@@ -159,9 +161,9 @@ def borrowed_names(trials: Sequence[Trial]) -> list[str]:
     lines = []
     for group in ("densify", "init"):
         parts = [trial.values[group] for trial in trials]
-        classes = {(str(part.get("name")), str(part.get("_target_") or OWN)) for part in parts}
+        classes = {(str(part.get("name")), str(part.get("_target_") or GSBENCH)) for part in parts}
         for name, target in sorted(classes):
-            if name in options(group) and not target.startswith(OWN):
+            if name in options(group) and not target.startswith(GSBENCH):
                 lines.append(
                     f"{target} is shown as {name}, like gsbench's own: "
                     f"give it a name, {group}.name={target.rpartition('.')[2].lower()}"

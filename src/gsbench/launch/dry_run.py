@@ -15,9 +15,11 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue
 from gsbench.parsing import DamagedError
-from gsbench.runs.keys import determining_settings, flatten, sha256_of
+from gsbench.runs.config_hash import determining_settings
 from gsbench.runs.layout import RESULTS, SEED, TRIAL_GLOB
+from gsbench.runs.nested import SHOWN, flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.user_code import user_modules
 from gsbench.words import counted, readable_time, some_of
 
 # in the order of a summary
@@ -136,16 +138,21 @@ def _change_since_last(trial: Trial, planned: Collection[Path]) -> str:
     if not earlier:
         return ""
     last = TrialFolder(max(earlier, key=lambda folder: (folder / RESULTS).stat().st_mtime))
+    record = last.sound_record()
     try:
-        before = flatten(determining_settings(last.configuration()))
+        before = _determining(last.configuration(), {} if record is None else record.code.sources)
     except (InputError, OSError):
         return ""
-    now, hash8 = flatten(determining_settings(trial.values)), last.path.name.partition(SEED)[0]
+    now, hash8 = _determining(trial.values, user_modules(trial.values)), last.path.name[:SHOWN]
     keys = [key for key in {**now, **before} if now.get(key) != before.get(key)]
-    if not keys:
-        return f"since {hash8} the code changed"
     changes = [f"{key} {before.get(key, 'unset')} → {now.get(key, 'unset')}" for key in keys]
-    return f"since {hash8} changed: {some_of(changes)}"
+    return f"since {hash8} changed: {some_of(changes)}" if changes else ""
+
+
+def _determining(values: Mapping[str, Any], modules: Mapping[str, str]) -> dict[str, Any]:
+    """The settings that determine a result, with dotted keys, and the user's code."""
+    code = {f"code of {module}": digest[:SHOWN] for module, digest in modules.items()}
+    return flatten(determining_settings(values)) | code
 
 
 def unavailable_in_dry_run(options: dict[str, Any]) -> Collection[str]:

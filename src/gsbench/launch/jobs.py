@@ -29,8 +29,8 @@ from gsbench.launch.states import (
     record_submission,
 )
 from gsbench.logs import set_up_logging
-from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import JOBS, LOG
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.isolate import error_tail

@@ -18,8 +18,8 @@ from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.launch.record import PlannedTrial, read_plan
 from gsbench.parsing import Record, read_if_sound
+from gsbench.runs.config_hash import determining_settings
 from gsbench.runs.experiments import trial_folders
-from gsbench.runs.keys import determining_settings
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
@@ -106,7 +106,7 @@ def _state(folder: Path, planned: PlannedTrial | None, queue: Queue | None) -> T
             folder,
             state,
             _changed(folder / RESULTS),
-            TrialFolder(folder).change() or TrialFolder(folder).why_not_done({}),
+            str(TrialFolder(folder).change() or TrialFolder(folder).why_not_done({})),
         )
     submission = read_submission(folder)
     lost = ""

@@ -32,14 +32,8 @@ from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, offers, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.keys import (
-    OWN,
-    UserCode,
-    module_digest,
-    targets_in,
-    unnamed_modules,
-    user_modules,
-)
+from gsbench.runs.nested import GSBENCH, targets_in
+from gsbench.runs.user_code import UserCode, module_digest, unnamed_modules, user_modules
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import check_values, unknown_setting
 from gsbench.system.device import select_device
@@ -101,7 +95,7 @@ class Parts:
     def initializer(self) -> Initializer:
         values = self.values["init"]
         # else COLMAP would take all cores
-        if values.get("threads") == "auto" and values["_target_"].startswith(OWN):
+        if values.get("threads") == "auto" and values["_target_"].startswith(GSBENCH):
             values = values | {"threads": self.threads}
         initializer: Initializer = build("init", values, self._allowed)
         return initializer
@@ -214,7 +208,7 @@ def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
         check_program(values, allow_targets)
     cls = External if external else locate(target, group, allow_targets)
     options = {key: value for key, value in values.items() if key not in RESERVED}
-    own = target.startswith(OWN)
+    own = target.startswith(GSBENCH)
     _check_names(cls, target, options, group)
     if dataclasses.is_dataclass(cls) and not own:
         options = check_values(cls, options, group)
@@ -281,7 +275,7 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
     ):
         return
     key = f"{group}.{unknown}"
-    if target.startswith(OWN):
+    if target.startswith(GSBENCH):
         raise InputError(unknown_setting(key, unknown, parameters))
     raise InputError(
         f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
@@ -303,7 +297,7 @@ def locate(target: str, group: str, allow_targets: list[str]) -> type:
     if not isinstance(cls, type) or lacking:
         without = f": it has no {', '.join(lacking)}()" if lacking else ""
         raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
-    if target.startswith(OWN):
+    if target.startswith(GSBENCH):
         return cls
     module, permitted = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
     # The first call keeps the digest of the files. It must come right after the import: later they

@@ -45,7 +45,9 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.pipeline.steps.train import external_step, train_step
 from gsbench.runs import keys, layout
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import read_declarations
+from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.store import Store, StoredResult, read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
@@ -64,6 +66,7 @@ from gsbench.runs.trial_record import (
     read_rows,
     split_text,
 )
+from gsbench.runs.user_code import user_modules
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
@@ -229,9 +232,9 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         capture, scene = trial_steps.capture, trial_steps.views.scene
         results = results_of(values, capture, scene, parts.raster, entries, code)
         published = _publish(folder.path, entries, capture.normalization)
-        made_of = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
+        kept = {name: entry.path for name, entry in entries.items() if name != keys.CAPTURE.name}
         sources = source_files(trial_steps.photographs, store)
-        was_done = folder.write_finished(values, results, sources, made_of, published)
+        was_done = folder.write_finished(values, results, sources, kept, published)
         (folder.path / layout.BUILDING).unlink(missing_ok=True)
     metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
@@ -356,19 +359,19 @@ def results_of(
         normalization=None if capture.normalization.is_identity else capture.normalization,
         train_views=len(scene.train),
         test_views=len(scene.test),
-        split=split_text(keys.flatten(values)),
+        split=split_text(flatten(values)),
         held_out=capture.held_out,
         resolution=max((view.camera.width, view.camera.height) for view in views),
         events=sum_events(read_rows(trained.path / layout.EVENTS)),
         init_report=read_json(init.path / REPORT_FILE),
         hashes={
-            "config": keys.config_hash(values),
+            "config": config_hash(values),
             "data": capture.fingerprint,
             "cloud": cloud_hash(init.path),
             **{stage.name: entries[stage.name].key for stage in stages},
         },
         code=Code(
-            sources=keys.user_modules(values),
+            sources=user_modules(values),
             stages={stage.name: stage.version for stage in keys.STAGES},
             rooms=dict(sorted(code.items())),
             **training.checkout,
@@ -411,7 +414,7 @@ def cloud_hash(init: Path) -> str:
     files = read_manifest(init).outputs
     model = (f"{MODEL_FOLDER.as_posix()}/", GAUSSIANS_FILE)
     kept = {name: file.sha256 for name, file in files.items() if name.startswith(model)}
-    return keys.sha256_of(kept)
+    return sha256_of(kept)
 
 
 def versions() -> dict[str, str]:

@@ -36,7 +36,7 @@ from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import TrialSteps, versions
 from gsbench.renders.predictions import opened_renders
 from gsbench.runs import keys
-from gsbench.runs.keys import EVALUATE, ROOMS, sha256_of, states_of
+from gsbench.runs.keys import CODE_OF_STAGE, EVALUATE
 from gsbench.runs.layout import (
     CONFIG,
     GROUND_TRUTH,
@@ -48,6 +48,8 @@ from gsbench.runs.layout import (
     SEED,
     STORE,
 )
+from gsbench.runs.nested import sha256_of
+from gsbench.runs.package_code import states_of
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, RENDERS_ALONE, Code, TrialRecord
@@ -454,7 +456,9 @@ def _results(
         resolution=truth.resolution,
         renders=dict(source),
         hashes={"config": identity, "data": truth.data},
-        code=Code(stages={EVALUATE.name: EVALUATE.version}, rooms=states_of(ROOMS[EVALUATE.name])),
+        code=Code(
+            stages={EVALUATE.name: EVALUATE.version}, rooms=states_of(CODE_OF_STAGE[EVALUATE.name])
+        ),
         versions=versions(),
     )
 

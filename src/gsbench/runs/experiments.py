@@ -15,8 +15,8 @@ from pydantic import Field
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
-from gsbench.runs.keys import sha256_of
 from gsbench.runs.layout import DECLARED, IN_RUNS
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_record import Declared, read_rows
 
 log = logging.getLogger(__name__)

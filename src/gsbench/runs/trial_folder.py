@@ -12,14 +12,14 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic_core import from_json, to_json
 
 from gsbench.errors import InputError
-from gsbench.files import atomic, file_sha256, require_no_links
+from gsbench.files import atomic, require_no_links
 from gsbench.parsing import (
     MAX_NUMBER,
     DamagedError,
@@ -32,8 +32,9 @@ from gsbench.parsing import (
     read_yaml,
 )
 from gsbench.runs import layout
-from gsbench.runs.keys import STAGES, changed_rooms, config_hash, sha256_of
-from gsbench.runs.store import read_manifest
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.freshness import Change, change_of_files, changes, origin_of
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_record import (
     Building,
     Configuration,
@@ -47,9 +48,9 @@ from gsbench.runs.trial_record import (
     read_rows,
     record_from,
 )
-from gsbench.system.install import version_of
 from gsbench.system.locks import is_held
 
+MADE_OF = "made_of"  # the key in results.json
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
 
 TAIL_BYTES = 4096  # bytes at the end of a growing log, enough for its last rows
@@ -193,25 +194,11 @@ class TrialFolder:
         self._stamps = {} if made_of is None else made_of.published
         return record
 
-    def change(self, thorough: bool = False) -> str:
-        """The change among the files `JUDGED` since the results were written, or "".
-
-        A large file with its recorded size and time counts as unchanged, unless ``thorough``. Files
-        that are gone do not count, since models are deleted to make room.
-        """
+    def change(self, thorough: bool = False) -> Change | None:
+        """A change among the judged files since the results were written (`change_of_files`)."""
         if self._digests is None:
             self.sound_record()
-        for name in JUDGED:
-            path, recorded = self.path / name, (self._digests or {}).get(name)
-            if recorded is None or not path.is_file():
-                continue
-            stamp = stamp_of(path)
-            is_large = stamp[0] > MAX_HASHED_BYTES
-            if is_large and not thorough and self._stamps.get(name) == stamp:
-                continue
-            if (file_sha256(path) if is_large else _digest(path)) != recorded:
-                return f"{name} was changed after {layout.RESULTS} was written"
-        return ""
+        return change_of_files(self.path, self._digests or {}, self._stamps, thorough)
 
     def sound_record(self) -> TrialRecord | None:
         """The same as `record`, but None if the trial has no sound results."""
@@ -255,31 +242,10 @@ class TrialFolder:
         path, content = self.path / layout.RESULTS, record.to_json()
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
-        files = sorted(
-            {*published, *(self.path / name for name in RECORDED if (self.path / name).is_file())}
-        )
-        names = {file.relative_to(self.path).as_posix(): file for file in files}
-        sources = sorted(sources)
-        made_of = MadeOf(
-            results=sha256_of(content),
-            config=config_hash(dict(values)),
-            stages={stage.name: stage.version for stage in STAGES},
-            pycolmap=version_of("pycolmap"),
-            sources={str(source): source_stamp_of(source) for source in sources},
-            # Adding or removing a file changes its folder's time.
-            folders={str(source.parent): _changed_at(source.parent) for source in sources},
-            entries={name: str(entry) for name, entry in (entries or {}).items()},
-            published={name: stamp_of(file) for name, file in names.items()},
-            digests={
-                name: file_sha256(file)
-                for name, file in names.items()
-                if name in RECORDED or file.stat().st_size <= MAX_HASHED_BYTES
-            },
-            settings=dict(values),
-        )
+        origin = origin_of(self.path, content, values, sources, entries or {}, published)
         with atomic(path) as temporary:
             temporary.write_text(
-                json.dumps(content | {MADE_OF: made_of.to_json()}, indent=1, allow_nan=False) + "\n"
+                json.dumps(content | {MADE_OF: origin.to_json()}, indent=1, allow_nan=False) + "\n"
             )
             # Verdicts count results from before their declaration by this time, so equal results
             # must not look newer.
@@ -289,32 +255,32 @@ class TrialFolder:
 
     def why_not_done(
         self,
-        values: dict[str, Any],
+        values: Mapping[str, Any],
         unavailable_now: Callable[[dict[str, Any]], Collection[str]] | None = None,
-    ) -> str:
-        """The reason to run or check the trial with the configuration ``values``; "" if it is done.
+    ) -> Change | None:
+        """The reason to run or check the trial with the configuration ``values``; None if done.
 
-        It is done if none of its inputs has changed. If it lacks a metric whose weights or
+        It is done if nothing that made it has changed. If it lacks a metric whose weights or
         packages were missing, it is done only if ``unavailable_now``, called with the
         ``eval`` settings, still contains that metric. Without ``unavailable_now``, it is
         not known whether the metric can be computed, so the trial must be checked.
         """
         try:
-            record, made_of = self.record(), self.made_of()
+            record, origin = self.record(), self.made_of()
         except (FileNotFoundError, UnfinishedError):
-            return f"{layout.RESULTS} is not there, or not complete"
+            return Change("unfinished", layout.RESULTS)
         except DamagedError as error:
-            return f"{error.path.name} {error.reason}"
-        if made_of is None:
-            return f"{layout.RESULTS} does not say what it was made of"
-        if change := next(find_changes(self.path, values, record, made_of), ""):
+            return Change("damaged", error.path.name, now=error.reason)
+        if origin is None:
+            return Change("unrecorded", layout.RESULTS)
+        if change := next(changes(self.path, values, record, origin), None):
             return change
         if not record.awaited:  # asking loads torch
-            return ""
+            return None
         if unavailable_now is None:
-            return f"it lacks {', '.join(record.awaited)}"
+            return Change("lacking", ", ".join(record.awaited))
         available = sorted(set(record.awaited) - set(unavailable_now(values["eval"])))
-        return f"it lacks {', '.join(available)}, which can be computed now" if available else ""
+        return Change("computable", ", ".join(available)) if available else None
 
     # ---- files beside the results
 
@@ -369,101 +335,3 @@ def _number(text: str) -> float:
     if not abs(value) <= MAX_NUMBER:
         raise ValueError(f"{text} is not a measured number")
     return value
-
-
-# ---- what a trial was made of: a repeated sweep recognises finished trials by it
-
-MADE_OF = "made_of"  # the key in results.json
-# files that tables and reports read
-READ_LATER = (layout.PER_VIEW, layout.CURVES, layout.EVENTS, layout.HISTOGRAMS)
-# files by which a trial is judged, exported or run again: after an edit it counts nowhere
-JUDGED = (layout.PER_VIEW, layout.CONFIG, layout.POINT_CLOUD)
-RECORDED = {*READ_LATER, *JUDGED}
-# Files up to so many bytes are compared by content, since a flipped bit changes neither size nor
-# time.
-MAX_HASHED_BYTES = 1e6
-
-# sha256 of files that this process has read, by device, inode and stamp
-_digests: dict[Stamp, str] = {}
-
-
-def find_changes(
-    folder: Path, values: dict[str, Any], record: TrialRecord, made_of: MadeOf
-) -> Iterator[str]:
-    """Reasons why the complete trial in ``folder`` is out of date, quickly found ones first.
-
-    Files are compared by size and time of change, small files of gsbench's also by content.
-    """
-    present = config_hash(values)
-    if record.hashes.get("config") != present or made_of.config != present:
-        yield "its results are of another configuration"
-    versions = {stage.name: stage.version for stage in STAGES}
-    for name in sorted(versions.keys() | made_of.stages.keys()):
-        made, now = made_of.stages.get(name), versions.get(name)
-        if made != now:
-            yield f"it was made by version {made} of the stage {name}, which is now at {now}"
-    if rooms := changed_rooms(record.code.rooms):
-        yield f"the code of gsbench changed in: {', '.join(rooms)}"
-    if made_of.pycolmap != (installed := version_of("pycolmap")):
-        yield f"it was made with pycolmap {made_of.pycolmap}, and {installed} is installed"
-    for source, stamp in made_of.sources.items():
-        yield from _change_of(Path(source), stamp, source_stamp_of)
-    for source_folder, changed in made_of.folders.items():
-        if _changed_at(Path(source_folder)) != changed:
-            yield f"files were added to {source_folder}, or removed"
-    for name, stamp in made_of.published.items():
-        yield from _change_of(folder / name, stamp, stamp_of)
-        is_small = stamp[0] <= MAX_HASHED_BYTES
-        if is_small and name in made_of.digests and _digest(folder / name) != made_of.digests[name]:
-            yield f"{folder / name} has changed"
-    for name, entry in made_of.entries.items():
-        try:
-            read_manifest(Path(entry))
-        except ValueError as error:
-            yield f"the result of its stage {name} in the store is damaged or gone ({error})"
-
-
-def stamp_of(path: Path) -> Stamp:
-    """Size and time of change; raises OSError."""
-    state = os.stat(path)
-    return state.st_size, state.st_mtime_ns
-
-
-def source_stamp_of(path: Path) -> Stamp:
-    """Size, mtime and ctime of a user's file; raises OSError.
-
-    A program may replace a file and restore its mtime, but not its ctime. The ctime of gsbench's
-    own files is not used: they are hard links, and each further link changes it.
-    """
-    state = os.stat(path)
-    return state.st_size, state.st_mtime_ns, state.st_ctime_ns
-
-
-def _change_of(path: Path, stamp: Stamp, stamp_now: Callable[[Path], Stamp]) -> Iterator[str]:
-    try:
-        if stamp_now(path) != stamp:
-            yield f"{path} has changed"
-    except (OSError, ValueError) as error:
-        yield f"{path} cannot be read ({getattr(error, 'strerror', error)})"
-
-
-def _changed_at(folder: Path) -> int | None:
-    try:
-        return folder.stat().st_mtime_ns
-    except (OSError, ValueError):
-        return None
-
-
-def _digest(path: Path) -> str | None:
-    """The sha256 of a file's content; None if it cannot be read.
-
-    Trials share photographs as hard links to one file, so its content is read once.
-    """
-    try:
-        state = os.stat(path)
-        key = state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
-        if key not in _digests:
-            _digests[key] = hashlib.sha256(read_bytes(path)).hexdigest()
-        return _digests[key]
-    except (OSError, DamagedError):
-        return None

@@ -59,8 +59,8 @@ class Budget(Record):
 class Code(Record):
     """The versions of the code: sha256 of a user's modules (``sources``), and of the stages.
 
-    ``rooms`` has the states of the rooms that made the trial (`gsbench.runs.keys`). ``commit`` is
-    that of the checkout that trained; ``edited`` says whether files that git tracks had changed.
+    ``rooms`` has the states of gsbench's packages (`gsbench.runs.package_code`). ``commit`` is that
+    of the checkout that trained; ``edited`` says whether files that git tracks had changed.
     """
 
     sources: dict[str, str] = field(default_factory=dict)

@@ -72,6 +72,15 @@ def model_files(folder: Path) -> list[Path]:
             return files + [
                 file for stem in OPTIONAL if (file := folder / f"{stem}{suffix}").is_file()
             ]
+    for suffix in (".bin", ".txt"):
+        lacking = [
+            f"{stem}{suffix}" for stem in REQUIRED if not (folder / f"{stem}{suffix}").is_file()
+        ]
+        if len(lacking) < len(REQUIRED):
+            hint = "; points3D.txt may be empty" if lacking == ["points3D.txt"] else ""
+            raise InputError(
+                f"{folder}: the COLMAP model is not complete: add {' and '.join(lacking)}{hint}"
+            )
     raise InputError(
         f"{folder}: no COLMAP model here: expected cameras, images and points3D as .bin or .txt"
     )

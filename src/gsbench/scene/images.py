@@ -13,6 +13,7 @@ a result.
 import logging
 import os
 import shutil
+import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -103,10 +104,10 @@ def match_names(
 
     A file of the same name comes first, then the only file whose path differs in the extension
     alone (``a.png`` for ``a.JPG``), then the only one that differs in capitals too (``IMG_1.JPG``
-    for ``img_1.jpg``). With ``other_folders``, if no file fits any name, names and files are
-    compared by the last parts of their paths, as many as give a match (``b/a.jpg`` for
-    ``C:\\data\\b\\a.jpg``). Raises `InputError` if several such files fit a name, or if several
-    names fit such a file.
+    for ``img_1.jpg``). Names that Unicode counts as equal are equal. With ``other_folders``, if no
+    file fits any name, names and files are compared by the last parts of their paths, as many as
+    give a match (``b/a.jpg`` for ``C:\\data\\b\\a.jpg``). Raises `InputError` if several such files
+    fit a name, or if several names fit such a file.
     """
     names, found = list(dict.fromkeys(wanted)), set(files)
     matches = _matched(names, found, WHOLE)
@@ -125,6 +126,8 @@ def _matched(wanted: Iterable[str], files: Iterable[str], count: int) -> dict[st
     """`match_names` by the last ``count`` parts of each path."""
 
     def tail(path: str) -> str:
+        # macOS writes é as two characters (NFD) where most programs write one (NFC)
+        path = unicodedata.normalize("NFC", path)
         return path if count == WHOLE else "/".join(_parts(path)[-count:])
 
     unmatched, free = dict.fromkeys(wanted), set(files)
@@ -163,6 +166,7 @@ def _matched(wanted: Iterable[str], files: Iterable[str], count: int) -> dict[st
 
 def same_folder(one: str, other: str) -> bool:
     """Return whether two names have the same folder, up to capitals."""
+    one, other = (unicodedata.normalize("NFC", name) for name in (one, other))
     return _parts(one)[:-1] == _parts(other)[:-1] or one.casefold() == other.casefold()
 
 

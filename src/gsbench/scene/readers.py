@@ -12,7 +12,7 @@ from gsbench.datasets.catalog import how_to_get
 from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.normalization import find_normalization
-from gsbench.parsing import without_byte_order_mark
+from gsbench.parsing import text_of
 from gsbench.scene.colmap_files import count_images, model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
 from gsbench.scene.images import (
@@ -341,11 +341,12 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
     path = root / file  # an absolute path stays as it is
     require_regular(path)
     try:
-        lines = without_byte_order_mark(path.read_bytes()).decode().splitlines()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+        lines = text_of(path.read_bytes()).splitlines()
+    except InputError as error:
+        raise InputError(f"{key}: {path}: {error}") from error
+    except OSError as error:
         raise InputError(
-            f"{key}: {path} cannot be read ({reason}): name a text file of image names"
+            f"{key}: {path} cannot be read ({error.strerror}): name a text file of image names"
         ) from error
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
 
@@ -354,7 +355,11 @@ def require_subfolder(root: Path, folder: str, key: str) -> Path:
     """The folder below ``root`` that the setting ``key`` names; raises `InputError` without it."""
     path = root / folder
     if not path.is_dir():
-        existing = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+        existing = sorted(
+            entry.name
+            for entry in root.iterdir()
+            if entry.is_dir() and not _is_model(entry) and not _is_model(entry / "0")
+        )
         raise InputError(
             f"{path}: no such folder; set {key} to one of: "
             f"{', '.join(existing) or '(there is no folder)'}"
@@ -385,6 +390,9 @@ def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
                 f"{path.relative_to(root)}: {counted(count, 'image')}"
                 for path, count in counts.items()
             ]
+    for folder in (root / name for name in SPARSE_FOLDERS):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            model_files(folder)  # its error names what the model lacks
     raise InputError(
         f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use "
         "scene=photos"

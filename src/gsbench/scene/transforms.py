@@ -32,7 +32,7 @@ from gsbench.parsing import (
     parse_typed,
     read_bytes,
     resolved,
-    without_byte_order_mark,
+    text_of,
 )
 from gsbench.scene.images import IMAGE_SUFFIXES, image_size, list_images, match_names, stem_of
 from gsbench.scene.options import Backdrop
@@ -59,6 +59,13 @@ PERSPECTIVE, FISHEYE = (
     ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"),
     "OPENCV_FISHEYE",
 )
+FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+# A focal length and a field of view of one camera may differ by rounding and by a shift of the
+# principal point; 5 % is far more than that.
+SAME_FOCAL = 1.05
+# A principal point is taken for the centre of a copy of another size if it is off by this factor
+# along both sides, equally up to a tenth. Copies are halved; other points are off by few percent.
+OTHER_SCALE, SAME_SCALE = 1.5, 0.1
 RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
@@ -204,7 +211,10 @@ def read_transforms(
                 continue
             if name in images:
                 raise InputError(f"{path}: {name} is there twice: name each image once")
-            images[name] = _camera(folder / name, path, record, frame), *_pose(path, frame, applied)
+            camera = _camera(folder / name, path, record, frame)
+            if not names[split]:
+                _report_contradictions(path, record, camera)
+            images[name] = camera, *_pose(path, frame, applied)
             names[split].append(name)
         if missing:
             share = f"{len(missing)} of {len(record.frames)}"
@@ -250,7 +260,7 @@ def _relative_path(path: Path, written: str) -> PurePosixPath:
 def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     content = read_bytes(resolved(path))
     try:
-        content = without_byte_order_mark(content)
+        content = text_of(content).encode()
     except InputError as error:
         raise DamagedError(path, f"cannot be read: {error}") from error
     record = parse_typed(content, TransformsRecord, path)
@@ -374,13 +384,18 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
         return intrinsic
 
     where = f"{path}: {frame.file_path}"
+    _check_own_size(where, record, frame)
     width, height = value("w"), value("h")
     if width is None or height is None:
         width, height = image_size(image)
+        _check_center(where, (width, height), (value("cx"), value("cy")))
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
-    focal_x = _focal_length(width, value("fl_x"), value("camera_angle_x"), value("x_fov"))
-    focal_y = _focal_length(height, value("fl_y"), value("camera_angle_y"), value("y_fov"))
+    # A frame with a focal length of its own, in whatever form, uses none of the file's.
+    own_focal = any(getattr(frame, name) is not None for name in FOCAL_KEYS)
+    source: Intrinsics = frame if own_focal else record
+    focal_x = _focal_length(width, source.fl_x, source.camera_angle_x, source.x_fov)
+    focal_y = _focal_length(height, source.fl_y, source.camera_angle_y, source.y_fov)
     # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
     focal_x, focal_y = (
         focal_y if focal_x is None else focal_x,
@@ -395,6 +410,38 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     model, distortion = _distortion(where, record, frame)
     return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
+
+
+def _check_own_size(where: str, record: TransformsRecord, frame: FrameRecord) -> None:
+    """Raise InputError if the file's intrinsics in px belong to another size than the frame's."""
+    sizes = [(frame.w, record.w), (frame.h, record.h)]
+    if not any(own is not None and shared is not None and own != shared for own, shared in sizes):
+        return
+    in_pixels = ("fl_x", "fl_y", "cx", "cy")
+    if borrowed := [
+        key for key in in_pixels if getattr(frame, key) is None and getattr(record, key) is not None
+    ]:
+        raise InputError(
+            f"{where}: it has another size (w, h) than the file, whose {', '.join(borrowed)} are "
+            "px of the file's size: give the frame its own"
+        )
+
+
+def _check_center(
+    where: str, size: tuple[float, float], center: tuple[float | None, float | None]
+) -> None:
+    """Raise InputError if the principal point is the centre of a copy of another size."""
+    cx, cy = center
+    if cx is None or cy is None:
+        return
+    ratios = [2 * cx / size[0], 2 * cy / size[1]]  # 1 at the centre
+    if min(ratios) <= 0 or abs(math.log(ratios[0] / ratios[1])) > math.log(1 + SAME_SCALE):
+        return
+    if not 1 / OTHER_SCALE < ratios[0] < OTHER_SCALE:
+        raise InputError(
+            f"{where}: its principal point ({cx:g}, {cy:g}) is the centre of a photograph "
+            f"of another size than {size[0]}x{size[1]} px: add w and h"
+        )
 
 
 def _distortion(
@@ -447,3 +494,23 @@ def _focal_length(
     if angle is None:
         return None
     return side / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
+
+
+def _report_contradictions(path: Path, record: TransformsRecord, camera: CameraModel) -> None:
+    """Log one line if a record's focal length and its field of view differ; the first is used."""
+    for source in (record, *record.frames):
+        given = (source.fl_x, source.fl_y)
+        seen = (
+            _focal_length(camera.width, None, source.camera_angle_x, source.x_fov),
+            _focal_length(camera.height, None, source.camera_angle_y, source.y_fov),
+        )
+        for length, other in zip(given, seen, strict=True):
+            if length and other and not 1 / SAME_FOCAL < length / other < SAME_FOCAL:
+                log.warning(
+                    "%s: its focal length is %g px, but its field of view means %g px: the focal "
+                    "length is used",
+                    path,
+                    length,
+                    other,
+                )
+                return

@@ -19,7 +19,8 @@ from gsbench.eval.facts import find_metric
 from gsbench.files import require_no_links
 from gsbench.parsing import Count, Record, read_if_sound
 from gsbench.runs import layout
-from gsbench.runs.keys import TRAIN, flatten, sha256_of
+from gsbench.runs.keys import TRAIN
+from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 

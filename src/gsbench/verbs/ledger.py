@@ -24,8 +24,8 @@ from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.runs import ledger as records
+from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import make_home, stamp_now
-from gsbench.runs.keys import config_hash
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
 from gsbench.settings import is_folder_name

@@ -15,7 +15,6 @@ from gsbench.analysis.cells import (
     to_frame,
     with_variants,
 )
-from gsbench.analysis.differences import short_version
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.paper import (
@@ -43,7 +42,7 @@ from gsbench.analysis.tables import (
 from gsbench.errors import InputError
 from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
-from gsbench.runs.keys import AS_RELEASED
+from gsbench.runs.package_code import edited
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import some_of, split_outside_brackets
 
@@ -345,15 +344,17 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["program"] = f"{record.trained_by.version}: {' '.join(record.trained_by.command)}"
     if machine := trial.machine:
         origin["machine"] = machine
-    if trial.code:
-        origin["code"] = _listed({part: short_version(own) for part, own in trial.code.items()})
+    if code := trial.code_texts:
+        origin["code"] = ", ".join(code)
+    if edits := trial.edits:
+        origin["since"] = "; ".join(map(str, edits))
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    rooms = record.code.rooms
-    edited = [room for room, state in rooms.items() if state != AS_RELEASED]
-    # before the first release all rooms count as edited
-    if edited and len(edited) < len(rooms):
-        origin["edited"] = f"since the last release: {some_of(edited)}"
+    packages = record.code.rooms
+    differing = list(edited(packages))
+    # before the first release all packages count as edited
+    if differing and len(differing) < len(packages):
+        origin["edited"] = f"since the last release: {some_of(differing)}"
     origin["versions"] = _listed(record.versions)
     return origin
 

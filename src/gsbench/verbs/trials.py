@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsbench.analysis.differences import find_superseded
-from gsbench.analysis.results import TrialResult, read_experiment
+from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import key_of, makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import PERMISSIONS
@@ -26,7 +26,6 @@ from gsbench.launch.progress import Progress, progress_of
 from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
-from gsbench.runs.keys import module_digest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
@@ -128,16 +127,12 @@ def progress_with_superseded(home: Path) -> list[TrialState]:
     """The state of every trial in ``home``; those that older code made are ``superseded``."""
     states = states_of_experiment(home)
     folders = {one.folder: one.planned.cwd for one in states if one.planned is not None}
-
     # The user's modules are read in the folder where the trial's command was given: another may
     # have a namesake.
-    def present_digest(module: str, trial: TrialResult) -> str | None:
-        return module_digest(module, folders[trial.path]) if trial.path in folders else None
-
-    reasons = find_superseded(read_experiment(home).trials, present_digest)
+    reasons = find_superseded(read_experiment(home).trials, folders)
     for place, trial in enumerate(states):
         if trial.state == "done" and trial.folder in reasons:
-            states[place] = replace(trial, state="superseded", note=reasons[trial.folder])
+            states[place] = replace(trial, state="superseded", note=str(reasons[trial.folder]))
     return states
 
 

@@ -23,7 +23,7 @@ from gsbench.external.program import run_program
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions
 from gsbench.runs.experiments import ERROR_RATE, Declaration, make_home, trial_key
-from gsbench.runs.keys import sha256_of
+from gsbench.runs.nested import sha256_of
 from gsbench.system.install import WorkTrees
 from gsbench.verbs.arguments import ArgumentParser, add_question, add_where, path
 from gsbench.words import counted, listed, printable

@@ -1,7 +1,5 @@
 """COLMAP's database as pycolmap reads it back: shared cameras, strongest features, counts."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from dataclasses import replace
@@ -10,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import features, geometry, matches
 from gsbench.init.colmap_initializer import report_lenses
-from gsbench.logs import Progress
 from gsbench.scene.exif import (
     DIGITAL_ZOOM,
     EXIF_IFD,
@@ -38,7 +36,7 @@ SIZES = {
 
 
 @pytest.fixture
-def images(tmp_path: Path) -> Path:
+def images(tmp_path):
     for name, size in SIZES.items():
         (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", size).save(tmp_path / "images" / name)
@@ -46,7 +44,7 @@ def images(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def database(images: Path, tmp_path: Path) -> Path:
+def database(images, tmp_path):
     """Cameras and images without features; the names are given unsorted."""
     made.create_database(
         tmp_path / "database.db",
@@ -56,7 +54,7 @@ def database(images: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("sharing", "expected"),
+    "sharing, expected",
     [
         ("exif", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
         ("single", [{"a.png", "b.png", "left/a.png", "left/b.png"}, {"c.png"}]),
@@ -64,9 +62,7 @@ def database(images: Path, tmp_path: Path) -> Path:
         ("per_image", [{name} for name in SIZES]),
     ],
 )
-def test_images_share_a_camera_by_size_folder_or_not_at_all(
-    images: Path, sharing: str, expected: list[set[str]]
-) -> None:
+def test_images_share_a_camera_by_size_folder_or_not_at_all(images, sharing, expected):
     groups = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", None)
     assert [set(names) for _, names in groups] == expected
     for camera, names in groups:
@@ -78,7 +74,7 @@ def test_images_share_a_camera_by_size_folder_or_not_at_all(
     )
 
 
-def with_exif(path: Path, size: tuple[int, int] = (40, 30), **tags: object) -> None:
+def with_exif(path, size=(40, 30), **tags):
     """Write a photograph with EXIF data."""
     exif = Image.Exif()
     own = exif.get_ifd(EXIF_IFD)
@@ -98,7 +94,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
 @pytest.mark.parametrize(
-    ("change", "cameras"),
+    "change, cameras",
     [
         ({}, 1),
         ({"mm": 6.8004}, 1),  # as written by another program
@@ -111,9 +107,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
         ({"film": 0, "mm": 0.0}, 2),  # unknown
     ],
 )
-def test_photographs_share_a_camera_by_their_exif_data(
-    tmp_path: Path, suffix: str, change: dict[str, object], cameras: int
-) -> None:
+def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change, cameras):
     names = [f"{k}{suffix}" for k in range(6)]
     for k, name in enumerate(names):
         with_exif(tmp_path / "images" / name, **TELEPHONE | (change if k % 3 == 2 else {}))
@@ -125,7 +119,7 @@ def test_photographs_share_a_camera_by_their_exif_data(
     assert len(single) == (2 if "size" in change else 1)
 
 
-def test_a_line_names_the_lenses_of_the_photographs(tmp_path: Path, caplog) -> None:
+def test_a_line_names_the_lenses_of_the_photographs(tmp_path, caplog):
     names = tuple(f"{k}.jpg" for k in range(5))
     for k, name in enumerate(names):
         with_exif(tmp_path / name, **TELEPHONE | ({"film": 52} if k == 0 else {}))
@@ -137,7 +131,7 @@ def test_a_line_names_the_lenses_of_the_photographs(tmp_path: Path, caplog) -> N
     assert not caplog.records
 
 
-def test_ids_follow_the_names_and_each_camera_has_a_rig(database: Path) -> None:
+def test_ids_follow_the_names_and_each_camera_has_a_rig(database):
     with pycolmap.Database.open(database) as opened:
         stored = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         assert [image.name for image in stored] == sorted(SIZES)
@@ -155,7 +149,7 @@ def test_ids_follow_the_names_and_each_camera_has_a_rig(database: Path) -> None:
     assert made.image_ids(database).keys() == SIZES.keys()
 
 
-def test_the_strongest_features_are_those_of_the_largest_area(database: Path) -> None:
+def test_the_strongest_features_are_those_of_the_largest_area(database):
     rng = np.random.default_rng(0)
     keypoints = rng.normal(size=(12, 6)).astype(np.float32)
     descriptors = rng.integers(0, 256, (12, 128), dtype=np.uint8)
@@ -169,10 +163,10 @@ def test_the_strongest_features_are_those_of_the_largest_area(database: Path) ->
     order = sorted(range(12), key=lambda row: -areas[row])
     for name, rows in (("b.png", order[:5]), ("a.png", [0]), ("c.png", [])):
         strongest = made.strongest_descriptors(database, name, 5)
-        np.testing.assert_array_equal(strongest, descriptors[rows].reshape(-1, 128))
+        assert_array_equal(strongest, descriptors[rows].reshape(-1, 128))
 
 
-def write_geometries(database: Path, inliers: dict[tuple[str, str], np.ndarray]) -> None:
+def write_geometries(database, inliers):
     ids = made.image_ids(database)
     with pycolmap.Database.open(database) as opened:
         for pair, matches in inliers.items():
@@ -182,7 +176,7 @@ def write_geometries(database: Path, inliers: dict[tuple[str, str], np.ndarray])
             opened.write_two_view_geometry(*(ids[name] for name in pair), verified)
 
 
-def test_verified_pairs_are_counted_only_with_inliers(database: Path) -> None:
+def test_verified_pairs_are_counted_only_with_inliers(database):
     keypoints = {name: np.ones((10 + place, 2)) for place, name in enumerate(SIZES)}
     made.write_keypoints(database, keypoints)
     matches, inliers = np.stack([np.arange(9)] * 2, axis=1), {"ab": 1, "bc": 7, "ac": 0}
@@ -197,7 +191,7 @@ def test_verified_pairs_are_counted_only_with_inliers(database: Path) -> None:
     }
 
 
-def test_assumed_focal_lengths_count_as_known(database: Path) -> None:
+def test_assumed_focal_lengths_count_as_known(database):
     made.write_keypoints(database, dict.fromkeys(SIZES, np.ones((3, 2))))
     some, none = np.zeros((1, 2)), np.zeros((0, 2))
     matches = {("c.png", "b.png"): some, ("a.png", "b.png"): some, ("a.png", "c.png"): none}
@@ -214,14 +208,12 @@ def test_assumed_focal_lengths_count_as_known(database: Path) -> None:
             assert opened.num_verified_image_pairs() == 0
 
 
-@pytest.mark.parametrize(("count", "each"), [(30, 50), (120, 50), (2100, 105)])
-def test_verification_reports_progress_in_parts(
-    database: Path, monkeypatch: pytest.MonkeyPatch, count: int, each: int
-) -> None:
+@pytest.mark.parametrize("count, each", [(30, 50), (120, 50), (2100, 105)])
+def test_verification_reports_progress_in_parts(database, monkeypatch, count, each):
     """A part has 50 pairs, or a twentieth of all; each pair is listed once, by image ids."""
     pairs, listed, told = [("a.png", "b.png"), ("left/a.png", "c.png")] * (count // 2), [], []
 
-    def verify(path: Path, file: Path, options: object) -> None:
+    def verify(path, file, options):
         listed.extend(file.read_text().splitlines())
 
     monkeypatch.setattr(pycolmap, "verify_matches", verify)
@@ -232,10 +224,10 @@ def test_verification_reports_progress_in_parts(
     assert not list(database.parent.glob("*.txt"))
 
 
-@pytest.mark.parametrize(("threads", "each"), [(1, 8), (4, 8), (9, 18)])
+@pytest.mark.parametrize("threads, each", [(1, 8), (4, 8), (9, 18)])
 def test_features_are_extracted_from_eight_images_at_a_time_or_two_per_thread(
-    images: Path, monkeypatch: pytest.MonkeyPatch, threads: int, each: int
-) -> None:
+    images, monkeypatch, threads, each
+):
     calls, told, names = [], [], [f"{number}.png" for number in range(40)]
     monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **options: calls.append(options))
     masks = images if threads == 4 else None
@@ -252,9 +244,7 @@ def test_features_are_extracted_from_eight_images_at_a_time_or_two_per_thread(
         assert Path(call["reader_options"].mask_path) == (masks or Path())
 
 
-def test_images_that_colmap_cannot_read_become_png_under_the_same_name(
-    images: Path, tmp_path: Path
-) -> None:
+def test_images_that_colmap_cannot_read_become_png_under_the_same_name(images, tmp_path):
     assert made.readable_images(images, list(SIZES), tmp_path / "work") == images
     Image.new("RGB", (40, 30), (1, 2, 3)).save(images / "left" / "c.WEBP", lossless=True)
     names = ["a.png", "left/c.WEBP"]
@@ -267,18 +257,17 @@ def test_images_that_colmap_cannot_read_become_png_under_the_same_name(
     assert made.readable_images(images, names, tmp_path / "work") == folder  # made again
 
 
-def test_masks_have_the_names_that_colmap_expects(images: Path, tmp_path: Path) -> None:
+def test_masks_have_the_names_that_colmap_expects(images, tmp_path):
     assert made.colmap_masks({}, tmp_path) is None
     given = {"a.png": images / "b.png", "left/b.png": images / "c.png"}
     for _ in range(2):
         folder = made.colmap_masks(given, tmp_path)
-        assert folder is not None
         for name, mask in given.items():
             assert (folder / f"{name}.png").resolve() == mask
         assert len([path for path in folder.rglob("*.png") if path.is_symlink()]) == 2
 
 
-def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images() -> None:
+def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     model = pycolmap.Reconstruction()
     for number, focal in ((1, 50.0), (2, 60.0)):
         model.add_camera_with_trivial_rig(
@@ -298,19 +287,17 @@ def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images() -
 
 
 @pytest.mark.parametrize(
-    ("count", "processes", "size"), [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
+    "count, processes, size", [(48, 2, 10), (10, 1, 3), (4, 8, 2), (200, 1, 16), (33, 3, 6)]
 )
-def test_parts_are_small_enough_for_six_per_process(count: int, processes: int, size: int) -> None:
+def test_parts_are_small_enough_for_six_per_process(count, processes, size):
     """sqrt(12 processes) blocks, rounded up, with ``size`` images each, at least 2 and at most 16."""
     assert matches._block_size(count, processes) == size
 
 
-def test_matching_is_divided_over_processes_and_reports_one_sum(
-    database: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_matching_is_divided_over_processes_and_reports_one_sum(database, monkeypatch):
     jobs, told = [], []
 
-    def match(function: object, job: matches.MatchingJob, progress: Progress, what: str) -> None:
+    def match(function, job, progress, what):
         """Act as a process that finds one match in its first pair."""
         jobs.append(job)
         assert made.image_ids(job.template) == {str(number): number for number in range(1, 6)}

@@ -1,7 +1,5 @@
 """Pairs of neighbours, and pairs from a preview against a slow version in whole numbers."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 from gsbench.init.colmap.pairs import STRONGEST, best_pairs, count_agreements, sequential_pairs
 
 
-def slow_count(first: np.ndarray, second: np.ndarray) -> int:
+def slow_count(first, second):
     """Mutual nearest neighbours with a ratio test, in int64."""
     distance = ((first[:, None].astype(np.int64) - second[None].astype(np.int64)) ** 2).sum(axis=2)
     found = 0
@@ -22,7 +20,7 @@ def slow_count(first: np.ndarray, second: np.ndarray) -> int:
     return found
 
 
-def sets_of_descriptors(sizes: list[int]) -> list[np.ndarray]:
+def sets_of_descriptors(sizes):
     """Images that share some descriptors, with a little noise."""
     rng = np.random.default_rng(0)
     base = rng.integers(0, 256, (400, 128))
@@ -62,7 +60,7 @@ def test_each_image_keeps_its_best_partners():
 
 
 @pytest.mark.parametrize("partners", [1, 3])
-def test_images_without_any_feature_still_get_partners(partners: int):
+def test_images_without_any_feature_still_get_partners(partners):
     pairs = best_pairs([np.zeros((0, 128), np.uint8)] * 6, partners)
     assert {image for pair in pairs for image in pair} == set(range(6))
 

@@ -1,11 +1,8 @@
 """Matching in several processes gives the matches of COLMAP on one thread."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -20,7 +17,6 @@ from gsbench.init.colmap.features import extract_sift
 from gsbench.init.colmap.matches import distribute_parts, divide_pairs, match_sift
 from gsbench.init.colmap.pairs import best_pairs
 from gsbench.logs import no_progress
-from gsbench.scene.types import Capture
 
 pairs_of_some_images = st.integers(2, 40).flatmap(
     lambda count: st.sets(st.sampled_from(list(itertools.combinations(range(1, count + 1), 2))))
@@ -28,7 +24,7 @@ pairs_of_some_images = st.integers(2, 40).flatmap(
 
 
 @given(pairs_of_some_images, st.integers(1, 9), st.integers(1, 5))
-def test_every_pair_is_matched_once(pairs: set[tuple[int, int]], block: int, processes: int):
+def test_every_pair_is_matched_once(pairs, block, processes):
     parts = divide_pairs(sorted(pairs), block)
     shares = distribute_parts(parts, processes)
     assert sorted(pair for share in shares for part in share for pair in part) == sorted(pairs)
@@ -50,9 +46,7 @@ def test_shares_are_about_equal_and_parts_hold_few_images():
 
 
 @pytest.fixture(scope="module")
-def features(
-    bare_photos: Capture, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, list[tuple[str, str]]]:
+def features(bare_photos, tmp_path_factory):
     """A database with features of photographs whose names have spaces, and all pairs of them."""
     folder = tmp_path_factory.mktemp("features")
     (folder / "images").mkdir()
@@ -65,7 +59,7 @@ def features(
     return database, list(itertools.combinations(names, 2))
 
 
-def read_matches(database: Path) -> tuple[dict[int, bytes], dict[int, tuple[bytes, ...]]]:
+def read_matches(database):
     """Matches and verified geometries by pair, as bytes."""
     with pycolmap.Database.open(database) as opened:
         pair_ids, matches = opened.read_all_matches()
@@ -84,9 +78,7 @@ def read_matches(database: Path) -> tuple[dict[int, bytes], dict[int, tuple[byte
 
 @pytest.mark.parametrize("processes", [1, 3])
 @pytest.mark.slow
-def test_matches_equal_those_of_colmap_on_one_thread(
-    features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, processes: int
-):
+def test_matches_equal_those_of_colmap_on_one_thread(features, tmp_path, processes):
     database, pairs = features
     shutil.copy(database, tmp_path / "colmap.db")
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
@@ -99,7 +91,7 @@ def test_matches_equal_those_of_colmap_on_one_thread(
         device=pycolmap.Device.cpu,
     )
     shutil.copy(database, tmp_path / "database.db")
-    told: list[int] = []
+    told = []
     tell = lambda phase, done, total: told.append(done)  # noqa: E731
     match_sift(tmp_path / "database.db", pairs, Sfm(), processes, tell)
     ours, theirs = read_matches(tmp_path / "database.db"), read_matches(tmp_path / "colmap.db")
@@ -114,21 +106,19 @@ def test_matches_equal_those_of_colmap_on_one_thread(
         }
 
 
-def test_colmaps_matcher_never_gets_a_second_thread(
-    features: tuple[Path, list[tuple[str, str]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_colmaps_matcher_never_gets_a_second_thread(features, tmp_path, monkeypatch):
     """Two threads in one process can corrupt matches, but too rarely to test for it."""
     database, pairs = features
     shutil.copy(database, tmp_path / "database.db")
     threads = []
     match = pycolmap.match_image_pairs
 
-    def noting(path: Path, **options: object) -> None:
+    def noting(path, **options):
         threads.append(options["matching_options"].num_threads)
         match(path, **options)
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", noting)
-    told: list[tuple[str, int, int]] = []
+    told = []
     match_sift(tmp_path / "database.db", pairs, Sfm(), 1, lambda *state: told.append(state))
     assert set(threads) == {1}
     assert (told[0], told[-1]) == (("match", 0, len(pairs)), ("match", len(pairs), len(pairs)))
@@ -137,10 +127,7 @@ def test_colmaps_matcher_never_gets_a_second_thread(
 
 @pytest.mark.slow
 def test_auto_matches_only_the_pairs_that_a_preview_proposes(
-    features: tuple[Path, list[tuple[str, str]]],
-    bare_photos: Capture,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    features, bare_photos, tmp_path, monkeypatch
 ):
     """Few images get all pairs and the same bits; with more (here five), each gets best partners."""
     exhaustive = Sfm(threads=1).run(bare_photos, tmp_path / "all")

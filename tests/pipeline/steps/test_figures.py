@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from PIL import Image, ImageDraw, ImageFont
 
 from gsbench.events import Cause
@@ -14,7 +15,7 @@ from gsbench.pipeline.steps.evaluate import _with_legend, draw_ellipsoids
 from tests.train.conftest import orbit_camera
 
 
-def two_gaussians(means: list[list[float]], log_scales: torch.Tensor) -> Gaussians:
+def two_gaussians(means, log_scales):
     return Gaussians(
         means=torch.tensor(means),
         log_scales=log_scales,
@@ -79,4 +80,4 @@ def test_the_legend_below_the_picture_is_wrapped(words_in_a_line):
     expected.paste(image, (0, 0))
     for (text, color), (left, line) in zip(words, at, strict=True):
         ImageDraw.Draw(expected).text((left, 10 + 14 * line), text, fill=color, font=font)
-    np.testing.assert_array_equal(_with_legend(image, "title word", [Cause.CLONE]), expected)
+    assert_array_equal(_with_legend(image, "title word", [Cause.CLONE]), expected)

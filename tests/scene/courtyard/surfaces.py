@@ -1,20 +1,13 @@
 """Distances of points to the courtyard's surfaces, and a digest of arrays."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from gsbench.scene.courtyard.kernels import nearest_surface
 from gsbench.scene.courtyard.layout import build_layout
 
 
-def surface_distance(
-    points: NDArray[np.float64], seed: int = 0, limit: float = 1e3
-) -> NDArray[np.float64]:
+def surface_distance(points, seed=0, limit=1e3):
     """The distance in m from points [P, 3] to the nearest true surface, at most ``limit``; [P].
 
     It is exact outside all solids. Inside, it is the distance to the nearest surface of any
@@ -26,13 +19,13 @@ def surface_distance(
     return result
 
 
-def fingerprint(values: NDArray[Any]) -> float:
+def fingerprint(values):
     """One number that depends on ``values`` and their order, but hardly on their last digits."""
     flat = np.asarray(values, dtype=np.float64).ravel()
     return float(flat @ (1 + np.arange(len(flat)) % 7) / len(flat))
 
 
 @njit
-def _distances(layout: Any, points: Any, limit: float, result: Any) -> None:
+def _distances(layout, points, limit, result):
     for p in range(len(points)):
         result[p] = nearest_surface(layout, points[p, 0], points[p, 1], points[p, 2], limit)

@@ -1,14 +1,11 @@
 """The procedural courtyard: repeatable, consistent between views, and not blank."""
 
-from __future__ import annotations
-
 import filecmp
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from gsbench.errors import InputError
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.layout import BOX, SPHERE, build_layout
 from gsbench.scene.courtyard.render import (
@@ -19,12 +16,13 @@ from gsbench.scene.courtyard.render import (
 )
 from gsbench.scene.load import load_scene
 from gsbench.scene.readers import read_colmap
+from tests.helpers import refusal
 from tests.scene.cameras import cameras_of
 from tests.scene.courtyard.surfaces import fingerprint, surface_distance
 
 
 @pytest.fixture(scope="module")
-def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture_dir(tmp_path_factory):
     folder = tmp_path_factory.mktemp("courtyard")
     render_courtyard(folder, views=4, width=160, height=120)
     return folder
@@ -32,7 +30,7 @@ def capture_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("threads", [1, 5])
 def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
-    capture_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
+    capture_dir, tmp_path, monkeypatch, threads
 ):
     monkeypatch.setattr("gsbench.scene.courtyard.render.available_threads", lambda: threads)
     told = []
@@ -46,18 +44,18 @@ def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
     assert len(same) == len(names) >= 7
 
 
-def test_the_colmap_model_has_the_exact_cameras(capture_dir: Path, tmp_path: Path):
+def test_the_colmap_model_has_the_exact_cameras(capture_dir, tmp_path):
     written = cameras_of(read_model(capture_dir / "sparse/0"))
     for name, camera in courtyard_cameras(4, 160, 120).items():
-        np.testing.assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
-        np.testing.assert_allclose(written[name].translation, camera.translation, atol=1e-12)
+        assert_allclose(written[name].rotation, camera.rotation, atol=1e-12)
+        assert_allclose(written[name].translation, camera.translation, atol=1e-12)
         assert (written[name].fx, written[name].cx, written[name].cy) == (camera.fx, 80, 60)
     capture = read_colmap("courtyard", capture_dir, exact_poses=True)
     assert len(load_scene(capture, capture.model, tmp_path).train) == 3
 
 
 @pytest.mark.parametrize("views", [12, 48, 60])
-def test_neighbouring_views_are_close(views: int):
+def test_neighbouring_views_are_close(views):
     centers = np.array([camera.center for camera in courtyard_cameras(views, 40, 30).values()])
     azimuth = np.degrees(np.unwrap(np.arctan2(centers[:, 1], centers[:, 0])))
     assert np.abs(np.diff(azimuth)).max() <= 7.5 + 1e-9
@@ -130,7 +128,7 @@ PICTURES = [  # for each view: `fingerprint` of red, green and blue, about four 
 
 
 @pytest.mark.parametrize("seed", SOLIDS)
-def test_the_solids_change_only_with_the_version(seed: int):
+def test_the_solids_change_only_with_the_version(seed):
     """If this test fails, raise the courtyard's VERSION."""
     made = {name: fingerprint(values) for name, values in build_layout(seed)._asdict().items()}
     assert made == pytest.approx(SOLIDS[seed], rel=1e-9), made
@@ -142,7 +140,7 @@ def test_the_images_change_only_with_the_version():
     for angle in np.arange(8) * np.pi / 4:
         picture = render_view(build_layout(1), ring_camera(angle, 80, 60), 1)
         made.append([fingerprint(picture[..., channel]) for channel in range(3)])
-    np.testing.assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
+    assert_allclose(made, PICTURES, atol=0.02, err_msg=str(np.round(made, 3).tolist()))
 
 
 def test_surface_distance_is_zero_on_surfaces_and_correct_above_the_lawn():
@@ -166,7 +164,7 @@ def test_surface_distance_is_zero_on_surfaces_and_correct_above_the_lawn():
         < 1e-9
     )
     # The ground is nearest to points of the open lawn, roofs to a point high above.
-    np.testing.assert_allclose(
+    assert_allclose(
         surface_distance(np.array([[-2.5, 3.6, 0.2], [-2.5, 3.6, -0.1]])), [0.2, 0.1], atol=1e-9
     )
     assert surface_distance(np.array([[0.0, 0.0, 8.0]]))[0] > 4
@@ -174,7 +172,7 @@ def test_surface_distance_is_zero_on_surfaces_and_correct_above_the_lawn():
 
 
 def test_too_few_views_and_too_small_images_are_refused():
-    with pytest.raises(InputError, match=r"scene\.views"):
+    with refusal(r"scene\.views"):
         courtyard_cameras(2, 40, 30)
-    with pytest.raises(InputError, match=r"scene\.width"):
+    with refusal(r"scene\.width"):
         courtyard_cameras(3, 8, 8)

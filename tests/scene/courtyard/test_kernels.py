@@ -4,21 +4,19 @@ The functions run as plain Python here, not compiled, so the pinned values are t
 processor.
 """
 
-from __future__ import annotations
-
 from math import inf
-from types import FunctionType, ModuleType, SimpleNamespace
+from types import FunctionType, SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.testing import assert_allclose
 
 from gsbench.scene.courtyard import kernels, layout, textures
 from gsbench.scene.courtyard.layout import BOX, SPHERE, TUBE, build_layout
 from tests.scene.courtyard.surfaces import fingerprint
 
 
-def uncompiled(*modules: ModuleType) -> SimpleNamespace:
+def uncompiled(*modules):
     """The functions of ``modules`` as plain Python, which call one another uncompiled."""
     names = {name: value for module in modules for name, value in vars(module).items()}
     for name, value in list(names.items()):
@@ -40,9 +38,7 @@ SHAPES = {
 }
 
 
-def is_inside(
-    kind: int, size: tuple[float, float, float], points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def is_inside(kind, size, points):
     """Mask [P] of the ``points`` [P, 3] in the solid."""
     if kind == BOX:
         return (np.abs(points) < size).all(axis=-1)
@@ -52,9 +48,7 @@ def is_inside(
     return (radii < size[0]) & (radii > size[2]) & (np.abs(points[:, 2]) < size[1])
 
 
-def rays(
-    seed: int, count: int, reach: float
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def rays(seed, count, reach):
     """Origins and unit directions of rays towards the middle, some of them along an axis.
 
     Origins are about ``reach`` from the middle.
@@ -69,7 +63,7 @@ def rays(
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name: str) -> None:
+def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name):
     kind, size = SHAPES[name]
     starts = [*rays(0, 120, 2.0), *(rays(1, 40, 0.0) if size[2] == 0.5 else [])]
     steps, hits = np.linspace(1e-4, 4.0, 8001), 0
@@ -88,7 +82,7 @@ def test_a_ray_hits_a_solid_where_samples_along_it_enter_the_solid(name: str) ->
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_normals_are_the_gradient_of_the_distance(name: str) -> None:
+def test_normals_are_the_gradient_of_the_distance(name):
     kind, size = SHAPES[name]
     tried = 0
     for origin, direction in [*rays(2, 80, 2.0), *(rays(3, 40, 0.0) if size[2] == 0.5 else [])]:
@@ -102,7 +96,7 @@ def test_normals_are_the_gradient_of_the_distance(name: str) -> None:
             for step in 1e-6 * np.eye(3)
         ]
         *normal, u, v = PLAIN.local_normal(kind, size, *point)
-        np.testing.assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
+        assert_allclose(normal, np.diff(moved, axis=1)[:, 0] / -2e-6, atol=1e-4)
         assert np.dot(normal, direction) < 0
         x, y, z = point
         if kind == BOX:  # along the longer side of the face, then along the other
@@ -116,7 +110,7 @@ def test_normals_are_the_gradient_of_the_distance(name: str) -> None:
     assert tried > 20
 
 
-def test_the_first_hit_equals_that_of_a_search_over_all_primitives() -> None:
+def test_the_first_hit_equals_that_of_a_search_over_all_primitives():
     """The boxes of groups and the bounding spheres exclude only what a ray misses."""
     found = set()
     for origin, direction in rays(4, 60, 4.0):
@@ -139,7 +133,7 @@ def test_the_first_hit_equals_that_of_a_search_over_all_primitives() -> None:
     assert len(found) > 10
 
 
-def test_the_nearest_surface_equals_that_of_a_search_over_all_primitives() -> None:
+def test_the_nearest_surface_equals_that_of_a_search_over_all_primitives():
     rng = np.random.default_rng(5)
     for point in np.concatenate(
         [rng.uniform([-7, -7, 0], [7, 7, 3], (40, 3)), LAYOUT.center[::6] + 0.1]
@@ -172,7 +166,7 @@ PINNED = {
 
 
 @pytest.mark.parametrize("name", PINNED)
-def test_textures_change_only_with_the_version(name: str) -> None:
+def test_textures_change_only_with_the_version(name):
     """Values near and far from the camera; if this test fails, raise the courtyard's VERSION."""
     rng = np.random.default_rng(6)
     values = []
@@ -191,7 +185,7 @@ def test_textures_change_only_with_the_version(name: str) -> None:
     assert found == pytest.approx(PINNED[name], rel=1e-9), found
 
 
-def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there() -> None:
+def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there():
     for i in range(-3, 3):
         corner = 2 * PLAIN.random_cell(i, 4 - i, 0, 7) - 1
         assert PLAIN.noise2(i, 4 - i, 7) == pytest.approx(corner)
@@ -204,7 +198,7 @@ def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there() -> No
     assert np.abs(counts - 128).max() < 5 * 128**0.5
 
 
-def test_pebbles_are_the_two_nearest_of_all_feature_points() -> None:
+def test_pebbles_are_the_two_nearest_of_all_feature_points():
     rng = np.random.default_rng(8)
     cells = [(i, j) for i in range(-9, 9) for j in range(-9, 9)]
     places = np.array(
@@ -219,7 +213,7 @@ def test_pebbles_are_the_two_nearest_of_all_feature_points() -> None:
         assert shade == PLAIN.random_cell(*cells[nearest], 3, 2)
 
 
-def test_light_is_encoded_as_srgb_up_to_a_soft_shoulder() -> None:
+def test_light_is_encoded_as_srgb_up_to_a_soft_shoulder():
     for value in np.linspace(0, 0.6, 20) / kernels.EXPOSURE:
         light = kernels.EXPOSURE * value
         srgb = 12.92 * light if light <= 0.0031308 else 1.055 * light ** (1 / 2.4) - 0.055

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gsbench.analysis import verdict_words
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.comparison import VERDICT, compare
-from gsbench.analysis.differences import between_scenes_notes, short_version
+from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
@@ -387,13 +387,12 @@ def provenance(trials: Sequence[TrialResult]) -> Table:
 
 def _facts_of(trial: TrialResult) -> dict[str, str]:
     record = trial.record
-    code = [f"{part} {short_version(version)}" for part, version in trial.code.items()]
     return {
         "raster": record.raster,
         "protocol": record.protocol,
         "iterations": str(record.iterations),
         **{f"{key} hash": value[:12] for key, value in record.hashes.items()},
-        "code": ", ".join(code),
+        "code": ", ".join(trial.code_texts),
         "machine": trial.machine or "",
         "versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
     }

@@ -19,22 +19,12 @@ from gsbench.init.placed import GREY
 from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, progress
 from gsbench.normalization import IDENTITY
-from gsbench.runs.keys import (
-    CAPTURE,
-    GROUND_TRUTH,
-    INIT,
-    NO_USER_CODE,
-    VIEWS_ROOMS,
-    Step,
-    UserCode,
-    edited,
-    options_of,
-    sha256_of,
-    states_of,
-    step_of,
-)
+from gsbench.runs.keys import CAPTURE, CODE_OF_VIEWS, GROUND_TRUTH, INIT, Step, options_of, step_of
 from gsbench.runs.layout import MASKS, VIEWS
+from gsbench.runs.nested import sha256_of
+from gsbench.runs.package_code import edited, states_of
 from gsbench.runs.store import Store
+from gsbench.runs.user_code import NO_USER_CODE, UserCode
 from gsbench.scene.colmap import normalize_capture, write_frames
 from gsbench.scene.courtyard.render import render_courtyard
 from gsbench.scene.images import (
@@ -249,7 +239,7 @@ def view_versions() -> dict[str, str | None]:
     Pillow reads and shrinks images, pycolmap undistorts them.
     """
     return {
-        **edited(states_of(VIEWS_ROOMS)),
+        **edited(states_of(CODE_OF_VIEWS)),
         **{package: version_of(package) for package in ("pycolmap", "pillow")},
     }
 

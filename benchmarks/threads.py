@@ -1,6 +1,6 @@
 """A simulation of a training step of ``raster=cpu`` on more threads than this machine has.
 
-    python -m tests.benchmarks.threads [TRIAL WIDTH] ...
+    python -m benchmarks.threads [TRIAL WIDTH] ...
 
 A trial is a folder with a trained model; one of its training views is drawn, ``WIDTH`` px wide.
 Without a trial, the scene of `gsbench bench` is drawn. Every shard is timed on one thread, by

@@ -1,6 +1,6 @@
 """Time a training iteration in OpenSplat and in ``raster=cpu``, in turns, with the same inputs.
 
-    python -m tests.benchmarks.opensplat [WIDTHxHEIGHT COUNT]
+    python -m benchmarks.opensplat [WIDTHxHEIGHT COUNT]
 
 The model is the trained-like scene of `gsbench bench`, seen by two cameras side by side;
 photographs are noise. Nothing grows, and both optimisers step in every iteration. Both programs are

@@ -1,18 +1,16 @@
 """What counts as a wait for a device, and how many waits a training step has."""
 
-from __future__ import annotations
-
 import json
 import os
-import subprocess
 import sys
 
 import pytest
 import torch
 
+from benchmarks.counters import counting_waits
 from gsbench.raster.staged import Readback
-from tests.benchmarks.counters import counting_waits
 from tests.conftest import ROOT
+from tests.processes import completed
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +35,7 @@ FREE = {
 
 
 @pytest.mark.parametrize("what", list(WAITING))
-def test_operations_that_wait_are_counted(what: str) -> None:
+def test_operations_that_wait_are_counted(what):
     work, expected = WAITING[what]
     with counting_waits(pretend=True) as counts:
         work()
@@ -45,26 +43,26 @@ def test_operations_that_wait_are_counted(what: str) -> None:
 
 
 @pytest.mark.parametrize("what", list(FREE))
-def test_operations_that_do_not_wait_are_not_counted(what: str) -> None:
+def test_operations_that_do_not_wait_are_not_counted(what):
     with counting_waits(pretend=True) as counts:
         FREE[what]()
     assert counts == {}
 
 
-def test_python_numbers_for_the_cpu_do_not_wait() -> None:
+def test_python_numbers_for_the_cpu_do_not_wait():
     with counting_waits() as counts:
         torch.tensor([1.0])
     assert counts == {}
 
 
-def test_waits_in_the_backward_pass_are_counted() -> None:
+def test_waits_in_the_backward_pass_are_counted():
     class Reads(torch.autograd.Function):
         @staticmethod
-        def forward(ctx, x):  # type: ignore[no-untyped-def]
+        def forward(ctx, x):
             return x.clone()
 
         @staticmethod
-        def backward(ctx, g):  # type: ignore[no-untyped-def]
+        def backward(ctx, g):
             return g * g.sum().item()
 
     leaf = torch.ones(3, requires_grad=True)
@@ -73,7 +71,7 @@ def test_waits_in_the_backward_pass_are_counted() -> None:
     assert counts == {"_local_scalar_dense": 1}
 
 
-def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch):
     with counting_waits() as counts:
         assert Readback(ONE).values().tolist() == [1, 1, 1, 1]
     assert counts == {}
@@ -84,7 +82,7 @@ def test_a_readback_waits_only_if_it_has_not_arrived(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("raster", ["triton", "reference"])
-def test_a_training_step_with_triton_waits_once(raster: str) -> None:
+def test_a_training_step_with_triton_waits_once(raster):
     """It reads how much there is to composite. The reference shows that more waits are counted."""
     pytest.importorskip("triton")
     environment = os.environ | {
@@ -92,10 +90,7 @@ def test_a_training_step_with_triton_waits_once(raster: str) -> None:
         "PYTHONPATH": os.pathsep.join(path for path in [str(ROOT), *sys.path] if path),
     }
     command = [sys.executable, "-m", "tests.train.one_step", raster]
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed(command, cwd=ROOT, env=environment)
     counts = {
         name: count for line in done.stdout.splitlines() for name, count in json.loads(line).items()
     }

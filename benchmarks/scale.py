@@ -1,6 +1,6 @@
 """Time how long verbs take to read an experiment of thousands of finished, made-up trials.
 
-    python -m tests.benchmarks.scale FOLDER [SCENES ARMS SEEDS]
+    python -m benchmarks.scale FOLDER [SCENES ARMS SEEDS]
 
 prints a line for each verb, and one for the dry run of a sweep of as many further trials: its name,
 CPU seconds and wall seconds of the whole command.
@@ -18,7 +18,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsbench.runs.keys import config_hash, sha256_of
+from gsbench.runs.config_hash import config_hash
+from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from tests.finished import record_of
 

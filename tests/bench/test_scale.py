@@ -1,20 +1,16 @@
 """Verbs over an experiment of many trials: their output is right; their time is only printed."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
+from benchmarks.scale import NAME, timed, write_all
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from tests.benchmarks.scale import NAME, timed, write_all
 
 pytestmark = pytest.mark.slow
 
 
-def test_many_trials_are_read_and_averaged(tmp_path: Path) -> None:
-    """For ten thousand trials: `python -m tests.benchmarks.scale FOLDER 50 20 10`."""
+def test_many_trials_are_read_and_averaged(tmp_path):
+    """For ten thousand trials: `python -m benchmarks.scale FOLDER 50 20 10`."""
     assert write_all(tmp_path, scenes=3, arms=4, seeds=5) == 60
     experiment = load_experiment(tmp_path, NAME)
     assert len(experiment.trials) == 60

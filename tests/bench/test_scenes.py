@@ -1,13 +1,10 @@
 """Scenes and cameras for timing."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from torch.testing import assert_close
 
 from gsbench.bench.scenes import (
     SCENES,
@@ -18,31 +15,28 @@ from gsbench.bench.scenes import (
     trained_like_gaussians,
 )
 from gsbench.bench.scenes import random_gaussians as initial_gaussians
-from gsbench.errors import InputError
-from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.ply import write_ply
 from gsbench.raster.reference import ReferenceRasterizer, project
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import refusal
 
 
-def test_the_camera_before_a_scene_is_at_twice_the_median_distance_from_its_middle() -> None:
+def test_the_camera_before_a_scene_is_at_twice_the_median_distance_from_its_middle():
     scene = random_gaussians(5)
     middle = torch.tensor([2.0, -1.0, 30.0])
     offsets = torch.tensor([[0.0, 0, 0], [3, 4, 0], [-3, -4, 0], [0, 0, 9], [0, 0, -9]])
     scene.means = middle + offsets  # distances 0, 5, 5, 9, 9
     camera = camera_before(scene, 60, 45)
-    np.testing.assert_allclose(camera.translation, [-2, 1, -30 + 10], atol=1e-6)
+    assert_allclose(camera.translation, [-2, 1, -30 + 10], atol=1e-6)
     for one in (camera, frontal_camera(60, 45)):
         assert (one.width, one.height, one.cx, one.cy) == (60, 45, 30, 22.5)
         assert one.fx == one.fy == 54
-        np.testing.assert_array_equal(one.rotation, np.eye(3))
-    np.testing.assert_array_equal(one.translation, np.zeros(3))
+        assert_array_equal(one.rotation, np.eye(3))
+    assert_array_equal(one.translation, np.zeros(3))
 
 
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
-def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(
-    make: Callable[..., Gaussians],
-) -> None:
+def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(make):
     scene = make(500)
     assert len(scene) == 500
     assert torch.equal(scene.means, make(500).means)
@@ -51,12 +45,12 @@ def test_scenes_have_the_wanted_count_and_are_seeded_and_seen(
         output = ReferenceRasterizer().render(scene, camera, 3, torch.zeros(3))
         assert 0.3 < output.visible.float().mean() <= 1
         assert output.alpha.mean() > 0.3
-    with pytest.raises(InputError, match="count must be at least 1, got 0"):
+    with refusal("count must be at least 1, got 0"):
         make(0)
     assert len(make(1)) == 1
 
 
-def test_a_trained_scene_has_small_flat_gaussians_at_all_depths() -> None:
+def test_a_trained_scene_has_small_flat_gaussians_at_all_depths():
     scene = trained_like_gaussians(20_000)
     depth = scene.means[:, 2]
     assert (depth.min(), depth.median(), depth.max()) == pytest.approx((2, 48**0.5, 24), rel=0.03)
@@ -77,17 +71,17 @@ def test_a_trained_scene_has_small_flat_gaussians_at_all_depths() -> None:
         assert (value.mean(), value.std()) == pytest.approx((mean, spread), rel=0.03, abs=0.05)
 
 
-def test_an_initial_scene_has_faint_spheres_of_the_size_of_their_distance_in_a_box() -> None:
+def test_an_initial_scene_has_faint_spheres_of_the_size_of_their_distance_in_a_box():
     scene = initial_gaussians(8000)
     assert scene.means.amin(0).tolist() == pytest.approx([-2, -2, 2], abs=0.01)
     assert scene.means.amax(0).tolist() == pytest.approx([2, 2, 6], abs=0.01)
-    torch.testing.assert_close(scene.scales, torch.full((8000, 3), 0.7 * 4 / 20))
-    torch.testing.assert_close(scene.opacities, torch.full((8000,), 0.1))
-    torch.testing.assert_close(scene.rotations, torch.eye(3).expand(8000, 3, 3))
+    assert_close(scene.scales, torch.full((8000, 3), 0.7 * 4 / 20))
+    assert_close(scene.opacities, torch.full((8000,), 0.1))
+    assert_close(scene.rotations, torch.eye(3).expand(8000, 3, 3))
     assert (scene.sh_rest.shape, scene.sh_rest.any().item()) == ((8000, 15, 3), False)
 
 
-def longest_list(scene: Gaussians) -> float:
+def longest_list(scene):
     """The longest list of a tile over the mean one; a Gaussian counts in the tile of its mean."""
     camera = frontal_camera(500, 375)
     tile = (project(scene, camera).means.double() + 0.5).div(16).floor().long()  # [M, 2]
@@ -96,7 +90,7 @@ def longest_list(scene: Gaussians) -> float:
     return (lists.max() / lists[lists > 0].mean()).item()
 
 
-def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
+def test_the_skewed_scene_has_the_skew_of_a_trained_model():
     """A trained courtyard has 1,054 entries per block at most, and 117 on average."""
     skewed, trained = skewed_gaussians(50_000), trained_like_gaussians(50_000)
     assert longest_list(skewed) == pytest.approx(1054 / 117, rel=0.25)
@@ -110,7 +104,7 @@ def test_the_skewed_scene_has_the_skew_of_a_trained_model() -> None:
     assert inside.float().mean(0).min() > 0.97
 
 
-def test_a_scene_for_timing_has_two_views_of_noise(tmp_path: Path) -> None:
+def test_a_scene_for_timing_has_two_views_of_noise(tmp_path):
     gaussians, scene = make_scene("random", 60, 45, 30)
     assert torch.equal(gaussians.means, initial_gaussians(30).means)
     assert ([view.name for view in scene.train], scene.test) == (["0.png", "1.png"], ())
@@ -121,6 +115,6 @@ def test_a_scene_for_timing_has_two_views_of_noise(tmp_path: Path) -> None:
     model, scene = make_scene("unused", 60, 45, 7, tmp_path / "m.ply")
     assert torch.equal(model.means, gaussians.means)
     wanted = camera_before(gaussians, 60, 45).translation
-    np.testing.assert_array_equal(scene.train[1].camera.translation, wanted)
-    with pytest.raises(InputError, match="--scene nosuch is not known; choose trained or random"):
+    assert_array_equal(scene.train[1].camera.translation, wanted)
+    with refusal("--scene nosuch is not known; choose trained or random"):
         make_scene("nosuch", 60, 45, 30)

@@ -1,0 +1,148 @@
+"""The user's code behind a trial: its modules, each with a digest of what it computes.
+
+These are the modules of configured classes and those in ``allow_targets``: no others can be
+imported. A module counts whole, Python by its syntax, other code by its bytes.
+"""
+
+import hashlib
+import importlib.util
+import sys
+import sysconfig
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from typing import Any
+
+from gsbench.files import file_sha256
+from gsbench.runs.nested import GSBENCH, targets_in
+from gsbench.runs.package_code import PACKAGE, syntax_of
+
+# packages in these folders are identified by their versions
+INSTALLED = frozenset({"site-packages", "dist-packages"})
+CODE_SUFFIXES = frozenset({".py", ".so", ".pyd", ".c", ".cpp", ".cu", ".h", ".cuh"})
+
+# a module's digest when it was first asked for
+_digests_at_import: dict[str, tuple[ModuleSpec, str | None]] = {}
+
+
+@dataclass(frozen=True)
+class UserCode:
+    """The user's code in a trial: digests of its modules, and the classes that are configured.
+
+    ``targets`` maps a place of the configuration (``densify``, ``eval.extra.sharp``) to a class's
+    import path, gsbench's own classes included.
+    """
+
+    modules: Mapping[str, str] = field(default_factory=dict)
+    targets: Mapping[str, str] = field(default_factory=dict)
+
+    def is_behind(self, component: Any, place: str) -> bool:
+        """Return whether the component's class comes from a user's module, or is named by one."""
+        paths = self.targets.get(place, GSBENCH), f"{type(component).__module__}."
+        return not all(path.startswith(GSBENCH) for path in paths)
+
+
+NO_USER_CODE = UserCode()
+
+
+def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
+    """``{module: sha256}`` of the user's code behind a configuration; {} if there is none.
+
+    These are the modules of its classes, and the modules in ``allow_targets``, which the classes
+    may import. An installed module is included only if a class comes from it.
+    """
+    targets = {target for _, target in targets_in(values) if not target.startswith(GSBENCH)}
+    of_classes = {target.split(".")[0] for target in targets}
+    if not of_classes:
+        return {}
+    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - of_classes
+    helpers = {
+        name
+        for name in helpers
+        if (spec := _find_spec(name)) is not None and not _is_installed(spec)
+    }
+    digests = {name: module_digest(name) for name in sorted(of_classes | helpers)}
+    return {name: digest for name, digest in digests.items() if digest is not None}
+
+
+def module_digest(name: str, folder: str | None = None) -> str | None:
+    """The sha256 of a top-level module: of its file, or of all code in its package.
+
+    None if it is not found. A module that this process has imported keeps its digest: that is
+    the code that runs. With ``folder``, the module is found as by a program that is started
+    there, without regard to what this process has imported.
+    """
+    loaded = sys.modules.get(name) if folder is None else None
+    spec = _find_spec(name, folder) if loaded is None else loaded.__spec__
+    if spec is None:
+        return None
+    if loaded is None:
+        return _digest_on_disk(spec)
+    cached = _digests_at_import.get(name)
+    if cached is None or cached[0] is not spec:
+        cached = _digests_at_import[name] = (spec, _digest_on_disk(spec))
+    return cached[1]
+
+
+def has_changed_since_import(name: str) -> bool:
+    """Return whether a module's files differ from the code that this process has imported."""
+    loaded = sys.modules.get(name)
+    spec = None if loaded is None else loaded.__spec__
+    return spec is not None and module_digest(name) != _digest_on_disk(spec)
+
+
+def unnamed_modules(before: Collection[str], named: Collection[str]) -> list[str]:
+    """The user's modules imported since ``before`` but not ``named``; no key has their code."""
+    tops = {name.split(".")[0] for name in sys.modules.keys() - set(before)} - {
+        *named,
+        PACKAGE.name,
+    }
+    specs = {top: getattr(sys.modules.get(top), "__spec__", None) for top in tops}
+    return sorted(
+        top for top, spec in specs.items() if spec is not None and not _is_installed(spec)
+    )
+
+
+def _find_spec(name: str, folder: str | None = None) -> ModuleSpec | None:
+    """A top-level module as Python would find it, without importing it."""
+    importlib.invalidate_caches()  # a finder caches the content of folders, and files may be newer
+    try:
+        if folder is not None:
+            return PathFinder.find_spec(name, [*sys.path, folder])
+        return importlib.util.find_spec(name) if name else None
+    except (ImportError, ValueError):
+        return None
+
+
+def _digest_on_disk(spec: ModuleSpec) -> str | None:
+    """The sha256 of a module's code: of its one file, else of the list of its files' hashes.
+
+    Python counts by its syntax, so that comments, docstrings and format make no other version.
+    """
+    folders = [Path(place) for place in spec.submodule_search_locations or ()]
+    if not folders:
+        file = Path(spec.origin or "")
+        return _code_digest(file) if spec.has_location and file.is_file() else None
+    parts = []
+    for folder in folders:
+        for file in sorted(folder.rglob("*")):
+            if file.suffix in CODE_SUFFIXES and file.is_file():
+                parts.append(f"{_code_digest(file)}  {file.relative_to(folder).as_posix()}\n")
+    return hashlib.sha256("".join(parts).encode()).hexdigest() if parts else None
+
+
+def _code_digest(file: Path) -> str:
+    if file.suffix != ".py":
+        return file_sha256(file)
+    return hashlib.sha256(syntax_of(file.read_bytes())).hexdigest()
+
+
+def _is_installed(spec: ModuleSpec) -> bool:
+    """Return whether a module is Python's or an installed package's, whose version counts."""
+    places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or [])
+    library = [sysconfig.get_path(key) for key in ("stdlib", "platstdlib")]
+    for path in [Path(place) for place in places if place is not None]:
+        if not INSTALLED & set(path.parts) and not any(map(path.is_relative_to, library)):
+            return False
+    return True

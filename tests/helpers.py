@@ -1,0 +1,42 @@
+"""What tests of all rooms need: an expected refusal, and files that are written and read."""
+
+import json
+from contextlib import contextmanager
+from shlex import split
+
+import pytest
+
+from gsbench.errors import InputError
+
+
+@contextmanager
+def refusal(pattern):
+    """Expect an error of the user's in the block: one line, in which ``pattern`` is found.
+
+    If that is None, expect none.
+    """
+    if pattern is None:
+        yield
+        return
+    with pytest.raises(InputError, match=pattern) as caught:
+        yield caught
+    assert "\n" not in str(caught.value)
+
+
+def write(path, content):
+    """Write a text, bytes or JSON values to a file and return its path; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def words_of(first, *more):
+    """The words of a command; the first argument may be a part of a command line, as typed."""
+    return [*(split(first) if " " in first else [first]), *map(str, more)]
+
+
+def read_json(path):
+    return json.loads(path.read_text())
