@@ -173,9 +173,9 @@ def surfaces(runs, experiment, comparison, words):
     assert words in "\n".join(map(str, build_table(experiment).notes))
     assert words in html.unescape(build_report(experiment))
     assert words in description(experiment)
-    lines: list[str] = []
+    lines = []
     handler = logging.Handler()
-    handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: lines.append(record.getMessage())
     stopping.log.addHandler(handler)
     level, stopping.log.level = stopping.log.level, logging.INFO
     try:

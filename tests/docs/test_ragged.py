@@ -2,7 +2,6 @@
 
 import ast
 import re
-from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
@@ -16,12 +15,12 @@ BREAK = re.compile(r"[a-z,] ?\n[a-z]")
 ENDS = tuple(".,:;)")  # a line may be short after one of these
 
 
-def first_word(text: str) -> str:
+def first_word(text):
     """The first word of a part; a replacement field is not broken."""
     return split_outside_brackets(text, " ")[0]
 
 
-def ragged_lines(source: str) -> Iterator[int]:
+def ragged_lines(source):
     """The numbers of the lines that break a sentence early: the next word has ample room."""
     lines = source.split("\n")
     for number, (line, after) in enumerate(pairwise(lines), 1):
@@ -32,7 +31,7 @@ def ragged_lines(source: str) -> Iterator[int]:
             yield number
 
 
-def broken_texts(source: str) -> Iterator[str]:
+def broken_texts(source):
     """The texts, without docstrings, that break a line within a sentence."""
     tree = ast.parse(source)
     statements = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
