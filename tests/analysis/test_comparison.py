@@ -226,12 +226,12 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
     declare(tmp_path, (1, [*adc, *old]), (5, new))
     found = answer(tmp_path)
     assert found.answers[0].beforehand
-    assert "missing" not in "\n".join(found.declaration_lines)
+    assert "missing" not in "\n".join(texts(found.declared_notes))
     assert "made by an earlier mine" in found.experiment.warnings[0]
     # the old code failed before any result: its folder has settings, but no results
     folder = tmp_path / "exp" / old[0].key
     (folder.parent / f"{folder.name}-seed0" / "results.json").unlink()
-    assert "missing" not in "\n".join(answer(tmp_path).declaration_lines)
+    assert "missing" not in "\n".join(texts(answer(tmp_path).declared_notes))
 
 
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):

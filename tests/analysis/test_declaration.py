@@ -58,7 +58,7 @@ def standing(experiment):
 
 
 def lines(experiment):
-    return "\n".join(compare(experiment).declaration_lines)
+    return "\n".join(texts(compare(experiment).declared_notes))
 
 
 def test_a_declaration_about_one_question_says_so(tmp_path):
@@ -429,4 +429,4 @@ def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
         "no verdict yet, not all of the first 2 seeds are there in both arms"
         in (answers.sentences[0])
     )
-    assert "since garden has no more" in str(answers.unused[0])
+    assert "there are no more of garden" in str(answers.unused[0])

@@ -43,8 +43,9 @@ def test_seeds_without_a_partner_are_named_and_all_scenes_keep_equally_many(make
     ]
     found = pair(trials, PSNR)
     assert "garden: seed 1 has no partner" in texts(found.left_out)
-    assert "2 seeds of each scene count, since garden has no more (others up to 3)" in texts(
-        found.left_out
+    assert (
+        "2 seeds of each scene can count: there are no more of garden (others have up to 3)"
+        in texts(found.left_out)
     )
     assert found.differences.shape == (2, 2)
     assert len(found.trials) == 8

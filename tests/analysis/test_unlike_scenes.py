@@ -181,7 +181,7 @@ def test_arms_differ_by_one_setting_alone_only_if_they_do_on_every_scene(tuned_o
     park = [trial for trial in tuned_on_room if trial.scene == "park"]
     assert ingredients_between(park, FIRST, SECOND) == ("grow",)
     said = "sfm-mcmc differs from sfm-adc by grow and split_size."
-    assert said in caveats(tuned_on_room, FIRST, SECOND)
+    assert said in texts(caveats(tuned_on_room, FIRST, SECOND))
 
 
 def test_a_fairness_sheet_has_the_values_of_all_scenes(tuned_on_room):

@@ -21,7 +21,7 @@ from pathlib import Path
 from random import Random
 
 from gsbench.analysis.cells import to_frame
-from gsbench.analysis.fairness import tuning_lines
+from gsbench.analysis.fairness import tuning_notes
 from gsbench.analysis.report.build import (
     event_charts,
     search_summary,
@@ -305,7 +305,7 @@ def look(runs, places):
         attempt(lambda: event_charts(experiment.trials, arms))
         attempt(lambda: volume_charts(experiment.trials, arms))
         for first, second in itertools.pairwise(arms):
-            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))
+            attempt(lambda pair=(first, second): tuning_notes(experiment.trials, pair))
         for trial in experiment.trials:
             attempt(lambda trial=trial: read_views(trial))
 

@@ -137,7 +137,7 @@ def test_the_learning_rate_of_the_means_is_log_linear():
 
 def test_too_few_rounds_of_a_densifier_cause_a_warning(lab, caplog):
     lab.train(ADC(start=500), "adc", iterations=15)
-    assert "ADC: 0 rounds of refinement in 15 iterations are too few" in caplog.text
+    assert "ADC: 0 rounds of refinement in 15 iterations, too few" in caplog.text
     caplog.clear()
     lab.train(NoDensifier(), "none", iterations=15)
     assert "refinement" not in caplog.text

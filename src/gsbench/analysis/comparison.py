@@ -27,7 +27,7 @@ from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
 from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
 
-VERDICT = "Verdict, "  # prefix of the lines below a table that state verdicts
+VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
 
 @dataclass(frozen=True)
@@ -92,22 +92,22 @@ class Comparison:
         return [*self.arms.uncompared, *unused_trials(trials, verdicts)]
 
     @cached_property
-    def declaration_lines(self) -> list[str]:
-        """Sentences on what was declared, and how much of it is still to come."""
+    def declared_notes(self) -> list[Note]:
+        """Notes on what was declared, and how much of it is still to come."""
         if self.declared is None or not self.answers:
             return []
         metric = self.answers[0].declared
         name = self.declared.metric if metric is None else metric.name
         standings = [one.standing for one in self.answers if one.standing is not None]
         progress = self.declared.progress(self.trials)
-        return [*self.declared.sentences(name, standings), *progress]
+        return [*self.declared.notes(name, standings), *progress]
 
-    def lines(self) -> list[str]:
-        """The lines below a table: verdicts, what no verdict uses, and what was declared."""
+    def notes(self) -> list[Note]:
+        """The notes below a table: verdicts, what no verdict uses, and what was declared."""
         return [
-            *(f"{VERDICT}{one}" for one in self.sentences),
-            *map(str, self.unused),
-            *self.declaration_lines,
+            *(Note.of("verdict", sentence=one) for one in self.sentences),
+            *self.unused,
+            *self.declared_notes,
         ]
 
     def to_json(self) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from gsbench.runs.config_hash import DECLARED, NOT_HASHED
 from gsbench.runs.freshness import Change, Part, code_changes, present_version
 from gsbench.runs.nested import SHOWN
 from gsbench.system.install import conf_dir
-from gsbench.words import counted, listed, some_of
+from gsbench.words import counted, some_of
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 ScenesByValue = dict[str, list[str]]  # value of a setting or condition -> the scenes that have it
@@ -349,15 +349,14 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
     return [representatives(group, first, second) for group in shared] or alone
 
 
-def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:
+def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:
     """``sfm-longaxis differs from sfm-adc by split, gradient and threshold.``"""
     if not names:
-        return f"{second} and {first} differ in no recorded setting."
-    shown = [
-        *names[:MAX_NAMED],
-        *([f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []),
-    ]
-    return f"{second} differs from {first} by {listed(shown)}{'' if is_mixed(names) else ' alone'}."
+        return Note.of("no ingredient", arm=second, baseline=first)
+    more = [f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []
+    alone = "" if is_mixed(names) else " alone"
+    shown = [*names[:MAX_NAMED], *more]
+    return Note.of("ingredients", arm=second, baseline=first, ingredients=shown, alone=alone)
 
 
 def is_mixed(names: Sequence[str]) -> bool:

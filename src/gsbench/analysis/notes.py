@@ -3,12 +3,12 @@
 A note is a record of facts, so that code and tests compare facts. Its sentence is made here alone.
 """
 
-import string
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
-from gsbench.words import counted, listed, some_of
+from gsbench.events import FEW_ROUNDS
+from gsbench.words import FORM
 
 
 @dataclass(frozen=True)
@@ -40,25 +40,6 @@ class Note:
         return f"{self.about}: {self.sentence}" if self.about else self.sentence
 
 
-class _Form(string.Formatter):
-    """The format of facts in sentences.
-
-    ``{count:n trial}`` gives ``2 trials``, ``{names:few}`` the first names and a count of the
-    rest, ``{names:all}`` all names with "and" before the last, ``{names:list}`` all with commas,
-    and ``{name:if: by %}`` gives `` by NAME``, or nothing if the fact is empty.
-    """
-
-    def format_field(self, value: Any, spec: str) -> str:
-        if spec.startswith("n "):
-            return counted(value, spec[2:])
-        if spec.startswith("if:"):
-            return spec[3:].replace("%", str(value)) if value else ""
-        joined = {"few": some_of, "all": listed, "list": ", ".join}.get(spec)
-        return joined([*map(str, value)]) if joined else str(super().format_field(value, spec))
-
-
-FORM = _Form()
-
 SENTENCES: dict[str, str] = {
     # ---- pairs of trials that cannot be compared
     "unlike": "{text}",  # the whole text of an error
@@ -66,7 +47,8 @@ SENTENCES: dict[str, str] = {
     "unpaired": "{scene}: seed {seed} has no partner",
     "valueless": "{places:few}: {reason}",
     "uneven": (
-        "{least:n seed} of each scene count, since {scenes:few} has no more (others up to {most})"
+        "{least:n seed} of each scene can count: there are no more of {scenes:few} (others have up "
+        "to {most})"
     ),
     "no pairs": "no trials of {baseline} and {arm} can be paired",
     "no value": "{reason}",
@@ -95,6 +77,110 @@ SENTENCES: dict[str, str] = {
     "not asked": "no declared question is about them",
     # ---- arms that are unlike in more than was asked
     "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
+    "unequal counts": (
+        "{arm} has {more} Gaussians than {baseline}, so this does not compare at equal counts. To "
+        "do so: {advice}."
+    ),
+    "no ingredient": "{arm} and {baseline} differ in no recorded setting.",
+    "ingredients": "{arm} differs from {baseline} by {ingredients:all}{alone}.",
+    "compared": "Compared: {pairs:n pair} of trials of one scene and seed.",
+    # ---- the tuning of arms
+    "no tuning": (
+        "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere "
+        "is not known."
+    ),
+    "unlike tuning": "They were not tuned alike: {arms:all}.",
+    "vain search": "{arm}: the search {experiment} found nothing.",
+    "search": (
+        "{arm}: {chosen:all} is the best of {points:n point} by {metric} of validation views "
+        "({scenes:all}; seed {seeds:list}; the search {experiment}), {when}. Tried: "
+        "{tried:list}{more:if: and % more}.{others}"
+    ),
+    "varied": (
+        "{arm}: {choices:n choice} of its settings ran here. They differ in {settings:all}, "
+        "and all were measured on the test views that the verdict uses."
+    ),
+    # ---- verdicts, and what was declared
+    "verdict": "Verdict, {sentence}",
+    "declared beforehand": "{metric} was declared beforehand (eval.primary, {when}).",
+    "declared": "{metric} was declared (eval.primary, {when}).",
+    "doubted": (
+        "An arm whose metric or trials were declared after its first result is judged in all "
+        "metrics, adjusted for their number. To test {metric} alone, run other seeds under another "
+        "name, all by one command."
+    ),
+    "replaced": "Declared before it: {metric} ({when}).",
+    "looks to come": (
+        "Seeds come in planned looks (launch.stop_when_decided); {missing} of the "
+        "{declared:n declared trial} are not there."
+    ),
+    "early look": (
+        "{missing} of the {declared:n declared trial} are still missing, so this is an early look. "
+        "Do not stop here because the result pleases: that finds effects that do not exist."
+    ),
+    # ---- how to read a table
+    "one trial": "One trial per cell, so there is no deviation.",
+    "mean": "Mean over {trials} trials; ± is the deviation (n − 1) over {spread}.",
+    "bold": "Bold: best mean of a scene after rounding; this is not a test.",
+    "few values": "(k/{trials}): only k of {trials} trials have a value; —: none.",
+    "protocol": "Protocol {protocols:list}.",
+    "not available": "n/a, {reason}.",
+    "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",
+    "no best": "{place}: not compared, no best marked: {conditions:list} differ.",
+    "unusable": "Left out ({count}): {folders:few}.",
+    "agreement": (
+        "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
+        "3DGS models was {metrics:list} in one study (arXiv 2511.06830, table 3). gsbench vote "
+        "asks people."
+    ),
+    # ---- trials: who made them, on what, and doubts
+    "worthless": "{mark} {trial} is {what}.",
+    "passed over": "{text}.",
+    "filters": (
+        "Pictures of scene.images and of scene.downscale were made by different filters: results "
+        "on them differ by about 0.3 to 0.45 dB."
+    ),
+    "near twins": (
+        "{scene}: {near} of {tested} test views have a near twin in training, so they measure "
+        "memory too."
+    ),
+    "copies": "{scene}: {copies:n photograph} left out, since another one has its name or content.",
+    "few rounds": FEW_ROUNDS,
+    "cloud": "Before training, {scene} {init}: {doubt}.",
+    "program's model": (
+        "Trained here by another program, its model rendered by gsbench (its time is that of the "
+        "whole program, and it sets its own budget): {arms:list}."
+    ),
+    "program's renders": (
+        "Trained here by another program, its own renders measured as they are (its time is that "
+        "of the whole program, and it sets its own budget): {arms:list}."
+    ),
+    "foreign model": (
+        "A model that another program trained, rendered here (its conditions are not known): "
+        "{arms:list}."
+    ),
+    "foreign renders": (
+        "Renders of another program, measured as they are (its conditions are not known): "
+        "{arms:list}."
+    ),
+    "edited": (
+        "{module} was edited since: {trials:n trial} of {arms:few} came from the old code. Give "
+        "the command again to run the new one."
+    ),
+    "machines": (
+        "The trials ran on {kinds} kinds of machine: {trials:parts}. There equal settings give "
+        "other last digits and, after thousands of iterations, other results."
+    ),
+    "clouds": (
+        "{scene}: trials of init {init} started from {clouds} different clouds ({trials:parts})."
+    ),
+    "held out": "Held out{question:if: (%)}{scenes:if:, %}: {rule}; {views}.",
+    "points of all": (
+        "Initial points of {init}: from all views, test views included (init.points_from=all)."
+    ),
+    "points of some": (
+        "Initial points of {init}: from training views alone (init.points_from={choice})."
+    ),
 }
 
 

@@ -4,7 +4,6 @@ The notes below a table say who trained, what was declared, and how else the com
 """
 
 import itertools
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -26,26 +25,25 @@ from gsbench.analysis.differences import (
     differing_conditions,
 )
 from gsbench.analysis.fairness import caveats
+from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import Quantity, choose_quantities
-from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
+from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.analysis.trial_notes import (
+    LEARNT_NOTHING,
+    cloud_notes,
+    doubt_notes,
+    edited_notes,
+    held_out_notes,
+    machine_notes,
+    origin_notes,
+    points_notes,
+)
 from gsbench.eval.facts import find_metric
-from gsbench.events import FEWEST_ROUNDS, few_rounds
-from gsbench.runs.layout import EVENTS
-from gsbench.runs.nested import SHOWN
-from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
-from gsbench.words import counted, some_of
+from gsbench.words import counted
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
-
-# trained here by another program (or elsewhere), what was measured, and its description
-ORIGINS = (
-    (True, FROM_MODEL, "Trained here by another program, its model rendered by gsbench"),
-    (True, FROM_RENDERS, "Trained here by another program, its own renders measured as they are"),
-    (False, FROM_MODEL, "A model that another program trained, rendered here"),
-    (False, FROM_RENDERS, "Renders of another program, measured as they are"),
-)
 
 Labels = tuple[str, ...]
 # of a cell: the labels of its row, those of its column, and the quantity's key
@@ -101,7 +99,7 @@ def build_table(
     shown = _rows(cells, bold, quantities)
     varied = with_variants(trials)
     if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(varied):
-        notes.append("No mean over the scenes is shown, since they differ in conditions or code.")
+        notes.append(Note.of("no mean"))
     elif "scene" in rows and len(scenes) > 1:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
@@ -114,15 +112,12 @@ def build_table(
             above, text = text, " + ".join(names.get(value, value) for value in column)
         headings.append(Column(above, text, (one.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
-    notes += map(str, between_scenes_notes(varied))
+    notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
     if left_out := experiment.warnings:
-        notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")
+        notes.append(Note.of("unusable", count=len(left_out), folders=list(left_out)))
     heading = title or f"Experiment {experiment.name}"
-    return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(notes))
-
-
-LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
+    return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(map(str, notes)))
 
 
 def format_cell(cell: Cell, quantity: Quantity) -> str:
@@ -165,7 +160,7 @@ def _rows(
 
 def _best(
     cells: Mapping[Position, Cell], quantities: Sequence[Quantity], scene_index: int | None
-) -> tuple[set[Position], list[str]]:
+) -> tuple[set[Position], list[Note]]:
     """The best cells of each scene, and a note for each scene whose cells cannot be compared.
 
     ``scene_index`` is the index of the scene in the labels of row and column; None if all cells are
@@ -177,7 +172,7 @@ def _best(
         return scene, next((trial.split for trial in cells[position].trials), "")
 
     bold: set[Position] = set()
-    notes: list[str] = []
+    notes: list[Note] = []
     for quantity in quantities:
         rivals = group_by(
             (position for position in cells if position[2] == quantity.key), scene_and_split
@@ -188,10 +183,7 @@ def _best(
             by_scene = group_by(shown, lambda trial: trial.scene).values()
             differing = sorted(set().union(*map(differing_conditions, by_scene)))
             if differing:
-                place = scene or "arms"
-                notes.append(
-                    f"{place}: not compared, no best marked: {', '.join(differing)} differ."
-                )
+                notes.append(Note.of("no best", place=scene or "arms", conditions=differing))
             else:
                 bold |= best_cells(own, quantity)
     return bold, list(dict.fromkeys(notes))
@@ -253,23 +245,21 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
 
 def _reading_notes(
     cells: Mapping[Position, Cell], quantities: Sequence[Quantity], expected: int, by_scene: bool
-) -> list[str]:
+) -> list[Note]:
     """Notes on how to read the table's numbers and marks."""
     spread = "trials" if by_scene else "the trials' means of scenes"
-    if expected == 1:
-        notes = ["One trial per cell, so there is no deviation."]
-    else:
-        notes = [f"Mean over {expected} trials; ± is the deviation (n − 1) over {spread}."]
-    notes.append("Bold: best mean of a scene after rounding; this is not a test.")
+    one_each = expected == 1
+    notes = [Note.of("one trial") if one_each else Note.of("mean", trials=expected, spread=spread)]
+    notes.append(Note.of("bold"))
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
-        notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
+        notes.append(Note.of("few values", trials=expected))
     trials = itertools.chain(*(cell.trials for cell in cells.values()))
-    protocols = {trial.record.protocol for trial in trials}
-    notes.append(f"Protocol {', '.join(sorted(protocols))}.")
+    notes.append(Note.of("protocol", protocols=sorted({t.record.protocol for t in trials})))
     for one in quantities:
         own = [cell for position, cell in cells.items() if position[2] == one.key]
         reasons = {cell.reason for cell in own if cell.trials and cell.reason}
-        notes += [f"{one.name}: n/a, {reason}." for reason in sorted(reasons)]
+        missing = [Note.of("not available", reason=reason) for reason in sorted(reasons)]
+        notes += [replace(note, about=one.name) for note in missing]
     return notes
 
 
@@ -284,7 +274,7 @@ def _natural(key: Labels) -> tuple[tuple[int, float, str], ...]:
     return tuple(parts)
 
 
-def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[str]:
+def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Note]:
     """All notes on ``trials`` of an experiment and on its comparisons."""
     return [
         *doubt_notes(trials),
@@ -298,101 +288,8 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
     ]
 
 
-def doubt_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on results that are worth little or may surprise.
-
-    They are about renders not better than one colour, executors that failed their proof, pictures
-    made by different filters, twins, and doubts about initial points.
-    """
-    notes = []
-    for trial in trials:
-        if line := trial.record.learnt_nothing:
-            notes.append(f"{LEARNT_NOTHING} {trial.label} is {line}.")
-        notes += [f"{line}." for line in trial.record.raster_passed_over]
-    known = [trial.config for trial in trials if trial.config]
-    folders = {config.get("scene.images") for config in known}
-    downscales = {config.get("scene.downscale") for config in known}
-    if len(folders) > 1 and len(downscales) > 1:
-        notes.append(
-            "Pictures of scene.images and of scene.downscale were made by different filters: "
-            "results on them differ by about 0.3 to 0.45 dB."
-        )
-    for trial in trials:
-        twins = trial.record.twins or TwinViews()
-        if twins.near:
-            count = f"{len(twins.near)} of {trial.record.test_views} test views have"
-            notes.append(
-                f"{trial.scene}: {count} a near twin in training, so they measure memory too."
-            )
-        if twins.left_out:
-            left_out = counted(len(twins.left_out), "photograph")
-            notes.append(
-                f"{trial.scene}: {left_out} left out, since another one has its name or content."
-            )
-    notes += [line for own in group_by(trials, arm_of).values() if (line := rounds_note(own[0]))]
-    for trial in trials:
-        cloud = trial.record.initial_cloud
-        lines = [] if cloud is None else cloud.warnings
-        notes += [f"Before training, {trial.scene} {trial.init}: {line}." for line in lines]
-    return list(dict.fromkeys(notes))  # trials of one cloud have the same lines
-
-
-def arm_of(trial: TrialResult) -> str:
-    """The arm's folder with its settings' hash: trials that share it have one schedule."""
-    return trial.key.partition("/")[2]
-
-
-def rounds_note(trial: TrialResult) -> str:
-    """A line if a trial's densifier had too few rounds to be judged by them; else ""."""
-    if trial.program or trial.made_elsewhere or not (trial.path / EVENTS).is_file():
-        return ""
-    rounds = len(trial.folder.curves(EVENTS))
-    if rounds >= FEWEST_ROUNDS or not trial.config.get("densify.interval"):
-        return ""
-    return few_rounds(f"{trial.init}-{trial.densify}", rounds, trial.record.iterations)
-
-
-def origin_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """Lines on arms that gsbench did not train: who did, and what was measured."""
-    notes = []
-    not_ours = [trial for trial in trials if trial.program or trial.made_elsewhere]
-    for trained_here, measured, what in ORIGINS:
-        own = [
-            t
-            for t in not_ours
-            if bool(t.program) == trained_here and t.record.evaluated_from == measured
-        ]
-        versions = sorted(
-            {(f"{trial.init}-{trial.densify}", trial.trainer_version) for trial in own}
-        )
-        arms = ", ".join(
-            f"{arm} (version {version})" if trained_here else arm for arm, version in versions
-        )
-        limits = (
-            "its time is that of the whole program, and it sets its own budget"
-            if trained_here
-            else "its conditions are not known"
-        )
-        notes += [f"{what} ({limits}): {arms}."] if own else []
-    return notes
-
-
-def edited_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each of the user's modules that was edited after it made some of the trials."""
-    of_module: dict[str, list[TrialResult]] = {}
-    for trial in trials:
-        for edit in trial.edits:
-            of_module.setdefault(edit.name, []).append(trial)
-    return [
-        f"{module} was edited since: {counted(len(own), 'trial')} of "
-        f"{some_of(sorted({f'{one.init}-{one.densify}' for one in own}))} are of the old code. "
-        "Give the command again to run the new one."
-        for module, own in of_module.items()
-    ]
-
-
-def comparison_notes(experiment: Experiment) -> list[str]:
-    """Lines on the compared arms: the verdicts, what no verdict uses, and caveats.
+def comparison_notes(experiment: Experiment) -> list[Note]:
+    """Notes on the compared arms: the verdicts, what no verdict uses, and caveats.
 
     They are about the whole experiment, so choosing the trials that a table shows cannot change a
     verdict.
@@ -402,11 +299,12 @@ def comparison_notes(experiment: Experiment) -> list[str]:
 
     comparison = compare(experiment)
     by_arm = group_by(comparison.trials, lambda trial: trial.arm)
-    sentences = (
-        caveats([*by_arm[first], *by_arm[second]], first, second)
+    between = [
+        note
         for first, second in comparison.pairs
-    )
-    return [*comparison.lines(), *filter(None, sentences)]
+        for note in caveats([*by_arm[first], *by_arm[second]], first, second)
+    ]
+    return [*comparison.notes(), *between]
 
 
 # Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA
@@ -432,91 +330,5 @@ def with_agreement(tables: Sequence[Table]) -> list[Table]:
     ]
     if not found:
         return list(tables)
-    note = (
-        "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
-        f"3DGS models was {', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench "
-        "vote asks people."
-    )
+    note = str(Note.of("agreement", metrics=found))
     return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]
-
-
-def machine_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line that names the kinds of machine if trials ran on several."""
-    kinds = Counter(trial.machine for trial in trials)
-    unknown = kinds.pop(None, 0)
-    if len(kinds) < 2:
-        return []
-    listed = "; ".join(f"{kind}: {counted(count, 'trial')}" for kind, count in kinds.most_common())
-    rest = f"; not recorded: {unknown}" if unknown else ""
-    return [
-        f"The trials ran on {len(kinds)} kinds of machine: {listed}{rest}. There equal settings "
-        "give other last digits and, after thousands of iterations, other results."
-    ]
-
-
-def cloud_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each scene and initialiser with equal settings but several clouds."""
-    notes = []
-    groups = group_by(
-        trials, lambda trial: (trial.scene, trial.init, trial.record.hashes.get("init"))
-    )
-    for (scene, init, _), group in groups.items():
-        clouds = group_by([trial for trial in group if trial.cloud], lambda trial: trial.cloud)
-        if len(clouds) > 1:
-            listed = "; ".join(f"{cloud[:SHOWN]}: {_arms(own)}" for cloud, own in clouds.items())
-            notes.append(
-                f"{scene}: trials of init {init} started from {len(clouds)} different clouds "
-                f"({listed})."
-            )
-    return notes
-
-
-def held_out_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each way of holding views out, with its scenes if there are several ways."""
-    notes = []
-    recorded = [trial for trial in trials if trial.record.held_out]
-    splits = group_by(recorded, lambda trial: (trial.question, trial.record.held_out))
-    for (question, words), group in sorted(
-        splits.items(), key=lambda item: (-len(item[1]), item[0])
-    ):
-        scenes = sorted({trial.scene for trial in group})
-        counts = sorted(
-            {(trial.record.test_views or 0, trial.record.train_views or 0) for trial in group}
-        )
-        views = " and ".join(f"{test} of {test + train} views" for test, train in counts)
-        where = (
-            f", {', '.join(scenes)}"
-            if len(splits) > 1 and len({trial.scene for trial in recorded}) > 1
-            else ""
-        )
-        notes.append(f"Held out{f' ({question})' if question else ''}{where}: {words}; {views}.")
-    return notes
-
-
-def points_notes(trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each initialiser on the views that made its points, if photographs did."""
-    notes = []
-    for init, choice in sorted({(trial.init, _points_from(trial)) for trial in trials}):
-        if choice == "all":
-            notes.append(
-                f"Initial points of {init}: from all views, test views included "
-                "(init.points_from=all)."
-            )
-        elif choice:
-            notes.append(
-                f"Initial points of {init}: from training views alone (init.points_from={choice})."
-            )
-    return notes
-
-
-def _points_from(trial: TrialResult) -> str:
-    """The views that made the trial's initial points: all or train; "" if no views did."""
-    if "init.points_from" in trial.config:
-        return str(trial.config["init.points_from"])
-    return "all" if trial.record.init_report.get("mean_track_length") is not None else ""
-
-
-def _arms(trials: Sequence[TrialResult]) -> str:
-    """``adc seeds 0, 1; volumetric seed 0``"""
-    groups = group_by(trials, lambda trial: trial.densify)
-    return "; ".join(f"{densify} {seeds_text(own)}" for densify, own in groups.items())

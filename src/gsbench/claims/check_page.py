@@ -13,7 +13,7 @@ from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, seeds_text
 from gsbench.analysis.statistics import plan_looks
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.tables import cloud_notes, machine_notes
+from gsbench.analysis.trial_notes import cloud_notes, machine_notes
 from gsbench.analysis.verdict_words import like_these_words, outlying_words
 from gsbench.claims.check import NOT_TESTABLE, Checked, ClaimVerdict
 from gsbench.runs.experiments import Declaration
@@ -140,8 +140,8 @@ def _fairness(one: ClaimVerdict) -> tuple[tuple[Table, ...], str]:
     )
     pairs = [(baseline, arm) for baseline, arm in arms if baseline != arm]
     # The arms are written in the claims file, so no command alone would change them.
-    sentences = dict.fromkeys(caveats(trials, *pair, equal_counts_settings) for pair in pairs)
-    return tuple(fairness_table(trials, *pair) for pair in pairs), " ".join(filter(None, sentences))
+    notes = texts(note for pair in pairs for note in caveats(trials, *pair, equal_counts_settings))
+    return tuple(fairness_table(trials, *pair) for pair in pairs), " ".join(notes)
 
 
 def _declared_line(declared: Declaration, declarations: Sequence[Declaration]) -> str:
