@@ -22,7 +22,7 @@ from scipy import special
 
 from gsbench.analysis import statistics
 from gsbench.analysis.judgement import FEW, OUTLYING
-from gsbench.analysis.statistics import SPENDING_POWER
+from gsbench.analysis.looks import SPENDING_POWER
 from gsbench.analysis.thresholds import Region, evenness
 
 Array = NDArray[np.float64]

@@ -22,6 +22,7 @@ BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY
 RESULTS, ARCHIVE = STATE / "results", BROUGHT / "brought.tar.xz"
 PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection"
 PACKAGES += " flip-evaluator plyfile pycolmap gsplat antlr4-python3-runtime"
+NOT_PACKED = "without Faster-GS: no wheel, and CUDA 13 does not compile its source (cub::Max)"
 WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")
 MOST_CARRIED = 45  # MiB
 SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 26}]
@@ -253,7 +254,7 @@ def wheels() -> str:
     size = ARCHIVE.stat().st_size / 2**20
     if size > MOST_CARRIED:
         sys.exit(f"{ARCHIVE} has {size:.1f} MiB, more than {MOST_CARRIED}: leave something out")
-    return f"{ARCHIVE}: {size:.1f} MiB, {len(weights)} files of weights"
+    return f"{ARCHIVE}: {size:.1f} MiB, {len(weights)} files of weights; {NOT_PACKED}"
 
 
 def read_ends(results: Path) -> dict[str, dict[str, Any]]:

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis.statistics import look_levels, plan_looks
+from gsbench.analysis.looks import look_levels, plan_looks
 from gsbench.analysis.thresholds import Region, evenness
 from gsbench.claims.ledger import GIVE_UP, RETRIES
 

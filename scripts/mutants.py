@@ -1,8 +1,8 @@
 """Mutation testing: plant small faults one at a time in a copy, and see whether the quick tests
 notice them.
 
-    python scripts/mutants.py # 160 faults over all rooms, two at a time
-    python scripts/mutants.py --rooms densify eval --count 40 --seed 3 --coverage lines.db
+    python scripts/mutants.py # 160 faults over all packages, two at a time
+    python scripts/mutants.py --packages densify eval --count 40 --seed 3 --coverage lines.db
 
 A fault is one of these:
 
@@ -21,7 +21,7 @@ or changes nothing. Triton's kernels are left out: their tests belong to ``make 
 First all quick tests run once, and coverage.py records which of them run each line (``--coverage``
 names a file that keeps this for further seeds of the same code). The tests of a fault are those
 that run its line. Some lines have no such record: what runs at the import of a module, or in a
-compiled kernel. Their tests are those of the room, then others that import the module.
+compiled kernel. Their tests are those of the package, then others that import the module.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ import coverage
 ROOT = Path(__file__).parents[1]
 SOURCE = "src/gsbench"
 GROUND = "ground"  # the single files of the package
-ROOMS = [GROUND, *sorted(path.name for path in (ROOT / SOURCE).iterdir() if path.is_dir())]
-ROOMS = [room for room in ROOMS if not room.startswith("_")]
+PACKAGES = [GROUND, *sorted(path.name for path in (ROOT / SOURCE).iterdir() if path.is_dir())]
+PACKAGES = [package for package in PACKAGES if not package.startswith("_")]
 YAML = ["tests/config/test_yaml_defaults.py"]  # the defaults of classes
 FURTHER_TESTS = {
     "app": ["tests/end_to_end/test_smoke.py"],
@@ -104,7 +104,7 @@ class Fault:
     after: str
 
     @property
-    def room(self) -> str:
+    def package(self) -> str:
         parts = Path(self.file).relative_to(SOURCE).parts
         return parts[0] if len(parts) > 1 else GROUND
 
@@ -213,33 +213,33 @@ def faults_of(path: Path) -> list[Fault]:
     return faults
 
 
-def files_of(room: str) -> list[Path]:
-    """The source files of a room."""
-    if room == GROUND:
+def files_of(package: str) -> list[Path]:
+    """The source files of a package."""
+    if package == GROUND:
         return sorted((ROOT / SOURCE).glob("*.py"))
-    return sorted((ROOT / SOURCE / room).rglob("*.py"))
+    return sorted((ROOT / SOURCE / package).rglob("*.py"))
 
 
-def choose_faults(rooms: list[str], count: int, seed: int) -> list[Fault]:
-    """Choose about ``count`` faults, by the square root of the rooms' sizes; all kinds are equally
+def choose_faults(packages: list[str], count: int, seed: int) -> list[Fault]:
+    """Choose about ``count`` faults, by the square root of packages' sizes; all kinds are equally
     likely."""
     rng = random.Random(seed)
-    by_room = {
-        room: [
+    by_package = {
+        package: [
             fault
-            for path in files_of(room)
+            for path in files_of(package)
             if LEFT_OUT not in path.as_posix()
             for fault in faults_of(path)
         ]
-        for room in rooms
+        for package in packages
     }
-    weights = {room: len(faults) ** 0.5 for room, faults in by_room.items()}
+    weights = {package: len(faults) ** 0.5 for package, faults in by_package.items()}
     picked = []
-    for room, faults in by_room.items():
+    for package, faults in by_package.items():
         by_kind = {
             kind: [f for f in faults if f.kind == kind] for kind in sorted({f.kind for f in faults})
         }
-        for _ in range(max(1, round(count * weights[room] / sum(weights.values())))):
+        for _ in range(max(1, round(count * weights[package] / sum(weights.values())))):
             kind = rng.choice([kind for kind, left in by_kind.items() if left])
             picked.append(by_kind[kind].pop(rng.randrange(len(by_kind[kind]))))
     return picked
@@ -298,8 +298,8 @@ def record_coverage(place: Path, record: Path) -> None:
 
 def tests_of(fault: Fault, place: Path, reached: Reached) -> list[str]:
     """The tests for a fault: those that run its line, or all that may. The module's own are the
-    first, then those of its room."""
-    own_folders = tests_of_room(fault.room, place)
+    first, then those of its package."""
+    own_folders = tests_of_package(fault.package, place)
 
     def distance(test: str) -> int:
         file = Path(test.partition("::")[0])
@@ -308,7 +308,7 @@ def tests_of(fault: Fault, place: Path, reached: Reached) -> list[str]:
         return 1 if any(file.is_relative_to(folder) for folder in own_folders) else 2
 
     tests = reached.tests(fault) or [*own_folders, *importing_tests(fault, place)]
-    return [*sorted(tests, key=distance), *FURTHER_TESTS.get(fault.room, [])]
+    return [*sorted(tests, key=distance), *FURTHER_TESTS.get(fault.package, [])]
 
 
 def importing_tests(fault: Fault, place: Path) -> list[str]:
@@ -322,11 +322,11 @@ def importing_tests(fault: Fault, place: Path) -> list[str]:
     ]
 
 
-def tests_of_room(room: str, place: Path) -> list[str]:
-    """The folder of a room's tests; for the ground floor, the files beside the folders."""
-    if room == GROUND:
+def tests_of_package(package: str, place: Path) -> list[str]:
+    """The folder of a package's tests; for the single files, those beside the folders."""
+    if package == GROUND:
         return [path.relative_to(place).as_posix() for path in (place / "tests").glob("test_*.py")]
-    return [f"tests/{room}"]
+    return [f"tests/{package}"]
 
 
 def is_caught(fault: Fault, place: Path, reached: Reached) -> bool:
@@ -377,23 +377,23 @@ def plant(faults: list[Fault], workers: int, kept: Path | None) -> Iterator[tupl
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", nargs="+", default=ROOMS, choices=ROOMS)
+    parser.add_argument("--packages", nargs="+", default=PACKAGES, choices=PACKAGES)
     parser.add_argument("--count", type=int, default=160)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--coverage", type=Path, help="file of the lines that each test runs")
     arguments = parser.parse_args()
-    faults = choose_faults(arguments.rooms, arguments.count, arguments.seed)
+    faults = choose_faults(arguments.packages, arguments.count, arguments.seed)
     random.Random(arguments.seed).shuffle(faults)
     results = {}
     for fault, caught in plant(faults, arguments.workers, arguments.coverage):
         results[fault] = caught
         print("caught  " if caught else "SURVIVED", describe(fault), flush=True)
-    planted = Counter(fault.room for fault in results)
-    seen = Counter(fault.room for fault in results if results[fault])
-    print("\n| room | planted | caught |\n|---|---|---|")
-    for room in sorted(planted):
-        print(f"| {room} | {planted[room]} | {seen[room]} |")
+    planted = Counter(fault.package for fault in results)
+    seen = Counter(fault.package for fault in results if results[fault])
+    print("\n| package | planted | caught |\n|---|---|---|")
+    for package in sorted(planted):
+        print(f"| {package} | {planted[package]} | {seen[package]} |")
     print(f"| all | {planted.total()} | {seen.total()} ({seen.total() / planted.total():.0%}) |\n")
     for fault in sorted(
         (f for f, found in results.items() if not found), key=lambda f: (f.file, f.line)

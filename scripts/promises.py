@@ -22,10 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsbench.analysis.designs import estimate_components
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.planning import Purpose, deviation_range
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, estimate_components, plan_looks
+from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
@@ -286,7 +288,9 @@ def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -
                 if one not in made:
                     level = 25 - loss * LEAST * (one >= worse)
                     noise = deviation * LEAST * math.sqrt(0.5)
-                    made[one] = trials("adc", rng.normal(level, noise, (scenes, seeds)))
+                    version = {0: gates.BASELINE, count: gates.LAST}.get(one, gates.NEW)
+                    drawn = rng.normal(level, noise, (scenes, seeds))
+                    made[one] = trials("adc", drawn, version)
                     most[one] = 0
             places = {gates.BASELINE: 0, gates.LAST: count, gates.NEW: number}
 

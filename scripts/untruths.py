@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from gsbench.analysis import judgement
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.looks import look_levels
 from gsbench.analysis.pairing import Pairs, ScenePairs
 from gsbench.analysis.quantities import asked_quantity
-from gsbench.analysis.statistics import answer_family, judge_like_these, look_levels
+from gsbench.analysis.statistics import answer_family, judge_like_these
 from gsbench.runs.experiments import Question
 
 CLAIMS, RATE = 4, 0.05

@@ -9,14 +9,14 @@ from gsbench.app.command import compose_trials
 
 
 @cache
-def _composed(words, multirun):
-    return compose_trials(words, multirun)
+def _composed(words, multirun, typed):
+    return compose_trials(words, multirun, typed)
 
 
-def composed(words, multirun=True):
+def composed(words, multirun=True, typed=None):
     """The trials of a command, in this test's runs folder. Equal words are composed once."""
     runs = {"runs": os.environ["GSBENCH_RUNS"]}
     return [
         replace(trial, values=deepcopy(trial.values) | runs)
-        for trial in _composed((*words,), multirun)
+        for trial in _composed((*words,), multirun, None if typed is None else (*typed,))
     ]

@@ -1,8 +1,7 @@
 """The records of a finished trial and of a search, for tests that need one."""
 
-import json
-
 from gsbench.runs.trial_record import TrialRecord
+from tests.helpers import write
 
 
 def record_of(values, **changes):
@@ -30,8 +29,7 @@ def record_of(values, **changes):
 def write_results(folder, values, **changes):
     """Write ``results.json`` without a record of the trial's inputs (``made_of``)."""
     record = record_of(values, **changes)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "results.json").write_text(json.dumps(record.to_json()))
+    write(folder / "results.json", record.to_json())
     return record
 
 

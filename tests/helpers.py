@@ -34,8 +34,8 @@ def write(path, content):
 
 
 def words_of(first, *more):
-    """The words of a command; the first argument may be a part of a command line, as typed."""
-    return [*(split(first) if " " in first else [first]), *map(str, more)]
+    """The words of a command; the first argument may be a verb or an option with words after it."""
+    return [*([first] if "=" in first.partition(" ")[0] else split(first)), *map(str, more)]
 
 
 def read_json(path):

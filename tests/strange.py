@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from shlex import split
 
 import pytest
 import yaml
@@ -9,6 +10,7 @@ import yaml
 from gsbench import cli
 from gsbench.errors import InputError
 from gsbench.system.own_modules import allowed_modules
+from tests.helpers import write
 
 BOMB = "from pathlib import Path\nPath('exploded').touch()\nclass Bomb:\n    pass\n"
 MINE = """
@@ -34,8 +36,7 @@ def place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     (tmp_path / "bomb.py").write_text(BOMB)
-    (tmp_path / "bombs").mkdir()
-    (tmp_path / "bombs" / "__init__.py").write_text(BOMB)
+    write(tmp_path / "bombs" / "__init__.py", BOMB)
     (tmp_path / "bombs" / "one.yaml").write_text("name: one\n")
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "hydra_plugins").mkdir()  # Hydra imports whatever it finds below this name
@@ -63,6 +64,5 @@ def ask(words, capsys, monkeypatch):
 def experiment(settings):
     """The words that run an experiment from a stranger's file."""
     folder = Path("conf/experiment")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "strange.yaml").write_text("# @package _global_\n" + yaml.safe_dump(settings))
-    return ["--config-dir", "conf", "+experiment=strange"]
+    write(folder / "strange.yaml", "# @package _global_\n" + yaml.safe_dump(settings))
+    return split("--config-dir conf +experiment=strange")

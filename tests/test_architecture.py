@@ -10,9 +10,8 @@ import pytest
 import gsbench
 
 PACKAGE = Path(gsbench.__file__).parent
-# The house from the top floor down. A room may import those on floors below its own, and the ground
-# floor.
-FLOORS = (
+# The layers from the top down. A package may import those of layers below its own, and the base.
+LAYERS = (
     {"__main__"},
     {"cli"},
     {"verbs"},
@@ -27,7 +26,7 @@ FLOORS = (
     {"gaussians", "datasets", "runs"},
     {"system"},
 )
-GROUND_FLOOR = {
+BASE = {
     "downloads",
     "errors",
     "events",
@@ -44,7 +43,7 @@ LIBRARY = ("train", "densify", "raster", "eval", "scene", "gaussians", "init", "
 WITHOUT_TORCH = ("analysis", "runs", "datasets", "system", "config", "claims", "cli")
 KNOW_HYDRA = {"app", "config"}
 HYDRA = {"hydra", "omegaconf"}
-# The only modules that a room may import from a room below it.
+# The only modules that a package may import from a package below it.
 ONLY = {
     # tables of facts, which load no torch
     ("analysis", "eval"): {"gsbench.eval.facts", "gsbench.eval.protocol"},
@@ -105,7 +104,7 @@ def arrows(inside_functions=True, for_types=False):
 
 def reached(start):
     """The module ``start`` and all modules of gsbench that it imports, also through others."""
-    found, waiting = set[str](), [start]
+    found, waiting = set(), [start]
     while waiting:
         name = waiting.pop()
         if name not in found and name in arrows():
@@ -114,21 +113,21 @@ def reached(start):
     return found
 
 
-def room(module):
-    """The room of a module: its folder below ``gsbench``, or itself if it is in none."""
+def package(module):
+    """The package of a module: its folder below ``gsbench``, or itself if it is in none."""
     parts = module.split(".")
     return parts[1] if parts[0] == "gsbench" and len(parts) > 1 else ""
 
 
-def by_room(graph):
-    """The arrows between rooms."""
-    rooms = {room(module): set() for module in graph if room(module)}
+def by_package(graph):
+    """The arrows between packages."""
+    packages = {package(module): set() for module in graph if package(module)}
     for module, targets in graph.items():
-        if room(module):
-            rooms[room(module)] |= {room(target) for target in targets if room(target)} - {
-                room(module)
-            }
-    return rooms
+        if package(module):
+            packages[package(module)] |= {
+                package(target) for target in targets if package(target)
+            } - {package(module)}
+    return packages
 
 
 def circle(graph):
@@ -150,13 +149,13 @@ def circle(graph):
 
 
 def upward(graph):
-    """Each arrow between rooms that does not run down, in words."""
-    level = {name: number for number, names in enumerate(reversed(FLOORS), 1) for name in names}
-    level |= dict.fromkeys(GROUND_FLOOR, 0)
+    """Each arrow between packages that does not run down, in words."""
+    level = {name: number for number, names in enumerate(reversed(LAYERS), 1) for name in names}
+    level |= dict.fromkeys(BASE, 0)
     found = []
     for module, targets in sorted(graph.items()):
         for target in sorted(targets):
-            here, there = room(module), room(target)
+            here, there = package(module), package(target)
             if here and there and here != there and level[there] >= max(level[here], 1):
                 found.append(f"{module} imports {target}, which stands no lower")
     return found
@@ -206,25 +205,25 @@ def test_a_planted_circle_of_files_is_found(tmp_path, monkeypatch, back):
 
 
 def test_no_circle_of_folders():
-    found = circle(by_room(arrows()))
+    found = circle(by_package(arrows()))
     assert not found, f"{' knows '.join(found)}: the last of these closes a circle"
 
 
-def test_every_room_has_a_floor_and_arrows_run_down():
-    assert set(by_room(arrows())) <= set().union(*FLOORS) | GROUND_FLOOR
+def test_every_package_has_a_layer_and_arrows_run_down():
+    assert set(by_package(arrows())) <= set().union(*LAYERS) | BASE
     assert not upward(arrows())
 
 
-def test_the_ground_floor_is_small():
+def test_the_base_is_small():
     loose = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
-    assert loose == GROUND_FLOOR | {"cli", "__main__"}
+    assert loose == BASE | {"cli", "__main__"}
 
 
 @pytest.mark.parametrize("above, below", sorted(ONLY))
-def test_some_rooms_import_only_parts_of_others(above, below):
+def test_some_packages_import_only_parts_of_others(above, below):
     for module, targets in arrows().items():
-        if room(module) == above:
-            seen = {target for target in targets if room(target) == below}
+        if package(module) == above:
+            seen = {target for target in targets if package(target) == below}
             assert seen <= ONLY[above, below], f"{module} imports {seen - ONLY[above, below]}"
 
 
@@ -233,19 +232,19 @@ def test_the_library_reaches_neither_hydra_nor_mlflow_nor_the_pipeline(name):
     program = {
         module
         for module in arrows()
-        if room(module) in {"pipeline", "config", "app", "launch", "tracking"}
+        if package(module) in {"pipeline", "config", "app", "launch", "tracking"}
     }
     for module in arrows():
-        if room(module) == name:
+        if package(module) == name:
             way = way_to(arrows(), module, HYDRA | {"mlflow"} | program)
             assert not way, " imports ".join(way)
 
 
 @pytest.mark.parametrize("name", WITHOUT_TORCH)
-def test_rooms_of_quick_commands_load_no_torch(name):
+def test_packages_of_quick_commands_load_no_torch(name):
     graph = arrows(inside_functions=False)
     for module in graph:
-        if room(module) == name and not module.startswith(MAY_LOAD_TORCH):
+        if package(module) == name and not module.startswith(MAY_LOAD_TORCH):
             way = way_to(graph, module, {"torch"})
             assert not way, " imports ".join(way)
 
@@ -254,9 +253,9 @@ def test_rooms_of_quick_commands_load_no_torch(name):
 MAY_LOAD_TORCH = ("gsbench.system.resources", "gsbench.system.device")
 
 
-def test_only_two_rooms_import_hydra():
+def test_only_two_packages_import_hydra():
     for module, targets in arrows().items():
-        assert not targets & HYDRA or room(module) in KNOW_HYDRA, (
+        assert not targets & HYDRA or package(module) in KNOW_HYDRA, (
             f"{module} imports {targets & HYDRA}"
         )
 
@@ -272,8 +271,8 @@ def test_verbs_do_not_import_each_other():
     # the arguments of all verbs, and the list of verbs
     shared = {"gsbench.verbs.arguments", "gsbench.verbs"}
     for module, targets in arrows().items():
-        if room(module) == "verbs":
-            others = {target for target in targets if room(target) == "verbs"} - shared
+        if package(module) == "verbs":
+            others = {target for target in targets if package(target) == "verbs"} - shared
             assert not others, f"{module} imports {others}"
 
 
@@ -300,7 +299,7 @@ def test_the_checks_can_fail():
     assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
     modules_apart = {"gsbench.train.x": {"gsbench.eval.x"}, "gsbench.eval.y": {"gsbench.train.y"}}
     assert not circle(modules_apart)  # no circle of modules, and yet
-    assert circle(by_room(modules_apart)) == ["eval", "train", "eval"]
+    assert circle(by_package(modules_apart)) == ["eval", "train", "eval"]
     assert upward(modules_apart) == [
         "gsbench.eval.y imports gsbench.train.y, which stands no lower"
     ]

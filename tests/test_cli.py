@@ -3,8 +3,8 @@
 import errno
 import importlib
 import os
-import subprocess
 import sys
+from shlex import split
 
 import pytest
 
@@ -12,6 +12,7 @@ from gsbench import __version__, cli
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.stopping import Stopped
 from gsbench.verbs import load_verb
+from tests.processes import completed
 
 
 @pytest.fixture(autouse=True)
@@ -39,10 +40,7 @@ def test_help_and_reading_verbs_load_no_torch(runs):
         "c.run(['-m', 'seed=0,1', '--dry-run'])\n"
         "sys.exit(any(name in sys.modules for name in ('torch', 'mlflow', 'numba', 'pycolmap')))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed([sys.executable, "-c", code])
     assert "volumetric" in done.stdout
     assert "2 trials: 2 missing" in done.stdout
 
@@ -128,7 +126,7 @@ def test_an_error_stays_a_line_whatever_it_quotes(monkeypatch, capfd):
 def test_help_lists_verbs_and_choices_also_of_the_users_folders(tmp_path, capsys):
     (tmp_path / "own" / "densify").mkdir(parents=True)
     (tmp_path / "own" / "densify" / "calm.yaml").touch()
-    assert cli.run(["--config-dir", "own", "--help"]) == 0
+    assert cli.run(split("--config-dir own --help")) == 0
     said = capsys.readouterr().out
     assert said.startswith(cli.USAGE)
     assert [name for name in cli.VERBS if f"\n  {name} " not in said] == []
@@ -141,7 +139,7 @@ def test_unknown_verb_names_the_nearest(capsys):
 
 
 def test_hydra_shows_the_configuration(capfd):
-    assert cli.run(["--cfg", "job", "train.iterations=77"]) == 0
+    assert cli.run(split("--cfg job train.iterations=77")) == 0
     assert "iterations: 77" in capfd.readouterr().out
 
 
@@ -176,10 +174,7 @@ def test_ctrl_c_while_the_first_modules_load_is_one_line(module, tmp_path):
         "sys.meta_path.insert(0, Interrupt())\n"
         "from gsbench.cli import main\nmain()\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 130
+    done = completed([sys.executable, "-c", program], code=130, cwd=tmp_path)
     assert done.stderr == "gsbench: stopped before it began\n"
 
 

@@ -30,6 +30,7 @@ from gsbench.files import (
     write_json,
     write_text,
 )
+from tests.helpers import refusal, write
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -87,7 +88,7 @@ def test_an_output_gets_its_folder_and_another_is_asked_for_if_it_cannot_be_writ
         (out / "a", r"cannot write .*page.html/a \(.*\); give another --out"),
         (out.parent, r"cannot write .*below \(Is a directory\)"),
     ):
-        with pytest.raises(InputError, match=said), writable_output(place):
+        with refusal(said), writable_output(place):
             place.write_text("a")
 
 
@@ -96,8 +97,7 @@ def special(tmp_path):
     """A runs folder with a file, a folder, and below it what may not be there."""
     place = tmp_path / "runs" / "x"
     place.mkdir(parents=True)
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "outside" / "file").write_text("kept")
+    write(tmp_path / "outside" / "file", "kept")
     (place / "file").write_text("a")
     (place / "folder").mkdir()
     os.mkfifo(place / "folder" / "pipe")
@@ -114,7 +114,7 @@ def test_only_regular_files_are_opened(special):
     with os.fdopen(open_plain(special["file"])) as stream:
         assert stream.read() == "a"
     for name in (*SPECIAL, "folder"):
-        with pytest.raises(InputError, match=f"{name} is a link or not a regular file"):
+        with refusal(f"{name} is a link or not a regular file"):
             open_plain(special[name])
     with pytest.raises(InputError):  # nobody reads the pipe
         open_plain(special["pipe"], os.O_WRONLY)
@@ -134,11 +134,11 @@ def test_links_are_found_on_the_way_and_only_if_asked_below(special):
     require_no_links(runs, runs / "x" / "none", below=True)
     require_no_links(runs, special["file"], below=True)
     for name in SPECIAL:
-        with pytest.raises(InputError, match=f"{name} is a link"):
+        with refusal(f"{name} is a link"):
             require_no_links(runs, special[name])
-        with pytest.raises(InputError, match=f"{name} is a link"):
+        with refusal(f"{name} is a link"):
             require_no_links(runs, special[name] / "below")
-    with pytest.raises(InputError, match="is a link"):
+    with refusal("is a link"):
         require_no_links(runs, runs / "x", below=True)
     outside = runs.parent / "outside"
     linked = runs.parent / "link to runs"  # the way to the runs folder is the user's own
@@ -157,7 +157,7 @@ def test_a_users_pipe_or_socket_is_refused_and_a_link_is_not(special):
         address = special["file"].with_name("s")
         server.bind(os.path.relpath(address))
         for path in (address, special["pipe"]):
-            with pytest.raises(InputError, match="is not a regular file: put a copy"):
+            with refusal("is not a regular file: put a copy"):
                 require_regular(path)
 
 
@@ -165,8 +165,7 @@ def test_the_remains_of_killed_writers_are_removed_and_no_other_files(tmp_path):
     kept = [".a.tmp-", ".a.tmp-1x", "a.tmp-1", ".tmp", ".hidden", "a"]
     for name in (".a.json.tmp-17", ".a.tmp", *kept):
         (tmp_path / name).touch()
-    (tmp_path / "below").mkdir()
-    (tmp_path / "below" / ".b.tmp-1").touch()
+    write(tmp_path / "below" / ".b.tmp-1", b"")
     (tmp_path / ".c.tmp-1").mkdir()
     remove_temporaries(tmp_path)
     assert {path.name for path in tmp_path.rglob("*")} == {"below", ".c.tmp-1", *kept}
@@ -205,7 +204,7 @@ def test_the_runs_folder_is_absolute_and_can_be_made(tmp_path, monkeypatch):
         ("a\0b", "cannot be the runs folder"),
         ("~nosuchuser/x", "cannot be the runs folder"),
     ):
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             checked_runs_folder(name)
 
 
@@ -219,7 +218,7 @@ def test_a_runs_folder_is_made_and_tried(tmp_path, monkeypatch):
         with pytest.raises(OSError, match=os.strerror(number)):
             make_runs_folder(folder)
     monkeypatch.setattr(files, "TemporaryDirectory", _refuse(errno.ENAMETOOLONG))
-    with pytest.raises(InputError, match=r"cannot be the runs folder \(File name too long\)"):
+    with refusal(r"cannot be the runs folder \(File name too long\)"):
         make_runs_folder(folder)
 
 

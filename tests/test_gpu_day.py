@@ -117,7 +117,6 @@ class Day:
         """The end of each part in the archive in $OUT; "files" has the names of the files in it."""
         with tarfile.open(self.out / f"gpu_day-{verb}.tar.gz") as archive:
             file = archive.extractfile(f"results/parts-{verb}.jsonl")
-            assert file is not None
             records = [json.loads(line) for line in file.read().splitlines()]
             return {record["part"]: record["end"] for record in records} | {
                 "files": archive.getnames()

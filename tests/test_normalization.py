@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from gsbench.normalization import COLMAP_SIZE, IDENTITY, Normalization, find_normalization
@@ -66,11 +67,9 @@ def test_normalized_cameras_do_not_depend_on_a_similarity(seed, count, log_scale
     own, other = normalization.apply(centers), again.apply(moved)
     if again.scale != 1:
         # float64 at 1e7 resolves 2e-9, and the size may be 1e-4
-        np.testing.assert_allclose(other, own, atol=2e-3)
+        assert_allclose(other, own, atol=2e-3)
         assert COLMAP_SIZE / 4 < np.ptp(other, axis=0).max() < 6 * COLMAP_SIZE
-    np.testing.assert_allclose(
-        again.undo(other), moved, rtol=1e-12, atol=1e-12 * np.abs(moved).max()
-    )
+    assert_allclose(again.undo(other), moved, rtol=1e-12, atol=1e-12 * np.abs(moved).max())
 
 
 @given(SEEDS, st.integers(8, 40), st.floats(3, 12))

@@ -1,7 +1,5 @@
 """Reading files that may be strange, up to the limits and one beyond."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass, field
@@ -10,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from gsbench import parsing
-from gsbench.errors import InputError
 from gsbench.parsing import (
     LARGEST_INT,
     MAX_DEPTH,
@@ -36,6 +33,7 @@ from gsbench.parsing import (
     resolved,
     without_byte_order_mark,
 )
+from tests.helpers import refusal, write
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="needs /proc")
@@ -85,7 +83,7 @@ def test_a_byte_order_mark_is_removed_and_other_encodings_are_refused():
     assert without_byte_order_mark("\ufeffä".encode()) == "ä".encode()
     assert without_byte_order_mark("ä\ufeff".encode()) == "ä\ufeff".encode()
     for encoding in ("utf-16-le", "utf-16-be", "utf-32-be", "utf-32-le"):
-        with pytest.raises(InputError, match="save it as UTF-8"):
+        with refusal("save it as UTF-8"):
             without_byte_order_mark("\ufeffä".encode(encoding))
 
 
@@ -253,7 +251,7 @@ def test_a_record_is_kept_without_its_defaults_and_unknown_keys_are_ignored(tmp_
     assert Row(amount=0, name="b").to_json() == {"amount": 0, "name": "b"}
     file = tmp_path / "a.json"
     assert read_if_sound(file, Row) is None
-    file.write_text(json.dumps(row.to_json() | {"later": 1}))
+    write(file, row.to_json() | {"later": 1})
     assert read_typed(file, Row) == read_if_sound(file, Row) == row
     file.write_text("{")
     assert read_if_sound(file, Row) is None

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gsbench import downloads
-from gsbench.errors import InputError
 from gsbench.weights import (
     MissingWeightsError,
     WeightsFile,
@@ -24,6 +24,7 @@ from gsbench.weights import (
     load_state,
 )
 from tests.datasets.server import Manners, serve
+from tests.helpers import refusal, write
 
 STATE = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.zeros(2)}
 
@@ -47,8 +48,7 @@ def test_search_order_is_argument_environment_cache(tmp_path, empty_caches, monk
         empty_caches,
     ]
     for place in places:
-        place.mkdir(parents=True)
-        (place / "net.pth").write_bytes(b"x")
+        write(place / "net.pth", b"x")
     monkeypatch.setenv("GSBENCH_WEIGHTS", str(tmp_path / "environment"))
     assert find_weights(spec(b"x"), tmp_path / "argument") == places[0] / "net.pth"
     assert find_weights(spec(b"x")) == places[1] / "net.pth"
@@ -58,8 +58,7 @@ def test_search_order_is_argument_environment_cache(tmp_path, empty_caches, monk
 
 def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path):
     for name, content in (("b/net.pth", b"2"), ("a/net.pth", b"1"), ("other/net.pth", b"3")):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_bytes(content)
+        write(tmp_path / name, content)
     named = WeightsFile(("net.pth", "other/net.pth"), None)
     # beside the names themselves come the sub-folders, in order
     assert find_weights(named, tmp_path) == tmp_path / "other/net.pth"
@@ -73,8 +72,7 @@ def test_every_name_counts_and_the_first_right_file_is_taken(tmp_path):
 
 
 def test_only_the_cache_is_not_searched_below(empty_caches, monkeypatch):
-    (empty_caches / "deep").mkdir(parents=True)
-    (empty_caches / "deep" / "net.pth").write_bytes(b"x")
+    write(empty_caches / "deep" / "net.pth", b"x")
     with pytest.raises(MissingWeightsError, match="it has no address to download from"):
         find_weights(spec())
     monkeypatch.setenv("GSBENCH_WEIGHTS", str(empty_caches.parent))
@@ -105,8 +103,7 @@ def test_after_a_failed_download_no_other_is_tried(monkeypatch):
 
 def test_users_files_without_a_published_checksum_are_known_by_their_digest(tmp_path, empty_caches):
     """Such a file may be any, so that it belongs into the keys of results; a download may not."""
-    empty_caches.mkdir(parents=True)
-    (empty_caches / "net.pth").write_bytes(b"downloaded")
+    write(empty_caches / "net.pth", b"downloaded")
     assert digests_of_unpinned([spec()]) == []
     (tmp_path / "net.pth").write_bytes(b"mine")
     digest = hashlib.sha256(b"mine").hexdigest()
@@ -118,14 +115,12 @@ def test_a_file_with_a_wrong_checksum_is_refused_unless_a_right_copy_is_found(
     tmp_path, empty_caches, digits
 ):
     folder = tmp_path / "mine"
-    folder.mkdir()
-    (folder / "net.pth").write_bytes(b"truncat")
+    write(folder / "net.pth", b"truncat")
     with pytest.raises(
         MissingWeightsError, match=r"net.pth has sha256 .* wrong or truncated; replace it"
     ):
         find_weights(spec(b"truncated", digits=digits), folder)
-    empty_caches.mkdir(parents=True)
-    (empty_caches / "net.pth").write_bytes(b"truncated")
+    write(empty_caches / "net.pth", b"truncated")
     assert find_weights(spec(b"truncated", digits=digits), folder).parent == empty_caches
 
 
@@ -142,7 +137,7 @@ def test_missing_files_are_named_together_with_places_and_sources(tmp_path):
     ):
         assert part in message
     assert "\n" not in message
-    with pytest.raises(InputError, match="does not exist"):
+    with refusal("does not exist"):
         find_weights(spec(), tmp_path / "nowhere")
 
 
@@ -236,7 +231,7 @@ def test_tensors_are_read_from_both_formats(tmp_path, name):
         torch.save(STATE, path)
     state = load_state(path)
     assert state.keys() == STATE.keys()
-    torch.testing.assert_close(state["a.weight"], STATE["a.weight"])
+    assert_close(state["a.weight"], STATE["a.weight"])
 
 
 def test_tensors_are_read_from_an_entry_of_a_checkpoint(tmp_path):

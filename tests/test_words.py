@@ -132,7 +132,7 @@ REFUSED = {  # command line: a part of the line that refuses it
     "patience?",
     "densify=adc densify._target_=own.Own allow_targets=[own] +densify.patience=x": "must be a "
     "whole number, got 'x'",
-    "densify=pixelgs raster=gsplat": "does not give them; take raster=reference or raster=cpu or "
+    "densify=pixelgs raster=gsplat": "does not give; take raster=reference or raster=cpu or "
     "raster=triton",
     "init._target_=5": "the import path of a class",
     # verbs and questions

@@ -11,12 +11,13 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # The imports are in the block, because a Ctrl-C during them would otherwise print a traceback.
 try:
     import os
+    from contextlib import suppress
 
     from gsbench import __version__
     from gsbench.errors import GsbenchError, InputError
     from gsbench.files import checked_runs_folder, storage_errors
     from gsbench.logs import printable_output, set_up_logging
-    from gsbench.system.own_modules import SAFE_PATH
+    from gsbench.system.programs import protect_environment
     from gsbench.verbs import VERBS, load_verb
     from gsbench.words import did_you_mean
 except KeyboardInterrupt:
@@ -36,7 +37,8 @@ def main() -> None:
 
 def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
-    os.environ.setdefault(*SAFE_PATH)  # also for Python processes that libraries start
+    with suppress(FileNotFoundError):  # the current folder was deleted, with all that is in it
+        protect_environment()
     set_up_logging()
     try:
         if argv and argv[0] == "help":

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from gsbench.errors import GsbenchError, InputError
+from gsbench.words import is_utf8
 
 CHUNK = 1 << 20
 # Of a file name. File systems allow 255, but the temporary name of a file that is being written is
@@ -218,6 +219,11 @@ def checked_runs_folder(name: str) -> Path:
     """
     advice = "set runs=FOLDER or GSBENCH_RUNS to another folder"
     try:
+        # Records of trials have the current folder, too.
+        if strange := [place for place in (name, os.getcwd()) if not is_utf8(place)]:
+            raise InputError(
+                f"the name of {strange[0]} is not UTF-8: rename it, or start elsewhere"
+            )
         folder = Path(name).expanduser().resolve()
         existing = next(place for place in (folder, *folder.parents) if place.exists())
     except (OSError, RuntimeError, ValueError) as error:

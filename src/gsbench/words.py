@@ -103,6 +103,11 @@ def is_path(value: str) -> bool:
         return False
 
 
+def is_utf8(text: str) -> bool:
+    """Return whether a name is UTF-8: Python reads other bytes of a file's name as surrogates."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
 def printable(text: str) -> str:
     """``text`` with control characters escaped: a terminal shows them, and does not act on them.
 

@@ -1,7 +1,5 @@
 """A runs folder with made-up results: known effects, known noise, and nothing trained."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import json
@@ -13,6 +11,8 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 from scipy.ndimage import gaussian_filter
+
+from tests.helpers import read_json, write
 
 METRICS = ("psnr", "ssim", "lpips_vgg_raw", "flip")
 BASE = {"psnr": 26.0, "ssim": 0.80, "lpips_vgg_raw": 0.25, "flip": 0.10}
@@ -147,10 +147,10 @@ def write_trial(runs, data, views, config_hash="c0ffee00", **settings):
     for key, value in settings.items():
         group, _, name = key.partition("__")
         config[group] = {**config.get(group, {}), name: value}
-    (path / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
+    write(path / "config.yaml", config)  # JSON is YAML
     _write_lines(path / "events.jsonl", events(data))
     _write_lines(path / "metrics.jsonl", curves(data))
-    (path / "results.json").write_text(json.dumps(data))
+    write(path / "results.json", data)
     return path
 
 
@@ -171,9 +171,9 @@ def write_arms(runs, arms, seeds=(0, 1, 2), scenes=("courtyard",), experiment="e
                 runs, data, views, sha256(repr(densify).encode()).hexdigest()[:8], **settings
             )
         )
-        config = json.loads((paths[-1] / "config.yaml").read_text())
+        config = read_json(paths[-1] / "config.yaml")
         config["densify"] = {"name": name, **densify}
-        (paths[-1] / "config.yaml").write_text(json.dumps(config))
+        write(paths[-1] / "config.yaml", config)
     return paths
 
 

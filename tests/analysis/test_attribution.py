@@ -1,7 +1,6 @@
 """The differences between two arms are named wherever the arms are compared."""
 
 import itertools
-import json
 import random
 from types import SimpleNamespace
 
@@ -28,6 +27,7 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
 from tests.analysis.synthetic import write_arms
 from tests.conftest import ROOT
+from tests.helpers import read_json, write
 
 SCHEDULE = {"train.densify_start": 500, "train.densify_stop": 15_000, "train.mcmc_stop": 25_000}
 SCHEDULE |= {
@@ -217,8 +217,8 @@ def test_another_program_counts_as_many_ingredients(tmp_path):
 def test_a_training_elsewhere_has_unknown_ingredients(tmp_path):
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "theirs": densifier("adc")}):
         if path.parent.name == "sfm-theirs":
-            data = json.loads((path / "results.json").read_text())
-            (path / "results.json").write_text(json.dumps(data | {"evaluated_from": "model"}))
+            data = read_json(path / "results.json")
+            write(path / "results.json", data | {"evaluated_from": "model"})
     trials = list(load_experiment(tmp_path, "exp").trials)
     assert trials[-1].made_elsewhere
     assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."

@@ -18,10 +18,7 @@ MINE = {"densify___target_": "mine.Patient"}
 
 
 def code(digest=None, **stages):
-    return {
-        "sources": {} if digest is None else {"mine": digest},
-        "stages": STAGES | stages,
-    }
+    return {"sources": {} if digest is None else {"mine": digest}, "stages": STAGES | stages}
 
 
 def of_gsbench(**packages):

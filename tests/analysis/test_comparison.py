@@ -25,7 +25,7 @@ from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import t_test
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import sentence
-from gsbench.claims.archive import write_archive
+from gsbench.claims.export import write_archive
 from gsbench.claims.site import write_site
 from gsbench.runs.experiments import Declaration, open_question, record_text
 from gsbench.tracking.comparison import description

@@ -1,21 +1,18 @@
 """The data frame of an experiment: one row per trial, with the values of the result files."""
 
 import io
-import json
 import statistics
-from collections.abc import Callable
+from shlex import split
 
-import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_array_equal
 
 from gsbench.analysis import to_frame
-from gsbench.analysis.results import Experiment, load_experiment
-from gsbench.errors import InputError
+from gsbench.analysis.results import load_experiment
 from gsbench.verbs.results import tables
 from tests.analysis.test_tables import one_trial
-
-Make = Callable[..., Experiment]
+from tests.helpers import read_json, refusal
 
 
 def test_each_row_has_the_values_of_one_trials_file(make_experiment):
@@ -23,7 +20,7 @@ def test_each_row_has_the_values_of_one_trials_file(make_experiment):
     frame = to_frame(experiment)
     assert len(frame) == len(experiment.trials) == 12
     for (_, row), trial in zip(frame.iterrows(), experiment.trials, strict=True):
-        data = json.loads((trial.path / "results.json").read_text())
+        data = read_json(trial.path / "results.json")
         assert row["folder"] == str(trial.path)
         for key in (
             "experiment",
@@ -69,18 +66,17 @@ def test_a_missing_value_is_na_and_a_swept_setting_has_a_column(tmp_path):
 
 def test_the_csv_of_trials_reads_back_as_the_frame(make_experiment, tmp_path, capsys):
     frame = to_frame(make_experiment())
-    assert tables(["exp", "--format", "trials"], tmp_path) == 0
+    assert tables(split("exp --format trials"), tmp_path) == 0
     again = pd.read_csv(io.StringIO(capsys.readouterr().out))
     assert again.columns.tolist() == frame.columns.tolist()
     for name in ("psnr", "flip", "seconds_train"):
-        np.testing.assert_array_equal(again[name], frame[name])
+        assert_array_equal(again[name], frame[name])
     assert (
         tables(
-            ["exp", "--format", "trials", "--where", "seed=1", "--out", str(tmp_path / "out")],
-            tmp_path,
+            [*split("exp --format trials --where seed=1 --out"), str(tmp_path / "out")], tmp_path
         )
         == 0
     )
     assert len(pd.read_csv(tmp_path / "out" / "exp-trials.csv")) == 4
-    with pytest.raises(InputError, match="takes no --metrics"):
-        tables(["exp", "--format", "trials", "--metrics", "psnr"], tmp_path)
+    with refusal("takes no --metrics"):
+        tables(split("exp --format trials --metrics psnr"), tmp_path)

@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.judgement import _contradicts, find_outlying, judge
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
-from gsbench.analysis.statistics import answer_family, seeds_needed
+from gsbench.analysis.results import read_experiment
+from gsbench.analysis.statistics import answer_family
+from gsbench.analysis.verdict_words import outlying_words
 from gsbench.analysis.verdicts import judge_pairs, seeds_to_resolve
 from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.runs.trial_record import Budget
@@ -214,6 +217,37 @@ def test_a_verdict_that_depends_on_one_training_is_undecided(make_experiment):
     assert {trial.seed for trial in verdict.outlying} == {5}
     assert verdict.outcome == "undecided"
     assert verdict.outcome_without is not None
+
+
+@pytest.mark.parametrize("effect", [3.0, -3.0, 0.0])
+@pytest.mark.parametrize("metric, direction", [("psnr", 1), ("lpips_vgg_raw", -1)])
+@pytest.mark.parametrize("lost", ["volumetric", "adc", "both", "foreign"])
+def test_no_verdict_favours_an_arm_whose_trials_failed_alone(
+    make_experiment, tmp_path, lost, metric, direction, effect
+):
+    """Only its good trainings may be left; against it, what is left is enough."""
+    plan = {"seeds": range(4), "effect": {metric: direction * effect}, "scenes": tuple("abcdefg")}
+    made = make_experiment(**plan, trial_noise=0.01, residual_noise=0.01)
+    for trial in made.trials:
+        if (trial.scene, trial.seed) == ("b", 2) and lost in (trial.densify, "both", "foreign"):
+            (trial.path / "results.json").unlink()
+            if lost == "foreign":
+                (trial.path / "config.yaml").unlink()
+            elif trial.densify == "adc":
+                text = '{"type": "E", "message": "lost", "traceback": "", "time": 1}'
+                (trial.path / "failed.json").write_text(text)
+    asked = replace(PSNR, metric=metric, sign=direction, least=1.0)
+    experiment = read_experiment(tmp_path / made.name)
+    declared = Declaration(time=EARLY, questions=(asked,))
+    (verdict,) = judge(experiment.trials, declared, experiment.lacking)
+    outcome = {3.0: "supported", -3.0: "refuted", 0.0: "too small to matter"}[effect]
+    undecided = lost in {3.0: ["volumetric"], -3.0: ["adc"], 0.0: ["volumetric", "adc"]}[effect]
+    assert verdict.outcome == ("undecided" if undecided else outcome)
+    assert verdict.favours_lacking == undecided
+    assert verdict.like_these.outcome == verdict.outcome
+    assert ("b/sfm-" in outlying_words(verdict)) == undecided
+    without_test = [one.scene for one in verdict.scenes if one.p is None]
+    assert without_test == ["b"] * (lost in ("volumetric", "adc"))
 
 
 @pytest.mark.parametrize(

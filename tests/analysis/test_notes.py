@@ -1,8 +1,8 @@
 """Notes below tables, word for word, for made-up trials with known numbers."""
 
 import itertools
-import json
 from dataclasses import replace
+from shlex import split
 
 import pytest
 
@@ -10,8 +10,8 @@ from gsbench.analysis.fairness import counts_note
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
+from gsbench.analysis.table_notes import doubt_notes, held_out_notes, origin_notes, points_notes
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.trial_notes import doubt_notes, held_out_notes, origin_notes, points_notes
 from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -21,6 +21,7 @@ from gsbench.runs.trial_record import (
     TwinViews,
 )
 from tests.analysis.synthetic import Plan, write_runs
+from tests.helpers import read_json, write
 
 ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 COMPARED = (
@@ -66,7 +67,7 @@ def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path,
 
 DEMO, MINE = (
     ["+experiment=demo"],
-    ["densify=adc", "densify._target_=mine.A", "allow_targets=[mine]"],
+    split("densify=adc densify._target_=mine.A allow_targets=[mine]"),
 )
 
 
@@ -113,7 +114,7 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         }
         for trial in trials
     }
-    (tmp_path / "exp" / "plan.json").write_text(json.dumps({"trials": planned}))
+    write(tmp_path / "exp" / "plan.json", {"trials": planned})
     sentence = str(counts_note(trials, ADC, VOLUMETRIC))
     assert f"To do so: {command}" in sentence
     assert sentence.endswith("densify.cap=governor densify.max_gaussians=12300 name=exp_equal`.")
@@ -122,9 +123,9 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
 @pytest.mark.parametrize("rounds, warns", [(0, True), (1, True), (4, True), (5, False)])
 def test_a_table_warns_of_too_few_rounds(tmp_path, rounds, warns):
     (trial,) = trials_of(tmp_path, scenes=["garden"], densifiers=("adc",), seeds=(0,))
-    config = json.loads((trial.path / "config.yaml").read_text())
+    config = read_json(trial.path / "config.yaml")
     config["densify"]["interval"] = 100
-    (trial.path / "config.yaml").write_text(json.dumps(config))
+    write(trial.path / "config.yaml", config)
     (trial.path / "events.jsonl").write_text('{"step": 100, "cloned": 1}\n' * rounds)
     words = f"sfm-adc: {rounds} round{'s' * (rounds != 1)} of refinement in 2000 iterations"
     page = build_report(load_experiment(tmp_path, "exp"))
@@ -164,11 +165,11 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
     for path in write_runs(
         tmp_path, Plan(inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",))
     ):
-        config = json.loads((path / "config.yaml").read_text())
+        config = read_json(path / "config.yaml")
         config["init"] |= {"sfm": {"points_from": "all"}, "dim": {"points_from": "train"}}.get(
             config["init"]["name"], {}
         )
-        (path / "config.yaml").write_text(json.dumps(config))
+        write(path / "config.yaml", config)
     made = load_experiment(tmp_path, "exp").trials
     some, every = points_notes(made)
     assert some == Note.of("points of some", init="dim", choice="train")
@@ -189,9 +190,9 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
 def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted):
     paths = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))
     for path, images, downscale in zip(paths, folders, downscales, strict=True):
-        config = json.loads((path / "config.yaml").read_text())
+        config = read_json(path / "config.yaml")
         config["scene"] |= {"images": images, "downscale": downscale}
-        (path / "config.yaml").write_text(json.dumps(config))
+        write(path / "config.yaml", config)
     notes = doubt_notes(load_experiment(tmp_path, "exp").trials)
     assert notes == [Note.of("filters")] * noted
 

@@ -1,16 +1,13 @@
 """Trials of several machines or initial clouds are averaged and compared, always with a note."""
 
-from collections.abc import Callable
-
 from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import Experiment, load_experiment
+from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
 from tests.analysis.test_tables import one_trial
 
-Make = Callable[..., Experiment]
 XEON = {
     "cpu": "Xeon",
     "architecture": "x86_64",

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from gsbench.analysis import table_formats
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.claims.archive import write_archive
 from gsbench.claims.check import to_html
+from gsbench.claims.export import write_archive
 from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
 from gsbench.runs.experiments import Arm

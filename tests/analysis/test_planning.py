@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from gsbench.analysis.designs import POWER, Components, Design, estimate_components
 from gsbench.analysis.planning import Purpose, deviation_range
-from gsbench.analysis.statistics import POWER, Components, Design, estimate_components
 from tests.conftest import script
 
 promises = script("promises")

@@ -1,16 +1,14 @@
 """The error in textured parts, against its definition pixel by pixel."""
 
-import json
-
 import numpy as np
 import pytest
 from PIL import Image
 
 from gsbench.analysis.images import textured_error
 from gsbench.analysis.results import load_experiment
-from gsbench.errors import InputError
 from gsbench.runs.layout import FROM_PIXELS, MASKS
 from tests.analysis.synthetic import Plan, write_runs
+from tests.helpers import refusal, write
 
 
 def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
@@ -37,7 +35,7 @@ def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
     assert textured_error(trial) == pytest.approx(4.0, abs=0.2)
     for picture in (trial.path / "renders").iterdir():
         picture.unlink()
-    with pytest.raises(InputError, match="holds no renders"):
+    with refusal("holds no renders"):
         textured_error(trial)
-    (trial.path / FROM_PIXELS).write_text(json.dumps({"error_textured": 3.25}))
+    write(trial.path / FROM_PIXELS, {"error_textured": 3.25})
     assert textured_error(trial) == 3.25

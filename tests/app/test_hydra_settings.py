@@ -1,16 +1,19 @@
 """Hydra's own settings: which ones take effect, and what errors advise."""
 
+from shlex import split
+
 import pytest
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.command_words import check_search_path
 from gsbench.errors import InputError
+from tests.helpers import write
 
 pytestmark = pytest.mark.usefixtures("runs")
 
 
-SWEEP = ["densify=adc,none", "seed=0,1", "init=random", "tracking=none"]
+SWEEP = split("densify=adc,none seed=0,1 init=random tracking=none")
 
 
 def test_now_is_the_same_in_all_trials_of_a_sweep():
@@ -36,16 +39,13 @@ def test_now_is_the_same_in_all_trials_of_a_sweep():
         ),
         (["-m", "seed=range(0,1000000000000000000000)"], "lists more than 1,000,000 values"),
         (
-            ["-m", "+hydra.sweeper.tune.ranges=1", "seed=0,1"],
+            split("-m +hydra.sweeper.tune.ranges=1 seed=0,1"),
             "hydra.sweeper.tune.ranges is not a setting",
         ),
-        (
-            ["-m", "hydra/sweeper=basic", "hydra.sweeper.params=3", "seed=0,1"],
-            "hydra.sweeper.params",
-        ),
+        (split("-m hydra/sweeper=basic hydra.sweeper.params=3 seed=0,1"), "hydra.sweeper.params"),
         (["-m", "densify=glob([av]*)"], """'densify=glob("[av]*")'"""),
         (["-m", "densify=choice([av,b)"], "is not a setting like key=value"),
-        (["-m", "hydra/launcher=joblib", "seed=0,1", "hydra.launcher.jobs=3"], "n_jobs"),
+        (split("-m hydra/launcher=joblib seed=0,1 hydra.launcher.jobs=3"), "n_jobs"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
@@ -63,8 +63,8 @@ def test_impossible_settings_are_refused_in_one_line(words, text, refused):
         ["-m", "hydra.sweep.dir=elsewhere", "hydra.sweep.subdir=${hydra:job.num}", "seed=0,1"],
         ["hydra.verbose=[gsbench]", "hydra.job.chdir=true"],
         ["hydra/job_logging=default", "hydra.job_logging.root.level=DEBUG"],
-        ["-m", "hydra/sweeper=basic", "seed=0,1"],
-        ["-m", "hydra/sweeper=basic", "hydra/launcher=basic", "seed=0,1"],
+        split("-m hydra/sweeper=basic seed=0,1"),
+        split("-m hydra/sweeper=basic hydra/launcher=basic seed=0,1"),
     ],
     ids=" ".join,
 )
@@ -104,16 +104,15 @@ def test_a_glob_in_the_quotes_that_the_error_advises_works(said):
 
 
 @pytest.mark.parametrize(
-    "words", [["--config-dir", "own", "--help"], ["-h", "--config-dir=own"], ["-m", "--help"]]
+    "words", [split("--config-dir own --help"), ["-h", "--config-dir=own"], ["-m", "--help"]]
 )
 def test_help_is_printed_wherever_its_option_stands(words, tmp_path, said):
-    (tmp_path / "own" / "densify").mkdir(parents=True)
-    (tmp_path / "own" / "densify" / "patient.yaml").write_text("defaults: [adc]\n")
+    write(tmp_path / "own" / "densify" / "patient.yaml", "defaults: [adc]\n")
     out = said(*words)
     assert "Verbs" in out
     # a folder's own choices are listed
     assert ("patient" in out) == any("own" in word for word in words)
-    assert cli.run(["--config-dir", "nowhere", "--help"]) == 2
+    assert cli.run(split("--config-dir nowhere --help")) == 2
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from gsbench.bench.scenes import (
     SCENES,
     camera_before,
+    crowded_gaussians,
     frontal_camera,
     make_scene,
     skewed_gaussians,
@@ -102,6 +103,21 @@ def test_the_skewed_scene_has_the_skew_of_a_trained_model():
     # the spots' field, and two standard deviations beyond an outermost spot
     inside = slopes.abs() < torch.tensor([0.5, 0.35]) + 2 * 0.05
     assert inside.float().mean(0).min() > 0.97
+
+
+def test_a_twentieth_of_the_crowded_scene_is_over_one_tile():
+    camera = frontal_camera(1600, 1060)
+    crowded, trained = crowded_gaussians(50_000), trained_like_gaussians(50_000)
+    tiles = [
+        (project(scene, camera).means.double() + 0.5)
+        .div(16)
+        .floor()
+        .unique(dim=0, return_counts=True)
+        for scene in (crowded, trained)
+    ]
+    (places, lists), (_, others) = tiles
+    assert lists.max() > 0.045 * 50_000 > 100 * others.double().mean()
+    assert places[lists.argmax()].tolist() == [50, 33]  # the middle of the picture
 
 
 def test_a_scene_for_timing_has_two_views_of_noise(tmp_path):

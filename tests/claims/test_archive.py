@@ -4,15 +4,18 @@ import json
 import os
 import shutil
 import zipfile
+from shlex import split
 
 import pytest
 import yaml
 
 from gsbench.analysis.images import textured_error
 from gsbench.analysis.results import load_experiment, read_views
-from gsbench.claims.archive import unpack_archive, write_archive
+from gsbench.claims.archive import unpack_archive
+from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
 from tests.analysis.synthetic import Plan, write_runs
+from tests.helpers import read_json, refusal, write
 
 # as many trials as Table 1 has
 MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)
@@ -74,14 +77,14 @@ def test_an_archive_has_no_pixels_no_paths_and_no_passwords(tmp_path):
         "a": "sqlite:////home/alice/a.db",
         "b": "https://alice:secret@a.org/c",
     }
-    (path / "config.yaml").write_text(json.dumps(config))
-    results = json.loads((path / "results.json").read_text())
+    write(path / "config.yaml", config)
+    results = read_json(path / "results.json")
     looked = (
         "weights not found: a.pth (looked in /home/alice/weights, /home/alice/.cache/torch; "
         "switched off): get them"
     )
     results["unavailable"] = {"lpips_alex": looked, "where": "/home/alice/weights/a.pth"}
-    (path / "results.json").write_text(json.dumps(results))
+    write(path / "results.json", results)
     write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
     content = members(tmp_path / "exp.zip")
     assert not any(name.endswith((".png", ".ply")) for name in content)
@@ -217,7 +220,7 @@ def test_every_kind_of_damage_is_refused_in_one_line_and_leaves_no_files(tmp_pat
 def test_a_file_too_large_is_not_unpacked(tmp_path, monkeypatch):
     file = export(tmp_path)
     monkeypatch.setattr("gsbench.claims.archive.MAX_BYTES", 1000)
-    with pytest.raises(InputError, match="an archive of gsbench never has that many"):
+    with refusal("an archive of gsbench never has that many"):
         unpack_archive(file, tmp_path / "other")
 
 
@@ -227,7 +230,7 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     first, second, *_ = write_runs(runs, Plan())
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
-    assert said("export", "--results", "exp", "--out", tmp_path / "out" / "a.zip").startswith(
+    assert said("export --results exp --out", tmp_path / "out" / "a.zip").startswith(
         f"{tmp_path / 'out' / 'a.zip'}: results of exp, "
     )
     assert "does not average" in caplog.text
@@ -235,12 +238,10 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     assert len(unpack_archive(tmp_path / "out" / "a.zip", tmp_path / "b").trials) == 10
     for path in runs.glob("exp/*/*/*/per_view.csv"):
         path.write_text("")
-    assert "no whole trial to export" in refused(
-        "export", "--results", "exp", "--out", tmp_path / "b.zip"
-    )
+    assert "no whole trial to export" in refused("export --results exp --out", tmp_path / "b.zip")
     assert not (tmp_path / "b.zip").exists()
     for words in (
-        ["--results", "exp", "exp:courtyard:adc:0"],
+        split("--results exp exp:courtyard:adc:0"),
         ["--results", "exq"],
         ["exp:courtyard:adc:0"],
         [],
@@ -277,5 +278,5 @@ def test_trials_without_a_sound_configuration_are_left_out(tmp_path):
 
 def test_a_pipe_is_no_archive(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match="it is not a regular file"):
+    with refusal("it is not a regular file"):
         unpack_archive(tmp_path / "pipe", tmp_path / "other")

@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from gsbench.claims.file import Claim, parse_claims, read_claims
-from gsbench.errors import InputError
 from tests.conftest import ROOT
+from tests.helpers import refusal
 
 SHIPPED = sorted((ROOT / "conf" / "claims").glob("*.yaml"))
 GOOD = {
@@ -229,14 +229,13 @@ BAD = [
     "content, message", [case[1:] for case in BAD], ids=[case[0] for case in BAD]
 )
 def test_bad_input_is_refused_in_one_line(content, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refusal(message):
         parse_claims(content())
-    assert "\n" not in str(caught.value)
 
 
 def test_a_users_own_metric_needs_its_class():
     content = changed("claims", 0, "metric", to="sharpness")
-    with pytest.raises(InputError, match=r"eval\.extra\.sharpness"):
+    with refusal(r"eval\.extra\.sharpness"):
         parse_claims(content)
     content["settings"]["eval.extra.sharpness._target_"] = "mine.Sharpness"
     assert parse_claims(content).claims[0].metric == "sharpness"
@@ -252,9 +251,9 @@ def test_the_file_that_the_document_shows_is_sound():
 
 
 def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
+    with refusal("cannot be read"):
         read_claims(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="cannot be read"):
+    with refusal("cannot be read"):
         read_claims(tmp_path)
     for text, message in (
         ("a: [", "not YAML"),
@@ -269,9 +268,8 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
     ):
         path = tmp_path / "bad.yaml"
         path.write_text(text)
-        with pytest.raises(InputError, match=message) as caught:
+        with refusal(message):
             read_claims(path)
-        assert "\n" not in str(caught.value)
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match=r"UTF-8|YAML"):
+    with refusal(r"UTF-8|YAML"):
         read_claims(path)

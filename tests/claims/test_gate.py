@@ -10,7 +10,7 @@ from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Answer, StudentT
-from gsbench.claims.archive import write_archive
+from gsbench.claims.export import write_archive
 from gsbench.claims.gate import (
     NOT_DECIDED,
     PASSED,

@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsbench.analysis.comparison import compare, unused_trials
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.statistics import plan_looks
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import in_words, numbers
 from gsbench.claims import gate as gates

@@ -12,7 +12,7 @@ from scipy import stats
 
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, t_test
-from gsbench.claims.archive import write_archive
+from gsbench.claims.export import write_archive
 from gsbench.claims.pooling import (
     PooledQuestion,
     Study,

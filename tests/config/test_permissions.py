@@ -9,51 +9,74 @@ import yaml
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
-from gsbench.config.compose import compose_one
+from gsbench.config.command_words import value_text
+from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
 from gsbench.pipeline.parts import build
+from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
-from tests.strange import no_trial
+from gsbench.settings import ADDRESS_VARIABLES, foreign_address
+from tests.strange import experiment, no_trial
 from tests.strange import place as place
 
 pytestmark = pytest.mark.usefixtures("place")
-STRANGE_TRIALS = {
-    "a class": ({"densify": {"_target_": "bomb.Bomb"}}, "add allow_targets=[bomb] to the command"),
-    "a metric": (
-        {"eval": {"extra": {"x": {"_target_": "bomb.Bomb"}}}},
-        "add allow_targets=[bomb] to the command",
+
+# settings that only a file names, and a part of the line that refuses them
+ADDRESS, DATABASE = "http://127.0.0.1:9", "sqlite:////tmp/theirs.db"
+PROGRAM_OF_A_FILE = {
+    "+densify.command": ["bash", "x"],
+    "+densify.version": "a",
+    "+densify.result": "x.ply",
+}
+STRANGE = {
+    "an address": ({"tracking.uri": ADDRESS}, f"add allow_targets=[{ADDRESS}]"),
+    "a database": ({"tracking.uri": DATABASE}, f"add allow_targets=[{DATABASE}]"),
+    "an address of W&B": (
+        {"tracking.sink": "wandb", "tracking.uri": ADDRESS},
+        f"add allow_targets=[{ADDRESS}]",
+    ),
+    "a class": ({"densify._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
+    "an initialiser": ({"init._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
+    "a rasterizer": ({"+raster._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
+    "a metric": ({"+eval.extra.x._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
+    "a class inside a class": ({"+densify.x._target_": "os.mkdir"}, "add allow_targets=[os]"),
+    "a class and its permission": (
+        {"allow_targets": ["bomb"], "densify._target_": "bomb.Bomb"},
+        "allow_targets=[",
     ),
     "a program": (
-        {
-            "densify": {
-                "_target_": "gsbench.densify.External",
-                "name": "x",
-                "command": "bash {data}",
-                "version": "1",
-                "result": "x.ply",
-            }
-        },
-        "add allow_targets=[bash] to the command",
+        {"densify._target_": "gsbench.densify.External", **PROGRAM_OF_A_FILE},
+        "add allow_targets=[bash]",
     ),
     "a program by another path": (
-        {
-            "densify": {
-                "_target_": "gsbench.external.settings.External",
-                "name": "x",
-                "command": "bash {data}",
-                "version": "1",
-                "result": "x.ply",
-            }
-        },
-        "add allow_targets=[bash] to the command",
+        {"densify._target_": "gsbench.external.settings.External", **PROGRAM_OF_A_FILE},
+        "add allow_targets=[bash]",
     ),
-    "a shell": (
-        {"launch": {"setup": ["touch exploded"]}},
-        "add allow_targets=[bash] to the command",
-    ),
+    "a shell": ({"launch.setup": ["touch exploded"]}, "add allow_targets=[bash]"),
+    "an option of Slurm": ({"launch.sbatch.export": "ALL"}, "add allow_targets=[sbatch]"),
+    "a package of settings": ({"hydra.searchpath": ["pkg://bombs"]}, "add allow_targets=[bombs]"),
+    "a variable": ({"+hydra.job.env_set.PATH": "."}, "set variables in the shell"),
+    "a callback": ({"+hydra.callbacks.x._target_": "os.mkdir"}, "add allow_targets=[os]"),
+    "a launcher": ({"hydra.launcher._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
+    "a folder to write": ({"runs": "theirs"}, "runs"),
+    "Hydra's folder": ({"hydra.run.dir": "theirs"}, "hydra.run.dir=theirs, a place to write"),
+    "Hydra's files": ({"hydra.output_subdir": "."}, "hydra.output_subdir=., a place to write"),
+    "a log": ({"hydra.job.name": "theirs"}, "hydra.job.name=theirs, a place to write"),
 }
+
+
+def nested(settings, values=None):
+    """The ``values`` with settings by their dotted keys."""
+    values = {} if values is None else values
+    for key, value in settings.items():
+        *groups, last = key.lstrip("+").split(".")
+        node = values
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[last] = value
+    return values
 
 
 def strange_runs(settings):
@@ -62,8 +85,7 @@ def strange_runs(settings):
     values = json.loads(json.dumps(trial.values)) | {
         "allow_targets": ["bomb", "bash", "os", "gsbench", "bombs"]
     }
-    for group, own in settings.items():
-        values[group] |= own
+    nested(settings, values)
     folder = Path(values["runs"]) / "x" / "courtyard" / "sfm-volumetric" / "01234567-seed0"
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(values))
@@ -71,31 +93,110 @@ def strange_runs(settings):
     return folder
 
 
-@pytest.mark.parametrize(
-    "words", [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
-)
-@pytest.mark.parametrize("case", STRANGE_TRIALS)
-def test_retry_runs_nothing_of_a_strangers_folder_without_permission(
-    case, words, monkeypatch, refused
-):
-    settings, said = STRANGE_TRIALS[case]
+def _words(settings):
+    return [f"{key}={value_text(value)}" for key, value in settings.items()]
+
+
+def _claims(settings):
+    """A stranger's file of claims, and the commands that read it."""
+    claim = {"id": "a", "says": "s", "where": "w", "baseline": "adc", "arm": "mcmc"}
+    claim |= {"metric": "psnr", "direction": "higher", "least": 1, "refuted_if": "not"}
+    file = {"name": "x", "paper": "p", "seeds": 4, "scenes": {"courtyard": {}}, "claims": [claim]}
+    file |= {"arms": {"adc": {}, "mcmc": {}}, "settings": settings}
+    Path("claims.yaml").write_text(yaml.safe_dump(file))
+    return [["check", "claims.yaml"], ["check", "claims.yaml", "--dry-run"]]
+
+
+def _plan(settings):
+    (trial,) = compose_trials(["name=x"])
+    add_to_plan([Trial(trial.values, ("name=x", *_words(settings)))])
+    return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
+
+
+def _ledger(settings):
+    """A stranger's ledger with a kept idea, whose baseline has the settings."""
+    home = Path("runs/x")
+    home.mkdir(parents=True)
+    words, keys = (*_words(settings), "seed=0,1,2,3"), {"courtyard": "courtyard/sfm-adc/0"}
+    opened = {"metric": "psnr", "sign": 1, "least": 0.5, "ideas": 40, "rate": 0.1}
+    begin_ledger(
+        home, Opened(time="2026-01-01T00:00:00Z", seeds=(0, 1), words=words, keys=keys, **opened)
+    )
+    append(
+        home,
+        lambda book: Started(
+            time="2026-01-01T00:00:01Z",
+            idea="i",
+            against="baseline",
+            level=0.1,
+            identity="1",
+            words=words,
+            keys={"courtyard": "courtyard/sfm-adc/1"},
+        ),
+    )
+    append(
+        home,
+        lambda book: Ended(
+            time="2026-01-01T00:00:02Z", idea="i", result="kept", reason="better", seeds=4
+        ),
+    )
+    return [
+        ["ledger", "try", "x", "densify.split_size=0.02"],
+        ["ledger", "try", "x", "--against", "i", "densify.split_size=0.02"],
+        ["ledger", "confirm", "x", "scene=courtyard", "scene.name=y", "seed=7,8"],
+    ]
+
+
+def _configuration(settings):
     strange_runs(settings)
-    monkeypatch.setattr("gsbench.app.command.run_trials", no_trial)
-    assert said.replace("[", "[other,") in (error := refused(*words)) or said in error
+    return [["retry", "x"], ["retry", "x", "--dry-run"], ["retry", "x", "allow_targets=[other]"]]
+
+
+def _experiment(settings):
+    words = experiment(nested(settings))
+    return [words, [*words, "--dry-run"], ["-m", *words, "seed=0,1"]]
+
+
+FILES = {
+    "claims": _claims,
+    "plan": _plan,
+    "ledger": _ledger,
+    "config.yaml": _configuration,
+    "experiment": _experiment,
+}
+# what a file cannot set: only an experiment starts Hydra's app, and `retry` knows its runs folder
+OF_AN_APP = ("Hydra's folder", "Hydra's files", "a log")
+CANNOT_SET = {("plan", "a folder to write"), ("config.yaml", "a folder to write")}
+CANNOT_SET |= {(file, case) for file in FILES if file != "experiment" for case in OF_AN_APP}
+CANNOT_SET |= {("config.yaml", case) for case, (own, _) in STRANGE.items() if "hydra" in str(own)}
+CANNOT_SET |= {("experiment", "a package of settings")}
+
+
+@pytest.mark.parametrize(
+    "file, case",
+    [(file, case) for file in FILES for case in STRANGE if (file, case) not in CANNOT_SET],
+)
+def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
+    file, case, monkeypatch, refused
+):
+    for variable in ADDRESS_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    settings, said = STRANGE[case]
+    for function in ("verbs.ledger.run_trials", "app.command.run_batch", "verbs.claims.run_batch"):
+        monkeypatch.setattr(f"gsbench.{function}", no_trial)
+    commands = FILES[file](settings)
+    for words in commands if case == "an address" else commands[:1]:
+        line = refused(*words)
+        assert said.replace("=[", "=[other,") in line or said in line
     assert not Path("exploded").exists()
+    assert not Path("theirs").exists()
 
 
-@pytest.mark.parametrize("case", ["a class", "a metric", "a program", "a program by another path"])
+@pytest.mark.parametrize("case", ["an address", "a class", "a metric", "a program"])
 def test_verbs_that_only_read_run_nothing_of_a_strangers_folder(case):
-    strange_runs(STRANGE_TRIALS[case][0])
-    for words in (
-        ["status"],
-        ["status", "x"],
-        ["status", "x", "--json"],
-        ["tables", "x"],
-        ["report", "x"],
-    ):
-        cli.run(words)
+    strange_runs(STRANGE[case][0])
+    for verb in ("status", "tables", "report", *["sync"] * (case == "an address")):
+        cli.run([verb, "x"])
     assert not Path("exploded").exists()
 
 
@@ -106,7 +207,7 @@ def test_permissions_in_a_trials_configuration_are_dropped():
 
 
 def test_retry_runs_what_its_command_allows(monkeypatch):
-    strange_runs({"densify": {"_target_": "mine.Mine"}})
+    strange_runs({"densify._target_": "mine.Mine"})
     began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
     assert cli.run(["retry", "x", "allow_targets=[mine]"]) == 0
@@ -231,14 +332,42 @@ def test_a_version_command_cannot_use_values_that_are_known_later():
         compose_one([*PROGRAM, "densify.version_command=['{output}/x']", "allow_targets=[python]"])
 
 
-def test_retry_sends_nothing_to_a_tracker_that_a_strangers_folder_names(monkeypatch, refused):
-    address = "http://127.0.0.1:9"
-    strange_runs({"tracking": {"uri": address}})
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    monkeypatch.setattr("gsbench.app.command.run_trials", no_trial)
-    assert f"to allow it, type tracking.uri={address}" in refused("retry", "x")
+def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypatch, refused):
+    """It counts as typed if a typed choice of a tracker has it, not if another file changes it."""
+    for variable in ADDRESS_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
     began = []
     monkeypatch.setattr("gsbench.app.command.run_trials", lambda trials: began.extend(trials) or 0)
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", address)
+    strange_runs({"tracking.uri": ADDRESS})
+    assert cli.run(["retry", "x", f"allow_targets=[{ADDRESS}]"]) == 0
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", ADDRESS)
     assert cli.run(["retry", "x"]) == 0
-    assert len(began) == 1
+    assert len(began) == 2
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    assert compose_one([f"tracking.uri={ADDRESS}"]).values["allow_targets"] == [ADDRESS]
+    words = experiment({"tracking": {"uri": ADDRESS}})
+    folder = Path("conf/tracking")
+    folder.mkdir()
+    (folder / "lab.yaml").write_text("name: lab\nuri: http://lab:5000\n")
+    lab = ["--config-dir", "conf", "tracking=lab", "--dry-run"]
+    assert cli.run(lab) == 0
+    assert f"results would go to {ADDRESS}" in refused(*words, "tracking=lab")
+
+
+@pytest.mark.parametrize(
+    "tracking, allowed, found",
+    [
+        ({"uri": None}, [], ""),
+        ({"uri": "http://a"}, [], "http://a"),
+        ({"uri": "databricks"}, [], "databricks"),
+        ({"uri": "http://a", "enabled": False}, [], ""),
+        ({"uri": "http://a"}, ["http://a"], ""),
+        ({"uri": "http://a"}, ["http://a/"], "http://a"),
+        ({"host": "http://a"}, [], "http://a"),  # an option of a user's own tracker
+        ({"hosts": ["http://a"]}, [], "['http://a']"),
+    ],
+)
+def test_addresses_of_any_tracker_are_found(tracking, allowed, found, monkeypatch):
+    for variable in ADDRESS_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    assert foreign_address(tracking, allowed) == found

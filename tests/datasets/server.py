@@ -1,7 +1,5 @@
 """A file server on loopback that can imitate faults of real servers."""
 
-from __future__ import annotations
-
 import re
 import threading
 import time

@@ -158,11 +158,10 @@ def test_another_image_folder_is_added_to_the_first(fetch, data):
     assert files_below(data / "garden") == both
 
 
-def test_the_list_tells_which_scenes_are_here(fetch, data, capsys):
+def test_the_list_tells_which_scenes_are_here(fetch, data, capsys, said):
     fetch("mipnerf360", "garden")
     capsys.readouterr()
-    assert run(["fetch", "--list"]) == 0
-    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    lines = {line.split()[0]: line for line in said("fetch --list").splitlines()}
     assert lines["garden"].endswith(" here")
     assert lines["bicycle"].endswith("not here")
     assert "about 12.5 GB" in lines["https://storage.googleapis.com/gresearch/refraw360/360_v2.zip"]

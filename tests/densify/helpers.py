@@ -87,7 +87,7 @@ class Round:
 
     def __init__(self, densifier, trainable, step, seed=0):
         self.densifier, self.trainable, self.step = densifier, trainable, step
-        self.rows, self.counts = to_rows(trainable), dict[str, int]()
+        self.rows, self.counts = to_rows(trainable), {}
         forecast = getattr(densifier, "forecast", None)
         capped = getattr(densifier, "cap", "soft") not in ("soft", "freeze", "governor")
         self.foreseen = None if forecast is None or capped else forecast(at(step, trainable))

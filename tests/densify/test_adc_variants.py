@@ -385,12 +385,12 @@ def test_splitting_matrices_are_summed_until_the_window_ends():
     before = densifier.statistics["splitting_sum"].clone()
     probe = torch.zeros(count, 3, 3, requires_grad=True)
     probe.grad = torch.arange(9.0).reshape(3, 3).expand(count, 3, 3)
-    render = rendered(torch.zeros(count, 2), splitting_probe=probe)
+    render = rendered(torch.zeros(count, 2), extra=probe)
     for step in (7, 8, densifier.stop):  # the last is after the window
         densifier.observe(step, render)
     assert_close(densifier.statistics["splitting_sum"] - before, 2 * probe.grad)
-    render.splitting_probe = None
-    with pytest.raises(RuntimeError, match="splitting_matrix=True"):
+    render.extra = None
+    with pytest.raises(RuntimeError, match="extra=NAME"):
         densifier.observe(9, render)
 
 

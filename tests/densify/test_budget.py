@@ -233,17 +233,26 @@ def test_a_cap_that_needs_a_forecast_or_a_limit_is_refused_without_it(cap):
     ],
 )
 def test_a_training_may_limit_the_count_further(cap, count, most, allowed):
-    asked = []
+    asked, told = [], []
 
-    def limit(refinement, cap):
-        asked.append(cap)
-        return most
+    class Schedule:
+        observe = staticmethod(told.append)
+
+        @staticmethod
+        def limit(refinement, cap):
+            asked.append(cap)
+            return most
 
     densifier = ADC(max_gaussians=7, cap=cap)
-    densifier.begin(random_gaussians(3), DensifyContext(1.0, limit=limit))
+    densifier.begin(random_gaussians(3), DensifyContext(1.0, schedule=Schedule()))
     assert densifier.allowance(at(600, range(count))) == allowed
     assert asked == [7 if cap == "hard" else None]
     for own in ("curve", "freeze", "governor"):  # these do not use the limit of the training
         densifier.cap = own
         densifier.allowance(at(600, range(count)))
     assert len(asked) == 1
+    trainable, _ = prepared(own := ADC(), 3)
+    own.context = densifier.context
+    assert own.refine(601, trainable, generator()) is None
+    assert told == []  # no round was due
+    assert [own.refine(600, trainable, generator())] == told

@@ -155,7 +155,7 @@ def seen_by_one_view():
     probe.grad = torch.zeros(3, 3, 3)
     ones = torch.ones(3)
     covered = Footprint(ones.int(), ones, ones, ones)
-    more = {"splitting_probe": probe, "footprint": lambda values=None: covered}
+    more = {"extra": probe, "footprint": lambda values=None: covered}
     return rendered(gradient, radii=[3, 7, 0], absolute=gradient, **more)
 
 

@@ -42,7 +42,7 @@ def observe(densifier, trainable, rng, step):
     probe = torch.zeros(count, 3, 3, dtype=torch.float64, requires_grad=True)
     probe.grad = torch.zeros_like(probe)
     absolute = torch.from_numpy(gradient)
-    densifier.observe(step, rendered(gradient, radii, absolute, splitting_probe=probe))
+    densifier.observe(step, rendered(gradient, radii, absolute, extra=probe))
     return gradient, radii
 
 

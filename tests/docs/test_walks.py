@@ -108,6 +108,13 @@ def test_the_new_loss_is_trained_with_under_a_new_version_of_the_stage(walked):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_no_kernel_computes_the_old_loss_on_any_device(walked, device):
+    ask = f"from gsbench.train.loss import *; print(PhotometricLoss().implementation({device!r}))"
+    assert "torch_photometric_loss" in walked("-c", ask).stdout
+
+
+@pytest.mark.slow
 def test_the_new_column_is_shown_in_tables(walked):
     shown = walked("-m", "gsbench", "tables", "walk", "--metrics", "psnr,test_views").stdout
     assert "test views (views)" in shown

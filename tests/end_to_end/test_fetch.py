@@ -32,7 +32,7 @@ def server(tmp_path):
 def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     one = gsbench("scene=garden", code=2)
     assert "`gsbench fetch mipnerf360 garden` brings what is missing" in one.stderr
-    before = gsbench("+experiment=table1 --dry-run", code=None)
+    before = gsbench("+experiment=table1", "--dry-run", code=None)
     assert before.stdout.count("does not exist") == 13
     advice = before.stdout.splitlines()[-1]
     commands = [
@@ -42,7 +42,7 @@ def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     for command in commands:
         done = gsbench(*command, GSBENCH_MIRROR=server.url)
         assert "licence:" in done.stdout
-    after = gsbench("+experiment=table1 --dry-run")
+    after = gsbench("+experiment=table1", "--dry-run")
     assert "does not exist" not in after.stdout
     assert "fetch" not in after.stdout
     assert (tmp_path / "data" / "tandt" / "truck" / "images" / "IMG_0001.JPG").is_file()

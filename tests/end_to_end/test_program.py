@@ -25,7 +25,9 @@ def test_truncated_photo_is_named(gsbench, tmp_path):
         Image.fromarray(noise).save(folder / f"{i}.jpg")
     data = (folder / "2.jpg").read_bytes()
     (folder / "2.jpg").write_bytes(data[: len(data) // 2])
-    done = gsbench(f"scene=photos scene.path={folder}", code=2, GSBENCH_RUNS=str(tmp_path / "runs"))
+    done = gsbench(
+        "scene=photos", f"scene.path={folder}", code=2, GSBENCH_RUNS=str(tmp_path / "runs")
+    )
     assert "2.jpg" in done.stderr.strip().splitlines()[-1]
 
 

@@ -10,7 +10,6 @@ from shlex import split
 import pytest
 from PIL import Image
 
-from gsbench import cli
 from tests.conftest import ROOT
 from tests.fuzz.models import write_originals
 from tests.processes import completed
@@ -55,7 +54,7 @@ NAN = float("nan")
         ("points3D.bin", lambda data: data + b"\0", "1 bytes too many"),
     ],
 )
-def test_the_program_names_the_damaged_file(file, harm, words, tmp_path, monkeypatch, capsys):
+def test_the_program_names_the_damaged_file(file, harm, words, tmp_path, monkeypatch, refused):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     write_originals(tmp_path)
     (tmp_path / "sparse").mkdir()
@@ -64,8 +63,7 @@ def test_the_program_names_the_damaged_file(file, harm, words, tmp_path, monkeyp
     Image.new("RGB", (32, 24)).save(tmp_path / "images" / "x.png")
     (model / file).write_bytes(harm((model / file).read_bytes()))
     words_given = split(f"scene=colmap scene.path={tmp_path} init=dataset tracking=none")
-    assert cli.run(words_given) == 2
-    lines = capsys.readouterr().err.splitlines()
+    lines = refused(*words_given).splitlines()
     assert len([line for line in lines if line.startswith("gsbench:")]) == 1
     assert file in lines[-1]
     assert words in lines[-1]

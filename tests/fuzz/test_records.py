@@ -82,6 +82,7 @@ READS_ITSELF = {
     "claims/stopping.py",  # text of this process
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made
+    "claims/export.py",  # text of this very process
     "parsing.py",
 }
 LOADERS = {

@@ -120,8 +120,7 @@ def test_a_header_that_promises_more_than_the_file_has_is_refused(tmp_path, text
     rewritten(path, b"element vertex 4", many)
     if text:
         rewritten(path, b"format binary_little_endian", b"format ascii")
-    said = f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"
-    with refusal(said):
+    with refusal(f"cut short: its header promises {1_000_000 * bytes_each} bytes or more"):
         check_ply(path)
     check_ply(rewritten(path, b"element vertex 1000000", b"element vertex 2"))
     with refusal("count of an element is negative"):
@@ -375,16 +374,14 @@ def test_opacities_of_zero_and_one_are_read(tmp_path, kind, caplog):
     assert ((opacities > 0) & (opacities < 1)).all()  # so that they can be trained
     assert "3 Gaussians have an opacity of exactly 0 or 1" in caplog.text
     table["opacity"][2] = np.nan
-    said = "opacity is not a finite number everywhere: it is nan in row 2 and in 0 more"
-    with refusal(said):
+    with refusal("opacity is not a finite number everywhere: it is nan in row 2 and in 0 more"):
         read_ply(save(table, tmp_path / "b.ply"))
 
 
 def test_a_value_beyond_float32_is_refused(tmp_path):
     table = with_type(table_of(tmp_path / "a.ply"), "x", "f8")
     table["x"][1] = 1e300
-    said = r"x is not a finite number everywhere: it is 1e\+300 in row 1"
-    with refusal(said):
+    with refusal(r"x is not a finite number everywhere: it is 1e\+300 in row 1"):
         read_ply(save(table, tmp_path / "b.ply"))
 
 

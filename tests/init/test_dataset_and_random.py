@@ -149,8 +149,9 @@ def test_reading_a_cloud_without_a_model_is_refused(tmp_path):
         read_cloud(tmp_path)
 
 
-def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_path):
+def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_path, caplog):
     gaussians = random_gaussians(20, dtype=torch.float32)
+    gaussians.opacity_logits[0] = torch.inf
     write_ply(gaussians, tmp_path / "model.ply")
     report = Ply(path=str(tmp_path / "model.ply")).run(courtyard, tmp_path / "out")
     assert report.num_points == 20
@@ -158,6 +159,7 @@ def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_p
     assert_allclose(cloud.points, gaussians.means.double().numpy())
     red = 0.5 + 0.28209479177387814 * gaussians.sh_dc[:, 0].numpy()  # Y00 = 1 / (2 sqrt(pi))
     assert_allclose(cloud.colors[:, 0] / 255, red.clip(0, 1), atol=0.5 / 255 + 1e-6)
+    assert caplog.text.count("opacity of exactly 0 or 1") == 1  # the file is read once
     kept = read_ply(tmp_path / "out" / GAUSSIANS_FILE)
     assert torch.equal(kept.log_scales, gaussians.log_scales)
     with refusal(r"init\.path=nowhere\.ply"):

@@ -58,34 +58,36 @@ def no_gpu(*_):
     raise torch.OutOfMemoryError("CUDA out of memory")
 
 
-class TestUntrained:
-    """The whole path, with untrained networks."""
+# ---- the whole path, with untrained networks
 
-    @pytest.fixture(scope="class")
-    def run(self, courtyard, untrained_weights, tmp_path_factory):
-        output = tmp_path_factory.mktemp("dim")
-        init = superpoint(untrained_weights, matcher="mutual_nearest")
-        return init, init.run(courtyard, output / "out", work_dir=output / "work"), output
 
-    @pytest.mark.slow
-    def test_cloud_lies_on_the_surfaces(self, run):
-        _, report, output = run
-        assert (report.init, report.poses, report.num_registered) == ("dim", "shared", 8)
-        assert report.counts["features"] == 8 * 400
-        assert report.settings["extractor"] == "superpoint"
-        assert report.settings["keypoint_threshold"] == 0.0005
-        assert len(report.settings["weights_sha256"]["superpoint.safetensors"]) == 64
-        assert "transformers" in report.versions
-        assert np.median(surface_distance(read_cloud(output / "out" / MODEL_FOLDER).points)) < 0.15
+@pytest.fixture(scope="module")
+def untrained(courtyard, untrained_weights, tmp_path_factory):
+    output = tmp_path_factory.mktemp("dim")
+    init = superpoint(untrained_weights, matcher="mutual_nearest")
+    return init, init.run(courtyard, output / "out", work_dir=output / "work"), output
 
-    @pytest.mark.slow
-    def test_lightglue_matches_enough_points(self, few, untrained_weights, tmp_path, caplog):
-        own = {"max_keypoints": 256, "filter_threshold": 0.0, "pairs": "sequential", "overlap": 1}
-        report = superpoint(untrained_weights, **own).run(few, tmp_path)
-        assert report.counts["pairs_selected"] == 3
-        assert report.counts["inlier_matches"] > 30
-        assert len(report.settings["weights_sha256"]) == 2
-        assert sum("noncommercial" in message for message in caplog.messages) == 1
+
+@pytest.mark.slow
+def test_cloud_lies_on_the_surfaces(untrained):
+    _, report, output = untrained
+    assert (report.init, report.poses, report.num_registered) == ("dim", "shared", 8)
+    assert report.counts["features"] == 8 * 400
+    assert report.settings["extractor"] == "superpoint"
+    assert report.settings["keypoint_threshold"] == 0.0005
+    assert len(report.settings["weights_sha256"]["superpoint.safetensors"]) == 64
+    assert "transformers" in report.versions
+    assert np.median(surface_distance(read_cloud(output / "out" / MODEL_FOLDER).points)) < 0.15
+
+
+@pytest.mark.slow
+def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplog):
+    own = {"max_keypoints": 256, "filter_threshold": 0.0, "pairs": "sequential", "overlap": 1}
+    report = superpoint(untrained_weights, **own).run(few, tmp_path)
+    assert report.counts["pairs_selected"] == 3
+    assert report.counts["inlier_matches"] > 30
+    assert len(report.settings["weights_sha256"]) == 2
+    assert sum("noncommercial" in message for message in caplog.messages) == 1
 
 
 def test_pairs_with_few_matches_at_low_resolution_are_left_out(few, tmp_path, monkeypatch):
@@ -113,152 +115,157 @@ def test_pairs_with_few_matches_at_low_resolution_are_left_out(few, tmp_path, mo
     assert "preselect" in preparation.seconds
 
 
-class TestStore:
-    """An interrupted run continues, and entries of other settings are not read."""
-
-    @pytest.fixture(scope="class")
-    def run(self, few, tmp_path_factory):
-        output = tmp_path_factory.mktemp("store")
-        init = SiftKornia(max_keypoints=500, max_ratio=0.9, threads=1)
-        init.run(few, output / "out", work_dir=output / "work")
-        return init, output
-
-    @pytest.mark.slow
-    def test_only_missing_or_damaged_files_are_computed_again(self, run, few):
-        init, output = run
-        features = sorted((output / "work" / "features").iterdir())
-        matches = sorted((output / "work" / "matches").iterdir())
-        assert (len(features), len(matches)) == (4, 6)
-        features[0].unlink()
-        features[1].write_bytes(b"half a file")
-        matches[5].unlink()
-        times = {path: path.stat().st_mtime_ns for path in features[2:] + matches[:5]}
-        init.run(few, output / "again", work_dir=output / "work")
-        assert {path: path.stat().st_mtime_ns for path in times} == times
-        assert digest(output / "again" / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
-
-    @pytest.mark.slow
-    def test_two_runs_are_equal_to_the_bit(self, run, few, tmp_path):
-        init, output = run
-        init.run(few, tmp_path)
-        assert digest(tmp_path / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
-
-    def test_other_settings_or_images_have_other_file_names(self, courtyard, tmp_path):
-        def paths(extraction, matching, images):
-            store = FeatureStore(tmp_path / "work", images, extraction, matching)
-            return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
-
-        same, changed = courtyard.images, tmp_path / "changed"
-        shutil.copytree(same, changed)
-        shutil.copy(changed / "0005.png", changed / "0000.png")
-        base = paths({"n": 1}, {"r": 0.9}, same)
-        for n, r, images, is_equal in (
-            (1, 0.9, same, (True, True)),
-            (2, 0.9, same, (False, False)),
-            (1, 0.9, changed, (False, False)),
-            (1, 0.8, same, (True, False)),
-        ):
-            found = paths({"n": n}, {"r": r}, images)
-            assert (found[0] == base[0], found[1] == base[1]) == is_equal
+# ---- an interrupted run continues, and entries of other settings are not read
 
 
-class TestContracts:
-    """Undocumented behaviour of transformers and kornia on which the code relies."""
+@pytest.fixture(scope="module")
+def stored(few, tmp_path_factory):
+    output = tmp_path_factory.mktemp("store")
+    init = SiftKornia(max_keypoints=500, max_ratio=0.9, threads=1)
+    init.run(few, output / "out", work_dir=output / "work")
+    return init, output
 
-    @pytest.mark.parametrize("width, height", [(128, 96), (1237, 40), (131, 101)])
-    def test_superpoint_keypoints_are_the_maxima_of_its_score_map(
-        self, untrained_weights, width, height
+
+@pytest.mark.slow
+def test_only_missing_or_damaged_files_are_computed_again(stored, few):
+    init, output = stored
+    features = sorted((output / "work" / "features").iterdir())
+    matches = sorted((output / "work" / "matches").iterdir())
+    assert (len(features), len(matches)) == (4, 6)
+    features[0].unlink()
+    features[1].write_bytes(b"half a file")
+    matches[5].unlink()
+    times = {path: path.stat().st_mtime_ns for path in features[2:] + matches[:5]}
+    init.run(few, output / "again", work_dir=output / "work")
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+    assert digest(output / "again" / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
+
+
+@pytest.mark.slow
+def test_two_runs_are_equal_to_the_bit(stored, few, tmp_path):
+    init, output = stored
+    init.run(few, tmp_path)
+    assert digest(tmp_path / MODEL_FOLDER) == digest(output / "out" / MODEL_FOLDER)
+
+
+def test_other_settings_or_images_have_other_file_names(courtyard, tmp_path):
+    def paths(extraction, matching, images):
+        store = FeatureStore(tmp_path / "work", images, extraction, matching)
+        return store.features_path("0000.png"), store.matches_path("0000.png", "0001.png")
+
+    same, changed = courtyard.images, tmp_path / "changed"
+    shutil.copytree(same, changed)
+    shutil.copy(changed / "0005.png", changed / "0000.png")
+    base = paths({"n": 1}, {"r": 0.9}, same)
+    for n, r, images, is_equal in (
+        (1, 0.9, same, (True, True)),
+        (2, 0.9, same, (False, False)),
+        (1, 0.9, changed, (False, False)),
+        (1, 0.8, same, (True, False)),
     ):
-        settings = superpoint(untrained_weights, max_keypoints=10**6).feature_settings()
-        weights = untrained_weights / "superpoint.safetensors"
-        extract = EXTRACTORS[settings.extractor](settings, weights, CPU)
-        transformers = pytest.importorskip("transformers")
-        config = transformers.SuperPointConfig(nms_radius=3)
-        network = transformers.SuperPointForKeypointDetection(config).eval()
-        network.load_state_dict(load_state(weights))
-        image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
-        with torch.inference_mode():
-            keypoints, descriptors, scores = extract(image)
-            luma = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
-            gray = (image * luma).sum(1, keepdim=True)
-            encoded = network.encoder(gray).last_hidden_state
-            score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
-        border = SUPERPOINT_BORDER
-        inner = score_map[border : height - border, border : width - border]
-        expected = torch.nonzero(inner > 0.0005).flip(1) + border  # x, y
-        assert set(map(tuple, keypoints.int().tolist())) == set(map(tuple, expected.tolist()))
-        assert len(keypoints) > 10
-        assert torch.equal(keypoints, keypoints.round())
-        for (x, y), score in zip(keypoints[:20].int().tolist(), scores[:20], strict=True):
-            assert score_map[y, x] == score
-        assert_close(descriptors.norm(dim=1), torch.ones(len(keypoints)))
+        found = paths({"n": n}, {"r": r}, images)
+        assert (found[0] == base[0], found[1] == base[1]) == is_equal
 
-    def test_lightglue_finds_a_permutation_with_images_of_different_sizes(self, untrained_weights):
-        rng = np.random.default_rng(0)
-        descriptors = rng.normal(size=(100, 256)).astype(np.float32)
-        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-        order = rng.permutation(100)[:80]
-        keypoints = rng.uniform(0, 60, (100, 2)).astype(np.float32)
-        first = Features(keypoints, descriptors, np.ones(100, np.float32), (100, 80), (100, 80))
-        second = Features(
-            keypoints[order], descriptors[order], np.ones(80, np.float32), (64, 200), (640, 2000)
-        )
-        settings = superpoint(untrained_weights).feature_settings()
-        matcher = build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
-        matches = matcher(first, second)
-        assert matches.dtype == np.uint32
-        assert len(matches) > 60  # width pruning may drop some
-        assert_array_equal(order[matches[:, 1]], matches[:, 0])
 
-    def test_lightglue_reads_the_published_names(self, untrained_weights, tmp_path, monkeypatch):
-        """Tensors are self_attn.0.… in published files, transformers.0.self_attn.… in the network."""
-        state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
-        published = {}
-        for name, value in state.items():
-            parts = name.split(".")
-            if parts[0] == "transformers":
-                name = ".".join([parts[2], parts[1], *parts[3:]])
-            published[name] = value
-        published.pop("confidence_thresholds")
-        torch.save(published, tmp_path / "published.pth")
-        settings = superpoint(untrained_weights).feature_settings()
-        networks = []
-        load_into = matchers.load_into
+# ---- undocumented behaviour of transformers and kornia on which the code relies
 
-        def note(network, *rest):
-            networks.append(network)
-            load_into(network, *rest)
 
-        monkeypatch.setattr(matchers, "load_into", note)
-        build_matcher(settings, tmp_path / "published.pth", CPU)
-        loaded = networks[0].state_dict()
-        assert all(torch.equal(loaded[name], value) for name, value in state.items())
+@pytest.mark.parametrize("width, height", [(128, 96), (1237, 40), (131, 101)])
+def test_superpoint_keypoints_are_the_maxima_of_its_score_map(untrained_weights, width, height):
+    settings = superpoint(untrained_weights, max_keypoints=10**6).feature_settings()
+    weights = untrained_weights / "superpoint.safetensors"
+    extract = EXTRACTORS[settings.extractor](settings, weights, CPU)
+    transformers = pytest.importorskip("transformers")
+    config = transformers.SuperPointConfig(nms_radius=3)
+    network = transformers.SuperPointForKeypointDetection(config).eval()
+    network.load_state_dict(load_state(weights))
+    image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        keypoints, descriptors, scores = extract(image)
+        luma = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
+        gray = (image * luma).sum(1, keepdim=True)
+        encoded = network.encoder(gray).last_hidden_state
+        score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
+    border = SUPERPOINT_BORDER
+    inner = score_map[border : height - border, border : width - border]
+    expected = torch.nonzero(inner > 0.0005).flip(1) + border  # x, y
+    assert set(map(tuple, keypoints.int().tolist())) == set(map(tuple, expected.tolist()))
+    assert len(keypoints) > 10
+    assert torch.equal(keypoints, keypoints.round())
+    for (x, y), score in zip(keypoints[:20].int().tolist(), scores[:20], strict=True):
+        assert score_map[y, x] == score
+    assert_close(descriptors.norm(dim=1), torch.ones(len(keypoints)))
 
-    def test_no_network_is_downloaded_by_the_libraries(self, untrained_weights, monkeypatch):
-        def refuse(*_, **__):
-            raise AssertionError("a library tried to download")
 
-        monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
-        monkeypatch.setattr("kornia.feature.lightglue.load_state_dict_from_url", refuse)
-        settings = superpoint(untrained_weights).feature_settings()
-        build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
-        EXTRACTORS[settings.extractor](settings, untrained_weights / "superpoint.safetensors", CPU)
+def test_lightglue_finds_a_permutation_with_images_of_different_sizes(untrained_weights):
+    rng = np.random.default_rng(0)
+    descriptors = rng.normal(size=(100, 256)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    order = rng.permutation(100)[:80]
+    keypoints = rng.uniform(0, 60, (100, 2)).astype(np.float32)
+    first = Features(keypoints, descriptors, np.ones(100, np.float32), (100, 80), (100, 80))
+    second = Features(
+        keypoints[order], descriptors[order], np.ones(80, np.float32), (64, 200), (640, 2000)
+    )
+    settings = superpoint(untrained_weights).feature_settings()
+    matcher = build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
+    matches = matcher(first, second)
+    assert matches.dtype == np.uint32
+    assert len(matches) > 60  # width pruning may drop some
+    assert_array_equal(order[matches[:, 1]], matches[:, 0])
 
-    def test_disk_is_loaded_from_its_published_layout(self, tmp_path):
-        from kornia.feature import DISK
 
-        torch.manual_seed(0)
-        content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
-        torch.save(content, tmp_path / "depth-save.pth")
-        disk = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50)
-        settings = disk.feature_settings()
-        extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
-        with torch.inference_mode():
-            keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
-        assert len(keypoints) == len(scores) <= 50
-        assert descriptors.shape == (len(keypoints), 128)
-        assert (keypoints >= 0).all()
-        assert (keypoints < torch.tensor([101, 75])).all()
+def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkeypatch):
+    """Tensors are self_attn.0.… in published files, transformers.0.self_attn.… in the network."""
+    state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
+    published = {}
+    for name, value in state.items():
+        parts = name.split(".")
+        if parts[0] == "transformers":
+            name = ".".join([parts[2], parts[1], *parts[3:]])
+        published[name] = value
+    published.pop("confidence_thresholds")
+    torch.save(published, tmp_path / "published.pth")
+    settings = superpoint(untrained_weights).feature_settings()
+    networks = []
+    load_into = matchers.load_into
+
+    def note(network, *rest):
+        networks.append(network)
+        load_into(network, *rest)
+
+    monkeypatch.setattr(matchers, "load_into", note)
+    build_matcher(settings, tmp_path / "published.pth", CPU)
+    loaded = networks[0].state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in state.items())
+
+
+def test_no_network_is_downloaded_by_the_libraries(untrained_weights, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("a library tried to download")
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
+    monkeypatch.setattr("kornia.feature.lightglue.load_state_dict_from_url", refuse)
+    settings = superpoint(untrained_weights).feature_settings()
+    build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
+    EXTRACTORS[settings.extractor](settings, untrained_weights / "superpoint.safetensors", CPU)
+
+
+def test_disk_is_loaded_from_its_published_layout(tmp_path):
+    from kornia.feature import DISK
+
+    torch.manual_seed(0)
+    content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
+    torch.save(content, tmp_path / "depth-save.pth")
+    disk = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50)
+    settings = disk.feature_settings()
+    extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
+    with torch.inference_mode():
+        keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
+    assert len(keypoints) == len(scores) <= 50
+    assert descriptors.shape == (len(keypoints), 128)
+    assert (keypoints >= 0).all()
+    assert (keypoints < torch.tensor([101, 75])).all()
 
 
 @pytest.mark.parametrize(
@@ -299,100 +306,105 @@ def test_detection_settings_are_the_extractors_own_unless_given(
     assert light == {"matcher": "lightglue", "filter_threshold": 0.1}
 
 
-class TestErrors:
-    def test_missing_weights_are_named_before_any_work(self, courtyard, tmp_path):
-        with pytest.raises(
-            MissingWeightsError,
-            match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth",
-        ):
-            Dim(download=False).run(courtyard, tmp_path / "out")
-        assert not (tmp_path / "out").exists()
+def test_missing_weights_are_named_before_any_work(courtyard, tmp_path):
+    with pytest.raises(
+        MissingWeightsError,
+        match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth",
+    ):
+        Dim(download=False).run(courtyard, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
-    def test_weights_with_a_wrong_checksum_are_refused(self, courtyard, tmp_path):
-        (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
-        with pytest.raises(
-            MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"
-        ):
-            Dim(extractor="aliked", weights=tmp_path, download=False).run(
-                courtyard, tmp_path / "out"
-            )
 
-    def test_weights_of_another_network_are_refused(self, tmp_path):
-        torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "foreign.pth")
-        settings = superpoint(tmp_path).feature_settings()
-        with pytest.raises(MissingWeightsError, match="is for another network"):
-            build_matcher(settings, tmp_path / "foreign.pth", CPU)
-        with pytest.raises(MissingWeightsError, match="is for another network"):
-            EXTRACTORS["aliked"](
-                Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU
-            )
+def test_weights_with_a_wrong_checksum_are_refused(courtyard, tmp_path):
+    (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
+    with pytest.raises(
+        MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"
+    ):
+        Dim(extractor="aliked", weights=tmp_path, download=False).run(courtyard, tmp_path / "out")
 
-    def test_weights_of_another_shape_are_refused(self, untrained_weights, tmp_path):
-        state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
-        state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
-        torch.save(state, tmp_path / "bad.pth")
-        with pytest.raises(MissingWeightsError, match="other shapes"):
-            build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
 
-    @pytest.mark.slow
-    def test_images_without_keypoints_are_left_out_with_a_warning(self, few, tmp_path):
-        """A blank photograph is named in a warning; if all are blank, it is an error."""
-        images = tmp_path / "images"
-        images.mkdir()
-        for name in few.image_names:
-            shutil.copy(few.images / name, images)
-        Image.new("RGB", (320, 240)).save(images / few.image_names[3])
-        capture = replace(few, images=images)
-        report = SiftKornia(max_keypoints=1000, max_ratio=0.9).run(capture, tmp_path / "out")
-        assert report.counts["images_without_keypoints"] == 1
-        assert any(f"no keypoint in {few.image_names[3]}" in warning for warning in report.warnings)
-        assert report.num_points > 50
-        for name in few.image_names:
-            Image.new("RGB", (320, 240)).save(images / name)
-        with refusal("no keypoint in any image"):
-            SiftKornia().run(capture, tmp_path / "blank")
+def test_weights_of_another_network_are_refused(tmp_path):
+    torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "foreign.pth")
+    settings = superpoint(tmp_path).feature_settings()
+    with pytest.raises(MissingWeightsError, match="is for another network"):
+        build_matcher(settings, tmp_path / "foreign.pth", CPU)
+    with pytest.raises(MissingWeightsError, match="is for another network"):
+        EXTRACTORS["aliked"](
+            Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU
+        )
 
-    def test_too_little_gpu_memory_for_matching_is_reported(self):
-        features = features_of(np.zeros((1000, 8)))
-        said = r"1000 keypoints ran out of memory: lower init.max_image_size"
-        with refusal(said):
-            match(no_gpu, features, features)
 
-    def test_too_little_gpu_memory_for_extraction_is_reported(self, courtyard):
-        settings = SiftKornia().feature_settings()
-        with refusal(r"0000.png: cpu ran out of memory at 320x240 px"):
-            extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
+def test_weights_of_another_shape_are_refused(untrained_weights, tmp_path):
+    state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
+    state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
+    torch.save(state, tmp_path / "bad.pth")
+    with pytest.raises(MissingWeightsError, match="other shapes"):
+        build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
 
-    def test_an_empty_image_has_no_matches(self):
-        some = features_of(np.eye(3, 8))
-        assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
 
-    @pytest.mark.parametrize(
-        "options, message",
-        [
-            (
-                {"extractor": "sift"},
-                "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'",
-            ),
-            ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
-            (
-                {"extractor": "aliked", "aliked_model": "t16"},
-                "init.matcher=lightglue has no weights",
-            ),
-            (
-                {"filter_threshold": -1},
-                r"init.filter_threshold must be a number in \[0, 1\], got -1",
-            ),
-            ({"max_keypoints": 0}, "init.max_keypoints must be a whole number above 0, got 0"),
-        ],
-    )
-    def test_settings_are_checked_by_name(self, options, message):
-        with refusal(message):
-            Dim(**options)
+@pytest.mark.slow
+def test_images_without_keypoints_are_left_out_with_a_warning(few, tmp_path):
+    """A blank photograph is named in a warning; if all are blank, it is an error."""
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in few.image_names:
+        shutil.copy(few.images / name, images)
+    Image.new("RGB", (320, 240)).save(images / few.image_names[3])
+    capture = replace(few, images=images)
+    report = SiftKornia(max_keypoints=1000, max_ratio=0.9).run(capture, tmp_path / "out")
+    assert report.counts["images_without_keypoints"] == 1
+    assert any(f"no keypoint in {few.image_names[3]}" in warning for warning in report.warnings)
+    assert report.num_points > 50
+    for name in few.image_names:
+        Image.new("RGB", (320, 240)).save(images / name)
+    with refusal("no keypoint in any image"):
+        SiftKornia().run(capture, tmp_path / "blank")
 
-    def test_an_unknown_device_is_refused(self, courtyard, tmp_path):
-        with refusal(r"init\.device=tpu is not known to torch"):
-            SiftKornia(device="tpu").run(courtyard, tmp_path)
+
+def test_too_little_gpu_memory_for_matching_is_reported():
+    features = features_of(np.zeros((1000, 8)))
+    with refusal(r"1000 keypoints ran out of memory: lower init.max_image_size"):
+        match(no_gpu, features, features)
+
+
+def test_too_little_gpu_memory_for_extraction_is_reported(courtyard):
+    settings = SiftKornia().feature_settings()
+    with refusal(r"0000.png: cpu ran out of memory at 320x240 px"):
+        extract_features(courtyard.images / "0000.png", no_gpu, settings, CPU)
+
+
+def test_an_empty_image_has_no_matches():
+    some = features_of(np.eye(3, 8))
+    assert match(mutual_nearest_matcher(0.9, CPU), some, some[:0]).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (
+            {"extractor": "sift"},
+            "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'",
+        ),
+        ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
+        (
+            {"extractor": "aliked", "aliked_model": "t16"},
+            "init.matcher=lightglue has no weights",
+        ),
+        (
+            {"filter_threshold": -1},
+            r"init.filter_threshold must be a number in \[0, 1\], got -1",
+        ),
+        ({"max_keypoints": 0}, "init.max_keypoints must be a whole number above 0, got 0"),
+    ],
+)
+def test_settings_are_checked_by_name(options, message):
+    with refusal(message):
+        Dim(**options)
+
+
+def test_an_unknown_device_is_refused(courtyard, tmp_path):
+    with refusal(r"init\.device=tpu is not known to torch"):
+        SiftKornia(device="tpu").run(courtyard, tmp_path)
 
 
 def test_mutual_nearest_matches_equal_those_of_brute_force():

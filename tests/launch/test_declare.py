@@ -8,12 +8,11 @@ import pytest
 
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.results import load_experiment
-from gsbench.cli import run
 from gsbench.config.compose import Trial
-from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan, declare, declare_questions, declared_metrics
 from gsbench.runs.experiments import Declaration, Question, read_declarations
 from tests.end_to_end.conftest import SMALL
+from tests.helpers import refusal
 from tests.launch.test_jobs import trial
 
 # later words win: a trial of seconds
@@ -77,9 +76,7 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
 
 def test_one_command_cannot_declare_two_metrics(tmp_path, refused):
     trials = [declaring(tmp_path, metric) for metric in ("psnr", "ssim")]
-    with pytest.raises(
-        InputError, match=r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"
-    ):
+    with refusal(r"trials of exp declare eval\.primary=psnr and eval\.primary=ssim"):
         declared_metrics(trials)
     assert "eval.primary does not make a different trial" in refused(
         "-m", *TINY, "eval.primary=psnr,ssim", f"runs={tmp_path}"
@@ -116,7 +113,7 @@ def test_nothing_is_written_into_an_experiment_that_is_a_link(tmp_path, write):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "x").symlink_to(tmp_path / "elsewhere")
     one = trial(tmp_path, eval={"primary": "psnr"})
-    with pytest.raises(InputError, match="is a link"):
+    with refusal("is a link"):
         write([Trial(one.values, ("seed=0",))])
     assert not list((tmp_path / "elsewhere").iterdir())
 
@@ -127,9 +124,9 @@ def ask(home):
 
 
 @pytest.mark.slow
-def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
+def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path, said):
     words = [*TINY, f"runs={tmp_path}", "name=exp"]
-    assert run([*words, "eval.primary=psnr"]) == 0
+    said(*words, "eval.primary=psnr")
     (file,) = tmp_path.glob("exp/*/*/*/results.json")
     before = file.read_bytes()
     results = json.loads(before)
@@ -137,17 +134,15 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
     assert results["declared"] == {"metric": "psnr", "time": declared.time}
     experiment = load_experiment(tmp_path, "exp")
     found = active_declaration(experiment.folder, experiment.trials)
-    assert found is not None
     assert found.standing([], experiment.trials).beforehand
     assert experiment.trials[0].measured >= declared.moment
 
     time.sleep(1.1)  # moments are kept in whole seconds
     store = {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")}
-    assert run([*words, "eval.primary=ssim"]) == 0
+    said(*words, "eval.primary=ssim")
     assert file.read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
     found = active_declaration(experiment.folder, load_experiment(tmp_path, "exp").trials)
-    assert found is not None
     assert (
         found.metric,
         len(found.standing([], experiment.trials).seen),
@@ -156,8 +151,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path):
 
     # Another experiment gets the same numbers from the store: they were measured before its
     # declaration.
-    assert run([*words, "name=again", "eval.primary=ssim"]) == 0
+    said(*words, "name=again", "eval.primary=ssim")
     again = load_experiment(tmp_path, "again")
     found = active_declaration(again.folder, again.trials)
-    assert found is not None
     assert not found.standing([], again.trials).beforehand

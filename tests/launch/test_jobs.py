@@ -20,7 +20,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError, TrainingError
 from gsbench.files import DiskFullError
 from gsbench.launch import jobs
-from gsbench.launch.jobs import Outcome, TrialJob, collect, job_folder, run_one
+from gsbench.launch.jobs import Outcome, TrialJob, collect, job_folder, new_job_folder, run_one
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
@@ -339,6 +339,16 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
         job_folder(trial_values(tmp_path, name="other"))
 
 
+def test_no_job_unpickles_what_a_strangers_runs_folder_has(tmp_path):
+    values = trial_values(tmp_path, name="theirs")
+    planted = job_folder(values) / "17_submitted.pkl"
+    planted.write_bytes(b"code")
+    first, second = new_job_folder(values), new_job_folder(values)
+    assert first != second
+    assert not list(first.iterdir())
+    assert {first.parent, second.parent} == {planted.parent}
+
+
 # ---- Slurm
 
 
@@ -403,7 +413,7 @@ def test_a_command_waits_for_slurm_unless_told_otherwise(tmp_path, slurm, monkey
     monkeypatch.setattr(jobs, "_wait", stop)
     with pytest.raises(KeyboardInterrupt):
         jobs.run_slurm([one])
-    assert caplog.messages[0] == f"1 trial in Slurm, job 9; logs: {tmp_path}"
+    assert caplog.messages[0] == f"1 trial in Slurm, job 9; logs: {tmp_path.parent}"
     assert caplog.messages[-1].endswith("`scancel 9` ends them")
 
 

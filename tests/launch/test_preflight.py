@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 
 from gsbench.config.compose import Trial
-from gsbench.errors import InputError
 from gsbench.launch import batch, dry_run
 from gsbench.launch.batch import (
     begin_for_another_launcher,
@@ -21,6 +20,7 @@ from gsbench.launch.jobs import Outcome
 from gsbench.launch.record import read_plan
 from gsbench.runs.experiments import read_declarations
 from tests.finished import write_results
+from tests.helpers import refusal
 from tests.launch.test_jobs import LOCAL, SLURM, Mirrored
 from tests.launch.test_jobs import trial as bare_trial
 
@@ -121,14 +121,14 @@ def test_what_is_missing_here_matters_unless_the_trials_run_elsewhere(tmp_path, 
         ({"tracking": tracked}, r"tracking\.sink=nosuch needs a package: .*pip install nosuch"),
         ({"eval": {"weights": "nosuch"}}, r"eval\.weights=nosuch: no such folder"),
     ):
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             run_batch([trial(runs, **wrong)])
         begin_for_another_launcher([trial(runs, 0, SLURM, **wrong)])
     one = trial(runs, eval={"weights": "nosuch"})
     write_results(one.folder, one.values)
-    with pytest.raises(InputError, match="no such folder"):  # wrong even if all trials are done
+    with refusal("no such folder"):  # wrong even if all trials are done
         run_batch([one])
-    with pytest.raises(InputError, match="declare eval"):
+    with refusal("declare eval"):
         run_batch([trial(tmp_path / "new", eval={"primary": name}) for name in ("psnr", "ssim")])
     assert not (tmp_path / "new").exists()
     called.clear()

@@ -1,7 +1,7 @@
 """How far a sweep is, as ``gsbench status --watch`` and `progress_frame` show it."""
 
-import json
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +13,7 @@ from gsbench.launch.progress import Progress, _in_words, _seconds_left, progress
 from gsbench.launch.states import TrialState
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
+from tests.helpers import write
 from tests.tracking.helpers import begin_trial, trial_values, write_trial
 
 ARMS, SEEDS = ("adc", "volumetric"), (0, 1, 2)
@@ -36,18 +37,17 @@ def sweep(tmp_path):
             trial_values(tmp_path, seed, "swept") | {"densify": {"name": arm}},
             psnr=value,
         )
-    (folders["volumetric", 1] / "failed.json").write_text(json.dumps({"message": "x"}))
+    write(folders["volumetric", 1] / "failed.json", {"message": "x"})
     return folders
 
 
 def test_states_speed_time_left_and_leader(sweep, tmp_path):
     running = sweep["volumetric", 2]
     building = tmp_path / "store" / "train" / "now"
-    building.mkdir(parents=True)
-    (building / "metrics.jsonl").write_text(
-        '{"step": 50, "seconds": 5.0}\n{"step": 75, "seconds": 10.0}\n'
+    write(
+        building / "metrics.jsonl", '{"step": 50, "seconds": 5.0}\n{"step": 75, "seconds": 10.0}\n'
     )
-    (running / "building.json").write_text(json.dumps({"stage": "train", "folder": str(building)}))
+    write(running / "building.json", {"stage": "train", "folder": str(building)})
     with hold(running / ".lock", "a trial"):
         frame = progress_frame(tmp_path, "swept").set_index("arm")
     assert frame.loc["a_init-adc", ["done", "running", "failed", "waiting"]].to_list() == [
@@ -103,7 +103,7 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
     if planned:
         words = {folder: ["densify=adc", "seed=0"] for folder in folders}
         words |= {folder: [*own, "densify.start=7"] for folder, own in words.items()}
-        words[other] = ["densify=adc", "seed=0", "+densify.start=5"]
+        words[other] = split("densify=adc seed=0 +densify.start=5")
         trials = {
             folder.relative_to(tmp_path / "swept").as_posix(): {
                 "overrides": own,
@@ -112,7 +112,7 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
             }
             for folder, own in words.items()
         }
-        (tmp_path / "swept" / "plan.json").write_text(json.dumps({"trials": trials}))
+        write(tmp_path / "swept" / "plan.json", {"trials": trials})
         arms = ["a_init-adc[start=7]", "a_init-adc[start=5]"]
     progress = progress_of(tmp_path / "swept")
     assert {name: cell["waiting"] for name, cell in progress.cells.items()} == {
@@ -152,7 +152,7 @@ def test_a_trial_takes_as_long_as_those_most_like_it(tmp_path, names, states, se
 
 def test_a_training_without_a_time_has_no_speed(sweep, tmp_path):
     running = sweep["volumetric", 2]
-    (running / "building.json").write_text(json.dumps({"folder": str(running)}))
+    write(running / "building.json", {"folder": str(running)})
     for rows in ("", '{"step": 75}\n', '{"step": 75, "seconds": 0}\n'):
         (running / "metrics.jsonl").write_text(rows)
         with hold(running / ".lock", "a trial"):
@@ -171,16 +171,16 @@ def test_the_leader_is_best_in_the_declared_direction_unless_the_shown_values_ar
 def test_watch_prints_the_table_and_ends_once_all_trials_have_ended(
     sweep, tmp_path, monkeypatch, capsys
 ):
-    (sweep["volumetric", 2] / "failed.json").write_text(json.dumps({"message": "x"}))
+    write(sweep["volumetric", 2] / "failed.json", {"message": "x"})
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    assert run(["status", "swept", "--watch"]) == 1
+    assert run(split("status swept --watch")) == 1
     said = capsys.readouterr().out
     assert "3/3" in said
     assert "1/3, 2 failed" in said
     assert "not a verdict" in " ".join(said.split())
 
 
-@pytest.mark.parametrize("words", [["status", "--watch"], ["status", "nothing", "--watch"]])
+@pytest.mark.parametrize("words", [["status", "--watch"], split("status nothing --watch")])
 def test_watching_no_experiment_is_refused_in_one_line(words, tmp_path, monkeypatch, refused):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     refused(*words)

@@ -1,6 +1,5 @@
 """The states of trials by their folders and Slurm's queue, and the estimate of a dry run."""
 
-import json
 import os
 import re
 import subprocess
@@ -10,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 
 from gsbench.config.compose import Trial
-from gsbench.errors import InputError
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials, describe_plan
 from gsbench.launch.record import PlanFile, PlannedTrial, add_to_plan, read_plan, remove
@@ -23,6 +21,7 @@ from gsbench.launch.states import (
 )
 from gsbench.system.locks import hold
 from tests.finished import write_results
+from tests.helpers import read_json, refusal, write
 from tests.launch.test_jobs import trial
 from tests.tracking.helpers import options
 
@@ -40,7 +39,6 @@ def test_the_queue_is_asked_for_the_users_and_is_unknown_if_slurm_fails(monkeypa
 
     monkeypatch.setattr(subprocess, "run", answer)
     queue = read_queue({"b", "a"})
-    assert queue is not None
     assert {name: (job.words, job.waits) for name, job in queue.items()} == {
         "7_1": ("pending (Resources)", True),
         "7_2": ("running", False),
@@ -59,7 +57,7 @@ def fail(error):
 
 
 def write_configuration(one, folder):
-    (folder / "config.yaml").write_text(json.dumps(one.values | {"tracking": options()}))
+    write(folder / "config.yaml", one.values | {"tracking": options()})
 
 
 def begun(runs, seed=0, step=0, **settings):
@@ -68,9 +66,7 @@ def begun(runs, seed=0, step=0, **settings):
     one.folder.mkdir(parents=True, exist_ok=True)
     write_configuration(one, one.folder)
     if step:
-        (one.folder / "building.json").write_text(
-            json.dumps({"stage": "train", "folder": str(one.folder)})
-        )
+        write(one.folder / "building.json", {"stage": "train", "folder": str(one.folder)})
         (one.folder / "metrics.jsonl").write_text(f'{{"step": 1}}\n{{"step": {step}}}\n')
     return one
 
@@ -106,7 +102,7 @@ def test_the_state_of_a_submitted_trial_is_that_of_its_job(
                 "/".join(one.folder.parts[-3:]): PlannedTrial(overrides=("a=1",), cwd="", time=5)
             }
         )
-        (tmp_path / "x" / "plan.json").write_text(json.dumps(record.to_json()))
+        write(tmp_path / "x" / "plan.json", record.to_json())
         (found,) = states_of_experiment(tmp_path / "x")
         assert (found.state, found.since) == ("missing", 5)
         assert found.note == "never started; Slurm job 7_1 has ended, log: a.log"
@@ -127,7 +123,7 @@ def test_states_have_the_time_of_the_file_that_tells_them(tmp_path, monkeypatch)
         os.utime(one.folder / name, (moment, moment))
     with hold(running.folder / ".lock", "a trial"):
         holder = running.folder / ".lock.holder"
-        since = json.loads(holder.read_text())["since"]
+        since = read_json(holder)["since"]
         seen = {state.folder: state for state in states_of_experiment(tmp_path / "x")}
         holder.unlink()
         unknown = {state.folder: state for state in states_of_experiment(tmp_path / "x")}
@@ -148,7 +144,7 @@ def test_a_failed_trial_is_superseded_by_one_with_its_settings_that_got_further(
         folder.mkdir()
         write_configuration(one, folder)
         if message:
-            (folder / "failed.json").write_text(json.dumps({"message": message}))
+            write(folder / "failed.json", {"message": message})
         else:
             write_results(folder, one.values)
         return folder
@@ -179,7 +175,7 @@ def test_removed_trials_leave_the_plan_and_links_stay(tmp_path):
     assert list(read_plan(tmp_path / "x")) == [linked.folder]
     elsewhere = linked.folder.rename(tmp_path / "elsewhere")
     linked.folder.symlink_to(elsewhere)
-    with pytest.raises(InputError, match="is a link"):
+    with refusal("is a link"):
         remove(tmp_path / "x", [linked.folder])
     assert list(elsewhere.iterdir())
 
@@ -200,7 +196,7 @@ def test_a_trial_whose_removal_fails_does_not_look_finished(tmp_path, monkeypatc
 @pytest.mark.parametrize("name", ["scene/arm", "scene/arm/trial/more", "scene/../trial"])
 def test_a_plan_names_folders_of_trials_alone(tmp_path, caplog, name):
     planned = {"overrides": [], "cwd": "", "time": 0}
-    (tmp_path / "plan.json").write_text(json.dumps({"trials": {name: planned}}))
+    write(tmp_path / "plan.json", {"trials": {name: planned}})
     assert read_plan(tmp_path) == {}
     assert "it is not a folder of a trial" in caplog.text
 

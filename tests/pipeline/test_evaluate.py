@@ -11,9 +11,11 @@ import torch
 from numpy.testing import assert_array_equal
 from PIL import Image
 
+from gsbench.config.compose import compose_one
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.protocol import PAPER
 from gsbench.gaussians.ply import write_ply
+from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps import evaluate as evaluate_module
 from gsbench.pipeline.steps.evaluate import evaluate_step, measure_speed, one_color_psnr
 from gsbench.raster import create_rasterizer
@@ -226,3 +228,21 @@ def test_the_mean_colour_of_counted_training_pixels_is_measured_against_the_test
     expected = np.mean([10 * np.log10(255**2 / error) for error in errors])
     assert one_color_psnr(scene, PAPER) == pytest.approx(expected, abs=1e-4)
     assert one_color_psnr(replace(scene, test=()), PAPER) is None
+
+
+def test_a_trial_is_measured_on_its_own_device():
+    """Torch's device "meta" stands in for a GPU: its tensors have no values, but a place."""
+    seen = set()
+
+    class Spy:
+        def measure(self, *images):
+            seen.update(image.device.type for image in images)
+            return 0.0
+
+    parts = Parts(compose_one(["scene=courtyard", "eval.lpips=[]", "eval.flip=false"]).values)
+    parts.device = torch.device("meta")
+    evaluator = parts.evaluator
+    evaluator._metrics = {"spy": Spy()}
+    image = np.zeros((4, 5, 3), np.uint8)
+    assert evaluator.evaluate_view(image, image, np.ones((4, 5), bool)) == {"spy": 0.0}
+    assert seen == {"meta"}

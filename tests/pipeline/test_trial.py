@@ -185,9 +185,9 @@ def test_a_users_rasterizer_needs_a_name_of_its_own(own_module, name, sound):
         if sound and densify == "adc":
             parts.check(on_this_machine=True)
         elif sound:
-            with refusal("raster=named does not give them"):
+            with refusal("raster=named does not give; take raster=reference"):
                 parts.check(on_this_machine=False)
-            with refusal("raster=named does not give them"):
+            with refusal("raster=named does not give; take raster=reference"):
                 _ = parts.rasterizer
     assert build_own_rasterizer({"name": "cpu"}, []) is None
 

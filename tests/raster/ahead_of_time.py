@@ -3,8 +3,6 @@
 Then read registers, spills and loops from the machine code.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile
@@ -27,10 +25,9 @@ BINARIES = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
 
 @dataclass(frozen=True)
 class Launch:
-    """One launch of a kernel: its positional arguments, and the named ones, constants and options."""
+    """One launch of a kernel with its arguments, constants and options."""
 
     kernel: JITFunction
-    arguments: tuple[Any, ...]
     named: dict[str, Any]
 
     @property
@@ -43,8 +40,8 @@ def recorded(monkeypatch):
     """Within this context, kernels do not run; their launches are appended to the list."""
     launches = []
 
-    def run(kernel, *arguments, grid, warmup, **named):
-        launches.append(Launch(kernel, arguments, named))
+    def run(kernel, *, grid, warmup, **named):
+        launches.append(Launch(kernel, named))
 
     with monkeypatch.context() as patch:
         patch.setattr(JITFunction, "run", run)
@@ -58,7 +55,7 @@ def specialization(launch, compute_capability=90):
     """
     backend = make_backend(GPUTarget("cuda", compute_capability, 32))
     binder = create_function_from_signature(launch.kernel.signature, launch.kernel.params, backend)
-    _, kinds, _ = binder(*launch.arguments, **launch.named)
+    _, kinds, _ = binder(**launch.named)
     return tuple(kinds)
 
 
@@ -83,7 +80,7 @@ def compile_for(launch, compute_capability):
     backend = make_backend(target)
     kernel = launch.kernel
     binder = create_function_from_signature(kernel.signature, kernel.params, backend)
-    bound, kinds, options = binder(*launch.arguments, **launch.named)
+    bound, kinds, options = binder(**launch.named)
     options, signature, constants, attributes = kernel._pack_args(
         backend, launch.named, bound, kinds, options
     )

@@ -1,7 +1,5 @@
 """Tests of what gsbench's own executors promise beyond the contract, one function per promise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -17,7 +17,7 @@ from gsbench.raster.contract import (
     footprint_errors,
     render_with_gradients,
 )
-from gsbench.raster.executors import find_executor, offers
+from gsbench.raster.executors import find_executor
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera
 from tests.raster.strategies import extreme_gaussians
@@ -63,9 +63,10 @@ def test_values_and_gradients_match_the_reference(rasterizer, device, case):
     for name, reference in references.items():  # if all were 0, nothing was compared
         if not (name == "sh_rest" and case.sh_degree == 0):
             assert reference.abs().max() > 0, name
-    assert find_executor(rasterizer.name).has_footprint
-    assert offers(rasterizer.name, "has_splitting_matrix")
-    assert "splitting_probe" in gradients
+    facts = find_executor(rasterizer.name)
+    assert facts.has_footprint
+    assert facts.extras == tuple(rasterizer.extras) == tuple(ReferenceRasterizer.extras)
+    assert gradients.keys() >= {*facts.extras}
     # here the footprint is computed after the backward pass
     assert max(footprint_errors(output, expected).values()) < FOOTPRINT_TOLERANCE
 
@@ -128,7 +129,7 @@ def test_extreme_gaussians_give_finite_results(rasterizer, device, gaussians):
     leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
     background = torch.zeros(3, device=device)
     output = rasterizer.render(
-        leaves, _camera(37, 21), 3, background, absolute_gradient=True, splitting_matrix=True
+        leaves, _camera(37, 21), 3, background, absolute_gradient=True, extra="splitting_matrix"
     )
     assert output.image.isfinite().all()
     assert ((output.alpha >= 0) & (output.alpha <= 1)).all()
@@ -138,7 +139,7 @@ def test_extreme_gaussians_give_finite_results(rasterizer, device, gaussians):
         assert tensor.grad is None or tensor.grad.isfinite().all(), name
     assert output.screen_points.grad is None or output.screen_points.grad.isfinite().all()
     assert output.screen_gradient_abs.isfinite().all()
-    assert output.splitting_probe.grad is None or output.splitting_probe.grad.isfinite().all()
+    assert output.extra.grad is None or output.extra.grad.isfinite().all()
 
 
 @pytest.mark.parametrize(

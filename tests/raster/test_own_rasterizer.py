@@ -76,7 +76,6 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder):
     values = composed(*OWN, "+raster.rows=7")
     rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
-    assert isinstance(key, dict)
     assert key["rows"] == 7
     assert rasterizer_inputs(create_rasterizer("reference", CPU)) == "reference"
     for words, message in (
@@ -91,14 +90,21 @@ def test_its_options_are_checked_and_are_part_of_the_key(folder):
         compose_one(OWN[:1])
 
 
-def test_without_a_footprint_it_is_refused_for_a_densifier_that_needs_one(folder):
+@pytest.mark.parametrize(
+    "arm, output, gives",
+    [
+        ("pixelgs", "footprints", {"has_footprint": True}),
+        ("steepgs", "the extra output splitting_matrix", {"extras": {"splitting_matrix": (3, 3)}}),
+    ],
+)
+def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(folder, arm, output, gives):
     Parts(composed(*OWN)).check(on_this_machine=False)
-    parts = Parts(composed(*OWN, "densify=pixelgs"))
-    with refusal(
-        r"densify=pixelgs needs .* raster=untiled does not give them; take raster=reference"
-    ):
+    parts = Parts(composed(*OWN, f"densify={arm}"))
+    able = "raster=reference or raster=cpu or raster=triton"
+    line = f"{output}, which raster=untiled does not give; take {able}"
+    with refusal(f"densify={arm} needs {line}"):
         parts.check(on_this_machine=False)
-    parts.own_rasterizer.has_footprint = True
+    vars(parts.own_rasterizer).update(gives)
     parts.check(on_this_machine=False)
 
 

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 from gsbench.raster import create_rasterizer
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.contract import Case
-from gsbench.raster.reference import ReferenceRasterizer, project, tile_rectangles
+from gsbench.raster.reference import project, tile_rectangles
 
 CASES = (
     Case(7, 5, 20, sh_degree=0),
@@ -109,10 +109,10 @@ class Slow:
         )
         executor = create_rasterizer(rasterizer, torch.device("cpu"), threads=1)
         output = executor.render(
-            gaussians, self.camera, 0, self.background.to(dtype), splitting_matrix=True
+            gaussians, self.camera, 0, self.background.to(dtype), extra="splitting_matrix"
         )
         (output.image * self.weights.to(dtype)).sum().backward()
-        return output.require_splitting_matrix().double()
+        return output.require_extra().double()
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -169,11 +169,13 @@ def test_the_matrix_predicts_how_a_split_changes_the_loss():
     assert compared >= 5
 
 
-def test_matrices_are_computed_only_on_request():
-    case = CASES[0]
-    plain = ReferenceRasterizer().render(
-        case.gaussians(), case.camera(), 0, torch.zeros(3).double()
-    )
-    assert plain.splitting_probe is None
-    with pytest.raises(RuntimeError, match="splitting_matrix=True"):
-        plain.require_splitting_matrix()
+@pytest.mark.parametrize("name", ["reference", "cpu"])
+def test_an_extra_output_is_given_only_on_request_and_by_its_name(name):
+    case, executor = CASES[0], create_rasterizer(name, torch.device("cpu"), threads=1)
+    inputs = case.gaussians().map(torch.Tensor.float), case.camera(), 0, torch.zeros(3)
+    plain = executor.render(*inputs)
+    assert plain.extra is None
+    with pytest.raises(RuntimeError, match="extra=NAME, then backward"):
+        plain.require_extra()
+    with pytest.raises(ValueError, match=f"raster={name} gives splitting_matrix, not hessian"):
+        executor.render(*inputs, extra="hessian")

@@ -2,6 +2,7 @@
 
 import math
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ class Recording(StagedRasterizer[str]):
     """Stages that render nothing: alpha is 1/4 everywhere, and gradients are constant."""
 
     name = "recording"
+    extras: ClassVar = {"five": (5,)}
 
     def __init__(self):
         self.calls = []
@@ -49,14 +51,12 @@ class Recording(StagedRasterizer[str]):
 
     def backward(self, *arguments):
         self.calls.append(arguments)
-        _, gaussians, *_, want_splitting = arguments
-        splitting = (
-            torch.full((len(gaussians), 3, 3), 8.0, dtype=torch.float64) if want_splitting else None
-        )
+        _, gaussians, request, *_ = arguments
+        extra = None
+        if request.extra is not None:
+            extra = torch.full((len(gaussians), 5), 8.0, dtype=torch.float64)
         sixes = [torch.full_like(tensor, 6.0) for tensor in gaussians.tensors().values()]
-        return Gradients(
-            sixes, torch.full((len(gaussians), 2), 7.0, dtype=torch.float64), splitting
-        )
+        return Gradients(sixes, torch.full((len(gaussians), 2), 7.0, dtype=torch.float64), extra)
 
     def footprint(self, *arguments):
         self.calls.append(arguments)
@@ -67,11 +67,11 @@ def test_gradients_reach_the_backward_stage_and_its_results_the_parameters():
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     background = BLACK.clone().requires_grad_()
-    output = rasterizer.render(leaves, camera(), 1, background, True, splitting_matrix=True)
+    output = rasterizer.render(leaves, camera(), 1, background, True, extra="five")
     assert not output.radii.requires_grad
     (2 * output.image).sum().backward()
-    ((frame, given, request, g_image, g_alpha, want_splitting),) = rasterizer.calls
-    assert (frame, g_alpha, want_splitting) == ("frame", None, True)
+    ((frame, given, request, g_image, g_alpha),) = rasterizer.calls
+    assert (frame, g_alpha, request.extra) == ("frame", None, "five")
     assert torch.equal(given.means, leaves.means)
     assert request.degree == 1
     assert request.absolute is output.screen_gradient_abs
@@ -79,7 +79,7 @@ def test_gradients_reach_the_backward_stage_and_its_results_the_parameters():
     assert (g_image == 2).all()
     assert all((tensor.grad == 6).all() for tensor in leaves.tensors().values())
     assert (output.screen_points.grad == 7).all()
-    assert (output.require_splitting_matrix() == 8).all()
+    assert (output.require_extra() == 8).all()
     assert background.grad.tolist() == [2 * 12 * 0.75] * 3
 
 
@@ -87,12 +87,12 @@ def test_alpha_may_be_differentiated_without_the_image():
     rasterizer = Recording()
     leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
-    ((_, _, request, g_image, g_alpha, want_splitting),) = rasterizer.calls
+    ((_, _, request, g_image, g_alpha),) = rasterizer.calls
     assert g_image.shape == (3, 4, 3)
     assert not g_image.any()
     assert (g_alpha == 1).all()
     assert g_alpha.is_contiguous()
-    assert not want_splitting
+    assert request.extra is None
     assert request.absolute is None
 
 

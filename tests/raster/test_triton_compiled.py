@@ -59,11 +59,11 @@ def launches(monkeypatch):
         yield record
 
 
-def step(case, device="cpu", absolute=False, footprint=False):
+def step(case, device="cpu", absolute=False, footprint=False, **extra):
     """The render, the loss and the backward pass of one training step."""
     gaussians = case.gaussians().map(lambda tensor: tensor.float().to(device).requires_grad_())
     output = TritonRasterizer().render(
-        gaussians, case.camera(), case.sh_degree, torch.zeros(3, device=device), absolute
+        gaussians, case.camera(), case.sh_degree, torch.zeros(3, device=device), absolute, **extra
     )
     target = torch.zeros(case.height, case.width, 3, dtype=torch.uint8, device=device)
     TritonLoss(0.2)(output.image, target)[0].backward()
@@ -87,6 +87,7 @@ def adam_step(case):
 def test_kernels_compile_without_spills(launches, target, monkeypatch):
     step(CASE)
     step(CASE, absolute=True, footprint=True)
+    step(CASE, extra="splitting_matrix")
     adam_step(CASE)
     # further variants: lower degrees, and 32-bit numbers of blocks
     if target == 90:
@@ -112,7 +113,7 @@ def test_kernels_compile_without_spills(launches, target, monkeypatch):
             assert made.inner_loop / composite.UNROLL_BACK.value < BACKWARD_ENTRY
     assert len({name for name, _ in compiled}) == 14
     # Adam has a variant for each width of a parameter, with and without a mask
-    assert len(compiled) == (23 if target == 90 else 16) + 8
+    assert len(compiled) == (24 if target == 90 else 17) + 8
 
 
 def test_no_kernel_is_compiled_again_for_other_sizes(launches):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbench.cli import run
 from gsbench.renders.predictions import _write, opened_renders
 from tests.helpers import refusal, write
 
@@ -67,19 +66,17 @@ FORMS = {
 }
 
 
-def test_predictions_are_measured_with_their_photographs_or_others(members, tmp_path, capsys):
+def test_predictions_are_measured_with_their_photographs_or_others(members, tmp_path, said):
     place = as_zip(members, tmp_path / "predictions")
     quick = ["eval.lpips=[]", "eval.flip=false"]
-    assert run(["evaluate", str(place), *quick, "--json"]) == 0
-    measured = json.loads(capsys.readouterr().out)
+    measured = json.loads(said("evaluate", place, *quick, "--json"))
     assert set(measured["views"]) == {f"{view}.png" for view in VIEWS}
     assert measured["metrics"]["psnr"] == pytest.approx(20 * np.log10(255 / 10))
     photographs = tmp_path / "photos"
     for view in VIEWS:
         file = photographs / f"{view}.JPG"
         write(file, members[f"gt-color/{view}.png"])
-    assert run(["evaluate", str(place), "--truth", str(photographs), *quick]) == 0
-    assert "names matched" in capsys.readouterr().out
+    assert "names matched" in said("evaluate", place, "--truth", photographs, *quick)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -118,7 +115,7 @@ def test_strange_archives_are_refused(pack, change, message, members, tmp_path):
 
 
 def test_files_that_are_no_archive_of_predictions_are_refused(
-    members, tmp_path, monkeypatch, capsys
+    members, tmp_path, monkeypatch, refused
 ):
     (tmp_path / "text.zip").write_text("no archive")
     whole = as_tar(members, tmp_path / "whole").read_bytes()
@@ -132,8 +129,7 @@ def test_files_that_are_no_archive_of_predictions_are_refused(
         (as_folder(renders, tmp_path / "plain"), "--truth PLACE is needed"),
         (tmp_path / "nowhere", "nowhere is not a folder of renders"),
     ):
-        assert run(["evaluate", str(place)]) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused("evaluate", place)
     wanted = [content for name, content in members.items() if name.split("/")[0] in PLACES]
     total = sum(len(content) for content in wanted) - len(members["color/notes.txt"])
     big = as_zip(members, tmp_path / "big")

@@ -1,10 +1,7 @@
 """The records of an experiment: its folder, the search for settings, and declarations."""
 
-import json
-
 import pytest
 
-from gsbench.errors import InputError
 from gsbench.parsing import DamagedError, read_typed
 from gsbench.runs.experiments import (
     Declaration,
@@ -21,6 +18,7 @@ from gsbench.runs.experiments import (
     trial_folders,
 )
 from gsbench.runs.trial_record import Declared
+from tests.helpers import refusal, write
 
 POINTS = [{"settings": {"x": 0.5}, "value": 2.0}, {"settings": {"x": 1}, "value": 4.0}]
 TUNING = {
@@ -46,7 +44,7 @@ def test_experiments_are_folders_that_are_not_hidden(tmp_path):
     assert list_experiments(tmp_path) == ["a", "b"]
     assert list(trial_folders(tmp_path / "a")) == [str(tmp_path / "a" / "scene" / "arm" / "trial")]
     assert experiment_home(tmp_path, "b") == tmp_path / "b"
-    with pytest.raises(InputError, match=r"no experiment 'c' in .*; there: a, b"):
+    with refusal(r"no experiment 'c' in .*; there: a, b"):
         experiment_home(tmp_path, "c")
 
 
@@ -55,12 +53,12 @@ def test_the_folder_of_an_experiment_is_made_unless_it_is_a_link(tmp_path):
     make_home(tmp_path / "runs" / "x")
     assert (tmp_path / "runs" / "x").is_dir()
     (tmp_path / "runs" / "link").symlink_to(tmp_path / "runs" / "x")
-    with pytest.raises(InputError, match="follows no links"):
+    with refusal("follows no links"):
         make_home(tmp_path / "runs" / "link")
 
 
 def tuning(tmp_path, **changes):
-    (tmp_path / "tuning.json").write_text(json.dumps(TUNING | changes))
+    write(tmp_path / "tuning.json", TUNING | changes)
     return read_typed(tmp_path / "tuning.json", TuningRecord)
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from gsbench.errors import InputError
 from gsbench.runs.layout import LEDGER
 from gsbench.runs.ledger import (
     FAILED,
@@ -22,6 +21,7 @@ from gsbench.runs.ledger import (
     chained,
     read_ledger,
 )
+from tests.helpers import refusal
 
 TIME = "2026-11-27T06:00:00Z"
 OPENED = Opened(
@@ -125,19 +125,19 @@ def test_a_line_that_was_changed_is_found(home, number, change):
     }
     after = number + (2 if change == "swap" else 1)
     path.write_text("".join([*lines[:number], *changes[change], *lines[after:]]))
-    with pytest.raises(InputError, match=r"line \d .*bring back the file|is empty"):
+    with refusal(r"line \d .*bring back the file|is empty"):
         read_ledger(home)
 
 
 @pytest.mark.parametrize("text", ["", "{}\n", "not JSON\n", "[1]\n", "\x00\n", "null\n"])
 def test_a_damaged_ledger_is_refused_in_one_line(home, text):
     (home / LEDGER).write_text(text)
-    with pytest.raises(InputError, match="bring back the file"):
+    with refusal("bring back the file"):
         read_ledger(home)
 
 
 def test_without_a_ledger_the_command_that_begins_one_is_named(tmp_path):
-    with pytest.raises(InputError, match="gsbench ledger new night"):
+    with refusal("gsbench ledger new night"):
         read_ledger(tmp_path / "night")
 
 
@@ -172,7 +172,7 @@ AFTER_ALL = {
 def test_an_entry_that_cannot_follow_is_refused(home, fault):
     entries = [*read_ledger(home).entries, AFTER_ALL[fault]]
     (home / LEDGER).write_text(chained(map(as_json, entries)))
-    with pytest.raises(InputError, match=f"line 8 .*{fault}.*bring back"):
+    with refusal(f"line 8 .*{fault}.*bring back"):
         read_ledger(home)
 
 
@@ -187,12 +187,12 @@ def test_a_relative_difference_that_no_number_holds_is_refused(home, place):
     if place == "confirmed":
         entries[2:] = [ended("a", KEPT), ENTRIES[4], replace(ENTRIES[5], differences={"a": huge})]
     (home / LEDGER).write_text(chained(map(as_json, entries)))
-    with pytest.raises(InputError, match="difference that cannot be"):
+    with refusal("difference that cannot be"):
         read_ledger(home)
 
 
 def test_results_of_ideas_that_were_not_asked_are_refused(home):
     other = replace(ENTRIES[5], results={"a": KEPT, "x": KEPT})
     (home / LEDGER).write_text(chained(map(as_json, [OPENED, *ENTRIES[:5], other])))
-    with pytest.raises(InputError, match="results of other ideas"):
+    with refusal("results of other ideas"):
         read_ledger(home)

@@ -9,7 +9,6 @@ import pytest
 
 from gsbench import cli
 from gsbench.analysis.results import load_experiment
-from gsbench.errors import InputError
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import DamagedError
 from gsbench.runs import freshness
@@ -18,6 +17,7 @@ from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.view.trials import model_file
 from tests.fuzz.records import EXPERIMENT, write_trial
+from tests.helpers import read_json, refusal, write
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_a_trial_with_changed_results_is_left_out_and_named(trial, capsys):
 
 def test_white_space_and_time_are_no_change_of_results(trial):
     path = trial / "results.json"
-    path.write_text(json.dumps(json.loads(path.read_text())))
+    write(path, read_json(path))
     os.utime(path, (1, 1))
     assert TrialFolder(trial).record().metrics == {"psnr": 26.5}
     assert TrialFolder(trial).state() == "done"
@@ -64,9 +64,9 @@ def test_white_space_and_time_are_no_change_of_results(trial):
 
 def test_results_without_made_of_are_accepted(trial):
     path = trial / "results.json"
-    content = json.loads(path.read_text())
+    content = read_json(path)
     del content["made_of"]
-    path.write_text(json.dumps(content))
+    write(path, content)
     edit(trial / "results.json", "26.5", "43.2")
     assert TrialFolder(trial).record().metrics == {"psnr": 43.2}
 
@@ -106,7 +106,7 @@ def test_a_large_file_with_its_old_size_and_time_is_compared_before_it_is_export
     state = model.stat()
     model.write_bytes(b"ply 26.5")
     os.utime(model, ns=(state.st_atime_ns, state.st_mtime_ns))
-    with pytest.raises(InputError, match=r"point_cloud\.ply was changed"):
+    with refusal(r"point_cloud\.ply was changed"):
         model_file(one)
 
 
@@ -123,11 +123,8 @@ def test_changed_curves_are_not_used(trial, caplog):
 def test_a_failed_trial_is_superseded_once_its_mended_class_has_results(trial):
     """The settings are equal, but the class was edited since, and the later trial is done."""
     old = trial.with_name(f"0ld0ld00-{trial.name.partition('-')[2]}")
-    old.mkdir()
-    (old / "config.yaml").write_text((trial / "config.yaml").read_text())
-    (old / "failed.json").write_text(
-        json.dumps({"error": "TypeError", "message": "mine.Mine has no x"})
-    )
+    write(old / "config.yaml", (trial / "config.yaml").read_text())
+    write(old / "failed.json", {"error": "TypeError", "message": "mine.Mine has no x"})
     found = {one.folder: one for one in states_of_experiment(trial.parents[2])}
     assert found[old].state == "superseded"
     assert f"{trial.name} is done, made by later code: mine.Mine has no x" in found[old].note
@@ -170,9 +167,7 @@ def test_the_state_of_a_trial_follows_from_its_files(tmp_path):
 def test_the_stage_and_the_last_iteration_are_read_from_the_files_of_a_training(tmp_path):
     folder = TrialFolder(tmp_path)
     assert folder.stage_and_step() == ("", 0)
-    (tmp_path / "building.json").write_text(
-        json.dumps({"stage": "train", "folder": str(tmp_path / "built")})
-    )
+    write(tmp_path / "building.json", {"stage": "train", "folder": str(tmp_path / "built")})
     assert folder.stage_and_step() == ("train", 0)
     (tmp_path / "built").mkdir()
     rows = "".join(json.dumps({"step": step, "loss": 0.1}) + "\n" for step in range(1000))
@@ -189,7 +184,7 @@ def test_a_configuration_that_cannot_be_used_is_refused(trial):
     with pytest.raises(DamagedError, match="seed is '0'"):
         TrialFolder(trial).configuration()
     (trial / "config.yaml").unlink()
-    with pytest.raises(InputError, match="give the command of the trial again"):
+    with refusal("give the command of the trial again"):
         TrialFolder(trial).configuration()
 
 
@@ -205,7 +200,6 @@ def test_equal_results_keep_their_time_and_others_do_not(trial):
     assert not folder.write_finished(values, record, entries={"train": trial})
     assert path.read_text().startswith('{\n "status": "complete",\n')
     made_of = folder.made_of()
-    assert made_of is not None
     assert made_of.entries == {"train": str(trial)}
     assert set(made_of.published) == {
         "config.yaml",
@@ -225,7 +219,6 @@ def test_only_small_files_and_those_that_tables_read_have_digests(trial, monkeyp
     monkeypatch.setattr(freshness, "MAX_HASHED_BYTES", 4)
     folder.write_finished(values, record, published=[trial / "small.png", trial / "large.png"])
     made_of = folder.made_of()
-    assert made_of is not None
     assert made_of.published.keys() - made_of.digests.keys() == {"large.png"}
 
 
@@ -279,7 +272,7 @@ def test_each_change_since_the_results_were_written_is_named(trial, place, value
     values = folder.settings()
     folder.write_finished(values, replace(folder.record(), hashes={"config": config_hash(values)}))
     assert folder.why_not_done(values) is None
-    content = json.loads(path.read_text())
+    content = read_json(path)
     inner = content
     for key in place[:-1]:
         inner = inner[key]
@@ -287,7 +280,7 @@ def test_each_change_since_the_results_were_written_is_named(trial, place, value
     content["made_of"]["results"] = sha256_of(
         {key: own for key, own in content.items() if key != "made_of"}
     )
-    path.write_text(json.dumps(content))
+    write(path, content)
     assert re.search(reason, str(folder.why_not_done(values)))
 
 

@@ -18,6 +18,7 @@ from gsbench.runs.user_code import (
     user_modules,
 )
 from gsbench.system.own_modules import allow_modules, allowed_modules
+from tests.helpers import write
 
 NAMES = ("own_code", "helper", "pack", "late")
 CLASS = "class Mine: ...\n"
@@ -100,8 +101,7 @@ def test_a_module_of_another_folder_is_found_even_if_its_namesake_is_imported(ho
     (home / "own_code.py").write_text(CLASS)
     importlib.import_module("own_code")
     other = home / "elsewhere"
-    other.mkdir()
-    (other / "own_code.py").write_text("class Other: ...\n")
+    write(other / "own_code.py", "class Other: ...\n")
     assert module_digest("own_code", str(other)) == digest(other / "own_code.py")
     assert module_digest("own_code", str(home)) == digest(home / "own_code.py")
     (home / "own_code.py").unlink()
@@ -112,8 +112,7 @@ def test_imported_modules_that_are_not_named_are_listed(home):
     (home / "own_code.py").write_text(
         "import sys\nsys.path.insert(0, 'lib')\nimport late, json.tool, helper\n" + CLASS
     )
-    (home / "lib").mkdir()
-    (home / "lib" / "late.py").touch()
+    write(home / "lib" / "late.py", b"")
     (home / "helper.py").touch()
     before = set(sys.modules)
     importlib.import_module("own_code")

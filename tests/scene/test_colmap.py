@@ -95,8 +95,7 @@ def test_files_of_one_camera_get_a_camera_for_each_size(make_scene):
 def test_an_image_of_another_shape_than_its_camera_is_refused(make_scene):
     root = make_scene(size=(40, 30))
     Image.fromarray(smooth_image(40, 26)).save(root / "images/01.png")
-    said = r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"
-    with refusal(said):
+    with refusal(r"01\.png: the image is 40x26 px but its camera in the COLMAP model 40x30"):
         read_reference(read_colmap("toy", root))
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -270,8 +269,9 @@ def test_a_name_in_a_code_page_is_named(make_scene, text):
     root = make_scene(names=[f"{k:04d}.png" for k in range(4)], text=text)
     file = root / "sparse/0" / ("images.txt" if text else "images.bin")
     file.write_bytes(file.read_bytes().replace(b"0003.png", "가나.png".encode("cp949")))
-    said = r"image.*not UTF-8 .*\\xb0\\xa1\\xb3\\xaa.png.*: rename the photographs to ASCII"
-    with refusal(said) as caught:
+    with refusal(
+        r"image.*not UTF-8 .*\\xb0\\xa1\\xb3\\xaa.png.*: rename the photographs to ASCII"
+    ) as caught:
         read_colmap("toy", root)
     assert "export it again" not in str(caught.value)
 

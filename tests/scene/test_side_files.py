@@ -87,7 +87,8 @@ def test_photographs_in_folders_of_other_names_are_all_read(tmp_path, caplog, pa
 
 def test_a_folder_that_is_named_is_read_whatever_its_name(tmp_path):
     photographs(tmp_path, "thumbs/{}.jpg")
-    said = r"all 5 files are masks, thumbnails or the like: thumbs/ \(5\): scene.images=FOLDER"
-    with refusal(said):
+    with refusal(
+        r"all 5 files are masks, thumbnails or the like: thumbs/ \(5\): scene.images=FOLDER"
+    ):
         read_photos("a", tmp_path)
     assert len(read_photos("a", tmp_path, images="thumbs").image_names) == COUNT

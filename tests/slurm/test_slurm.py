@@ -106,7 +106,7 @@ def models(runs):
 
 
 def job_logs(runs):
-    return "\n".join(path.read_text() for path in sorted(runs.glob(".jobs/cluster/*_log.*")))
+    return "\n".join(path.read_text() for path in sorted(runs.glob(".jobs/cluster/*/*_log.*")))
 
 
 def queue():
@@ -149,7 +149,7 @@ def test_a_requeued_sweep_ends_with_the_models_of_an_undisturbed_one(place, envi
     assert not set(queue()) & set(queued)
     assert sorted(models(runs)) == sorted(models(place / "whole"))
     assert models(runs) == models(place / "whole")
-    assert len(list(runs.glob(".jobs/cluster/*_submission.sh"))) == 1, (
+    assert len(list(runs.glob(".jobs/cluster/*/*_submission.sh"))) == 1, (
         "the trials were submitted a second time"
     )
     assert "Requeued job" in logs
@@ -209,7 +209,7 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environme
 
     second = gsbench(place, environment, *sweep, pause=PAUSE)
     assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr
-    assert len(list(place.glob("runs/.jobs/cluster/*_submission.sh"))) == 1, (
+    assert len(list(place.glob("runs/.jobs/cluster/*/*_submission.sh"))) == 1, (
         "the trials were submitted a second time"
     )
 

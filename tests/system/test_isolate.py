@@ -25,7 +25,7 @@ PATIENCE = 120.0  # seconds; a slow machine needs fewer
 SOURCE = Path(gsbench.__file__).parents[1]
 
 FUNCTIONS = """
-import os, sys, time
+import logging, os, sys, time
 import numpy as np
 from gsbench.errors import InputError
 
@@ -41,6 +41,10 @@ def double(array):
 
 def loaded_modules():
     return sorted(sys.modules), sys.modules["__main__"].__dict__.get("__file__")
+
+def warn():
+    logging.getLogger("gsbench.x").warning("%s is odd", "it")
+    logging.getLogger("gsbench.x").info("and more")
 
 def refuse():
     raise InputError("the folder is empty: add photos")
@@ -96,6 +100,11 @@ def test_exception_keeps_type_text_and_traceback(functions):
     assert "in refuse" in "".join(caught.value.__notes__)
     with pytest.raises(RuntimeError, match="Unpicklable: x-1"):
         run_isolated(functions.odd)
+
+
+def test_warnings_of_the_function_are_logged_here(functions, caplog):
+    run_isolated(functions.warn)
+    assert caplog.messages == ["it is odd"]
 
 
 def test_crash_is_one_line_with_the_reason(functions, tmp_path):

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+from shlex import split
 
 import pytest
 
@@ -41,7 +42,7 @@ def postgresql(tmp_path):
     if os.geteuid() == 0:  # the server refuses to run as root
         if shutil.which("runuser") is None:
             pytest.skip("PostgreSQL does not run as root, and there is no runuser")
-        prefix = ["runuser", "-u", "nobody", "--"]
+        prefix = split("runuser -u nobody --")
         shutil.chown(data, "nobody")
         # a worker of pytest-xdist has a folder of its own
         for folder in (tmp_path, *tmp_path.parents[:3]):

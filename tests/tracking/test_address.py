@@ -7,7 +7,7 @@ import pytest
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.tracking import connect, default_uri, tracker_uri
-from gsbench.tracking.mlflow_sink import STATE, VARIABLE, untyped_address
+from gsbench.tracking.mlflow_sink import STATE, VARIABLE
 from tests.tracking.helpers import (
     begin_trial,
     found_runs,
@@ -27,17 +27,6 @@ def test_the_address_is_the_configured_one_else_the_environments_else_the_runs_f
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
     assert tracker_uri(None, tmp_path) == "http://127.0.0.1:1"
     assert tracker_uri("http://127.0.0.1:2", tmp_path) == "http://127.0.0.1:2"
-
-
-def test_an_address_from_a_file_must_be_typed_or_in_the_environment(monkeypatch):
-    monkeypatch.delenv(VARIABLE, raising=False)
-    assert untyped_address({"uri": None}) is None
-    assert untyped_address({"uri": "http://a"}) == "http://a"
-    assert untyped_address({"uri": "http://a", "enabled": False}) is None
-    assert untyped_address({"uri": "http://a"}, "http://a") is None
-    assert untyped_address({"uri": "http://a"}, "http://a/") == "http://a"
-    monkeypatch.setenv(VARIABLE, "http://a")
-    assert untyped_address({"uri": "http://a"}) is None
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "http"])

@@ -1,6 +1,5 @@
 """A complete trial ends with exit code 0 and at most one warning, whatever its tracker does."""
 
-import json
 import os
 import signal
 import subprocess
@@ -8,6 +7,7 @@ import sys
 import time
 import urllib.request
 from contextlib import ExitStack, contextmanager, suppress
+from shlex import split
 from urllib.parse import urlsplit
 
 import psutil
@@ -17,7 +17,8 @@ from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, ensure_experiment
 from gsbench.tracking.mlflow_sink import SETTINGS
 from tests.end_to_end.conftest import SMALL
-from tests.processes import heed_interrupts
+from tests.helpers import read_json
+from tests.processes import completed, heed_interrupts
 from tests.tracking.helpers import (
     RECORDS,
     begin_trial,
@@ -81,7 +82,7 @@ def check_complete(runs, name, code, errors):
     assert len(said) == 1, errors
     assert "gsbench sync" in said[0]
     (results,) = (runs / name).glob("**/results.json")
-    assert json.loads(results.read_text())["status"] == "complete"
+    assert read_json(results)["status"] == "complete"
 
 
 @pytest.mark.parametrize(
@@ -228,34 +229,22 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
 def mirror_a_trial(runs, uri, seed, patience):
     """Mirror a trial in a process of its own, which must succeed; returns its stderr."""
     words = mirror_command(runs, uri, seed, patience)
-    done = subprocess.run(
-        words, env=child_environment(), capture_output=True, text=True, timeout=SECONDS, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = completed(words, env=child_environment(), timeout=SECONDS)
     return done.stderr
 
 
 @contextmanager
 def mlflow_server(folder):
     port = free_port()
-    words = [
-        "server",
-        "--backend-store-uri",
-        f"sqlite:///{folder}/mlflow.db",
-        "--artifacts-destination",
-        str(folder),
-    ]
+    words = split(
+        f"server --backend-store-uri sqlite:///{folder}/mlflow.db --artifacts-destination {folder}"
+    )
     command = [
         sys.executable,
         "-m",
         "mlflow",
         *words,
-        "--host",
-        "127.0.0.1",
-        "--port",
-        str(port),
-        "--workers",
-        "1",
+        *split(f"--host 127.0.0.1 --port {port} --workers 1"),
     ]
     lean = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     server = subprocess.Popen(

@@ -6,6 +6,7 @@ import threading
 import time
 import zlib
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 
 import mlflow
@@ -188,7 +189,7 @@ def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path, monkeypatch):
         servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
     )
     thread = threading.Thread(
-        target=servers.ui, args=(["swept", "--port", str(port), "--no-browser"], runs)
+        target=servers.ui, args=(split(f"swept --port {port} --no-browser"), runs)
     )
     # signals need the main thread
     monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())

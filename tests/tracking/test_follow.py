@@ -70,7 +70,8 @@ def test_one_process_gets_the_folders_of_all_trials(processes, tmp_path, caplog)
         one.follow(tmp_path / "a", settings)
         one.follow(tmp_path / "b", settings)
         (process,) = processes
-        assert process.stdin.getvalue() == f"{tmp_path}/a\n{tmp_path}/b\n".encode()
+        told = [json.loads(line) for line in process.stdin.getvalue().splitlines()]
+        assert told == [[f"{tmp_path}/{name}", settings] for name in ("a", "b")]
     assert process.command[-2:] == ["0.2", "7.0"]
     assert process.how["start_new_session"]  # Ctrl-C does not reach it
     assert process.did == [7.0, "killed", "closed"]
@@ -302,8 +303,8 @@ class Followed:
     made: list["Followed"]
     error: Exception | None = None
 
-    def __init__(self, folder):
-        self.folder, self.options, self.has_ended = folder, options("u"), False
+    def __init__(self, folder, options):
+        self.folder, self.options, self.has_ended = folder, options, False
         self.calls = []
         self.made.append(self)
 
@@ -337,12 +338,16 @@ class Lines:
         return self.queue.get_nowait()
 
 
+def line(folder):
+    return json.dumps([folder, options("u")])
+
+
 def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
     renewed = []
     now = iter([100.0, 100.0, 159.0, 160.5, 160.5, 170.0, 170.0])
     monkeypatch.setattr(mirror, "_renew", lambda pages: renewed.append(sorted(map(str, pages))))
     monkeypatch.setattr(time, "monotonic", lambda: next(now))
-    lines = Lines(["a/b/c/d", "a/b/c/e"], [], ["a/b/c/f"], [None])
+    lines = Lines([line("a/b/c/d"), line("a/b/c/e")], [], [line("a/b/c/f")], [None])
     mirror._follow(lines, 0.5)
     assert [str(one.folder.path) for one in followed] == ["a/b/c/d", "a/b/c/e", "a/b/c/f"]
     # the first two ended at the second reading; the last one is read once more at the end
@@ -357,7 +362,7 @@ def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
 def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
     monkeypatch.setattr(Followed, "error", error)
     monkeypatch.setattr(mirror, "_renew", lambda pages: None)
-    lines = Lines(["a/b/c/d"], [], [None])
+    lines = Lines([line("a/b/c/d")], [], [None])
     if isinstance(error, BusyError):
         mirror._follow(lines, 0)
     else:
@@ -369,7 +374,7 @@ def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
 def test_a_trial_is_opened_once_it_runs_or_has_ended_now(told, tmp_path):
     values = trial_values(tmp_path)
     folder = TrialFolder.of(values).path
-    one = mirror._FollowedTrial(TrialFolder(folder))
+    one = mirror._FollowedTrial(TrialFolder(folder), options())
     one.catch_up(last=True)  # it has no configuration yet
     begin_trial(values)
     write_trial(folder, values)
@@ -384,15 +389,23 @@ def test_a_trial_is_opened_once_it_runs_or_has_ended_now(told, tmp_path):
     one.catch_up(last=False)
     assert words(told[3:]) == ["complete"]
     assert one.has_ended
-    assert one.options == options()
     assert mirror_ended(TrialFolder(folder), options(), values) is False  # it was let go
+
+
+def test_a_trial_that_never_began_is_not_sent_where_its_old_configuration_says(told, tmp_path):
+    values = trial_values(tmp_path)
+    folder = TrialFolder(begin_trial(values, "http://theirs"))
+    one = mirror._FollowedTrial(folder, options("http://own"))
+    one.catch_up(last=True)
+    assert one._run is not None
+    assert one._run._options["uri"] == "http://own"
 
 
 @pytest.mark.parametrize("name", ["results.json", "failed.json", "none"])
 def test_a_trial_that_ended_before_it_was_seen_is_mirrored(told, tmp_path, name):
     values = trial_values(tmp_path)
     folder = begin_trial(values)
-    one = mirror._FollowedTrial(TrialFolder(folder))
+    one = mirror._FollowedTrial(TrialFolder(folder), options())
     one._added_at = 100.0
     if name == "failed.json":
         (folder / name).write_text("{}")

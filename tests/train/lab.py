@@ -1,7 +1,5 @@
 """Short trainings of a tiny scene, for most tests of this folder."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path

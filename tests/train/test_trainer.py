@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsbench.densify import ADC, NoDensifier, Volumetric
+from gsbench.densify import ADC, NoDensifier, SteepGS, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.ply import read_ply
 from gsbench.raster.staged import Readback
@@ -19,6 +19,7 @@ from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import snapshot_file
 from gsbench.train.views import STREAMS, CameraOrder, generators
+from tests.helpers import refusal
 from tests.train.lab import EVENTS, METRICS, STATEFUL, StopError, same, small, stop_at
 
 
@@ -135,6 +136,15 @@ def test_the_learning_rate_of_the_means_is_log_linear():
     assert rates.position(99_000) == pytest.approx(1.6e-6)
 
 
+def test_a_rasterizer_without_an_output_that_the_densifier_needs_is_refused_at_once(lab):
+    class Plain:
+        name = "plain"
+
+    lab.rasterizer = Plain()
+    with refusal("SteepGS needs the extra output splitting_matrix, which"):
+        lab.new(SteepGS())
+
+
 def test_too_few_rounds_of_a_densifier_cause_a_warning(lab, caplog):
     lab.train(ADC(start=500), "adc", iterations=15)
     assert "ADC: 0 rounds of refinement in 15 iterations, too few" in caplog.text
@@ -224,7 +234,7 @@ def test_the_context_of_a_densifier_knows_a_white_background(background, white, 
     context = lab.new(NoDensifier(), background=background).context
     assert context.white_background is white
     assert context.extent == lab.scene.extent
-    assert context.limit is None
+    assert context.schedule is None
 
 
 @pytest.mark.parametrize("spare, resident", [(0, True), (-2, False)])

@@ -1,19 +1,20 @@
 """``gsbench export`` of models, initial models and results."""
 
 from pathlib import Path
+from shlex import split
 
 import pytest
 import torch
 
 from gsbench import cli
 from gsbench.config.compose import compose_one
-from gsbench.errors import InputError
 from gsbench.gaussians.ply import write_ply
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs import exchange
 from tests.analysis.synthetic import Plan, write_runs
 from tests.finished import write_results
 from tests.gaussians.helpers import random_gaussians
+from tests.helpers import refusal, write
 
 pytestmark = pytest.mark.usefixtures("runs")
 
@@ -24,8 +25,7 @@ def finished_trial(runs, gaussians):
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
     write_ply(gaussians, folder / "point_cloud.ply")
-    (runs / "store" / "init" / "abc" / "sparse" / "0").mkdir(parents=True)
-    (runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin").write_bytes(b"points")
+    write(runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin", b"points")
     write_results(folder, values, num_gaussians=len(gaussians), hashes={"init": "abc"})
     return folder
 
@@ -37,44 +37,43 @@ def gaussians():
 
 def test_results_of_an_experiment_without_trials_are_not_exported(runs):
     (runs / "empty").mkdir(parents=True)
-    with pytest.raises(InputError, match="'empty' has no complete trial among 0 folders"):
+    with refusal("'empty' has no complete trial among 0 folders"):
         exchange.export_results("empty", runs, None)
 
 
-def test_export_of_the_model_and_the_initial_cloud(runs, gaussians, tmp_path, capsys):
+def test_export_of_the_model_and_the_initial_cloud(runs, gaussians, tmp_path, capsys, refused):
     folder = finished_trial(runs, gaussians)
-    assert cli.run(["export", "x:courtyard:adc:0", "--out", "new/model.ply"]) == 0
+    assert cli.run(split("export x:courtyard:adc:0 --out new/model.ply")) == 0
     assert (tmp_path / "new" / "model.ply").read_bytes() == (
         folder / "point_cloud.ply"
     ).read_bytes()
     assert "new/model.ply: x/courtyard/sfm-adc/" in capsys.readouterr().out
-    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 0
+    assert cli.run(split(f"export init {folder} --out model")) == 0
     assert (tmp_path / "model" / "sparse" / "0" / "points3D.bin").read_bytes() == b"points"
-    assert cli.run(["export", "init", str(folder), "--out", "model"]) == 2
-    assert cli.run(["export", str(folder), "--out", "model.xyz"]) == 2
-    assert cli.run(["export", "x:courtyard:mcmc", "--out", "model.ply"]) == 2
-    assert cli.run(["export", str(folder), "--out", "/proc/nowhere/model.ply"]) == 2
-    assert "give another --out" in capsys.readouterr().err
+    assert cli.run(split(f"export init {folder} --out model")) == 2
+    assert cli.run(split(f"export {folder} --out model.xyz")) == 2
+    assert cli.run(split("export x:courtyard:mcmc --out model.ply")) == 2
+    assert "give another --out" in refused(f"export {folder} --out /proc/nowhere/model.ply")
 
 
 def test_the_archive_of_results_gets_the_name_of_the_experiment_or_of_out(runs, tmp_path, said):
     write_runs(runs, Plan())
     (tmp_path / "new").mkdir()
     for out, file in (([], "exp.zip"), (["--out", "new"], "new/exp.zip"), (["--out", "a"], "a")):
-        assert said("export", "--results", "exp", *out).startswith(f"{file}: results of exp, ")
+        assert said("export --results exp", *out).startswith(f"{file}: results of exp, ")
         assert (tmp_path / file).stat().st_size > 1000
 
 
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--results", "exp", "a:b:c"], "takes an experiment, --out and --pictures alone"),
+        (split("--results exp a:b:c"), "takes an experiment, --out and --pictures alone"),
         (["--results", "a/b"], "'a/b' is not the name of an experiment"),
-        (["a:b:c", "--pictures", "--out", "x.ply"], "--pictures goes with --results"),
+        (split("a:b:c --pictures --out x.ply"), "--pictures goes with --results"),
         (["a:b:c"], "export needs a TRIAL and --out PATH"),
         (["--out", "x.ply"], "export needs a TRIAL and --out PATH"),
         (["a:b:c", "d:e:f", "--out", "x.ply"], "one TRIAL is exported, not 2"),
-        (["init", "init", "d:e:f", "--out", "x"], "one TRIAL is exported, not 3"),
+        (split("init init d:e:f --out x"), "one TRIAL is exported, not 3"),
     ],
 )
 def test_words_that_do_not_go_together_are_refused(refused, words, message):
@@ -89,36 +88,36 @@ def test_only_the_3dgs_form_is_written(name, good):
     if good:
         exchange.check_form(Path(name))
     else:
-        with pytest.raises(InputError, match=r"name a file that ends in \.ply, the 3DGS form"):
+        with refusal(r"name a file that ends in \.ply, the 3DGS form"):
             exchange.check_form(Path(name))
 
 
 def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, refused):
     folder = finished_trial(runs, gaussians)
     (runs / "store" / "init" / "abc").rename(runs / "gone")
-    assert "no longer in the store" in refused("export", "init", folder, "--out", "model")
+    assert "no longer in the store" in refused("export init", folder, "--out", "model")
 
 
 @pytest.mark.parametrize(
     "words, file",
     [
-        (["export", "--results", "exp"], "exp.zip"),
-        (["export", "--results", "exp", "--out", "."], "exp.zip"),
-        (["tables", "exp", "--format", "csv", "--out", "."], "exp.csv"),
-        (["report", "exp", "--out", "."], "exp-report.html"),
-        (["site", "a.zip", "--out", "."], "index.html"),
-        (["site", "a.zip", "--out", "."], "reports/exp.html"),
+        (split("export --results exp"), "exp.zip"),
+        (split("export --results exp --out ."), "exp.zip"),
+        (split("tables exp --format csv --out ."), "exp.csv"),
+        (split("report exp --out ."), "exp-report.html"),
+        (split("site a.zip --out ."), "index.html"),
+        (split("site a.zip --out ."), "reports/exp.html"),
     ],
 )
 def test_a_file_that_the_user_did_not_name_is_not_overwritten(
-    words, file, tmp_path, monkeypatch, refused
+    words, file, tmp_path, monkeypatch, refused, said
 ):
     write_runs(tmp_path / "runs", Plan())
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
-    assert cli.run(["export", "--results", "exp", "--out", "a.zip"]) == 0
+    said("export --results exp --out a.zip")
     for _ in range(2):  # its own file is renewed
-        assert cli.run(words) == 0
+        said(*words)
     assert Path(file).is_file()
     Path(file).write_text("the user's own")
     assert "not as gsbench wrote it: move it" in refused(*words)

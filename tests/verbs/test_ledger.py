@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsbench.analysis.results import read_experiment
-from gsbench.claims.archive import _shared_ledger, without_private_words
+from gsbench.claims.export import _shared_ledger, without_private_words
 from gsbench.cli import run
 from gsbench.runs import ledger as records
 from gsbench.runs.layout import LEDGER
@@ -433,27 +433,6 @@ def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, t
         )
         assert (ended.result == "kept", ended.seeds) == (keep[0], seeds[0])
         kept += bool(keep[0])
-
-
-HOME_OF_ANOTHER = "http://203.0.113.5:5000"
-
-
-def test_an_address_that_only_the_ledger_names_gets_no_results(trainings, refused, tmp_path):
-    settings = [word for word in NEW if word != "tracking=none"]
-    assert run(["ledger", *settings, f"tracking.uri={HOME_OF_ANOTHER}"]) == 0
-    for words in (
-        ["try", "night", f"{SPLIT}=0.02"],
-        ["try", "night", f"{SPLIT}=0.02", "device=cpu"],
-    ):
-        assert f"would send its results to {HOME_OF_ANOTHER}" in refused("ledger", *words)
-    assert not trainings.trained
-    assert len(read_ledger(tmp_path / "runs" / "night").entries) == 1
-    confirm = ["confirm", "night", "scene=courtyard", "scene.name=yard", "seed=7,8"]
-    assert attempt(f"{SPLIT}=0.02", f"tracking.uri={HOME_OF_ANOTHER}") == 0
-    trained = len(trainings.trained)
-    assert "would send its results" in refused("ledger", *confirm)
-    assert len(trainings.trained) == trained
-    assert attempt(f"{SPLIT}=0.03", "tracking=none") == 0
 
 
 def test_a_result_that_its_trials_deny_is_shown(home, caplog):

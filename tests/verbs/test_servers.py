@@ -9,6 +9,7 @@ import time
 import urllib.request
 from contextlib import suppress
 from pathlib import Path
+from shlex import split
 from types import SimpleNamespace
 
 import psutil
@@ -18,6 +19,7 @@ import torch
 from gsbench.runs.experiments import make_home
 from gsbench.tracking import connect
 from gsbench.verbs import servers
+from tests.helpers import write
 
 SECONDS = 120
 
@@ -34,7 +36,7 @@ def test_all_processes_of_the_dashboard_end_and_none_imports_from_the_current_fo
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     environment = os.environ | {"GSBENCH_RUNS": str(tmp_path / "runs")}
-    command = [sys.executable, "-P", "-m", "gsbench.cli", "ui", "--port", str(port)]
+    command = [sys.executable, *split(f"-P -m gsbench.cli ui --port {port}")]
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
     ) as process:
@@ -96,8 +98,7 @@ def served(runs, monkeypatch):
             print(lines)
             served.extend([(server, page, self.daemon)] * bool(page))
 
-    runs.mkdir()
-    (runs / "mlflow.db").touch()
+    write(runs / "mlflow.db", b"")
     monkeypatch.setattr(servers, "publish", lambda home, uri: f"{len(home.name)}")
     monkeypatch.setattr(servers, "version", lambda package: "3.17.0")
     monkeypatch.setattr(servers, "serve", lambda uri, port: served.append((uri, port)) or 0)
@@ -119,10 +120,10 @@ def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
     assert served == [(LOCAL, LOCAL, True), (uri, 5000)]
     for name in ("ab", "cde"):
         make_home(runs / name)
-        words = said("ui", "--port", "81").split()
+        words = said("ui --port 81").split()
     assert words == ["dashboard", "http://127.0.0.1:81"]  # one of two was not chosen
     served.clear()
-    pages = said("ui", "cde", "--no-browser").split()
+    pages = said("ui cde --no-browser").split()
     assert pages[0] == "arms"
     assert pages[1].startswith(f"{LOCAL}/#/experiments/3/")
     assert pages[2] == "table"
@@ -132,11 +133,11 @@ def test_the_dashboard_opens_at_the_only_experiment(runs, served, said):
 def test_no_second_server_is_started(runs, served, said, monkeypatch):
     make_home(runs / "ab")
     address = "https://tracker.example"
-    page = said("ui", "--uri", address).split()[1]
+    page = said("ui --uri", address).split()[1]
     assert served == [(address, page, False)]
     served.clear()
     monkeypatch.setattr(servers, "_serves", lambda server, name, page: name == "ab")
-    said("ui", "--no-browser")
+    said("ui --no-browser")
     assert served == []
 
 
@@ -248,7 +249,7 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
     proven = SimpleNamespace(rasterizer="rasterizer")
     monkeypatch.setattr("gsbench.train.proof.create_proven", lambda name, device: proven)
     monkeypatch.setattr(servers.threading, "Event", Event)
-    assert servers.view(["a", "b", "--device", "cpu", "--port", "0"], runs) == 0
+    assert servers.view(split("a b --device cpu --port 0"), runs) == 0
     cpu = torch.device("cpu")
     painters = [(("a", cpu), "rasterizer"), (("b", cpu), "rasterizer")]
     assert made == [0, (painters, 0), "stopped"]
@@ -256,6 +257,6 @@ def test_the_viewer_shows_one_or_two_trials_until_ctrl_c(runs, monkeypatch, caps
         "http://127.0.0.1:8080  (Ctrl+C ends it)",
         "stopped",
     ]
-    assert "one or two trials can be viewed, not 3" in refused("view", "a", "b", "c")
+    assert "one or two trials can be viewed, not 3" in refused("view a b c")
     monkeypatch.setattr(servers.importlib.util, "find_spec", lambda name: None)
-    assert "the viewer needs viser: " in refused("view", "a")
+    assert "the viewer needs viser: " in refused("view a")

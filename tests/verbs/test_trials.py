@@ -4,12 +4,13 @@ import io
 import json
 import time
 from pathlib import Path
+from shlex import split
 
 import pytest
 from rich.console import Console
 
 from gsbench.config.compose import compose_one
-from gsbench.errors import GsbenchError, InputError
+from gsbench.errors import GsbenchError
 from gsbench.launch.progress import Progress
 from gsbench.launch.record import add_to_plan, read_plan
 from gsbench.launch.states import TrialState
@@ -19,24 +20,24 @@ from gsbench.tracking.mirror import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed
 from tests.finished import write_results
+from tests.helpers import refusal, write
 
 pytestmark = pytest.mark.usefixtures("runs")
 
 
 def begin(trial):
     """Write the configuration of a trial that has begun; returns its folder."""
-    trial.folder.mkdir(parents=True)
-    (trial.folder / "config.yaml").write_text(trial.yaml)
+    write(trial.folder / "config.yaml", trial.yaml)
     return trial.folder
 
 
 @pytest.fixture
 def folders(runs):
     """Three planned trials: the first is done, the second failed, the third never started."""
-    planned = composed(["name=x", "densify=adc", "seed=0,1,2"])
+    planned = composed(split("name=x densify=adc seed=0,1,2"))
     add_to_plan(planned)
     write_results(begin(planned[0]), planned[0].values)
-    (begin(planned[1]) / "failed.json").write_text(json.dumps({"message": "the loss became nan"}))
+    write(begin(planned[1]) / "failed.json", {"message": "the loss became nan"})
     return [trial.folder for trial in planned]
 
 
@@ -63,10 +64,10 @@ def test_status_lists_unfinished_trials(folders, runs, capsys, said, refused):
     }
     assert states == dict(zip(folders, ("done", "failed", "missing"), strict=True))
     assert " ".join(said("status").split()) == "x 3 trials: 1 done, 1 missing, 1 failed"
-    assert said("status", "x", "--forget") == "1 trial removed from the plan\n"
+    assert said("status x --forget") == "1 trial removed from the plan\n"
     assert trials.status(["x"], runs) == 1
     assert capsys.readouterr().out.splitlines()[-1] == "2 trials: 1 done, 1 failed"
-    assert "no experiment 'y'" in refused("status", "y")
+    assert "no experiment 'y'" in refused("status y")
 
 
 def test_status_of_an_empty_runs_folder_says_so(runs, said):
@@ -103,7 +104,7 @@ def test_superseded_trials_are_shown_and_deleted_on_demand(folders, monkeypatch,
     reasons = {done: "helper was 1, it is now 2"}
     monkeypatch.setattr(trials, "find_superseded", lambda *_: reasons)
     assert said("status").endswith(" 3 trials: 1 superseded, 1 missing, 1 failed\n")
-    lines = said("status", "x", "--forget-superseded").splitlines()
+    lines = said("status x --forget-superseded").splitlines()
     assert lines == [f"removed {done}: helper was 1, it is now 2", "1 superseded trial removed"]
     assert not done.exists()
     assert [*read_plan(done.parents[2])] == folders[1:]
@@ -175,9 +176,9 @@ def test_ctrl_c_ends_only_the_watching(folders, monkeypatch):
 
 
 def test_retry_runs_the_unfinished_with_their_own_settings(folders, runs, ran, said):
-    assert "2 trials: 1 missing, 1 failed" in said("retry", "x", "--dry-run")
+    assert "2 trials: 1 missing, 1 failed" in said("retry x --dry-run")
     assert ran == []
-    said("retry", "x", "launch=local", "launch.parallel=3")
+    said("retry x launch=local launch.parallel=3")
     assert [(one.values["densify"]["name"], one.values["seed"]) for one in ran] == [
         ("adc", 1),
         ("adc", 2),
@@ -190,20 +191,20 @@ def test_retry_with_everything_done_runs_nothing(folders, ran, said):
     for folder in folders[1:]:
         write_results(folder, composed(["name=x", "densify=adc"])[0].values)
     line = "nothing to retry: all trials of x are done, running or queued\n"
-    assert (said("retry", "x"), ran) == (line, [])
+    assert (said("retry x"), ran) == (line, [])
 
 
 def test_retry_refuses_a_setting_that_makes_other_trials(folders, ran, refused):
-    line = refused("retry", "x", "launch.parallel=2", "densify.stop=5")
+    line = refused("retry x launch.parallel=2 densify.stop=5")
     assert "densify.stop=5 would make other trials than those of the plan" in line
     assert ran == []
 
 
 def test_planned_settings_of_a_launcher_go_with_it_unless_it_stays(runs, ran, said):
-    words = ["name=x", "densify=adc", "launch=local", "launch.parallel=2"]
+    words = split("name=x densify=adc launch=local launch.parallel=2")
     add_to_plan(composed(words))
-    said("retry", "x", "launch=local")
-    said("retry", "x", "launch=serial")
+    said("retry x launch=local")
+    said("retry x launch=serial")
     assert [(one.values["launch"]["name"], one.values["launch"]["parallel"]) for one in ran] == [
         ("local", 2),
         ("serial", 1),
@@ -218,7 +219,7 @@ def test_a_trial_whose_configuration_has_changed_takes_the_place_of_the_old_one(
         return composed(["name=x", "densify=adc", seed, "train.sh_interval=2"])[0]
 
     monkeypatch.setattr(trials, "recompose", changed)
-    said("retry", "x")
+    said("retry x")
     assert {one.values["train"]["sh_interval"] for one in ran} == {2}
     assert caplog.text.count("its configuration has changed since; the new one is run") == 2
     assert [*read_plan(folders[0].parents[2])] == folders[:1]
@@ -228,19 +229,19 @@ def test_retry_of_a_trial_without_a_plan_uses_its_configuration(folders, runs):
     (runs / "x" / "plan.json").unlink()
     again = trials.recompose(folders[1], None, runs, [], str(runs.parent))
     assert TrialFolder.of(again.values).path == folders[1]
-    assert again.values == compose_one(["name=x", "densify=adc", "seed=1"]).values
+    assert again.values == compose_one(split("name=x densify=adc seed=1")).values
     own = trials.recompose(folders[1], None, runs, ["allow_targets=[mine.Arm]"], "theirs")
     assert own.values["allow_targets"] == ["mine.Arm"]
     assert allowed_modules()["mine"] == "theirs"
-    with pytest.raises(InputError, match="is in no plan, so no setting of it can be changed"):
+    with refusal("is in no plan, so no setting of it can be changed"):
         trials.recompose(folders[1], None, runs, ["launch=local"], "theirs")
 
 
 def test_a_trial_from_renders_is_entered_by_its_own_command(folders, runs):
-    values = compose_one(["name=x", "densify=adc", "seed=1"]).values
+    values = compose_one(split("name=x densify=adc seed=1")).values
     values["densify"]["evaluated_from"] = "renders"
-    (folders[1] / "config.yaml").write_text(json.dumps(values))
-    with pytest.raises(InputError, match="give the command of `gsbench evaluate` again"):
+    write(folders[1] / "config.yaml", values)
+    with refusal("give the command of `gsbench evaluate` again"):
         trials.recompose(folders[1], None, runs, [], str(runs.parent))
 
 
@@ -270,7 +271,7 @@ def test_sync_sends_the_begun_trials_of_one_or_all_experiments(folders, runs, mo
         return [f"sent {len(given)}"]
 
     monkeypatch.setattr(trials, "send_missing", send)
-    assert said("sync", "x", "--uri", "http://here") == "sent 2\n"
+    assert said("sync x --uri http://here") == "sent 2\n"
     assert sent == [("x", "http://here")] * 2
     assert said("sync") == "sent 3\n"
     assert sent[2:] == [("x", None), ("x", None), ("y", None)]

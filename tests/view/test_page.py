@@ -36,11 +36,11 @@ def stand_in(folder, works, fails, works_too=":"):
 
 
 @pytest.mark.parametrize("works", ["splat-transform", "-g cpu"], ids=["with a GPU", "without"])
-def test_the_page_has_every_test_view(works, small_runs, tmp_path, monkeypatch):
+def test_the_page_has_every_test_view(works, small_runs, tmp_path, monkeypatch, said):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     npx = stand_in(tmp_path / "bin", works, "exit 1")
     monkeypatch.setenv("PATH", f"{npx}{os.pathsep}{os.environ['PATH']}")
-    assert run(["export", ADDRESS, "--out", str(tmp_path / "page.html")]) == 0
+    said("export", ADDRESS, "--out", tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     assert text.startswith(
         '<head><meta http-equiv="Content-Security-Policy" content="default-src \'n'
@@ -118,7 +118,7 @@ def hostile_capture(folder, monkeypatch):
 
 
 def test_npx_starts_where_no_package_of_the_current_folder_is_found(
-    small_runs, tmp_path, monkeypatch
+    small_runs, tmp_path, monkeypatch, said
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(small_runs))
     seen = "(pwd; ls -A; echo $PATH) > $SEEN; d=$(pwd); while [ $d != / ]; do d=$(dirname $d); ls -A $d >> $SEEN; done"
@@ -128,7 +128,7 @@ def test_npx_starts_where_no_package_of_the_current_folder_is_found(
     monkeypatch.setenv("PATH", os.pathsep.join(["node_modules/.bin", ".", "", str(npx), own]))
     (tmp_path / "capture").mkdir()
     hostile_capture(tmp_path / "capture", monkeypatch)
-    assert run(["export", ADDRESS, "--out", "page.html"]) == 0
+    said("export", ADDRESS, "--out", "page.html")
     assert not Path("exploded").exists()
     where, *seen_lines = (tmp_path / "seen").read_text().splitlines()
     assert Path(where) != tmp_path / "capture"

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
-from gsbench.analysis.results import Configurations
+from gsbench.analysis.trial_settings import Configurations
 from gsbench.events import Cause
 from gsbench.gaussians.initial import gaussians_from_cloud
 from gsbench.init.base import PointCloud

@@ -18,7 +18,8 @@ from gsbench.analysis.differences import (
     differing_settings,
 )
 from gsbench.analysis.quantities import Quantity, metric_keys
-from gsbench.analysis.results import Configured, Experiment, TrialResult, group_by
+from gsbench.analysis.results import Experiment, TrialResult, group_by
+from gsbench.analysis.trial_settings import Configured
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import is_hashed
 

@@ -13,7 +13,8 @@ from functools import reduce
 from pathlib import Path
 
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import TrialResult, load_flat_config, settings_text
+from gsbench.analysis.results import TrialResult
+from gsbench.analysis.trial_settings import load_flat_config, settings_text
 from gsbench.parsing import DamagedError
 from gsbench.runs.experiments import Declaration, merge_planned, read_declarations
 from gsbench.runs.layout import SEED
@@ -81,7 +82,11 @@ class ActiveDeclaration:
         keys = {trial.key for trial in arm}
         naming = [one for one in before if keys & one.planned.keys()] or before[:1]
         in_looks = [one for one in naming if one.looks]
-        old = [one for one in self.older if arm and _is_version_of(one, arm[0])]
+        old = [
+            one
+            for one in self.older
+            if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)
+        ]
         seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
         # first result could not be chosen by it.
@@ -144,14 +149,6 @@ class ActiveDeclaration:
         return notes + [
             Note.of("replaced", metric=one.primary, when=one.when) for one in self.earlier
         ]
-
-
-def _is_version_of(older: TrialResult, trial: TrialResult) -> bool:
-    """Return whether a trial of earlier code is one of the arm of ``trial``."""
-    values = dict(trial.variant)
-    return (older.init, older.densify) == (trial.init, trial.densify) and all(
-        str(older.config.get(key)) == value for key, value in values.items()
-    )
 
 
 def _places(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:

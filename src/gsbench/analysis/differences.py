@@ -17,15 +17,8 @@ from typing import Any
 import yaml
 
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import (
-    Arm,
-    Configured,
-    TrialPair,
-    TrialResult,
-    canonical,
-    group_by,
-    seeds_text,
-)
+from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
+from gsbench.analysis.trial_settings import Configured, canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED

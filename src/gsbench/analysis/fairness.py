@@ -21,8 +21,9 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, canonical, group_by, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
+from gsbench.analysis.trial_settings import canonical
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING

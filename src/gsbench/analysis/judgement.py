@@ -7,10 +7,12 @@ its pairs of trials from `gsbench.analysis.pairing.pair`.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from gsbench.analysis.differences import between_scenes_notes
+from gsbench.analysis.looks import look_levels
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
@@ -23,10 +25,11 @@ from gsbench.analysis.statistics import (
     LikeThese,
     Outcome,
     answer_family,
+    favoured,
     judge_like_these,
-    look_levels,
     t_test,
 )
+from gsbench.analysis.unfinished import Unfinished, one_sided
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.words import signed
 
@@ -41,7 +44,7 @@ FEW = 1.2
 class SceneVerdict:
     """The mean paired difference of one scene.
 
-    Its test is adjusted for all scenes of all questions.
+    Its test is adjusted for all scenes of all questions; without a test if one arm lacks results.
     """
 
     scene: str
@@ -63,6 +66,8 @@ class Verdict:
     ``seen`` are the arm's trials that were measured before the question. If there are any, each
     metric could have been chosen by its result, and the error rate is divided by the number of
     metrics.
+    ``lacking`` are trials of one arm without a result where the other arm has one; if the outcome
+    favoured that arm, the verdict ``favours_lacking`` and is undecided.
     """
 
     question: Question
@@ -78,6 +83,8 @@ class Verdict:
     outlying: tuple[TrialResult, ...] = ()
     outcome_without: Outcome | None = None
     rests_on_outlying: bool = False
+    lacking: tuple[Unfinished, ...] = ()
+    favours_lacking: bool = False
     seen: tuple[TrialResult, ...] = ()
     notes: tuple[Note, ...] = ()
 
@@ -158,12 +165,15 @@ class Verdict:
         return f"{self.shown(interval.low)} to {self.shown(interval.high)}"
 
 
-def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdict]:
+def judge(
+    trials: Sequence[TrialResult], declaration: Declaration, lacking: Sequence[Path] = ()
+) -> list[Verdict]:
     """The verdicts on the questions of ``declaration``, in their order.
 
-    Questions share the error rate. If seeds come in looks, each question gets an equal share
-    and is answered at the first look that decides it; otherwise Holm's method adjusts them as
-    one family. Secondary questions have an error rate of their own.
+    ``lacking`` are the folders of trials without a usable result; a look waits for its trials, so
+    they matter only without looks. Questions share the error rate. If seeds come in looks, each
+    question gets an equal share and is answered at the first look that decides it; otherwise
+    Holm's method adjusts them as one family. Secondary questions have an error rate of their own.
     """
     by_arm, by_folder = (
         group_by(trials, lambda trial: trial.arm),
@@ -177,6 +187,7 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
             return [trial for key in keys for trial in by_folder.get(key, [])]
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
+    unfinished = [Unfinished(path) for path in lacking]
     unjudged = [
         _with_pairs(trials_of(question), question, declaration)
         for question in declaration.questions
@@ -197,7 +208,10 @@ def judge(trials: Sequence[TrialResult], declaration: Declaration) -> list[Verdi
             differences = [unjudged[k].pairs.differences for k in family]
             answers = answer_family(differences, declaration.error_rate / candidates)
             for k, answer in zip(family, answers, strict=True):
-                judged[k] = _decide(replace(unjudged[k], family=len(family)), answer)
+                decided = _decide(replace(unjudged[k], family=len(family)), answer)
+                if unfinished:
+                    decided = _without_lacking(decided, trials_of(decided.question), unfinished)
+                judged[k] = decided
     return _with_scenes(judged, declaration.error_rate)
 
 
@@ -284,6 +298,28 @@ def _decide(verdict: Verdict, answer: Answer) -> Verdict:
     )
 
 
+def _without_lacking(
+    verdict: Verdict, trials: Sequence[TrialResult], unfinished: Sequence[Unfinished]
+) -> Verdict:
+    """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
+    lacking = one_sided(verdict.question, trials, unfinished)
+
+    def favours_lacking(outcome: Outcome) -> bool:
+        sides = favoured(outcome, verdict.question.sign, verdict.quantity.direction)
+        return any(lacking[side] for side in sides)
+
+    like, favours = verdict.like_these, favours_lacking(verdict.outcome)
+    if like is not None and favours_lacking(like.outcome):
+        like = replace(like, outcome=UNDECIDED)
+    return replace(
+        verdict,
+        outcome=UNDECIDED if favours else verdict.outcome,
+        like_these=like,
+        lacking=(*lacking[0], *lacking[1]),
+        favours_lacking=favours,
+    )
+
+
 def _contradicts(rest: float, mean: float, outcome: Outcome, least: float | None) -> bool:
     """Return whether ``rest``, the mean without outlying trials, contradicts ``outcome``.
 
@@ -340,10 +376,10 @@ def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
                 next(answers) if verdict.answer and len(verdict.pairs.rows) > 1 else verdict.answer
             )
             if answer is not None:
+                tested = row.scene not in {one.scene for one in verdict.lacking}
+                interval, p = (answer.interval, answer.p) if tested else (None, None)
                 scenes.append(
-                    SceneVerdict(
-                        row.scene, answer.mean, verdict.pairs.seeds, answer.interval, answer.p
-                    )
+                    SceneVerdict(row.scene, answer.mean, verdict.pairs.seeds, interval, p)
                 )
         completed.append(replace(verdict, scenes=tuple(scenes)))
     return completed

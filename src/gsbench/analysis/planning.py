@@ -13,18 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis.statistics import (
-    ALPHA,
+from gsbench.analysis.designs import (
     DESIGN_DRAWS,
     MAX_SCENES,
     MAX_SEEDS,
     POWER,
     Components,
     Design,
-    look_levels,
-    plan_looks,
     power_of_mean,
 )
+from gsbench.analysis.looks import look_levels, plan_looks
+from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.thresholds import Region, evenness
 
 COMMANDS = ("sweep", "looks", "check", "gate", "ledger")

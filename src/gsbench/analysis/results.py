@@ -5,7 +5,6 @@ A trial's folder is ``<runs>/<experiment>/<scene>/<init>-<densify>/<hash8>-seed<
 tables over thousands of trials start quickly.
 """
 
-import json
 import math
 import os
 import re
@@ -13,17 +12,22 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, TypeVar
 
+from gsbench.analysis.trial_settings import (
+    Configurations,
+    canonical,
+    load_flat_config,
+    settings_text,
+)
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
-from gsbench.runs.config_hash import is_hashed
 from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
 from gsbench.runs.experiments import Arm as Arm
 from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
 from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
-from gsbench.runs.nested import SHOWN, flatten
+from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
 from gsbench.system.machine import kind_of_machine
@@ -32,86 +36,8 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 MEAN_TOLERANCE = 1e-6  # relative: per-view values must average to the trial's metric
-# settings in which repetitions of a trial may differ
-UNCOUNTED = ("eval.primary", "eval.controls", "densify.switches", "scene.path", "hydra.")
-GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
-ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
+FOREIGN = "foreign"  # first word about a folder that is no trial of the experiment
 TRIAL_FOLDER = re.compile(rf"(?P<hash>[0-9a-f]{{8}}){SEED}(?P<seed>\d+)")
-
-
-class Configurations:
-    """The settings that determine results, of all trials of an experiment.
-
-    Each file is read once for all seeds. ``trial`` is the key that the seeds of a trial share
-    (`TrialResult.key`). ``known`` has, by this key, the settings of trials that have not run
-    and thus have no file.
-    """
-
-    def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-        self._known: dict[str, Mapping[str, Any]] = dict(known or {})
-
-    def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
-        """A trial's settings, read from ``folder`` or from an earlier seed; {} if unreadable."""
-        if trial not in self._known:
-            self.read(trial, [folder])
-        return self._known[trial]
-
-    def read(self, trial: str, folders: Iterable[Path]) -> str:
-        """Read a trial's settings from its first readable folder; return "", or the last fault."""
-        fault = ""
-        for folder in folders:
-            try:
-                config = load_flat_config(folder)
-            except FileNotFoundError:
-                fault = f"{CONFIG} is not there"
-            except DamagedError as error:
-                fault = f"{error.path.name} {error.reason}"
-            else:
-                self._known[trial] = {key: value for key, value in config.items() if is_hashed(key)}
-                return ""
-        self._known.setdefault(trial, {})
-        return fault
-
-
-def load_flat_config(folder: Path) -> dict[str, Any]:
-    """The configuration of the trial in ``folder`` with dotted keys.
-
-    Raises FileNotFoundError and DamagedError.
-    """
-    values = TrialFolder(folder).settings()
-    if not isinstance(values, dict) or not all(
-        isinstance(values.get(group), dict) for group in GROUPS
-    ):
-        raise DamagedError(
-            folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}"
-        )
-    return flatten(values)
-
-
-def canonical(value: object) -> str:
-    """JSON text that is equal for equal values."""
-    if type(value) is int or (type(value) is float and math.isfinite(value)):
-        return repr(value)  # the same text as JSON's, but faster: most settings are numbers
-    return ENCODER.encode(value)
-
-
-class Configured(Protocol):
-    """A trial with its place and its settings, finished or only planned."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def scene(self) -> str: ...
-    @property
-    def init(self) -> str: ...
-    @property
-    def densify(self) -> str: ...
-    @property
-    def config_hash(self) -> str: ...
-    @property
-    def config(self) -> Mapping[str, Any]: ...
-    @property
-    def key(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -234,7 +160,7 @@ class TrialResult:
         """The hash of the initial model's files (cameras, poses, points); "" if unrecorded."""
         return self.record.hashes.get("cloud", "")
 
-    @property
+    @cached_property
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of the file."""
         moment = unix_time(self.record.measured)
@@ -315,7 +241,8 @@ TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one o
 class Experiment:
     """The usable trials of an experiment, and a line for each trial folder that cannot be used.
 
-    ``older`` are trials of earlier code that `newest_code` left out.
+    ``older`` are trials of earlier code that `newest_code` left out. ``lacking`` are the folders of
+    trials without a usable result: they failed, were stopped, or are damaged.
     """
 
     name: str
@@ -323,6 +250,7 @@ class Experiment:
     trials: tuple[TrialResult, ...]
     warnings: tuple[str, ...]
     older: tuple[TrialResult, ...] = ()
+    lacking: tuple[Path, ...] = ()
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -384,7 +312,12 @@ def read_experiment(folder: Path) -> Experiment:
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
-    return Experiment(folder.name, folder, tuple(usable), tuple(warnings))
+    lacking = tuple(
+        path
+        for path, fault in sorted(faults.items())
+        if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
+    )
+    return Experiment(folder.name, folder, tuple(usable), tuple(warnings), lacking=lacking)
 
 
 def newest_code(experiment: Experiment) -> Experiment:
@@ -418,18 +351,6 @@ def newest_code(experiment: Experiment) -> Experiment:
     )
 
 
-def settings_text(config: Mapping[str, Any]) -> str:
-    """The settings that determine a result, as text that is equal for equal settings."""
-    # A missing key counts as unset: trials from before a setting existed equal later ones.
-    return canonical(
-        {
-            key: value
-            for key, value in config.items()
-            if value is not None and is_hashed(key) and not key.startswith(UNCOUNTED)
-        }
-    )
-
-
 def _left_out_line(made: Sequence[TrialResult], newest: TrialResult) -> str:
     """``sw/garden/sfm-mine seeds 0, 1: left out, made by an earlier mine (3fa9c1d2, now …)``"""
     parts = dict.fromkeys([*newest.code, *made[0].code], "none")
@@ -448,8 +369,8 @@ def _read_settings(trials: Sequence[TrialResult], settings: Configurations) -> d
     ones. Other trials' files are not opened here, which saves time.
     """
     faults: dict[str, str] = {}
-    for own in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
-        by_key = group_by(own, lambda trial: trial.key)
+    for of_arm in group_by(trials, lambda trial: trial.key.rpartition("/")[0]).values():
+        by_key = group_by(of_arm, lambda trial: trial.key)
         if len(by_key) > 1:
             faults |= {
                 key: settings.read(key, [trial.path for trial in same])
@@ -508,7 +429,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         raise _UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
-        raise _UnusableError("foreign, the folder is not named <hash8>-seed<k>")
+        raise _UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
     recorded = {
         "experiment": record.experiment,
         "scene": record.scene,
@@ -518,11 +439,13 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     names = (*path.relative_to(runs_dir).parts[-4:-1], match["seed"])
     for (key, value), name in zip(recorded.items(), names, strict=True):
         if value != name:
-            raise _UnusableError(f"foreign, its {RESULTS} is of {key} {value!r}")
+            raise _UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
 
 
 def _why_unfinished(path: Path) -> str:
     if (path / FAILED).exists():
         return f"failed, {TrialFolder(path).failure().reason}"
-    return f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else "foreign, not a trial"
+    return (
+        f"unfinished, no {RESULTS} yet" if (path / CONFIG).is_file() else f"{FOREIGN}, not a trial"
+    )

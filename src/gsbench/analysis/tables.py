@@ -24,21 +24,11 @@ from gsbench.analysis.differences import (
     differing_code,
     differing_conditions,
 )
-from gsbench.analysis.fairness import caveats
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.analysis.trial_notes import (
-    LEARNT_NOTHING,
-    cloud_notes,
-    doubt_notes,
-    edited_notes,
-    held_out_notes,
-    machine_notes,
-    origin_notes,
-    points_notes,
-)
+from gsbench.analysis.table_notes import LEARNT_NOTHING, trials_notes
 from gsbench.eval.facts import find_metric
 from gsbench.words import counted
 
@@ -90,10 +80,10 @@ def build_table(
     scenes = sorted({trial.scene for trial in trials})
     scene_index = fields.index("scene") if "scene" in fields else None
     cells: dict[Position, Cell] = {}
-    for row, one, column in itertools.product(row_labels, quantities, column_labels):
+    for row, quantity, column in itertools.product(row_labels, quantities, column_labels):
         own_scenes = scenes if scene_index is None else [(*row, *column)[scene_index]]
-        cells[row, column, one.key] = make_cell(
-            groups.get((*row, *column), []), one, own_scenes, expected
+        cells[row, column, quantity.key] = make_cell(
+            groups.get((*row, *column), []), quantity, own_scenes, expected
         )
     bold, notes = _best(cells, quantities, scene_index)
     shown = _rows(cells, bold, quantities)
@@ -106,11 +96,11 @@ def build_table(
         best = set() if notes else _best(means, quantities, None)[0]
         shown += _rows(means, best, quantities, ruled=True)
     headings = []
-    for one, column in itertools.product(quantities, column_labels):
-        above, text = "", one.heading
+    for quantity, column in itertools.product(quantities, column_labels):
+        above, text = "", quantity.heading
         if columns:
             above, text = text, " + ".join(names.get(value, value) for value in column)
-        headings.append(Column(above, text, (one.key, "+".join(column))))
+        headings.append(Column(above, text, (quantity.key, "+".join(column))))
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
     notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
@@ -142,7 +132,7 @@ def _rows(
 
     A cell over fewer scenes than the others says how many.
     """
-    quantity_of = {one.key: one for one in quantities}
+    quantity_of = {quantity.key: quantity for quantity in quantities}
     most_scenes = max((cell.scenes for cell in cells.values()), default=0)
     rows: list[Row] = []
     for labels, positions in group_by(cells, lambda position: position[0]).items():
@@ -178,14 +168,14 @@ def _best(
             (position for position in cells if position[2] == quantity.key), scene_and_split
         )
         for (scene, _), positions in rivals.items():
-            own = {position: cells[position] for position in positions}
-            shown = itertools.chain(*(cell.trials for cell in own.values()))
+            compared = {position: cells[position] for position in positions}
+            shown = itertools.chain(*(cell.trials for cell in compared.values()))
             by_scene = group_by(shown, lambda trial: trial.scene).values()
             differing = sorted(set().union(*map(differing_conditions, by_scene)))
             if differing:
                 notes.append(Note.of("no best", place=scene or "arms", conditions=differing))
             else:
-                bold |= best_cells(own, quantity)
+                bold |= best_cells(compared, quantity)
     return bold, list(dict.fromkeys(notes))
 
 
@@ -220,17 +210,17 @@ def _means(
                     left.remove(scene)
         return left
 
-    shared_scenes = {one.key: shared(one) for one in quantities}
+    shared_scenes = {quantity.key: shared(quantity) for quantity in quantities}
     most_scenes = max(map(len, shared_scenes.values()))
     if most_scenes == 0:
         return {}
     label = f"mean of {counted(most_scenes, 'scene')}"
     cells: dict[Position, Cell] = {}
-    for row, one, column in itertools.product(mean_rows, quantities, column_labels):
-        own_scenes = shared_scenes[one.key]
-        own = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
+    for row, quantity, column in itertools.product(mean_rows, quantities, column_labels):
+        own_scenes = shared_scenes[quantity.key]
+        averaged = list(itertools.chain(*(trials(row, column, scene) for scene in own_scenes)))
         labels = (*row[:scene_index], label, *row[scene_index:])
-        cells[labels, column, one.key] = make_cell(own, one, own_scenes, expected)
+        cells[labels, column, quantity.key] = make_cell(averaged, quantity, own_scenes, expected)
     return cells
 
 
@@ -240,7 +230,7 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
     ``trials`` have their variants.
     """
     by_arm = group_by(trials, lambda trial: trial.arm).values()
-    return any(conditions_between_scenes(own) or differing_code(own) for own in by_arm)
+    return any(conditions_between_scenes(of_arm) or differing_code(of_arm) for of_arm in by_arm)
 
 
 def _reading_notes(
@@ -272,39 +262,6 @@ def _natural(key: Labels) -> tuple[tuple[int, float, str], ...]:
         except ValueError:
             parts.append((1, 0.0, text))
     return tuple(parts)
-
-
-def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Note]:
-    """All notes on ``trials`` of an experiment and on its comparisons."""
-    return [
-        *doubt_notes(trials),
-        *origin_notes(trials),
-        *edited_notes(trials),
-        *comparison_notes(experiment),
-        *held_out_notes(trials),
-        *points_notes(trials),
-        *machine_notes(trials),
-        *cloud_notes(trials),
-    ]
-
-
-def comparison_notes(experiment: Experiment) -> list[Note]:
-    """Notes on the compared arms: the verdicts, what no verdict uses, and caveats.
-
-    They are about the whole experiment, so choosing the trials that a table shows cannot change a
-    verdict.
-    """
-    # here, since SciPy is slow to import
-    from gsbench.analysis.comparison import compare
-
-    comparison = compare(experiment)
-    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
-    between = [
-        note
-        for first, second in comparison.pairs
-        for note in caveats([*by_arm[first], *by_arm[second]], first, second)
-    ]
-    return [*comparison.notes(), *between]
 
 
 # Spearman's rank correlation with viewers' scores of trained 3DGS models: Chen et al. 2025, MUGSQA

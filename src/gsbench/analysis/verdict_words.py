@@ -13,6 +13,7 @@ from gsbench.analysis.statistics import (
     Outcome,
     exact_for,
 )
+from gsbench.analysis.unfinished import lacking_words
 from gsbench.analysis.verdicts import DECLARED, SECONDARY, PairVerdicts
 from gsbench.words import counted, least_text, some_of
 
@@ -66,6 +67,8 @@ def reason(verdict: Verdict, early: str = "") -> str:
         return MISSING
     if verdict.outcome != UNDECIDED:
         return f"{outcome_words(verdict)}{_known_sign(verdict)}"
+    if verdict.favours_lacking:
+        return "undecided, since trials of one arm alone failed"
     if verdict.rests_on_outlying:
         return "undecided, since it depends on trials far outside the others"
     return early or f"undecided{' by all seeds' if verdict.final else ' so far'}"
@@ -80,7 +83,7 @@ def in_words(verdict: Verdict, early: str = "") -> str:
     if verdict.interval is None or verdict.untestable is not None:
         return reason(verdict)
     named = early or f"{outcome_words(verdict)}{_known_sign(verdict)}"
-    if verdict.rests_on_outlying:
+    if verdict.favours_lacking or verdict.rests_on_outlying:
         named = reason(verdict)
     text = f"{named} in {verdict.quantity.name} on {_scope(verdict)}: {numbers(verdict)}"
     if planned := verdict.question.seeds:
@@ -155,17 +158,18 @@ def like_these_words(verdict: Verdict) -> str:
 
 
 def outlying_words(verdict: Verdict) -> str:
-    """The outlying trials of a verdict in words; "" if there are none.
+    """The outlying trials, and the missing ones that make it undecided, in words; "" for none.
 
     For example ``far outside the other seeds: garden/sfm-adc/…-seed3; without it: undecided``.
     """
-    if not verdict.outlying:
-        return ""
-    labels, word = (
-        some_of([trial.label for trial in verdict.outlying]),
-        WORDS[verdict.outcome_without or "undecided"],
-    )
-    return f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
+    parts = [lacking_words(verdict.lacking)] if verdict.favours_lacking else []
+    if verdict.outlying:
+        labels = some_of([trial.label for trial in verdict.outlying])
+        word = WORDS[verdict.outcome_without or "undecided"]
+        parts.append(
+            f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
+        )
+    return "; ".join(parts)
 
 
 def p_text(p: float) -> str:
@@ -204,12 +208,14 @@ def sentence(judged: PairVerdicts) -> str:
         details = [line for line in (like_these_words(first), outlying_words(first)) if line]
         words = "; ".join([in_words(first), *details])
         return f"{against}: {waits}{words}. The metric was declared beforehand."
+    in_doubt = [one for one in verdicts if one.favours_lacking][:1]
     if all(one.interval is None for one in verdicts):
         return f"{against}: no verdict, {TOO_FEW.format(where)}."
     return (
         f"{against}, on {where}: {_by_word(verdicts, with_numbers=True)}. Exploratory: "
         f"{_why_exploratory(judged)}, so all metrics count, adjusted for their number "
         f"({max(one.family for one in verdicts)})."
+        + "".join(f" Undecided: {lacking_words(one.lacking)}." for one in in_doubt)
     )
 
 

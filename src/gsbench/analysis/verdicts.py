@@ -13,9 +13,11 @@ Holm (1979). So a further arm never changes the verdict on another one.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration, Standing
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import (
@@ -25,7 +27,6 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
-from gsbench.analysis.statistics import seeds_needed
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
@@ -77,10 +78,11 @@ def judge_pairs(
     trials: Sequence[TrialResult],
     pairs: Sequence[ArmPair],
     declared: ActiveDeclaration | None = None,
+    lacking: Sequence[Path] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
-    ``declared`` defines the families of tests.
+    ``declared`` defines the families of tests; ``lacking`` are folders of trials without a result.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primary = None if declared is None else asked_quantity(declared.metric, trials)
@@ -97,7 +99,8 @@ def judge_pairs(
             if metric.direction:
                 question = _question(by_arm, pair, metric, declared, standings.get(pair))
                 asked.append((pair, metric, question))
-    verdicts = _judge_families(trials, [(pair, own) for pair, _, own in asked], standings)
+    questions = [(pair, own) for pair, _, own in asked]
+    verdicts = _judge_families(trials, questions, standings, lacking)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0][0])
     judged = []
     for pair in pairs:
@@ -130,6 +133,7 @@ def _judge_families(
     trials: Sequence[TrialResult],
     asked: Sequence[tuple[ArmPair, Question]],
     standings: Mapping[ArmPair, Standing],
+    lacking: Sequence[Path],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair."""
 
@@ -162,7 +166,7 @@ def _judge_families(
                 looks=looks,
             )
         places = [place for place, _ in own]
-        verdicts |= dict(zip(places, judge(trials, declaration), strict=False))
+        verdicts |= dict(zip(places, judge(trials, declaration, lacking), strict=False))
     return [verdicts[place] for place in range(len(asked))]
 
 

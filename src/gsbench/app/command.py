@@ -8,7 +8,7 @@ another (`gsbench.app.other_sweepers`).
 import logging
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from hydra.errors import HydraException
@@ -37,11 +37,9 @@ from gsbench.launch.batch import check_parts, missing_folders, need_no_check, ru
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
-from gsbench.tracking.mlflow_sink import VARIABLE, untyped_address
 
 # the errors of Hydra for a user's words and files
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, OSError)
-TRACKER = "tracking.uri"
 HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
 
 log = logging.getLogger(__name__)
@@ -60,26 +58,16 @@ def launch(argv: list[str]) -> int:
     return summarize(task.outcomes, task.trials)
 
 
-def compose_trials(words: Sequence[str], multirun: bool = False) -> list[Trial]:
-    """The trials that a command line would run."""
-    task = TrialTask(lambda trials: [], look_only=True)
-    run_app(words, multirun, task)
-    return task.trials
+def compose_trials(
+    words: Sequence[str], multirun: bool = False, typed: Sequence[str] | None = None
+) -> list[Trial]:
+    """The trials that a command line would run.
 
-
-def check_trackers(trials: Iterable[Trial], typed: Sequence[str]) -> None:
-    """Raise InputError for a trial that would send results to an address that only a file names.
-
-    The runs folder may be somebody else's, and the address theirs. ``typed`` are the user's words.
+    Only the words ``typed`` by the user (default: all ``words``) give permissions.
     """
-    typed_uri = next((word.partition("=")[2] for word in typed if key_of(word) == TRACKER), None)
-    for trial in trials:
-        if address := untyped_address(trial.values["tracking"], typed_uri):
-            raise InputError(
-                f"{trial.files.label} would send its results to {address}, an address from a file: "
-                f"to allow it, type {TRACKER}={address} (for a trial in no plan: set "
-                f"{VARIABLE}={address}); tracking=none sends nothing"
-            )
+    task = TrialTask(lambda trials: [], look_only=True)
+    run_app(words, multirun, task, typed)
+    return task.trials
 
 
 def one_trial_per_scene(verb: str, settings: Sequence[str], metric: str) -> dict[str, Trial]:
@@ -114,21 +102,25 @@ def run_trials(trials: Sequence[Trial]) -> int:
     return summarize(run_batch(trials), trials)
 
 
-def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
+def run_app(
+    words: Sequence[str], multirun: bool, task: TrialTask, typed: Sequence[str] | None = None
+) -> None:
     """Run ``task`` for a command line's trials: one, or many (``multirun``, an experiment).
 
-    Raises InputError with one line for a wrong configuration.
+    Only the words ``typed`` by the user (default: all) give permissions; others are for a task that
+    only looks. Raises InputError with one line for a wrong configuration.
     """
     check_words(words)
+    typed = words if typed is None else typed
     with compose.hydra_ready():
-        config, multirun = _checked_config(words, multirun)
+        config, multirun = _checked_config(words, multirun, typed)
         task.allowed = tuple(config[PERMISSIONS])
         other = other_sweeper(config) if multirun else ""
         if other and task.look_only:
             words, multirun = words_without_sweeper(config, words, other)
             if not multirun:
                 task.handle = lambda trials: []  # trials with other values are not listed
-            config, other = compose.compose_whole([*words, _mode_word(multirun)]), ""
+            config, other = compose.compose_whole([*words, _mode_word(multirun)], typed), ""
         if not other:
             task.grids = OmegaConf.to_container(config.hydra.sweeper, resolve=False).get("grids")  # type: ignore[union-attr]
         # The grids are taken out: Hydra would resolve their ${…} when it makes the sweeper, before
@@ -136,7 +128,7 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         argv = [*words, *[f"{GRIDS}=[]"] * bool(task.grids)]
         if task.look_only:
             if task.grids:
-                config = compose.compose_whole([*argv, _mode_word(multirun)])
+                config = compose.compose_whole([*argv, _mode_word(multirun)], typed)
             with compose.explained(words, HYDRA_ERRORS):
                 _look(config, words, multirun, task)
             return
@@ -172,10 +164,12 @@ def run_app(words: Sequence[str], multirun: bool, task: TrialTask) -> None:
         log.info("hydra/sweeper=%s: %s", other, best)
 
 
-def _checked_config(words: Sequence[str], multirun: bool) -> tuple[DictConfig, bool]:
+def _checked_config(
+    words: Sequence[str], multirun: bool, typed: Sequence[str]
+) -> tuple[DictConfig, bool]:
     """The whole configuration of ``words``, and whether it is a sweep."""
     # without -m, a file may say that it is a sweep
-    config = compose.compose_whole([*words, _mode_word(True)] if multirun else words)
+    config = compose.compose_whole([*words, _mode_word(True)] if multirun else words, typed)
     multirun = config.hydra.mode == RunMode.MULTIRUN
     swept = [word for word in words if is_sweep(word)]
     if swept and not multirun:

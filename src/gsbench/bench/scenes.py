@@ -24,6 +24,8 @@ SIGMA_SPREAD = 0.7  # standard deviation of log sigma
 # Skewed scene: number of spots, share of Gaussians in them, standard deviation of x/z and y/z. For
 # comparison, a trained courtyard has 117 entries per block on average, and at most 1,054.
 SPOTS, SPOT_SHARE, SPOT_RADIUS = 40, 0.5, 0.05
+# Crowded scene: share of Gaussians over one tile, and its side in units of the field of view's.
+CROWD_SHARE, CROWD_SIDE = 0.05, 0.007
 BOX_DEPTH, BOX_SIDE = 4.0, 4.0  # random scene: depth of its centre, and side
 NEIGHBOUR = 0.7  # distance to the nearest neighbours in units of count^-1/3, approximately
 INITIAL_OPACITY = 0.1  # 3DGS
@@ -91,7 +93,27 @@ def skewed_gaussians(count: int, seed: int = SEED) -> Gaussians:
     return gaussians
 
 
-SCENES = {"trained": trained_like_gaussians, "random": random_gaussians, "skewed": skewed_gaussians}
+def crowded_gaussians(count: int, seed: int = SEED) -> Gaussians:
+    """Make `trained_like_gaussians`, but a twentieth of them is over one tile near the middle.
+
+    So it is in a picture of 1600x1060 px. There the longest list is several hundred times the mean;
+    a rasterizer in which one program composites a list is as slow as this one.
+    """
+    gaussians = trained_like_gaussians(count, seed)
+    slopes = gaussians.means[:, :2] / gaussians.means[:, 2:]  # [N, 2]
+    # Moved to one side of the middle, which is often a border between tiles.
+    crowded = CROWD_SIDE * (slopes - slopes.amin(0)) * gaussians.means[:, 2:]
+    moved = torch.arange(count) < CROWD_SHARE * count  # [N]; the first are as random as the others
+    gaussians.means[:, :2] = torch.where(moved[:, None], crowded, gaussians.means[:, :2])
+    return gaussians
+
+
+SCENES = {
+    "trained": trained_like_gaussians,
+    "random": random_gaussians,
+    "skewed": skewed_gaussians,
+    "crowded": crowded_gaussians,
+}
 
 
 def make_scene(

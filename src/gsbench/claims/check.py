@@ -162,7 +162,7 @@ def prepare(
                 words = (*own, f"name={file.name}", "seed=0", *permissions)
                 if words not in composed:
                     where = f"claim {claim.id}, scene {scene}, arm {arm}"
-                    composed[words] = _compose(words, runs, where)
+                    composed[words] = _compose(words, permissions, runs, where)
                 trials.append(composed[words])
             if lacking := [*find_missing(trials[:1]), *find_missing(trials[1:])]:
                 reasons.setdefault(lacking[0], []).append(scene)
@@ -257,9 +257,9 @@ def _check_same_claims(file: ClaimsFile, declaration: Declaration) -> None:
         raise InputError(f"the file lacks claims that were declared: {', '.join(sorted(unknown))}")
 
 
-def _compose(words: Sequence[str], runs: Path, where: str) -> Trial:
+def _compose(words: Sequence[str], typed: Sequence[str], runs: Path, where: str) -> Trial:
     try:
-        trial = compose_one(words)
+        trial = compose_one(words, typed)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return Trial(trial.values | {"runs": str(runs.resolve())}, trial.overrides)

@@ -8,12 +8,12 @@ from pathlib import Path
 from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import caveats, fairness_table
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.charts import ForestRow, forest_plot
 from gsbench.analysis.results import TrialResult, group_by, seeds_text
-from gsbench.analysis.statistics import plan_looks
 from gsbench.analysis.table_formats import Table, fill
-from gsbench.analysis.trial_notes import cloud_notes, machine_notes
+from gsbench.analysis.table_notes import cloud_notes, machine_notes
 from gsbench.analysis.verdict_words import like_these_words, outlying_words
 from gsbench.claims.check import NOT_TESTABLE, Checked, ClaimVerdict
 from gsbench.runs.experiments import Declaration

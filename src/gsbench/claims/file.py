@@ -32,8 +32,9 @@ from typing import Annotated, Any, Literal
 
 from annotated_types import Interval, Predicate, doc
 
+from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.quantities import askable_names, asked_quantity
-from gsbench.analysis.statistics import ALPHA, FIRST_LOOK, plan_looks
+from gsbench.analysis.statistics import ALPHA
 from gsbench.config.command_words import value_text
 from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError

@@ -10,21 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from gsbench.analysis.designs import POWER, Design, power_of_mean
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.looks import FIRST_LOOK, look_levels, plan_looks
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import (
-    FIRST_LOOK,
-    POWER,
-    REFUTED,
-    SUPPORTED,
-    TOO_SMALL,
-    UNDECIDED,
-    Design,
-    look_levels,
-    plan_looks,
-    power_of_mean,
-)
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
 from gsbench.analysis.verdict_words import in_words, least_words, with_notes
 from gsbench.claims.file import LeastEffect, read_least
 from gsbench.claims.stopping import Asked, facts_for
@@ -52,7 +43,9 @@ def ask_gate(declaration: Declaration, baseline: ReadTrials, new: ReadTrials) ->
 def _versions(sides: Mapping[str, ReadTrials]) -> ReadTrials:
     """A function that reads the trials of all versions, with the versions in their keys."""
     return lambda: [
-        replace(trial, config_hash=version) for version, read in sides.items() for trial in read()
+        one if one.config_hash == version else replace(one, config_hash=version)
+        for version, read in sides.items()
+        for one in read()
     ]
 
 

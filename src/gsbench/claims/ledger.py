@@ -13,10 +13,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from gsbench.analysis.comparison import unused_trials
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, plan_looks
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.analysis.verdict_words import least_words, reason, with_notes
 from gsbench.claims.stopping import Asked
 from gsbench.errors import InputError

@@ -15,17 +15,11 @@ import yaml
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import choose_pairs
-from gsbench.analysis.results import (
-    GROUPS,
-    Arm,
-    TrialResult,
-    group_by,
-    newest_code,
-    read_experiment,
-)
-from gsbench.analysis.statistics import FIRST_LOOK, plan_looks
+from gsbench.analysis.results import Arm, TrialResult, group_by, newest_code, read_experiment
+from gsbench.analysis.trial_settings import GROUPS
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric

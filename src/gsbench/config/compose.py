@@ -96,16 +96,20 @@ class Trial:
         return self.files.path
 
 
-def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfig:
+def compose_whole(
+    words: Sequence[str], typed: Sequence[str] | None = None, modules: str | None = None
+) -> DictConfig:
     """Compose the configuration of ``words`` with Hydra's node, and check what it may run.
 
-    Words that list several values are left out. From here on Python finds the modules that
-    ``words`` allow in the folder ``modules`` (default: the current one). Raises InputError with one
-    line. Call it within `hydra_ready`.
+    Only the words ``typed`` by the user (default: all ``words``) give permissions. Words that list
+    several values are left out. From here on Python finds the modules that are allowed in the
+    folder ``modules`` (default: the current one). Raises InputError with one line. Call it within
+    `hydra_ready`.
     """
     # The order matters: Hydra imports packages of the search path while it composes, so they are
     # checked first.
-    allowed = command_words.typed_permissions(words)
+    typed = words if typed is None else typed
+    allowed = command_words.typed_permissions(typed)
     command_words.check_search_path(words, allowed)
     check_files(command_words.searched_folders(words))
     allow_modules(allowed, os.getcwd() if modules is None else modules)
@@ -113,9 +117,18 @@ def compose_whole(words: Sequence[str], modules: str | None = None) -> DictConfi
         # Hydra only warns of a folder in its search path that does not exist.
         warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")
         single = [word for word in words if not command_words.is_sweep(word)]
-        return enforce_permissions(
-            hydra.compose(CONFIG_NAME, single, return_hydra_config=True), allowed
-        )
+        config = hydra.compose(CONFIG_NAME, single, return_hydra_config=True)
+        if config.tracking.get("uri"):
+            allowed += typed_address(typed)
+        return enforce_permissions(config, allowed)
+
+
+def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
+    """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
+    own = ("tracking", "hydra.searchpath")
+    words = [word for word in typed if command_words.key_of(word).startswith(own)]
+    config = hydra.compose(CONFIG_NAME, words)
+    return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
 
 
 def check_files(folders: Sequence[Path]) -> None:
@@ -200,14 +213,13 @@ def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
         return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 
-def compose_one(overrides: Sequence[str], modules: str | None = None) -> Trial:
-    """The single trial that ``overrides`` describe.
-
-    The folder ``modules`` (default: the current one) is where the user's modules are looked for.
-    """
+def compose_one(
+    overrides: Sequence[str], typed: Sequence[str] | None = None, modules: str | None = None
+) -> Trial:
+    """The single trial that ``overrides`` describe; `compose_whole` says what the others mean."""
     command_words.check_single(overrides, "choose one")
     with hydra_ready():
-        return resolve_trial(compose_whole(overrides, modules), overrides)
+        return resolve_trial(compose_whole(overrides, typed, modules), overrides)
 
 
 def resolve_trial(config: DictConfig, overrides: Sequence[str]) -> Trial:

@@ -23,6 +23,7 @@ from omegaconf.grammar_parser import parse
 from gsbench.errors import InputError
 from gsbench.external.settings import program_of
 from gsbench.runs.nested import TARGET, entries_of, targets_in
+from gsbench.settings import foreign_address
 from gsbench.system.own_modules import allowed_modules
 from gsbench.words import did_you_mean
 
@@ -35,6 +36,16 @@ COMPONENTS = ("init", "densify", "raster")
 EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")
 # the permissions for shell lines, and for unusual options of Slurm
 SHELL, SBATCH = "bash", "sbatch"
+# Where gsbench and Hydra write, by gsbench's own configuration (None: what the installed packages
+# say). Only the command line chooses another place: Hydra would overwrite a ``config.yaml`` there.
+WRITTEN = {
+    "runs": "${oc.env:GSBENCH_RUNS,runs}",
+    "hydra.run.dir": None,
+    "hydra.sweep.dir": None,
+    "hydra.sweep.subdir": None,
+    "hydra.output_subdir": None,
+    "hydra.job.name": None,
+}
 # Variables that a configuration may set: they choose numbers of threads and devices. This is a list
 # of harmless ones, since no list of dangerous ones could be complete: MPLBACKEND imports a module,
 # NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load libraries, CC names a
@@ -60,7 +71,7 @@ SBATCH_RESOURCES = frozenset(
     thread_spec threads_per_core time time_min tmp use_min_nodes wckey
     """.split()  # noqa: SIM905
 )
-UNQUOTED = re.compile(r"[\w./+-]+")  # a name that needs no quotes in a list on the command line
+UNQUOTED = re.compile(r"[\w./:+-]+")  # a name that needs no quotes in a list on the command line
 
 # ---- Hydra's own settings
 SPECIAL_KEYS = (  # keys by which Hydra instantiates objects, beside _target_
@@ -106,7 +117,7 @@ HYDRAS_VALUES = ("${hydra_override_dirname:}", "${hydra_deprecated_override_dirn
 PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")
 # Settings that a sweep in a file may not vary: its jobs are composed after the check of the whole
 # configuration.
-NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|{PERMISSIONS})\s*([./@:=\[]|$)")
+NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|runs|{PERMISSIONS})\s*([./@:=\[]|$)")
 
 
 def is_allowed(target: str, allowed: Sequence[str]) -> bool:
@@ -204,6 +215,11 @@ def check_permissions(values: Mapping[str, Any]) -> None:
     if is_external(values["densify"]):
         check_program(values["densify"], allowed)
     _check_launch(values["launch"], allowed)
+    if address := foreign_address(values["tracking"], allowed):
+        raise InputError(
+            f"results would go to {address}, which only a file names; if you trust it, "
+            f"{permission_advice([address], allowed)}; tracking=none sends nothing"
+        )
 
 
 def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
@@ -239,6 +255,27 @@ def check_composed(
             )
     for place, target in targets_in(raw):
         _check_place(place, target, allowed)
+    if "hydra" in raw:
+        _check_written(raw, {"hydra": installed})
+
+
+def _check_written(raw: Mapping[str, Any], installed: Mapping[str, Any]) -> None:
+    """Refuse a place to write that is neither gsbench's own nor typed."""
+    words = [word for own in raw["hydra"]["overrides"].values() for word in own]
+    typed = {word.partition("=")[0].lstrip("+~") for word in words}
+    for key, own in WRITTEN.items():
+        given, usual = (_value_at(key, values) for values in (raw, installed))
+        if key not in typed and given not in (None, own or usual):
+            raise InputError(
+                f"a file sets {key}={given}, a place to write: type it on the command line"
+            )
+
+
+def _value_at(key: str, values: Any) -> Any:
+    """The value of a dotted ``key``; None without it."""
+    for part in key.split("."):
+        values = values.get(part) if isinstance(values, Mapping) else None
+    return values
 
 
 def _differing(given: Any, installed: Any) -> Any:

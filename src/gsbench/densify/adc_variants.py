@@ -213,7 +213,7 @@ class SteepGS(ADC):
         # per world unit squared, since the last refinement
         "splitting_sum": Statistic(torch.float32, (3, 3))
     }
-    needs_splitting_matrix = True
+    needs_extra = "splitting_matrix"
 
     SWITCHES: ClassVar[Mapping[str, Switch]] = {
         "saddle": Switch(
@@ -229,7 +229,7 @@ class SteepGS(ADC):
     def observe(self, step: int, render: RenderOutput) -> None:
         super().observe(step, render)
         if step < self.stop:
-            self.statistics["splitting_sum"] += render.require_splitting_matrix()
+            self.statistics["splitting_sum"] += render.require_extra()
 
     def steepest(self, where: Tensor) -> tuple[Tensor, Tensor]:
         """The least eigenvalue [S] of each mean splitting matrix, and its eigenvector [S, 3].

@@ -91,7 +91,7 @@ class Budgeted(Densifier):
       (`govern`).
 
     Under ``soft`` and ``hard``, the training may also set a limit for each round
-    (``train.resolution_schedule``).
+    (`gsbench.densify.base.CountSchedule`).
 
     A subclass calls `allowance` before it adds Gaussians. To support ``freeze`` and ``governor``,
     it also overrides `forecast`, and multiplies its growth thresholds by ``strictness`` and its
@@ -170,9 +170,10 @@ class Budgeted(Densifier):
         """The number of Gaussians that may be added now; None: no limit."""
         count = len(refinement.gaussians)
         allowed = allowance(count, self.limit(refinement.step), self.cap)
-        if self.context.limit is None or self.cap not in ("soft", "hard"):
+        schedule = self.context.schedule
+        if schedule is None or self.cap not in ("soft", "hard"):
             return allowed
-        most = self.context.limit(refinement, self.max_gaussians if self.cap == "hard" else None)
+        most = schedule.limit(refinement, self.max_gaussians if self.cap == "hard" else None)
         return max(0, most - count) if allowed is None else max(0, min(allowed, most - count))
 
     def forecast(self, refinement: Refinement) -> int:

@@ -47,6 +47,10 @@ class GivenCameras(Initializer):
     def __post_init__(self) -> None:
         check_settings(self, "init")
 
+    def needs_reference(self, capture: Capture) -> bool:
+        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
+        return capture.model is None
+
     def run(
         self,
         capture: Capture,
@@ -112,6 +116,9 @@ class Dataset(GivenCameras):
 
     points_from: PointsFrom = "all"
 
+    def needs_reference(self, capture: Capture) -> bool:
+        return False  # it takes the points of the capture's own model, so it cannot do without one
+
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
@@ -137,24 +144,24 @@ class Dataset(GivenCameras):
 class PlacedCloud(GivenCameras):
     """Base of initialisers that replace the reference's points. Subclasses are dataclasses."""
 
-    def needs_reference(self, capture: Capture) -> bool:
-        """Return whether `run` needs a ``reference`` because the capture came without cameras."""
-        return capture.model is None
-
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
-        import pycolmap
-
-        cloud = self.cloud(capture, model)
-        model.delete_all_points2D_and_points3D()
-        for point, color in zip(cloud.points, cloud.colors, strict=True):
-            model.add_point3D(point, pycolmap.Track(), color)
+        replace_points(model, self.cloud(capture, model))
         return None
 
     @abstractmethod
     def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
         """The points for the reference ``model``; runs in the isolated process."""
+
+
+def replace_points(model: pycolmap.Reconstruction, cloud: PointCloud) -> None:
+    """Replace all points of ``model`` by those of ``cloud``, which no image observes."""
+    import pycolmap
+
+    model.delete_all_points2D_and_points3D()
+    for point, color in zip(cloud.points, cloud.colors, strict=True):
+        model.add_point3D(point, pycolmap.Track(), color)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,8 +246,8 @@ GREY = 128  # for points without a colour in the file and out of view of all tra
 
 
 @dataclass(frozen=True, kw_only=True)
-class CloudFromFile(PlacedCloud):
-    """Base of initialisers that read their points from the file ``path``."""
+class FromFile(GivenCameras):
+    """Base of initialisers that read the file ``path``."""
 
     path: AnyPath
 
@@ -259,7 +266,7 @@ class CloudFromFile(PlacedCloud):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Points(CloudFromFile):
+class Points(FromFile, PlacedCloud):
     """The points of a file, which must have the coordinates of the reference cameras.
 
     At most ``max_points`` random points are kept. If the file has no colours, a point's colour
@@ -313,7 +320,7 @@ def seen_colors(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ply(CloudFromFile):
+class Ply(FromFile):
     """The Gaussians of a 3DGS PLY file, which must have the coordinates of the reference cameras.
 
     The model holds their means and colours as points. Training starts from the Gaussians in
@@ -328,32 +335,14 @@ class Ply(CloudFromFile):
 
         check_ply(self.file)
 
-    def run(
-        self,
-        capture: Capture,
-        output_dir: Path,
-        progress: Progress = no_progress,
-        reference: Path | None = None,
-        work_dir: Path | None = None,
-    ) -> InitReport:
-        from gsbench.gaussians.ply import read_ply
-
-        read_ply(self.file)  # in this process too, because the isolated one has no log
-        return super().run(capture, output_dir, progress, reference, work_dir)
-
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
+        from gsbench.gaussians.model import dc_to_rgb
         from gsbench.gaussians.ply import read_ply, write_ply
 
         gaussians = read_ply(self.file, normalization=capture.normalization)
         write_ply(gaussians, output_dir / GAUSSIANS_FILE)
-        return super().set_points(model, capture, output_dir)
-
-    def cloud(self, capture: Capture, model: pycolmap.Reconstruction) -> PointCloud:
-        from gsbench.gaussians.model import dc_to_rgb
-        from gsbench.gaussians.ply import read_ply
-
-        gaussians = read_ply(self.file, normalization=capture.normalization)
         colors = (dc_to_rgb(gaussians.sh_dc).clamp(0, 1) * 255).round().byte().numpy()  # [N, 3]
-        return PointCloud(gaussians.means.double().numpy(), colors)
+        replace_points(model, PointCloud(gaussians.means.double().numpy(), colors))
+        return None

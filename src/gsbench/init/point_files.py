@@ -1,5 +1,6 @@
 """Reading clouds of points: PLY files of any program, and tables of numbers as text."""
 
+import logging
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +15,9 @@ from gsbench.init.point_tables import COLOR_NAMES, read_table
 from gsbench.parsing import one_line, without_byte_order_mark
 from gsbench.scene.types import Array
 
+log = logging.getLogger(__name__)
+
+KNOWN_WITHOUT_COLOR = frozenset(("x", "y", "z", "nx", "ny", "nz"))
 DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts", ".asc")
@@ -62,20 +66,25 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
 def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
     vertices = read_ply_data(path)["vertex"].data
-    present = set(vertices.dtype.names or ())
-    if lacking := [name for name in "xyz" if name not in present]:
+    # CloudCompare writes colours that it computed as scalar_R, others use capitals
+    names = {name.lower().removeprefix("scalar_"): name for name in vertices.dtype.names or ()}
+    if lacking := [name for name in "xyz" if name not in names]:
         raise ValueError(f"its vertices have no property {', '.join(lacking)}")
 
-    def columns(names: Iterable[str]) -> NDArray[np.generic]:
-        return np.stack([vertices[name] for name in names], axis=1)
+    def columns(wanted: Iterable[str]) -> NDArray[np.generic]:
+        return np.stack([vertices[names[name]] for name in wanted], axis=1)
 
-    points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
-    for names in COLOR_NAMES:
-        if present.issuperset(names):
-            return points, columns(names)
-    if present.issuperset(DC_NAMES):  # a model of Gaussians
+    points = columns("xyz").astype(np.float64)
+    for group in COLOR_NAMES:
+        if names.keys() >= set(group):
+            return points, columns(group)
+    if names.keys() >= set(DC_NAMES):  # a model of Gaussians
         dc = columns(DC_NAMES).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
+    if others := [name for name in names.values() if name.lower() not in KNOWN_WITHOUT_COLOR]:
+        log.warning(
+            "%s: it has no red, green and blue, and its %s is not used", path, ", ".join(others)
+        )
     return points, None
 
 

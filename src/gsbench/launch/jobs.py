@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import signal
 import sys
 import time
@@ -205,7 +206,7 @@ def run_local(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
         parallel,
         name,
     )
-    executor = submitit.LocalExecutor(job_folder(values))
+    executor = submitit.LocalExecutor(new_job_folder(values))
     executor.update_parameters(timeout_min=values["launch"]["timeout_min"] or 365 * DAYS)
     return _run(trials, executor, parallel, mirror)
 
@@ -222,6 +223,17 @@ def job_folder(values: dict[str, Any]) -> Path:
             link.unlink(missing_ok=True)
     require_no_links(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def new_job_folder(values: dict[str, Any]) -> Path:
+    """A new folder in `job_folder`, whose name nobody could guess.
+
+    A job unpickles the first file that has its number in its name. A stranger's runs folder could
+    have such files for all numbers.
+    """
+    folder = job_folder(values) / secrets.token_hex(8)
+    folder.mkdir()
     return folder
 
 
@@ -318,9 +330,12 @@ def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
     status "queued".
     """
     values = trials[0].values
-    executor = make_executor(values["launch"], job_folder(values))
-    with hold(Path(executor.folder) / SUBMIT_LOCK, f"submitting trials of {values['name']}"):
+    executor = make_executor(values["launch"], new_job_folder(values))
+    folder = Path(executor.folder)
+    with hold(folder.parent / SUBMIT_LOCK, f"submitting trials of {values['name']}"):
         jobs = _submit(trials, executor)
+    with suppress(OSError):  # nothing was submitted
+        folder.rmdir()
     array = sorted({job.job_id.split("_")[0] for job in jobs.values()})
     if not values["launch"].get("wait", True):
         print(
@@ -332,7 +347,7 @@ def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
         "%s in Slurm, job %s; logs: %s",
         counted(len(jobs), "trial"),
         ", ".join(array),
-        executor.folder,
+        folder.parent,
     )
     try:
         return _wait(jobs, trials)
@@ -388,7 +403,7 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
     for folder, trial in zip(folders, trials, strict=True):
         submission = read_submission(folder)
         if submission and submission.job in queue:
-            jobs[folder] = submitit.SlurmJob(executor.folder, submission.job)
+            jobs[folder] = submitit.SlurmJob(Path(submission.log).parent, submission.job)
         else:
             to_submit[folder] = trial
     if to_submit:

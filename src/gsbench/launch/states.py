@@ -52,7 +52,7 @@ def states_of_experiment(home: Path) -> list[TrialState]:
     folders = sorted({*plan, *begun})
     queue = ask_queue(folders)
     states = [_state(folder, plan.get(folder), queue) for folder in folders]
-    return _mark_superseded([replace(one, planned=plan.get(one.folder)) for one in states])
+    return _mark_superseded([replace(state, planned=plan.get(state.folder)) for state in states])
 
 
 def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
@@ -67,9 +67,9 @@ def _mark_superseded(trials: Sequence[TrialState]) -> list[TrialState]:
     states = []
     for trial in trials:
         if trial.state in ("failed", "partial"):
-            others, own = further.get(_arm_and_seed(trial.folder), []), _settings(trial.folder)
-            later = next((other for other in others if _settings(other.folder) == own), None)
-            if own is not None and later is not None:
+            others, settings = further.get(_arm_and_seed(trial.folder), []), _settings(trial.folder)
+            later = next((other for other in others if _settings(other.folder) == settings), None)
+            if settings is not None and later is not None:
                 note = f"{later.folder.name} is {later.state}, made by later code: {trial.note}"
                 trial = replace(trial, state="superseded", note=note)
         states.append(trial)
@@ -259,24 +259,24 @@ def current_user() -> str:
 
 # ---- the names of arms
 
-OF_A_PLACE = ("seed", "scene", "scene.path", "name")  # words that tell no arms apart
+OF_A_PLACE = ("seed", "scene", "scene.path", "name")  # overrides that tell no arms apart
 
 
-def arm_names(words: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, str]]:
-    """Arm and scene of each trial's folder, from the words of its command.
+def arm_names(overrides: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, str]]:
+    """Arm and scene of each trial's folder, from the overrides of its command.
 
-    If an arm's folder has several settings, the words that differ in their commands are added:
-    ``sfm-momentum[decay=0.9]``. Without such words it is the settings' hash.
+    If an arm's folder has several settings, the overrides in which their commands differ are added:
+    ``sfm-momentum[decay=0.9]``. Without such overrides it is the settings' hash.
     """
     by_arm: dict[str, list[Path]] = {}
-    for folder in words:
+    for folder in overrides:
         by_arm.setdefault(folder.parent.name, []).append(folder)
     names = {}
-    for arm, own in by_arm.items():
-        given = {folder: _settings_of(words[folder]) for folder in own}
+    for arm, of_arm in by_arm.items():
+        given = {folder: _settings_of(overrides[folder]) for folder in of_arm}
         shared = set.intersection(*given.values())
-        several = len({folder.name.partition(SEED)[0] for folder in own}) > 1
-        for folder in own:
+        several = len({folder.name.partition(SEED)[0] for folder in of_arm}) > 1
+        for folder in of_arm:
             values = ", ".join(sorted(given[folder] - shared)) or folder.name.partition(SEED)[0]
             names[folder] = (f"{arm}[{values}]" if several else arm, folder.parents[1].name)
     return names
@@ -284,7 +284,9 @@ def arm_names(words: Mapping[Path, Iterable[str]]) -> dict[Path, tuple[str, str]
 
 def names_of(states: Sequence[TrialState]) -> dict[Path, tuple[str, str]]:
     """`arm_names` of trials from their entries in the plan."""
-    return arm_names({one.folder: one.planned.overrides if one.planned else () for one in states})
+    return arm_names(
+        {state.folder: state.planned.overrides if state.planned else () for state in states}
+    )
 
 
 def label_of(folder: Path, names: Mapping[Path, tuple[str, str]]) -> str:
@@ -294,7 +296,7 @@ def label_of(folder: Path, names: Mapping[Path, tuple[str, str]]) -> str:
     return f"{scene}/{arm} seed {seed} ({hash8})"
 
 
-def _settings_of(words: Iterable[str]) -> set[str]:
+def _settings_of(overrides: Iterable[str]) -> set[str]:
     """The settings in a command by their last names, without a trial's place."""
-    given = (word.lstrip("+~").partition("=") for word in words)
+    given = (word.lstrip("+~").partition("=") for word in overrides)
     return {f"{key.rpartition('.')[2]}={value}" for key, _, value in given if key not in OF_A_PLACE}

@@ -30,7 +30,7 @@ from gsbench.eval.protocol import get_protocol
 from gsbench.external.settings import External
 from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
-from gsbench.raster.executors import AUTO, offers, resolve
+from gsbench.raster.executors import AUTO, lacks, resolve
 from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.nested import GSBENCH, targets_in
 from gsbench.runs.user_code import UserCode, module_digest, unnamed_modules, user_modules
@@ -44,18 +44,6 @@ from gsbench.words import did_you_mean
 
 log = logging.getLogger(__name__)
 
-# Features of a render that not every rasterizer has: the densifier's attribute that asks for it ->
-# (the rasterizer's attribute that offers it, the error's words).
-OPTIONAL_FEATURES = {
-    "needs_footprint": (
-        "has_footprint",
-        "needs the pixels that a Gaussian covers, and raster={} does not give them",
-    ),
-    "needs_splitting_matrix": (
-        "has_splitting_matrix",
-        "needs splitting matrices, and raster={} does not give them",
-    ),
-}
 RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
 REQUIRED_METHODS = {  # of a user's class, by the group that names it
     "init": ("needs_reference", "content", "run"),
@@ -139,7 +127,7 @@ class Parts:
         """The rasterizer for ``device``, with its proof. A user's own has none."""
         chosen = None if self.own_rasterizer is None else Proven(self.own_rasterizer)
         chosen = chosen or create_proven(self.values["raster"]["name"], self.device, self.threads)
-        self._check_features(chosen.rasterizer.name)
+        self._check_outputs(chosen.rasterizer.name)
         return chosen
 
     @property
@@ -173,24 +161,19 @@ class Parts:
         if on_this_machine and self.program is not None:
             self.program.executable()
         if own is not None or name != AUTO:
-            self._check_features(name if own is None else own.name)
+            self._check_outputs(name if own is None else own.name)
         if on_this_machine:
             device = self.device
             if own is None and name != AUTO:
                 resolve(name, device.type)
 
-    def _check_features(self, raster: str) -> None:
-        """Raise InputError if the densifier needs a feature that raster=``raster`` lacks."""
-        for need, (offer, words) in OPTIONAL_FEATURES.items():
-            if getattr(self.trainer, need, False) and not offers(
-                raster, offer, self.own_rasterizer
-            ):
-                able = " or ".join(
-                    f"raster={executor.name}" for executor in EXECUTORS if getattr(executor, offer)
-                )
-                raise InputError(
-                    f"densify={self.values['densify']['name']} {words.format(raster)}; take {able}"
-                )
+    def _check_outputs(self, raster: str) -> None:
+        """Raise InputError if the densifier needs an output that ``raster`` does not give."""
+        # Another program has no needs, and a user's class may not extend ``Densifier``.
+        footprint = getattr(self.trainer, "needs_footprint", False)
+        extra = getattr(self.trainer, "needs_extra", None)
+        if lack := lacks(raster, self.own_rasterizer, footprint, extra):
+            raise InputError(f"densify={self.values['densify']['name']} {lack}")
 
 
 def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:

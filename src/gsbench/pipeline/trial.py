@@ -399,9 +399,9 @@ def _declared_sweep(values: Mapping[str, Any]) -> Declared | None:
     """The newest declaration of a sweep about this trial's primary metric; None without one."""
     primary = values["eval"].get("primary")
     declared = [
-        one
-        for one in read_declarations(TrialFolder.of(values).home)
-        if one.kind == "sweep" and one.primary == primary
+        sweep
+        for sweep in read_declarations(TrialFolder.of(values).home)
+        if sweep.kind == "sweep" and sweep.primary == primary
     ]
     return declared[-1].summary() if declared else None
 

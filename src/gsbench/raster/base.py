@@ -138,12 +138,8 @@ class RenderOutput:
     - ``footprint()`` computes the `Footprint` of this view, also after ``backward``;
       ``footprint(values)`` sums ``values`` [H, W] over its pixels, too. None if the rasterizer has
       no footprints.
-    - ``splitting_probe`` is [N, 3, 3], a leaf of zeros, or None if not requested. After
-      ``backward``, its ``.grad`` is the splitting matrix of each Gaussian in this view, per world
-      unit squared (SteepGS, arXiv 2505.05587): the sum over pixels of (d loss / d s) times the
-      second derivative of s by the mean. s is the opacity times the density at the pixel, before
-      the clamp to ``alpha_max``. Here the projection is linearised and the 2D covariance is
-      constant.
+    - ``extra`` is a leaf of zeros [N, …], or None if no extra output was requested. After
+      ``backward``, its ``.grad`` is the extra output.
     """
 
     image: Tensor
@@ -152,7 +148,7 @@ class RenderOutput:
     screen_points: Tensor
     screen_gradient_abs: Tensor | None = None
     footprint: Callable[..., Footprint] | None = None
-    splitting_probe: Tensor | None = None
+    extra: Tensor | None = None
 
     @property
     def visible(self) -> Tensor:
@@ -167,25 +163,25 @@ class RenderOutput:
             )
         return self.footprint(values)
 
-    def require_splitting_matrix(self) -> Tensor:
-        """Return the splitting matrices [N, 3, 3] of this view.
+    def require_extra(self) -> Tensor:
+        """Return the extra output [N, …] of this view.
 
-        Raises RuntimeError if they were not requested, and before ``backward``.
+        Raises RuntimeError if none was requested, and before ``backward``.
         """
-        if self.splitting_probe is None or self.splitting_probe.grad is None:
+        if self.extra is None or self.extra.grad is None:
             raise RuntimeError(
-                "this densifier needs splitting matrices: render with splitting_matrix=True, then "
-                "backward"
+                "this densifier needs an extra output: render with extra=NAME, then backward"
             )
-        return self.splitting_probe.grad
+        return self.extra.grad
 
 
 class Rasterizer(Protocol):
     """The contract of rasterizers; ``tests/raster/test_contract.py`` tests all executors.
 
-    Two outputs are optional. A class that gives ``RenderOutput.footprint`` has the class attribute
-    ``has_footprint = True``. A class that gives splitting matrices has ``has_splitting_matrix =
-    True``, and its ``render`` has a further argument ``splitting_matrix: bool = False``.
+    Some outputs are optional. A class that gives ``RenderOutput.footprint`` has the class attribute
+    ``has_footprint = True``. A class that gives ``RenderOutput.extra`` has ``extras``, the shape of
+    each extra output for one Gaussian by name, for example ``{"splitting_matrix": (3, 3)}``; its
+    ``render`` has a further argument ``extra: str | None = None``, the name of the one requested.
 
     Examples:
         The reference without colours. `departures` lists where it differs from the contract.

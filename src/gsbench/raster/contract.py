@@ -16,7 +16,6 @@ from torch import Tensor
 
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import Rasterizer, RenderOutput
-from gsbench.raster.executors import offers
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera
 
@@ -106,13 +105,14 @@ def render_with_gradients(
 ) -> tuple[RenderOutput, dict[str, Tensor]]:
     """Render ``case``; return the output and the gradients, as float64 on the CPU.
 
-    The loss is a sum of image and alpha with fixed random weights. The gradients include the
-    splitting matrices if the rasterizer offers them.
+    The loss is a sum of image and alpha with fixed random weights. An extra output that the
+    rasterizer and the reference have in common is among the gradients, under its name.
     """
     gaussians = case.gaussians().map(lambda tensor: tensor.to(device, dtype).requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, device=device)
-    has_matrix = offers(rasterizer.name, "has_splitting_matrix", rasterizer)
-    extra = {"splitting_matrix": True} if has_matrix else {}
+    offered = getattr(rasterizer, "extras", {})
+    common = next((name for name in ReferenceRasterizer.extras if name in offered), None)
+    extra = {} if common is None else {"extra": common}
     output = rasterizer.render(
         gaussians, case.camera(), case.sh_degree, background, absolute_gradient=True, **extra
     )
@@ -125,8 +125,8 @@ def render_with_gradients(
         "screen_points": output.screen_points.grad,
         "screen_gradient_abs": output.screen_gradient_abs,
     }
-    if extra:
-        gradients["splitting_probe"] = output.require_splitting_matrix()
+    if common is not None:
+        gradients[common] = output.require_extra()
     return output, {
         name: torch.zeros(()) if gradient is None else gradient.detach().cpu().double()
         for name, gradient in gradients.items()
@@ -162,7 +162,7 @@ def departures(
     """List where ``rasterizer``, in float32 on ``device``, departs from the contract.
 
     Returns one line for each departure; [] if there is none. For all ``cases``, image, alpha,
-    radii, all gradients and, if offered, footprint and splitting matrices are compared with the
+    radii, all gradients and, if offered, footprint and extra output are compared with the
     reference. A scene without Gaussians is tested, too. Takes seconds.
     """
     lines = []
@@ -191,11 +191,12 @@ def measure(rasterizer: Rasterizer, case: Case, device: str) -> list[Error]:
         found = f"is {output.radii.dtype}, expected torch.int32"
         errors.append(Error(str(case), "radius", math.inf, RADIUS_TOLERANCE, found))
     for name, reference in references.items():
-        if name == "splitting_probe" and name not in gradients:
+        is_extra = name in ReferenceRasterizer.extras
+        if is_extra and name not in gradients:
             continue  # optional
         if reference.dim() == 0:  # no gradient: at degree 0 nothing depends on ``sh_rest``
             reference = torch.zeros_like(gradients[name])
-        quantity = "splitting matrix" if name == "splitting_probe" else f"gradient of {name}"
+        quantity = name if is_extra else f"gradient of {name}"
         errors.append(
             _compare(case, quantity, gradients[name], reference, GRADIENT_TOLERANCE, True)
         )

@@ -35,7 +35,7 @@ class Executor:
     install: str = ""  # how to get that package
     takes_threads: bool = False  # its class has an argument ``threads``
     has_footprint: bool = True  # it gives ``RenderOutput.footprint``
-    has_splitting_matrix: bool = True  # it gives ``RenderOutput.splitting_probe``
+    extras: tuple[str, ...] = ("splitting_matrix",)  # names of its extra outputs
     same_bits: bool = True  # two runs on a device give the same bits
     keeps_contract: bool = True  # False: its module says where it departs
 
@@ -97,7 +97,7 @@ EXECUTORS = (  # ``auto`` takes the first that is made for the type of device an
         package="gsplat",
         install=install_command("gsplat"),
         has_footprint=False,
-        has_splitting_matrix=False,
+        extras=(),
         same_bits=False,
         keeps_contract=False,
     ),
@@ -123,14 +123,22 @@ def find_executor(name: str) -> Executor:
     )
 
 
-def offers(name: str, fact: str, own: object = None) -> bool:
-    """Return whether the rasterizer called ``name`` offers an optional output.
+def lacks(name: str, own: object, needs_footprint: bool, extra: str | None) -> str | None:
+    """Say which optional output the rasterizer called ``name`` lacks, with a remedy, or None.
 
-    ``fact`` is the field of `Executor` to look up, for example ``has_footprint``. If ``name`` is
-    not an executor of gsbench, the attribute ``fact`` of the rasterizer ``own`` decides.
+    The outputs are the footprint, if needed, and the extra output called ``extra``. If ``name`` is
+    not an executor of gsbench, the attributes of the rasterizer ``own`` decide.
     """
-    offered = {executor.name: bool(getattr(executor, fact)) for executor in EXECUTORS}
-    return offered.get(name, bool(getattr(own, fact, False)))
+    known: dict[str, object] = {executor.name: executor for executor in EXECUTORS}
+    for wanted, output, gives in (
+        (needs_footprint, "footprints", lambda one: getattr(one, "has_footprint", False)),
+        (extra, f"the extra output {extra}", lambda one: extra in getattr(one, "extras", ())),
+    ):
+        if wanted and not gives(known.get(name, own)):
+            able = " or ".join(f"raster={other}" for other in known if gives(known[other]))
+            remedy = f"take {able}" if able else "take a rasterizer of your own that gives it"
+            return f"needs {output}, which raster={name} does not give; {remedy}"
+    return None
 
 
 def resolve(name: str, device_type: str) -> Executor:

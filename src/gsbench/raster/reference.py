@@ -15,7 +15,8 @@ from torch.utils.checkpoint import checkpoint
 
 from gsbench.gaussians.model import Gaussians, colors
 from gsbench.raster.base import CONSTANTS, Footprint, RenderOutput, slope_limits, view_depths
-from gsbench.raster.staged import check_inputs
+from gsbench.raster.splitting import SPLITTING_MATRIX, on_image, probed
+from gsbench.raster.staged import check_inputs, make_probe
 from gsbench.scene.types import Camera
 
 MAX_RADIUS = 2**24  # px; keeps the radius of a huge Gaussian within int32
@@ -37,6 +38,7 @@ class ReferenceRasterizer:
     """The contract of ``raster.base`` in torch operations; autograd computes the gradients."""
 
     name = "reference"
+    extras = SPLITTING_MATRIX
 
     def render(
         self,
@@ -45,7 +47,7 @@ class ReferenceRasterizer:
         sh_degree: int,
         background: Tensor,
         absolute_gradient: bool = False,
-        splitting_matrix: bool = False,
+        extra: str | None = None,
     ) -> RenderOutput:
         check_inputs(gaussians, camera, sh_degree, background)
         # NDC to pixels
@@ -61,11 +63,10 @@ class ReferenceRasterizer:
         radii[index[reached]] = projected.radii[reached].to(torch.int32)
 
         means = projected.means + screen_points[index] * half_size  # [M, 2]
-        probe, image_probe = None, None
-        if splitting_matrix:
-            probe = gaussians.means.new_zeros(len(gaussians), 3, 3, requires_grad=True)
-            jacobians = mean_jacobians(gaussians.means.detach()[index], camera)  # [M, 2, 3]
-            image_probe = jacobians @ probe[index] @ jacobians.mT  # [M, 2, 2] all zero
+        probe = make_probe(self, extra, gaussians.means)
+        image_probe = None
+        if probe is not None:
+            image_probe = on_image(probe[index], gaussians.means.detach()[index], camera)
         rgb = self._colors(gaussians, index, camera, sh_degree)  # [M, 3]
         opacities = gaussians.opacities[index]  # [M]
 
@@ -186,19 +187,6 @@ def _to_image(
     return torch.stack([column, row], -1), (xx, covariance[:, 0, 1], yy), z
 
 
-def mean_jacobians(means: Tensor, camera: Camera) -> Tensor:
-    """The Jacobians [M, 2, 3] of the projected means, px, by ``means`` [M, 3].
-
-    Unlike those of the covariances, they have no limits on the slopes.
-    """
-    rotation = means.new_tensor(camera.rotation)  # [3, 3]
-    # each [M, 1]
-    x, y, z = (means @ rotation.T + means.new_tensor(camera.translation)).unsqueeze(-1).unbind(1)
-    row_x = camera.fx / z * (rotation[0] - x / z * rotation[2])  # [M, 3]
-    row_y = camera.fy / z * (rotation[1] - y / z * rotation[2])
-    return torch.stack([row_x, row_y], 1)
-
-
 def tile_rectangles(projected: Projection, camera: Camera) -> tuple[Tensor, Tensor]:
     """The tiles that each Gaussian's square of side 2 radius touches.
 
@@ -276,19 +264,13 @@ def blending_weights(
 ) -> Tensor:
     """Alpha times transmittance, [P, K], for the arguments of ``composite``.
 
-    0 where a Gaussian is not blended. ``image_probe`` [K, 2, 2] is zero. Its gradient is the sum
-    over pixels of (d loss / d s) times the second derivative of s by the projected mean, where s is
-    the opacity times the density at the pixel.
+    0 where a Gaussian is not blended. For ``image_probe`` see `raster.splitting.probed`.
     """
     dx, dy = (means - pixels.unsqueeze(1)).unbind(-1)  # [P, K]
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     raw = opacities * power.clamp_max(0).exp()  # [P, K]
     if image_probe is not None:
-        offset = (means - pixels.unsqueeze(1)).detach()  # [P, K, 2]
-        inverse = conics.detach()[:, [0, 1, 1, 2]].reshape(-1, 2, 2)  # [K, 2, 2]
-        slope = (inverse @ offset.unsqueeze(-1)).squeeze(-1)  # [P, K, 2]
-        second = slope.unsqueeze(-1) * slope.unsqueeze(-2) - inverse  # [P, K, 2, 2]
-        raw = raw + raw.detach() * (second * image_probe).sum((-2, -1))
+        raw = probed(raw, means - pixels.unsqueeze(1), conics, image_probe)
     # the gradient passes the clamp, as in 3DGS
     saturated = raw + (raw.clamp_max(CONSTANTS.alpha_max) - raw).detach()
     alpha = torch.where((power <= 0) & (raw >= CONSTANTS.alpha_min), saturated, 0.0)

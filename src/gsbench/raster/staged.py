@@ -1,7 +1,7 @@
 """Code that executors share: checks of inputs, asynchronous reads, autograd for compiled stages."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
-from gsbench.raster.base import Footprint, RenderOutput
+from gsbench.raster.base import Footprint, Rasterizer, RenderOutput
 from gsbench.scene.types import Camera
 
 MAX_SIDE = 16384  # px; a larger image is most likely a mistake in the settings
@@ -39,6 +39,7 @@ def bad_values(gaussians: Gaussians, background: Tensor) -> Tensor:
     It is always True if there is a bad value. It is also True if only a sum overflows.
     """
     tensors = [background, *gaussians.tensors().values()]
+    # A sum is not finite if one of its values is not. Unlike a mask, it needs no memory.
     bad = ~torch.stack([tensor.detach().sum() for tensor in tensors]).isfinite().all()
     if len(gaussians):
         bad = bad | (gaussians.quaternions.detach().norm(dim=-1).amin() < MIN_QUATERNION_NORM)
@@ -110,6 +111,20 @@ def raise_for_values(gaussians: Gaussians, background: Tensor | None = None) -> 
         raise ValueError(f"quaternions: length 0 at Gaussian {index} ({int(short.sum())} in all)")
 
 
+def make_probe(rasterizer: Rasterizer, extra: str | None, means: Tensor) -> Tensor | None:
+    """Zeros [N, …] that require a gradient, which will be the output ``extra``; None for None.
+
+    ``means`` are those of the N Gaussians. Raises ValueError if the rasterizer has no such output.
+    """
+    if extra is None:
+        return None
+    shapes: Mapping[str, tuple[int, ...]] = getattr(rasterizer, "extras", {})
+    if extra not in shapes:
+        choices = ", ".join(shapes) or "no extra output"
+        raise ValueError(f"extra: raster={rasterizer.name} gives {choices}, not {extra}")
+    return means.new_zeros(len(means), *shapes[extra], requires_grad=True)
+
+
 def upload(numbers: Sequence[float], device: torch.device) -> Tensor:
     """The ``numbers`` as float32 on ``device``; the host does not wait for the copy."""
     # A copy is asynchronous only from page-locked memory.
@@ -169,15 +184,16 @@ class RenderRequest(NamedTuple):
     degree: int
     background: Tensor
     absolute: Tensor | None  # [N, 2] filled by the backward pass
+    extra: str | None  # name of the extra output
     lifetime: Lifetime  # of the frame's memory: the graph and the footprint refer to this request
 
 
 class Gradients(NamedTuple):
-    """Gradients by the six tensors and the screen points; splitting matrices, if requested."""
+    """Gradients by the six tensors and the screen points, and the extra output, if requested."""
 
     tensors: list[Tensor]
     screen: Tensor  # [N, 2]
-    splitting: Tensor | None  # [N, 3, 3]
+    extra: Tensor | None  # [N, …]
 
 
 class StagedRasterizer(ABC, Generic[FrameT]):
@@ -189,6 +205,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
     """
 
     name: str
+    extras: ClassVar[Mapping[str, tuple[int, ...]]] = {}  # see `raster.base.Rasterizer`
 
     @abstractmethod
     def check(self, gaussians: Gaussians) -> None:
@@ -211,7 +228,6 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
-        want_splitting: bool,
     ) -> Gradients:
         """Compute the gradients of the loss from those by image and alpha."""
 
@@ -232,7 +248,7 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         sh_degree: int,
         background: Tensor,
         absolute_gradient: bool = False,
-        splitting_matrix: bool = False,
+        extra: str | None = None,
     ) -> RenderOutput:
         """See `gsbench.raster.base.Rasterizer`.
 
@@ -242,18 +258,15 @@ class StagedRasterizer(ABC, Generic[FrameT]):
         self.check(gaussians)
         screen_points = torch.zeros_like(gaussians.means[:, :2], requires_grad=True)
         absolute = torch.zeros_like(screen_points) if absolute_gradient else None
-        probe = (
-            screen_points.new_zeros(len(gaussians), 3, 3, requires_grad=True)
-            if splitting_matrix
-            else None
-        )
+        probe = make_probe(self, extra, gaussians.means)
         request = RenderRequest(
-            camera, sh_degree, background.detach().contiguous(), absolute, Lifetime()
+            camera, sh_degree, background.detach().contiguous(), absolute, extra, Lifetime()
         )
         tensors = gaussians.tensors().values()
         image, alpha, radii, frame = _Render.apply(
             self, request, background, screen_points, probe, *tensors
         )
+        # Detached: the output would otherwise keep the caller's graph alive.
         footprint = partial(self.footprint, frame, gaussians.detach(), request)
         return RenderOutput(image, alpha, radii, screen_points, absolute, footprint, probe)
 
@@ -279,6 +292,7 @@ class _Render(torch.autograd.Function):
         ctx.rasterizer, ctx.frame, ctx.request = rasterizer, frame, request
         _, _, wants_background, *_ = ctx.needs_input_grad
         ctx.save_for_backward(alpha if wants_background else None, *gaussians.tensors().values())
+        # Most losses have no gradient by alpha: None saves a picture of zeros and the pass over it.
         ctx.set_materialize_grads(False)
         return image, alpha, radii, frame
 
@@ -289,13 +303,13 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor | None, ...]:
         alpha, *tensors = ctx.saved_tensors
         request: RenderRequest = ctx.request
+        # Only alpha was differentiated.
         if g_image is None:
             g_image = request.background.new_zeros(request.camera.height, request.camera.width, 3)
         g_image = g_image.contiguous()
         g_alpha = None if g_alpha is None else g_alpha.contiguous()
-        _, _, _, _, wants_splitting, *_ = ctx.needs_input_grad
         gradients = ctx.rasterizer.backward(
-            ctx.frame, Gaussians(*tensors), request, g_image, g_alpha, wants_splitting
+            ctx.frame, Gaussians(*tensors), request, g_image, g_alpha
         )
         g_background = None if alpha is None else (g_image * (1 - alpha).unsqueeze(-1)).sum((0, 1))
-        return None, None, g_background, gradients.screen, gradients.splitting, *gradients.tensors
+        return None, None, g_background, gradients.screen, gradients.extra, *gradients.tensors

@@ -19,7 +19,8 @@ from PIL import Image
 
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS
-from gsbench.analysis.results import TrialResult, load_flat_config, read_experiment, read_views
+from gsbench.analysis.results import TrialResult, read_experiment, read_views
+from gsbench.analysis.trial_settings import load_flat_config
 from gsbench.config.command_words import options, typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import PERMISSIONS

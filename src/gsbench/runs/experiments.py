@@ -162,6 +162,11 @@ class Arm:
         values = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in self.variant)
         return f"{self.densify}[{values}]" if values else self.densify
 
+    def has(self, name: str, config: Mapping[str, Any]) -> bool:
+        """Return whether a trial of the arm called ``name`` with these settings belongs to it."""
+        own = f"{self.init}-{self.densify}"
+        return name == own and all(str(config.get(key)) == value for key, value in self.variant)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):
@@ -304,12 +309,10 @@ def read_declarations(folder: Path, repeated: Iterable[Declared | None] = ()) ->
     ``repeated`` are the declarations in its trials' results. They are added if the file lacks them.
     """
     declarations: list[Declaration] = [
-        one for one in read_rows(folder / DECLARED, Declaration) if one.questions
+        row for row in read_rows(folder / DECLARED, Declaration) if row.questions
     ]
-    in_file = {(one.primary, one.time) for one in declarations}
-    for metric, when in dict.fromkeys(
-        (one.metric, one.time) for one in repeated if one is not None
-    ):
+    in_file = {(declaration.primary, declaration.time) for declaration in declarations}
+    for metric, when in dict.fromkeys((known.metric, known.time) for known in repeated if known):
         if (metric, when) not in in_file and unix_time(when) is not None:
             declarations.append(Declaration(time=when, questions=(open_question(metric),)))
     return sorted(declarations, key=lambda declaration: declaration.moment)

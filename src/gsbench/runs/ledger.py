@@ -161,34 +161,34 @@ class Ledger:
     @cached_property
     def started(self) -> dict[str, Started]:
         """The ideas in the order of their tests."""
-        return {one.idea: one for one in self.entries if isinstance(one, Started)}
+        return {entry.idea: entry for entry in self.entries if isinstance(entry, Started)}
 
     @cached_property
     def ended(self) -> dict[str, Ended]:
-        return {one.idea: one for one in self.entries if isinstance(one, Ended)}
+        return {entry.idea: entry for entry in self.entries if isinstance(entry, Ended)}
 
     @property
     def tried(self) -> int:
         """The number of tests that count; ideas that failed do not, since they tell nothing."""
-        failed = sum(one.result == FAILED for one in self.ended.values())
+        failed = sum(entry.result == FAILED for entry in self.ended.values())
         return len(self.started) - failed
 
     @property
     def kept(self) -> list[str]:
         """The ideas that were kept."""
-        return [one.idea for one in self.ended.values() if one.result == KEPT]
+        return [entry.idea for entry in self.ended.values() if entry.result == KEPT]
 
     @property
     def confirmations(self) -> list[tuple[Confirming, Confirmed | None]]:
         """Each confirmation with its results, None while trials are missing."""
-        begun = [one for one in self.entries if isinstance(one, Confirming)]
-        done = {one.number: one for one in self.entries if isinstance(one, Confirmed)}
-        return [(one, done.get(number)) for number, one in enumerate(begun)]
+        begun = [entry for entry in self.entries if isinstance(entry, Confirming)]
+        done = {entry.number: entry for entry in self.entries if isinstance(entry, Confirmed)}
+        return [(entry, done.get(number)) for number, entry in enumerate(begun)]
 
     def number_of(self, asked: Confirming) -> int | None:
         """The number of the confirmation with the same trials, None if there is none."""
         same = (asked.keys, asked.seeds)
-        begun = [(one.keys, one.seeds) for one, _ in self.confirmations]
+        begun = [(entry.keys, entry.seeds) for entry, _ in self.confirmations]
         return begun.index(same) if same in begun else None
 
     def words_of(self, idea: str) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ a result.
 import logging
 import os
 import shutil
+import sys
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,7 +27,7 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.errors import InputError
 from gsbench.files import MAX_NAME_BYTES, require_regular
 from gsbench.scene.options import Backdrop
-from gsbench.words import counted, some_of
+from gsbench.words import counted, is_utf8, some_of
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,8 @@ WHOLE = 0  # all parts of a path
 def list_images(folder: Path) -> list[str]:
     """The sorted image files below a folder, relative, with "/" as separator, without hidden files.
 
-    Links to folders are followed, and no folder is read twice.
+    Links to folders are followed, and no folder is read twice. Raises InputError for a name that is
+    not UTF-8, since no file of results could have it.
     """
     names: list[str] = []
     unread = 0
@@ -86,6 +88,11 @@ def list_images(folder: Path) -> list[str]:
     if unread:
         files = f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
         log.warning("%s: %s not read: save as JPEG", folder, files)
+    if strange := sorted(name for name in names if not is_utf8(name)):
+        advice = "rename them"
+        if sys.getfilesystemencoding() != "utf-8":
+            advice += f", or set PYTHONUTF8=1: Python reads names as {sys.getfilesystemencoding()}"
+        raise InputError(f"{folder}: names that are not UTF-8: {some_of(strange)}: {advice}")
     return sorted(names)
 
 

@@ -14,6 +14,7 @@ group identifies it. On Linux a process can adopt all orphans among its descenda
 
 import ctypes
 import json
+import logging
 import os
 import pickle
 import re
@@ -26,11 +27,13 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, BinaryIO, TypeVar
 
 from gsbench.errors import GsbenchError
-from gsbench.logs import Progress
+from gsbench.logs import LOGGER, Progress
 from gsbench.system.own_modules import allowed_modules
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -145,7 +148,7 @@ def run_isolated(
     ``function`` must be a top-level function of a module other than ``__main__``. The function, its
     arguments and its result are pickled. ``what`` names the work in errors ("undistortion"). The
     output of the child, also of native libraries, is appended to the file ``log``; without ``log``
-    it is dropped on success.
+    it is dropped on success. Warnings that the function logs are logged here.
 
     An exception of the function is raised again here, with the child's traceback as a note. A crash
     of the process raises `CrashError`, whose message ends with the last error lines of the output.
@@ -162,7 +165,9 @@ def run_isolated(
             raise CrashError(
                 f"{what} {describe_exit(code)}; its last lines: {error_tail(output, start)}"
             )
-        succeeded, value, trace = pickle.loads(result.read_bytes())
+        succeeded, value, trace, records = pickle.loads(result.read_bytes())
+    for record in records:
+        logging.getLogger(record.name).handle(record)
     if succeeded:
         return value
     value.add_note(f"raised in the isolated process of {what}:\n{trace}")
@@ -282,11 +287,14 @@ def _child() -> None:
         threading.Thread(target=_end_with_parent, daemon=True).start()
     call, result = Path(sys.argv[2]), Path(sys.argv[3])
     function, args = pickle.loads(call.read_bytes())
+    logged = SimpleQueue[logging.LogRecord]()
+    LOGGER.addHandler(QueueHandler(logged))
     try:
-        outcome = (True, function(*args), "")
+        succeeded, value, trace = True, function(*args), ""
     except Exception as error:  # noqa: BLE001  raised again in the parent
-        outcome = (False, _portable(error), traceback.format_exc())
-    result.write_bytes(pickle.dumps(outcome))
+        succeeded, value, trace = False, _portable(error), traceback.format_exc()
+    records = [logged.get() for _ in range(logged.qsize())]
+    result.write_bytes(pickle.dumps((succeeded, value, trace, records)))
     sys.stdout.flush()
     sys.stderr.flush()
     # Native libraries are not unloaded, because they may crash then. The result is already written.

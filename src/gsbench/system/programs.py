@@ -6,15 +6,41 @@ it; other programs have similar habits. `tests/system/test_programs.py` lists al
 
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from gsbench.errors import GsbenchError
+from gsbench.system.own_modules import SAFE_PATH
 
 # for programs that neither write nor need files: gsbench's own folder, which is trusted anyway
 NEUTRAL = Path(__file__).resolve().parent
+
+
+def protect_environment() -> None:
+    """Take the current folder out of the places where this process looks for code.
+
+    Programs and modules of the current folder must not run, also in the processes that libraries
+    start. An empty entry in ``PATH`` or ``PYTHONPATH``, as in ``$PYTHONPATH:/mine``, is the current
+    folder.
+    """
+    os.environ["PATH"] = safe_environment()["PATH"]
+    if not os.environ.get(SAFE_PATH[0]):
+        os.environ.update([SAFE_PATH])
+    given = os.environ.get("PYTHONPATH")
+    if not given:
+        return
+    here, entries = os.path.abspath(""), given.split(os.pathsep)
+    kept = [os.path.abspath(entry) for entry in entries if not _is_current(entry, here)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(kept)
+    if len(kept) < len(entries) and here not in kept:
+        sys.path[:] = [entry for entry in sys.path if entry != here]
+
+
+def _is_current(entry: str, here: str) -> bool:
+    return not os.path.isabs(entry) and os.path.abspath(entry) == here
 
 
 def safe_environment() -> dict[str, str]:

@@ -5,13 +5,14 @@ hanging thread cannot be ended, and a thread that is inside a C library when the
 crashes the process, after a trial that was complete. A process can be killed.
 
 `Mirror` starts the process, and at the end waits for it a bounded time. `follow` is the main
-function of the process. It gets the folders to follow on stdin, and reads everything else from
+function of the process. It gets folders and settings on stdin, and reads everything else from
 files. Its exit code says how it ended, and the last line on its stderr says why. `sync` mirrors,
 once, the trials that have ended.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
@@ -22,7 +23,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, chdir, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Queue
@@ -33,10 +34,12 @@ from gsbench.files import write_json
 from gsbench.parsing import read_if_sound
 from gsbench.runs.layout import CONFIG, FAILED, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
+from gsbench.settings import foreign_address
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
+from gsbench.system.programs import own_folder, safe_environment
 from gsbench.tracking.comparison import publish
-from gsbench.tracking.mlflow_sink import MlflowSink, untyped_address
+from gsbench.tracking.mlflow_sink import VARIABLE, MlflowSink, absolute_address
 from gsbench.tracking.sinks import MirrorState, Sink, TensorBoardSink, TrackedTrial, WandbSink
 from gsbench.words import counted
 
@@ -52,6 +55,14 @@ SINKS: dict[str, Any] = {"mlflow": MlflowSink, "tensorboard": TensorBoardSink, "
 def sink_of(options: dict[str, Any]) -> Any:
     """The class of the tracker that the settings ``tracking`` name."""
     return SINKS[options.get("sink", "mlflow")]
+
+
+def with_absolute_address(options: dict[str, Any]) -> dict[str, Any]:
+    """The settings ``tracking`` for a process in another folder than the command's."""
+    uri = options.get("uri")
+    if not uri and sink_of(options) is MlflowSink:
+        uri = os.environ.get(VARIABLE)
+    return options | {"uri": absolute_address(uri)} if uri else options
 
 
 class MirrorError(Exception):
@@ -77,14 +88,14 @@ class Mirror:
         """Mirror the trial in ``folder`` with the settings ``tracking`` from start to end."""
         if self._idle or not options["enabled"]:
             return
-        self._options = options
+        self._options = options = with_absolute_address(options)
         try:
             if self._process is not None and self._process.poll() is not None:
                 self._finish(self._process, 0)
             if self._process is None:
                 self._process = self._start()
             assert self._process.stdin is not None
-            self._process.stdin.write(f"{folder}\n".encode())
+            self._process.stdin.write(f"{json.dumps([str(folder), options])}\n".encode())
             self._process.stdin.flush()
         except OSError as error:
             self._warn(error)
@@ -102,13 +113,19 @@ class Mirror:
 
         Raises OSError where it cannot start.
         """
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process runs
+        # Trackers' clients read settings in the current folder: W&B would take its server's address
+        # from a stranger's ``wandb/settings``.
+        self._held = ExitStack()  # as long as the process runs
+        folder = self._held.enter_context(own_folder())
+        self._errors = self._held.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
             python_command(__name__, "follow", *words),
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,  # what MLflow prints
             stderr=self._errors,
+            cwd=folder,
+            env=safe_environment(),
             # Ctrl-C must reach only the trials' process, which then ends this one
             start_new_session=True,
         )
@@ -116,7 +133,7 @@ class Mirror:
     def _finish(self, process: subprocess.Popen[bytes], seconds: float) -> None:
         """Close the process's input, wait for its end ``seconds`` at most, then kill it."""
         self._process = None
-        with self._errors, process:
+        with self._held, process:
             try:
                 process.communicate(timeout=seconds)
             except subprocess.TimeoutExpired:
@@ -245,14 +262,17 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
         options = values["tracking"] | ({"uri": uri} if uri else {})
         # The runs folder may be a stranger's. It must not make gsbench send files or passwords to
         # the stranger's address.
-        if address := untyped_address(options, uri):
+        if address := foreign_address(options, [uri] if uri else []):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "
                 f"--uri {address} was not typed"
             )
             continue
+        options = with_absolute_address(options)
         try:
-            is_new = mirror_ended(folder, options, values)
+            # for the same reason as in `Mirror`
+            with own_folder() as place, chdir(place):
+                is_new = mirror_ended(folder, options, values)
             pages[folder.home, options["uri"]] = folder, options
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
@@ -306,7 +326,9 @@ Lines = Queue[str | None]  # of stdin; None is the end
 
 
 def follow() -> NoReturn:
-    """Mirror the trials whose folders come on stdin, until it and the trials have ended.
+    """Mirror the trials that come on stdin, until it and the trials have ended.
+
+    Each line is JSON: a trial's folder, and its settings ``tracking``.
 
     Arguments of the process: the time between two readings of the files, and how long the parent
     waits for this process at the end; both in seconds.
@@ -332,10 +354,11 @@ def _follow(lines: Lines, pause: float) -> None:
     last = False
     while not last:
         with suppress(Empty):
-            path = lines.get(timeout=pause)
-            while path is not None:
-                trials.append(_FollowedTrial(TrialFolder(Path(path))))
-                path = lines.get_nowait()
+            line = lines.get(timeout=pause)
+            while line is not None:
+                folder, options = json.loads(line)
+                trials.append(_FollowedTrial(TrialFolder(Path(folder)), options))
+                line = lines.get_nowait()
             last = True
         for trial in trials:
             try:
@@ -356,14 +379,15 @@ def _follow(lines: Lines, pause: float) -> None:
 
 
 class _FollowedTrial:
-    """A trial to mirror.
+    """A trial to mirror with the settings ``options`` of tracking.
 
     Its run is opened once the trial runs or has ended, or when the sweep ends.
     """
 
-    def __init__(self, folder: TrialFolder) -> None:
-        self.folder, self.has_ended = folder, False
-        self.options: dict[str, Any] = {}
+    def __init__(self, folder: TrialFolder, options: dict[str, Any]) -> None:
+        # These are the settings that were checked: a trial that has not begun may have a stranger's
+        # `config.yaml`, with the stranger's address.
+        self.folder, self.options, self.has_ended = folder, options, False
         self._added_at = time.time()
         self._run: TrackerRun | None = None
 
@@ -379,9 +403,7 @@ class _FollowedTrial:
         if not (self.folder.path / CONFIG).exists() or (is_waiting and not last):
             return
         if self._run is None:
-            values = self.folder.configuration()
-            self.options = values["tracking"]
-            self._run = TrackerRun(self.folder, self.options, values)
+            self._run = TrackerRun(self.folder, self.options, self.folder.configuration())
         self._run.add_curves()
         if state != "running":
             self._run.end()

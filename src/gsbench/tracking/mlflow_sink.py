@@ -11,7 +11,7 @@ import logging
 import os
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,19 +55,12 @@ def tracker_uri(uri: str | None, runs: Path) -> str:
     return uri or os.environ.get(VARIABLE) or default_uri(runs)
 
 
-def untyped_address(options: Mapping[str, Any], typed: str | None = None) -> str | None:
-    """The tracker's address in a file's settings ``tracking`` if it may not be used, else None.
-
-    It may be used if it is the ``typed`` one or that of the environment.
-    """
-    address = options.get("uri")
-    if (
-        not options.get("enabled", True)
-        or not address
-        or address in (typed, os.environ.get(VARIABLE))
-    ):
-        return None
-    return str(address)
+def absolute_address(uri: str) -> str:
+    """A tracker's address as a process that starts in another folder needs it."""
+    place = uri.removeprefix("sqlite:///")
+    if place != uri:
+        return uri if place in ("", ":memory:") else f"sqlite:///{os.path.abspath(place)}"
+    return uri if ":" in uri else os.path.abspath(uri)
 
 
 def connect(uri: str | None, runs: Path) -> MlflowClient:

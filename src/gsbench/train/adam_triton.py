@@ -87,13 +87,13 @@ class TritonAdam:
             width = parameter.numel() // count
             with torch.cuda.device_of(parameter):
                 launch_grid(adam_step, triton.cdiv(parameter.numel(), NUMBERS))(
-                    parameter.detach(),
-                    gradient,
-                    state.first,
-                    state.second,
-                    own,
-                    gradient if seen is None else seen,
-                    count,
+                    values=parameter.detach(),
+                    gradients=gradient,
+                    first=state.first,
+                    second=state.second,
+                    factors=own,
+                    seen=gradient if seen is None else seen,
+                    count=count,
                     WIDTH=width,
                     ACTIVE=width if active is None else active,
                     HAS_SEEN=seen is not None,

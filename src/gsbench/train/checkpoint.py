@@ -26,9 +26,11 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any]) -> None:
     path = folder / f"checkpoint-{step:08d}.pt"
     with atomic(path) as temporary, temporary.open("wb") as stream:
         torch.save(state, stream)
+        # In the same file, so that one rename publishes state and digest together.
         stream.flush()
         stream.write(bytes.fromhex(file_sha256(temporary)))
     sync_to_disk(folder)
+    # Only now that the new one is on disk: a kill before this line leaves the earlier ones.
     for old in sorted(folder.glob(PATTERN))[:-KEPT]:
         old.unlink()
 

@@ -24,7 +24,13 @@ from torch import Tensor
 
 from gsbench.gaussians.trainable import AdamState, KnownGradients, TrainableGaussians
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.staged import Lifetime, Readback, RenderRequest, raise_for_values
+from gsbench.raster.staged import (
+    Lifetime,
+    Readback,
+    RenderRequest,
+    make_probe,
+    raise_for_values,
+)
 from gsbench.raster.triton.executor import Started, TritonFrame, TritonRasterizer, camera_numbers
 from gsbench.raster.triton.launch import Workspace
 from gsbench.raster.triton.lists import UNITS_AT_FIRST, Room, check_pairs
@@ -57,7 +63,7 @@ class Shape(NamedTuple):
     height: int
     degree: int
     absolute: bool
-    splitting: bool
+    extra: str | None
     target: torch.dtype
 
 
@@ -88,14 +94,14 @@ class DirectStep:
         target: Tensor,
         degree: int,
         absolute: bool,
-        splitting: bool,
+        extra: str | None,
     ) -> Differentiated:
         """Render ``camera``, and differentiate the loss against ``target`` [H, W, 3].
 
         Raises ValueError for bad values of parameters.
         """
         size = camera.width, camera.height
-        shape = Shape(*size, degree, absolute, splitting, target.dtype)
+        shape = Shape(*size, degree, absolute, extra, target.dtype)
         memory = self._memory_of(size)
         plan = self._plan.get(size)
         if plan is None or not plan.suits(gaussians, shape):
@@ -105,6 +111,7 @@ class DirectStep:
             self._plan[size] = plan
         self._last = plan
         plan.camera = camera
+        # A graph always reads the same memory, so what differs from step to step is copied to it.
         plan.view.copy_(self._numbers(camera), non_blocking=True)
         plan.target.copy_(target, non_blocking=True)
         with torch.cuda.device_of(self.background):
@@ -117,6 +124,7 @@ class DirectStep:
         plan = self._last
         assert plan is not None, "optimize follows step"
         states = gaussians.advance(plan.known)
+        # After a refinement, a graph would write to the parameters that were replaced.
         if plan.suits(gaussians, plan.shape) and plan.adam_graph is not None:
             plan.replay_adam(states)
         else:
@@ -144,6 +152,7 @@ class DirectStep:
 
     def _numbers(self, camera: Camera) -> Tensor:
         """The numbers of ``camera`` on the device; kept, since training views come back."""
+        # A freed camera's id may come back for another, so the camera is kept and compared.
         known = self._cameras.get(id(camera))
         if known is None or known[0] is not camera:
             known = camera, camera_numbers(camera, self.background.device)
@@ -196,13 +205,11 @@ class _Plan:
         self.factors_on_host = torch.empty(
             (FACTORS_KEPT, *self.factors.shape), pin_memory=memory.device.type == "cuda"
         )
-        self.request = RenderRequest(camera, shape.degree, step.background, absolute, Lifetime())
-        self.screen_points = torch.zeros_like(self.values.means[:, :2], requires_grad=True)
-        self.probe = (
-            self.values.means.new_zeros(count, 3, 3, requires_grad=True)
-            if shape.splitting
-            else None
+        self.request = RenderRequest(
+            camera, shape.degree, step.background, absolute, shape.extra, Lifetime()
         )
+        self.screen_points = torch.zeros_like(self.values.means[:, :2], requires_grad=True)
+        self.probe = make_probe(step.rasterizer, shape.extra, self.values.means)
         self.runs = 0
         self.started: Started | None = None
         self.finished: tuple[Tensor, Tensor, Tensor, TritonFrame] | None = None
@@ -243,6 +250,7 @@ class _Plan:
     def result(self) -> Differentiated:
         assert self.finished is not None
         image, alpha, radii, frame = self.finished
+        # The plan's own request has the camera of its first step.
         request = self.request._replace(camera=self.camera)
         footprint = partial(self.owner.rasterizer.footprint, frame, self.values, request)
         render = RenderOutput(
@@ -297,14 +305,13 @@ class _Plan:
             self.request,
             self.g_image,
             None,
-            self.shape.splitting,
             memory.scratch,
             memory.allocate,
             self.gradients,
         )
         self.screen_points.grad = found.screen
         if self.probe is not None:
-            self.probe.grad = found.splitting
+            self.probe.grad = found.extra
         seen = frame.projected.row_counts
         self.known = KnownGradients(self.parameters, self.gradients, seen, self.shape.degree)
 
@@ -332,6 +339,7 @@ class _Plan:
         self.memory.room = Room(
             max(known.units, int(MARGIN * units) + 1), max(known.pairs, int(MARGIN * pairs) + 1)
         )
+        # The graphs launch with the old room. The next step may allocate: it is not recorded yet.
         self.render_graphs = self.adam_graph = None
         self.runs = 0
 

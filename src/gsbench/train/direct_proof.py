@@ -87,7 +87,7 @@ def _direct(
     def step(number: int) -> None:
         if number == CRAMPED_STEP:
             direct.limit_room(Room(1, 1))
-        direct.step(model, camera, target, case.sh_degree, False, False)
+        direct.step(model, camera, target, case.sh_degree, False, None)
         direct.optimize(model)
         if number == CRAMPED_STEP and direct.repeats == 0:
             raise RuntimeError("lists without room were not noticed")

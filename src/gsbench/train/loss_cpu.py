@@ -122,6 +122,7 @@ def similarity_rows(memory, begin, end, height, width, image, target, divisor, d
         store(memory, i, splat(ZERO))
     lane = load(LANE, 0)
     for row in range(begin - WINDOW_RADIUS, end + WINDOW_RADIUS):
+        # A ring has the last eleven rows, blurred horizontally: so each is read once.
         slot = (row + TAPS) % TAPS * length
         if 0 <= row < height:
             _read_row(image, row, numbers, ONE, x)
@@ -256,6 +257,7 @@ class CompiledLoss:
         wanted = target.contiguous().numpy().reshape(-1)
         divisor = BYTE_MAX if target.dtype == torch.uint8 else ONE
         edges = [height * shard // SHARDS for shard in range(SHARDS + 1)]
+        # One sum for each row, added in the order of rows: threads do not change the bits.
         sums = np.empty((height, 2))
         holder = Lifetime()
         arena = self._arenas.lease(holder)

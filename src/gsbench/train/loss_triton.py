@@ -66,6 +66,7 @@ def _weight(k: tl.constexpr):
 @triton.jit
 def _zeros(like):
     """Eleven running sums, all zero."""
+    # Written out: Triton's tuples know no ``*``.
     zero = tl.zeros_like(like)
     return (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
 
@@ -138,6 +139,7 @@ def measure_similarity(
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
+        # Windows of the first and the last row reach RADIUS rows beyond; L1 does not count these.
         x = _load(image, row, number, height, numbers, 1.0)
         y = _load(target, row, number, height, numbers, scale)
         total_l1 += tl.where((row >= first) & (row < first + rows), tl.abs(x - y), 0.0)
@@ -148,6 +150,8 @@ def measure_similarity(
                 x = _load(image, row, neighbour, height, numbers, 1.0)
                 y = _load(target, row, neighbour, height, numbers, scale)
                 blurred = _add(blurred, x, y, _weight(k))
+        # A row is blurred horizontally once, and added to the eleven rows whose windows it is in.
+        # The sums of the row RADIUS above are now complete.
         mean_x, mean_y = _push(mean_x, blurred[0]), _push(mean_y, blurred[1])
         square_x, square_y = _push(square_x, blurred[2]), _push(square_y, blurred[3])
         product = _push(product, blurred[4])
@@ -172,6 +176,7 @@ def measure_similarity(
             tl.store(place + plane, -similarity * b1 * inverse, mask=inside)
             tl.store(place + 2 * plane, 2 * a1 * inverse, mask=inside)
     program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
+    # Atomics would add in any order; `add_up` adds these in one order, for the same bits.
     tl.store(sums + 2 * program, tl.sum(total_similarity, 0))
     tl.store(sums + 2 * program + 1, tl.sum(total_l1, 0))
 
@@ -270,10 +275,18 @@ class Measured:
     def grid(self) -> tuple[int, int]:
         return triton.cdiv(self.numbers, STRIP), triton.cdiv(self.height, self.rows)
 
-    @property
-    def scale(self) -> float:
-        """The factor of the target's numbers."""
-        return 1 / 255 if self.target.dtype == torch.uint8 else 1.0
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that both kernels over an image have in common."""
+        return {
+            "image": self.image,
+            "target": self.target,
+            "scale": 1 / 255 if self.target.dtype == torch.uint8 else 1.0,
+            "height": self.height,
+            "numbers": self.numbers,
+            "derivatives": self.derivatives,
+            "rows": self.rows,
+            "STRIP": STRIP,
+        }
 
 
 class TritonLoss:
@@ -304,36 +317,22 @@ class TritonLoss:
         columns, lines = measured.grid
         sums = memory.take("sums", 2 * columns * lines, torch.float32)
         launch_grid(measure_similarity, columns, lines)(
-            image,
-            target,
-            measured.scale,
-            measured.height,
-            measured.numbers,
-            derivatives,
-            sums,
-            measured.rows,
-            DIFFERENTIATE=differentiated,
-            STRIP=STRIP,
+            **measured.arguments(), sums=sums, DIFFERENTIATE=differentiated
         )
         launch_grid(add_up, 1)(
-            sums, columns * lines, float(image.numel()), self.ssim_weight, values, GROUP=1024
+            sums=sums,
+            programs=columns * lines,
+            size=float(image.numel()),
+            ssim_weight=self.ssim_weight,
+            values=values,
+            GROUP=1024,
         )
         return measured
 
     def differentiate(self, measured: Measured, g_loss: Tensor, gradient: Tensor) -> None:
         """Write the gradient by the image to ``gradient`` [H, W, 3], times ``g_loss`` []."""
         launch_grid(differentiate, *measured.grid)(
-            measured.image,
-            measured.target,
-            measured.scale,
-            measured.height,
-            measured.numbers,
-            measured.derivatives,
-            g_loss,
-            self.ssim_weight,
-            gradient,
-            measured.rows,
-            STRIP=STRIP,
+            **measured.arguments(), g_loss=g_loss, ssim_weight=self.ssim_weight, gradient=gradient
         )
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsbench.densify import Densifier, DensifyContext, NoDensifier
 from gsbench.densify.volumetric import log_volume
-from gsbench.errors import TrainingError
+from gsbench.errors import InputError, TrainingError
 from gsbench.eval.images import replace_ignored
 from gsbench.events import FEWEST_ROUNDS, RefineEvent, few_rounds
 from gsbench.files import write_text
@@ -27,7 +27,7 @@ from gsbench.gaussians.ply import write_ply
 from gsbench.gaussians.trainable import StepAll, TrainableGaussians
 from gsbench.raster import Rasterizer
 from gsbench.raster.base import RenderOutput
-from gsbench.raster.executors import find_executor
+from gsbench.raster.executors import find_executor, lacks
 from gsbench.raster.staged import Readback
 from gsbench.runs.layout import CURVES, EVENTS, HISTOGRAMS
 from gsbench.runs.trial_record import whole_lines
@@ -122,6 +122,9 @@ class Trainer:
         seed: int,
         snapshot_at: Collection[int] = (),
     ) -> None:
+        needs = densifier.needs_footprint, densifier.needs_extra
+        if lack := lacks(rasterizer.name, rasterizer, *needs):
+            raise InputError(f"{type(densifier).__name__} {lack}")
         self.scene = scene
         self.densifier = densifier
         self.rasterizer = rasterizer
@@ -156,9 +159,9 @@ class Trainer:
         scheduled = options.resolution_schedule != "none"
         self.resolution = Resolution(options, scene.train, len(initial)) if scheduled else None
         counts = options.resolution_schedule == "pictures_and_count"
-        limit = self.resolution.limit if self.resolution is not None and counts else None
+        schedule = self.resolution if counts else None
         is_white = bool((self.background == 1).all())
-        self.context = DensifyContext(scene.extent, is_white, self.device, views, limit)
+        self.context = DensifyContext(scene.extent, is_white, self.device, views, schedule)
         densifier.begin(initial, self.context)
 
     def run(
@@ -174,6 +177,7 @@ class Trainer:
             (folder / snapshot_file(0)).parent.mkdir(exist_ok=True)
         writer = CheckpointWriter(folder, background=self.device.type != "cpu")
         try:
+            # Signals wait for the end of the iteration: half a step could not be resumed.
             with deferred(), self._explained(folder):
                 self._loop(folder, writer, on_status)
         finally:
@@ -192,6 +196,7 @@ class Trainer:
         last_checkpoint = time.monotonic()
         with (folder / CURVES).open("a") as metrics, (folder / EVENTS).open("a") as events:
             while self.step < options.iterations:
+                # Before the refinement: the losses of this iteration are those of this model.
                 counts = {"num_gaussians": len(self.gaussians)}
                 event = self.iterate(folder)
                 self.seconds = earlier_seconds + time.perf_counter() - started
@@ -260,8 +265,7 @@ class Trainer:
         event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
         if event is not None:
             self.growth.observe(event)
-            if self.resolution is not None:
-                self.resolution.observe(event)
+        # As in 3DGS, parameters that the refinement has replaced have no gradient: no step.
         if not options.step_after_refine:
             self._optimize(render.visible)
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
@@ -281,6 +285,7 @@ class Trainer:
         target, mask = targets.get(index), targets.mask(index)
         regularizer = self.densifier.regularizer(self.gaussians.values)
         direct = self.direct
+        # Direct steps know only the loss of whole pictures; whatever else enters it needs autograd.
         self.is_direct = direct is not None and mask is None and regularizer is None
         if direct is not None and self.is_direct:
             step = direct.step(
@@ -289,7 +294,7 @@ class Trainer:
                 target,
                 self.sh_degree,
                 self.densifier.needs_absolute_gradient,
-                self.densifier.needs_splitting_matrix,
+                self.densifier.needs_extra,
             )
             return step.render, step.losses
         render = self.render(index)
@@ -305,8 +310,8 @@ class Trainer:
         """Render the training view ``index`` as in the current iteration, with gradients."""
         camera = self.scaled_views.at(self.scale)[0][index]
         # Passed only if needed: a user's rasterizer may not have this argument.
-        wants = self.densifier.needs_splitting_matrix
-        extra: dict[str, Any] = {"splitting_matrix": True} if wants else {}
+        wanted = self.densifier.needs_extra
+        extra = {} if wanted is None else {"extra": wanted}
         return self.rasterizer.render(
             self.gaussians.values,
             camera,

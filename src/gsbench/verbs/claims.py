@@ -10,18 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.designs import Components, Design, designs_needed, estimate_components
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair
 from gsbench.analysis.planning import COMMANDS, UNSURE, Purpose, deviation_range
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import load_experiment, read_experiment
-from gsbench.analysis.statistics import (
-    MIN_SCENES,
-    Components,
-    Design,
-    designs_needed,
-    estimate_components,
-)
+from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
 from gsbench.claims.check import Check, prepare, recheck

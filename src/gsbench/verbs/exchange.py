@@ -153,7 +153,7 @@ def export_model(trial: TrialResult, out: Path, is_init: bool) -> None:
 
 def export_results(name: str, runs: Path, out: Path | None, pictures: bool = False) -> None:
     """Write the archive of an experiment's results, and warn of what is left out."""
-    from gsbench.claims.archive import write_archive
+    from gsbench.claims.export import write_archive
 
     if not is_folder_name(name):
         raise InputError(

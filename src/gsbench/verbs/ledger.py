@@ -9,11 +9,11 @@ from typing import Any
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
+from gsbench.analysis.looks import FIRST_LOOK
 from gsbench.analysis.notes import texts
 from gsbench.analysis.results import read_experiment
-from gsbench.analysis.statistics import FIRST_LOOK
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.app.command import check_trackers, compose_trials, require_waiting, run_trials
+from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.ledger import IDEAS, RATE
@@ -97,7 +97,7 @@ def _parser() -> ArgumentParser:
 
 def new(options: argparse.Namespace, home: Path) -> int:
     """Declare a ledger; the same command again changes nothing."""
-    trials = _compose(options.name, options.settings)
+    trials = _compose(options.name, options.settings, options.settings)
     keys, seeds = _keys(trials, options.name), _seeds(trials)
     values = next(iter(trials.values())).values
     metric = options.metric or "psnr"
@@ -138,14 +138,13 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
         )
     _check_words(options.settings)
     start = _permitted(book, against, options.settings)
-    trials = _compose(home.name, start)
+    trials = _compose(home.name, start, options.settings)
     if _keys(trials, home.name) != book.keys_of(against):
         raise InputError(
             f"the settings or the code of {against} have changed since its trials ran: bring them "
             "back"
         )
-    own = _compose(home.name, _merged(start, options.settings))
-    check_trackers([*trials.values(), *own.values()], options.settings)
+    own = _compose(home.name, _merged(start, options.settings), options.settings)
     idea, book = _start(home, own, against, options)
     if (ended := book.ended.get(idea)) is None or ended.result == FAILED:
         trials |= own
@@ -244,11 +243,12 @@ def confirm(options: argparse.Namespace, home: Path) -> int:
         raise InputError("confirm needs captures that no idea has seen: scene=…")
     by_idea = {
         idea: _compose(
-            home.name, _merged(_permitted(book, idea, options.settings), options.settings)
+            home.name,
+            _merged(_permitted(book, idea, options.settings), options.settings),
+            options.settings,
         )
         for idea in (BASELINE, *ideas)
     }
-    check_trackers((one for own in by_idea.values() for one in own.values()), options.settings)
     keys = {idea: _keys(trials, home.name) for idea, trials in by_idea.items()}
     asked = records.Confirming(time=stamp_now(), seeds=_seeds(by_idea[BASELINE]), keys=keys)
 
@@ -279,7 +279,8 @@ def _run_confirmation(
     trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
-    verdicts = judge(finished_trials(home, trials.values()), declaration)
+    done, lacking = finished_trials(home, trials.values()), read_experiment(home).lacking
+    verdicts = judge(done, declaration, lacking)
 
     def make(now: Ledger) -> records.Confirmed | None:
         if now.confirmations[number][1] is not None:  # by a process that ran the same command
@@ -329,12 +330,15 @@ ACTIONS = {  # with the options that each of them takes
 # ---- trials of the ledger's words
 
 
-def _compose(name: str, words: Sequence[str]) -> Trials:
-    """The trials of words by key and seed; raises InputError for settings that the ledger sets."""
+def _compose(name: str, words: Sequence[str], typed: Sequence[str]) -> Trials:
+    """The trials of words by key and seed; only the ``typed`` ones give permissions.
+
+    Raises InputError for settings that the ledger sets.
+    """
     for word in words:
         if key_of(word) in OWN:
             raise InputError(f"ledger: {key_of(word)} follows from the ledger: leave it out")
-    trials = compose_trials([*words, f"name={name}"], multirun=True)
+    trials = compose_trials([*words, f"name={name}"], multirun=True, typed=typed)
     require_waiting("ledger", trials)
     return {(trial.files.key, trial.values["seed"]): trial for trial in trials}
 

@@ -248,9 +248,9 @@ def _bench_parser() -> ArgumentParser:
     parser.add_argument(
         "--scene",
         default="trained",
-        choices=("trained", "random", "skewed"),
-        help="like a trained model (default), like one at the start, or like one with its detail "
-        "at few places",
+        choices=("trained", "random", "skewed", "crowded"),
+        help="like a trained model (default), like one at the start, like one with its detail at "
+        "few places, or with a twentieth of it over one tile",
     )
     parser.add_argument("--ply", type=path, help="time this model instead of a synthetic scene")
     parser.add_argument("--repeats", type=_count, default=5, help="turns that count (default 5)")

@@ -23,7 +23,7 @@ from gsbench.system.isolate import end_descendants
 from gsbench.system.programs import NEUTRAL, own_folder, safe_environment
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking.comparison import addresses, publish
-from gsbench.tracking.mlflow_sink import SETTINGS, default_uri, tracker_uri
+from gsbench.tracking.mlflow_sink import SETTINGS, absolute_address, default_uri, tracker_uri
 from gsbench.verbs.arguments import ArgumentParser, port
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
@@ -150,14 +150,6 @@ def _announce(server: str, lines: str, page: str) -> None:
         command = [sys.executable, "-P", "-m", "webbrowser", page]
         subprocess.run(command, cwd=NEUTRAL, env=safe_environment(), check=False)
         return
-
-
-def absolute_address(uri: str) -> str:
-    """A tracker's address as the server, which starts in another folder, needs it."""
-    place = uri.removeprefix("sqlite:///")
-    if place != uri:
-        return uri if place in ("", ":memory:") else f"sqlite:///{os.path.abspath(place)}"
-    return uri if ":" in uri else os.path.abspath(uri)
 
 
 def serve(uri: str, port: int) -> int:

@@ -126,7 +126,7 @@ def _cell(counts: dict[str, int]) -> str:
 def progress_with_superseded(home: Path) -> list[TrialState]:
     """The state of every trial in ``home``; those that older code made are ``superseded``."""
     states = states_of_experiment(home)
-    folders = {one.folder: one.planned.cwd for one in states if one.planned is not None}
+    folders = {state.folder: state.planned.cwd for state in states if state.planned is not None}
     # The user's modules are read in the folder where the trial's command was given: another may
     # have a namesake.
     reasons = find_superseded(read_experiment(home).trials, folders)
@@ -173,7 +173,7 @@ def _age(trial: TrialState) -> str:
 
 def retry(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: the exit code says whether a trial failed, as that of a sweep does."""
-    from gsbench.app.command import check_trackers, run_trials
+    from gsbench.app.command import run_trials
 
     parser = ArgumentParser("retry")
     parser.add_argument("experiment")
@@ -203,7 +203,6 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         recompose(folder, planned.get(folder), runs, options.changes, modules)
         for folder in unfinished
     ]
-    check_trackers(trials, options.changes)
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
@@ -237,7 +236,7 @@ def recompose(
             kept = [word for word in kept if not word.startswith("launch.")]
         # Modules are not taken from planned.cwd: somebody else's plan would name a folder of
         # theirs.
-        trial = compose_one([*kept, *changes], modules=modules)
+        trial = compose_one([*kept, *changes], typed=changes, modules=modules)
         return Trial(trial.values | {"runs": str(runs)}, trial.overrides)
     files, allowed = TrialFolder(folder), typed_permissions(changes)
     if any(key_of(change) != PERMISSIONS for change in changes):

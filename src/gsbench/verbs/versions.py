@@ -230,7 +230,7 @@ class CommitSearch:
             environment["PYTHONPATH"] = str(tree / OWN_SOURCE.parts[0])
         make_home(home)
         words = ["-m", *self.settings, f"name={home.name}", f"seed={','.join(missing)}"]
-        command = [sys.executable, "-m", "gsbench", *words]
+        command = [sys.executable, "-P", "-m", "gsbench", *words]
         run_program(command, home / LOG, tree / self.trees.prefix, environment, None)
 
     def table(self) -> list[str]:

@@ -86,8 +86,7 @@ def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change
 def test_matches_that_contradict_the_cameras_are_refused(database, tmp_path):
     images = database.parent / "images"
     reference = model_of(dict(zip(NAMES, reversed(poses().values()), strict=True)))
-    said = "no point could be triangulated under the reference cameras"
-    with refusal(said):
+    with refusal("no point could be triangulated under the reference cameras"):
         mapping.triangulate(database, images, tmp_path, reference, NAMES, Sfm(), no_progress)
 
 

@@ -192,6 +192,7 @@ def _start_blocks(left, top, state, frame, planes, live):
         x, y = _corner(block, left, top)
         inside = (lane_x < np.float32(width - x)) & (lane_y < np.float32(height - y))
         live[block] = mask_bits(inside)
+        # 0 tells the backward pass that nothing was blended into a pixel outside the image.
         store(frame.last, state + place, select(inside, splat(NEVER_STOPPED), ZERO))
         if live[block] != 0:
             alive |= np.uint64(1) << np.uint64(block)
@@ -214,8 +215,10 @@ def _gather_batch(entry, count, end, left, top, alive, frame, batch, touched):
         touched[k] = blocks
         frame.masks[entry + k] = blocks
         store(batch, k * at.RECORD, load(records, base))
+        # Once for each entry; in the second loop it would be once for each block.
         batch[k * at.RECORD + at.MEAN_X] = tile_x - records[base + at.MEAN_X]
         batch[k * at.RECORD + at.MEAN_Y] = tile_y - records[base + at.MEAN_Y]
+    # ``lanes_with_bit`` reads a whole batch: what is behind the end of the list touches nothing.
     for k in range(count, BATCH):
         touched[k] = 0
 
@@ -249,6 +252,7 @@ def _blend_batch(block, todo, entry, before_batch, state, frame, planes, batch, 
         after = before - weight
         stop = blend & (after < TRANSMITTANCE_MIN)
         stopped = mask_bits(stop)
+        # Few entries stop a pixel: only these pay for the memory of ``last`` and ``live``.
         if stopped != 0:
             number = splat(np.float32(before_batch + np.int64(k)))
             earlier = load(frame.last, state + place)
@@ -335,6 +339,7 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
         _start_backward(left, top, state, frame, g_image, g_alpha, planes, behind, through)
         for entry in range(end - 1, begin - 1, -1):
             ahead = max(entry - AHEAD, begin)
+            # An entry that touches no block is skipped below, so its record is not needed.
             if masks[ahead] != 0:
                 prefetch(records, entries[ahead] * at.RECORD)
                 prefetch(rows, entries[ahead] * at.ROW)
@@ -400,6 +405,7 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                 sums = lane_sums((*moments, sum_abs_t, sum_abs_y))
             else:
                 sums = lane_sums(moments)
+            # No atomics: a shard of tiles is run by one thread, which alone writes to these rows.
             store(rows, base, load(rows, base) + sums)
 
 

@@ -1,5 +1,6 @@
 """The compiled CPU rasterizer: runs the stages of both passes on several threads."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ from gsbench.raster.cpu.composite import (
 from gsbench.raster.cpu.projection import BAD_VALUE, VISIBLE, backproject_shards, project_shards
 from gsbench.raster.cpu.shuffle import REST
 from gsbench.raster.cpu.workspace import HEADROOM, Arena, ArenaPool, ShardRunner, TensorPool
+from gsbench.raster.splitting import SPLITTING_MATRIX
 from gsbench.raster.staged import (
     Gradients,
     Lifetime,
@@ -62,6 +64,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
     """
 
     name = "cpu"
+    extras = SPLITTING_MATRIX
 
     def __init__(self, threads: int | None = None) -> None:
         if threads is not None and threads < 1:
@@ -107,8 +110,10 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             )
 
         self._runner.run(GAUSSIAN_SHARDS, project)
+        # The kernels only notice that some value is bad; this search names it.
         if flags[:, BAD_VALUE].any():
             raise_for_values(gaussians)
+        # Only now is it known how many Gaussians are visible.
         order = arena.take("order", (int(flags[:, VISIBLE].sum()),), np.uint64)
         spare = arena.take("spare", order.shape, np.uint64)
         sort_by_depth(
@@ -161,6 +166,8 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         def pair(first: int, past: int) -> None:
             pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
 
+        # How many pairs there are is known only when all are made. So they are made with the room
+        # that has sufficed so far; a second pass is needed only if the scene has grown.
         room = self._pairs_of_shard
         pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)
         self._runner.run(GAUSSIAN_SHARDS, pair)
@@ -184,7 +191,6 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
-        want_splitting: bool,
     ) -> Gradients:
         """See `StagedRasterizer`."""
         lifetime = Lifetime()
@@ -201,7 +207,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
 
         try:
             self._runner.run(TILE_SHARDS, composite_backward)
-            return self._backproject(passed, gaussians, request, rows, want_splitting)
+            return self._backproject(passed, gaussians, request, rows)
         except BaseException:
             # The kernels need rows of zeros and clear them after use; an interrupt may have left
             # sums in them.
@@ -214,13 +220,13 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         gaussians: Gaussians,
         request: RenderRequest,
         rows: NDArray[np.float32],
-        want_splitting: bool,
     ) -> Gradients:
         """Compute all gradients from the gradient sums in ``rows``; fill ``request.absolute``."""
         count, take = len(gaussians), self._tensors.empty
         gradients = gaussians.map(lambda tensor: take(tuple(tensor.shape)))
         g_screen = take((count, 2))
-        g_splitting = take((count, 3, 3)) if want_splitting else None
+        shape = self.extras[request.extra] if request.extra else ()
+        g_extra = take((count, *shape)) if shape else None
         arguments = (
             _edges(count),
             passed.visible,
@@ -232,7 +238,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
                 _arrays(gradients),
                 g_screen.numpy(),
                 _rows_or_none(request.absolute, 2),
-                _rows_or_none(g_splitting, 9),
+                _rows_or_none(g_extra, math.prod(shape)),
             ),
         )
 
@@ -240,7 +246,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             backproject_shards(at.kernel_memory(), first, past, *arguments)
 
         self._runner.run(GAUSSIAN_SHARDS, backproject)
-        return Gradients(list(gradients.tensors().values()), g_screen, g_splitting)
+        return Gradients(list(gradients.tensors().values()), g_screen, g_extra)
 
     def footprint(
         self,
@@ -263,6 +269,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
             cover_tiles(*_tiles(passed.frame, first, past), given, covered, sums, distances)
 
         self._runner.run(TILE_SHARDS, cover)
+        # The shards are added in one order, whatever the number of threads.
         totals = (
             torch.from_numpy(shards.sum(0, dtype=shards.dtype))
             for shards in (covered, sums, distances)

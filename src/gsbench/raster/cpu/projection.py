@@ -66,6 +66,7 @@ from gsbench.raster.cpu.simd import (
     square_root,
     store,
 )
+from gsbench.raster.cpu.splitting import scatter_splitting
 from gsbench.raster.staged import MIN_QUATERNION_NORM
 from gsbench.system.jit import inlined, kernel
 
@@ -314,8 +315,8 @@ def backproject_shards(
 
     Shard s has the Gaussians from ``edges[s]`` to ``edges[s + 1]``, of which ``visible[s]`` have
     records. ``rows`` is [shards of tiles * N * 16]. ``outputs`` are the gradients by the
-    parameters, by the screen points [N, 2], the absolute ones [N, 2] and the splitting matrices
-    [N, 9]; the last two are empty if not requested.
+    parameters, by the screen points [N, 2], the absolute ones [N, 2] and the extra output
+    [N, C]; the last two are empty if not requested.
     """
     for shard in range(first, past):
         begin, end = edges[shard], edges[shard + 1]
@@ -329,7 +330,7 @@ def backproject_shards(
 @inlined
 def _clear_unseen(begin, end, visible, record_ints, outputs):
     """Set the gradients of a shard's Gaussians without a record to 0."""
-    gradients, g_screen, g_absolute, g_splitting = outputs
+    gradients, g_screen, g_absolute, g_extra = outputs
     unseen = begin  # the first Gaussian whose gradients are not written yet
     for record in range(begin, begin + visible + 1):
         past = end if record == begin + visible else record_ints[record * at.RECORD + at.INDEX]
@@ -343,15 +344,15 @@ def _clear_unseen(begin, end, visible, record_ints, outputs):
             _clear(g_screen, unseen, past)
             if len(g_absolute) > 0:
                 _clear(g_absolute, unseen, past)
-            if len(g_splitting) > 0:
-                _clear(g_splitting, unseen, past)
+            if len(g_extra) > 0:
+                _clear(g_extra, unseen, past)
         unseen = past + 1
 
 
 @inlined
 def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     """Write the gradients of up to 16 Gaussians: those of the records ``record`` to ``past``."""
-    gradients, g_screen, g_absolute, g_splitting = outputs
+    gradients, g_screen, g_absolute, g_extra = outputs
     v, record_ints = frame.camera, frame.record_ints
     floats, indices = memory
     sums, colors = floats[:MATRIX], floats[3 * MATRIX :]
@@ -400,9 +401,9 @@ def _backproject(memory, record, past, gaussians, degree, frame, rows, outputs):
     q01 = a * e * load(sums, at.SUM_H_TY * LANES)
     q11 = e * e * load(sums, at.SUM_H_YY * LANES)
     h = load(sums, at.SUM_H * LANES)
-    if len(g_splitting) > 0:
+    if len(g_extra) > 0:
         free = image_rows(free_x, free_y, inverse_z, v)
-        _scatter_splitting(g_splitting, indices, q00 - a * h, q01, q11 - e * h, shear, free)
+        scatter_splitting(g_extra, indices, q00 - a * h, q01, q11 - e * h, shear, free)
     u0 = plus(n0, shear, n1)
     g0, g1 = mixed(q00, u0, q01, n1), mixed(q01, u0, q11, n1)
     variances = scaled(scales, scales)
@@ -481,33 +482,6 @@ def _backproject_harmonics(degree, to, indices, sh_rest, g_sh_rest, memory):
         else:
             store_rest(g_sh_rest, own, (splat(ZERO), splat(ZERO), splat(ZERO)))
     return direction_gradient(degree, to, pulled)
-
-
-@inlined
-def _scatter_splitting(g_splitting, indices, d00, d01, d11, shear, rows):
-    """Write the splitting matrices F^T U^T (D G D - h D) U F (SteepGS, arXiv 2505.05587).
-
-    F = ``rows`` is the derivative of the projected mean; ``d00``, ``d01`` and ``d11`` are the
-    entries of D G D - h D. The second derivative of alpha by the projected mean is alpha
-    (u u^T - C), with u = C (dx, dy) and the conic C = U^T D U. Its sum with weights h / alpha is
-    U^T (D G D - h D) U.
-    """
-    r1 = rows[1]
-    r0 = plus(rows[0], shear, r1)
-    s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
-    # The matrix is symmetric: entries above the diagonal are written twice.
-    xy = r0[0] * s0[1] + r1[0] * s1[1]
-    xz = r0[0] * s0[2] + r1[0] * s1[2]
-    yz = r0[1] * s0[2] + r1[1] * s1[2]
-    scatter(g_splitting, indices, 9, 0, r0[0] * s0[0] + r1[0] * s1[0])
-    scatter(g_splitting, indices, 9, 1, xy)
-    scatter(g_splitting, indices, 9, 2, xz)
-    scatter(g_splitting, indices, 9, 3, xy)
-    scatter(g_splitting, indices, 9, 4, r0[1] * s0[1] + r1[1] * s1[1])
-    scatter(g_splitting, indices, 9, 5, yz)
-    scatter(g_splitting, indices, 9, 6, xz)
-    scatter(g_splitting, indices, 9, 7, yz)
-    scatter(g_splitting, indices, 9, 8, r0[2] * s0[2] + r1[2] * s1[2])
 
 
 @inlined

@@ -243,6 +243,7 @@ def composite(
             red, green, blue = tl.zeros_like(light), tl.zeros_like(light), tl.zeros_like(light)
             crossed += 1
 
+    # The lane that loads a number of a border need not be the one that stored it.
     tl.debug_barrier()
     red, green, blue = _leave_light_behind(first_border, crossed, red, green, blue)
 
@@ -385,6 +386,7 @@ def composite_backward(
     """
     block, begin = _segment(order, starts, blocks, inner)
     end = tl.load(past + block)
+    # Compositing did not reach this segment.
     if begin >= end:
         return
     inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
@@ -435,6 +437,7 @@ def composite_backward(
             weight = light * opacity
             behind = tl.fma(weight, shine, behind)
 
+            # A pair has a row of its own: no atomics. `sum_units` adds in the order of slots.
             tl.store(
                 rows_out + slot * ROW + number,
                 _sums_over_lanes(_lane_sums(h, weight, t, dy, g, record, ABSOLUTE), lane, ABSOLUTE),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import CONSTANTS, CameraNumbers, Footprint, view_depths
 from gsbench.raster.executors import load_driver
+from gsbench.raster.splitting import SPLITTING_MATRIX
 from gsbench.raster.staged import (
     Gradients,
     Lifetime,
@@ -45,7 +47,12 @@ from gsbench.raster.triton.lists import (
     sort_by_depth,
 )
 from gsbench.raster.triton.projection import backproject, project, sum_units
+from gsbench.raster.triton.splitting import store_splitting
 from gsbench.scene.types import Camera
+
+EXTRA_KERNELS = {"splitting_matrix": store_splitting}  # each writes an extra output
+# the parameters from which the backward pass repeats the geometry of the forward pass
+READ_AGAIN = ("means", "log_scales", "quaternions", "opacity_logits")
 
 # Makes an output: name, shape, dtype.
 Allocate = Callable[[str, tuple[int, ...], torch.dtype], Tensor]
@@ -106,6 +113,39 @@ class TritonFrame:
     borders: Tensor  # [count_borders(pairs) * BORDER]
     last_slots: Tensor  # [blocks] int64
 
+    def of_blocks(self, request: RenderRequest) -> dict[str, Any]:
+        """The arguments that all kernels which read the lists of blocks have in common."""
+        return {
+            "starts": self.lists.starts,
+            "entries": self.lists.entries,
+            "slots": self.lists.slots,
+            "records": self.projected.records,
+            "width": request.camera.width,
+            "height": request.camera.height,
+            "blocks_x": self.blocks_x,
+            "last": self.last,
+            "past": self.past,
+        }
+
+    def of_pixels(self, request: RenderRequest) -> dict[str, Any]:
+        """The further arguments that both passes of compositing have in common."""
+        return {
+            "order": self.lists.order,
+            "closing": len(self.projected.row_counts),
+            "background": request.background,
+            "transmittance": self.transmittance,
+            "borders": self.borders,
+        }
+
+    def of_rows(self) -> dict[str, Tensor]:
+        """The arguments by which a kernel finds the rows of a Gaussian."""
+        return {
+            "row_counts": self.projected.row_counts,
+            "first_units": self.units.first,
+            "pair_ends": self.units.pair_ends,
+            "unit_widths": self.units.widths,
+        }
+
 
 class TritonRasterizer(StagedRasterizer[TritonFrame]):
     """A rasterizer in float32 on a GPU, compiled by Triton at first use.
@@ -117,6 +157,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
     """
 
     name = "triton"
+    extras = SPLITTING_MATRIX
 
     def __init__(self) -> None:
         self.direct_steps = True  # whether trainings may use `gsbench.train.direct`
@@ -218,23 +259,11 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             memory.take("last_slots", blocks, torch.int64),
         )
         launch_grid(composite, blocks)(
-            lists.order,
-            lists.starts,
-            lists.entries,
-            frame.projected.records,
-            len(started.radii),
-            started.request.background,
-            camera.width,
-            camera.height,
-            frame.blocks_x,
-            image,
-            alpha,
-            frame.transmittance,
-            frame.last,
-            frame.past,
-            frame.borders,
-            lists.slots,
-            frame.last_slots,
+            **frame.of_blocks(started.request),
+            **frame.of_pixels(started.request),
+            image=image,
+            alpha=alpha,
+            last_slots=frame.last_slots,
             num_warps=1,
         )
         return image, alpha, started.radii, frame
@@ -246,7 +275,6 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
-        want_splitting: bool,
     ) -> Gradients:
         """See `StagedRasterizer`."""
         lifetime = Lifetime()
@@ -259,7 +287,6 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
                 request,
                 g_image,
                 g_alpha,
-                want_splitting,
                 scratch,
                 fresh_on(device),
                 zeros_like_all(gaussians),
@@ -273,7 +300,6 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         request: RenderRequest,
         g_image: Tensor,
         g_alpha: Tensor | None,
-        want_splitting: bool,
         scratch: Workspace,
         allocate: Allocate,
         gradients: list[Tensor],
@@ -282,65 +308,48 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
 
         Others, and those of harmonics above the degree, are not changed.
         """
-        camera, units, lists, count = request.camera, frame.units, frame.lists, len(gaussians)
-        projected, absolute = frame.projected, request.absolute
+        lists, projected, count = frame.lists, frame.projected, len(gaussians)
+        absolute = request.absolute
         rows = scratch.take("rows", lists.room.pairs * ROW.value, torch.float32)
         inner = count_borders(lists.room.pairs)
         launch_grid(composite_backward, inner + frame.blocks)(
-            lists.order,
-            lists.starts,
-            frame.blocks,
-            inner,
-            lists.entries,
-            lists.slots,
-            projected.records,
-            count,
-            request.background,
-            camera.width,
-            camera.height,
-            frame.blocks_x,
-            frame.transmittance,
-            frame.last,
-            frame.past,
-            frame.borders,
-            g_image,
-            g_image if g_alpha is None else g_alpha,
-            rows,
+            **frame.of_blocks(request),
+            **frame.of_pixels(request),
+            blocks=frame.blocks,
+            inner=inner,
+            g_image=g_image,
+            g_alpha=g_image if g_alpha is None else g_alpha,
+            rows_out=rows,
             HAS_ALPHA=g_alpha is not None,
             ABSOLUTE=absolute is not None,
             num_warps=1,
         )
         _sum_units(frame, rows)
-        means, log_scales, quaternions, logits, *_ = gaussians.tensors().values()
+        tensors = gaussians.tensors()
         g_screen = allocate("g_screen", (count, 2), torch.float32)
-        g_splitting = (
-            allocate("g_splitting", (count, 3, 3), torch.float32) if want_splitting else None
-        )
+        g_extra = None
+        if request.extra is not None:
+            g_extra = allocate("g_extra", (count, *self.extras[request.extra]), torch.float32)
+        # An output that is not wanted has no memory; its pointer is any other, and is not used.
         launch(backproject, count, 128)(
-            means,
-            log_scales,
-            quaternions,
-            logits,
-            count,
-            frame.view,
-            projected.records.view(torch.int32),
-            projected.color_slopes,
-            projected.row_counts,
-            units.first,
-            units.pair_ends,
-            units.widths,
-            units.status,
-            *lists.room,
-            rows,
-            *gradients,
-            g_screen,
-            g_screen if absolute is None else absolute,
-            g_screen if g_splitting is None else g_splitting,
+            **{name: tensors[name] for name in READ_AGAIN},
+            count=count,
+            camera=frame.view,
+            record_ints=projected.records.view(torch.int32),
+            color_slopes=projected.color_slopes,
+            **frame.of_rows(),
+            status=frame.units.status,
+            **lists.room._asdict(),
+            rows=rows,
+            **{f"g_{name}": gradient for name, gradient in zip(tensors, gradients, strict=True)},
+            g_screen=g_screen,
+            g_absolute=g_screen if absolute is None else absolute,
+            g_extra=g_screen if g_extra is None else g_extra,
             DEGREE=request.degree,
             ABSOLUTE=absolute is not None,
-            SPLITTING=want_splitting,
+            EXTRA=None if request.extra is None else EXTRA_KERNELS[request.extra],
         )
-        return Gradients(gradients, g_screen, g_splitting)
+        return Gradients(gradients, g_screen, g_extra)
 
     def footprint(
         self,
@@ -353,41 +362,28 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         lifetime = Lifetime()
         with torch.cuda.device_of(gaussians.means):
             scratch = self._scratch.lease(lifetime, gaussians.means.device)
-            units = frame.units
-            lists = frame.lists
             count = len(gaussians)
             device = gaussians.means.device
             covered = torch.zeros(count, dtype=torch.int32, device=device)
             sums, distances = torch.zeros(2, count, device=device)
             given = sums if values is None else values.detach().float().contiguous()
             # ``cover`` fills 3 of 16 columns
-            rows = scratch.take("rows", lists.room.pairs * ROW.value, torch.float32)
+            rows = scratch.take("rows", frame.lists.room.pairs * ROW.value, torch.float32)
             launch_grid(cover, frame.blocks)(
-                lists.starts,
-                lists.entries,
-                lists.slots,
-                frame.projected.records,
-                request.camera.width,
-                request.camera.height,
-                frame.blocks_x,
-                frame.last,
-                frame.past,
-                given,
-                rows,
+                **frame.of_blocks(request),
+                values=given,
+                rows_out=rows,
                 HAS_VALUES=values is not None,
                 num_warps=1,
             )
             _sum_units(frame, rows)
             launch(sum_cover, count, 128)(
-                count,
-                frame.projected.row_counts,
-                units.first,
-                units.pair_ends,
-                units.widths,
-                rows,
-                covered,
-                sums,
-                distances,
+                **frame.of_rows(),
+                count=count,
+                rows=rows,
+                covered=covered,
+                sums=sums,
+                distances=distances,
             )
             return Footprint(covered, view_depths(gaussians, request.camera), sums, distances)
 
@@ -425,18 +421,15 @@ def _project(
         memory.take("color_slopes", count * COLOR_SLOPES.value, torch.float32),
         memory.take("row_counts", count, torch.int32),
     )
-    parameters = [tensor.detach() for tensor in gaussians.tensors().values()]
     launch(project, count + 1, 128)(
-        *parameters,
-        count,
-        view,
-        projected.records,
-        projected.records.view(torch.int32),
-        projected.color_slopes,
-        keys,
-        projected.row_counts,
-        radii,
-        flags,
+        **gaussians.detach().tensors(),
+        count=count,
+        camera=view,
+        **projected._asdict(),
+        record_ints=projected.records.view(torch.int32),
+        keys=keys,
+        radii=radii,
+        flags=flags,
         DEGREE=degree,
     )
     return projected
@@ -446,5 +439,11 @@ def _sum_units(frame: TritonFrame, rows: Tensor) -> None:
     """Sum the ``rows`` of the pairs of each unit, in place."""
     units, room = frame.units, frame.lists.room
     launch(sum_units, room.units, 32)(
-        units.pair_ends, units.widths, units.blocks, frame.last_slots, units.status, *room, rows
+        pair_ends=units.pair_ends,
+        unit_widths=units.widths,
+        unit_blocks=units.blocks,
+        last_slots=frame.last_slots,
+        status=units.status,
+        **room._asdict(),
+        rows=rows,
     )

@@ -74,6 +74,12 @@ def store_vector(array, index, values, mask):
 
 
 @triton.jit
+def store_or_zero(place, value, seen, inside):
+    """Store ``value`` where a Gaussian is ``seen``, 0 for the others ``inside`` the arrays."""
+    tl.store(place, tl.where(seen, value, 0.0), mask=inside)
+
+
+@triton.jit
 def load_quaternion(quaternions, index, mask):
     """The unit quaternions (w, x, y, z); the inverse and the squared norm of the stored ones."""
     place = quaternions + 4 * index

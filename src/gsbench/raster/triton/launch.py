@@ -20,9 +20,9 @@ def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
     It launches nothing if ``count`` is 0.
     """
 
-    def run(*arguments: Any, **constants: Any) -> None:
+    def run(**arguments: Any) -> None:
         if count:
-            launch_grid(kernel, -(-count // group))(*arguments, GROUP=group, **constants)
+            launch_grid(kernel, -(-count // group))(GROUP=group, **arguments)
 
     return run
 
@@ -30,11 +30,13 @@ def launch(kernel: Any, count: int, group: int) -> Callable[..., None]:
 def launch_grid(kernel: Any, *programs: int) -> Callable[..., None]:
     """Return a launcher of ``kernel`` on a grid of ``programs``, at least 1 on each axis.
 
-    The launcher also takes options of Triton, for example ``num_warps``.
+    The launcher takes the kernel's arguments and constants, and options of Triton, for example
+    ``num_warps``, all by name: a kernel has up to 25, and two that change places would be found
+    late or never.
     """
 
-    def run(*arguments: Any, **constants: Any) -> None:
-        kernel[programs](*arguments, **OPTIONS, **constants)
+    def run(**arguments: Any) -> None:
+        kernel[programs](**OPTIONS, **arguments)
 
     return run
 

@@ -255,22 +255,28 @@ def find_all_units(
         memory.take("status", 3, torch.int64),
     )
     launch(find_units, count, 128)(
-        order,
-        count,
-        projected.row_counts,
-        unit_ends,
-        projected.records,
-        projected.records.view(torch.int32),
-        blocks_x,
-        capacity,
-        units.first,
-        units.owners,
-        units.blocks,
-        units.widths,
+        order=order,
+        count=count,
+        row_counts=projected.row_counts,
+        unit_ends=unit_ends,
+        records=projected.records,
+        record_ints=projected.records.view(torch.int32),
+        blocks_x=blocks_x,
+        capacity=capacity,
+        first_units=units.first,
+        unit_owners=units.owners,
+        unit_blocks=units.blocks,
+        unit_widths=units.widths,
     )
     torch.cumsum(units.widths, 0, out=units.pair_ends)
     launch_grid(summarise, 1)(
-        unit_ends, count, units.pair_ends, capacity, flags, background, units.status
+        unit_ends=unit_ends,
+        count=count,
+        pair_ends=units.pair_ends,
+        capacity=capacity,
+        flags=flags,
+        background=background,
+        status=units.status,
     )
     return units
 
@@ -296,14 +302,14 @@ def make_lists(
     sorted_keys = scratch.take(f"sorted_keys_{key_type}", pairs, key_type)
     slot_owners = scratch.take("slot_owners", pairs, torch.int32)
     launch(write_pairs, room.units, 128)(
-        units.owners,
-        units.blocks,
-        units.widths,
-        units.pair_ends,
-        units.status,
-        *room,
-        block_keys,
-        slot_owners,
+        unit_owners=units.owners,
+        unit_blocks=units.blocks,
+        unit_widths=units.widths,
+        pair_ends=units.pair_ends,
+        status=units.status,
+        **room._asdict(),
+        keys=block_keys,
+        owners=slot_owners,
     )
     slots = memory.take("slots", pairs, torch.int64)
     torch.sort(block_keys, stable=True, out=(sorted_keys, slots))

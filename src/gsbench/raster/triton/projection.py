@@ -29,6 +29,7 @@ from gsbench.raster.triton.geometry import (
     scaled,
     spread,
     store_gradients,
+    store_or_zero,
     store_vector,
     stretched,
     through,
@@ -103,7 +104,7 @@ def project(
     means,
     log_scales,
     quaternions,
-    logits,
+    opacity_logits,
     sh_dc,
     sh_rest,
     count,
@@ -135,7 +136,7 @@ def project(
     mean, log_scale = load_vector(means, index, inside), load_vector(log_scales, index, inside)
     dc = load_vector(sh_dc, index, inside)
     quaternion, _, squared_norm = load_quaternion(quaternions, index, inside)
-    logit = tl.load(logits + index, mask=inside, other=0.0)
+    logit = tl.load(opacity_logits + index, mask=inside, other=0.0)
     total = mean[0] + mean[1] + mean[2] + log_scale[0] + log_scale[1] + log_scale[2]
     total += squared_norm + logit + dc[0] + dc[1] + dc[2]
     bad = (squared_norm < MIN_SQUARED_NORM) | ~(tl.abs(total) < float("inf"))
@@ -241,39 +242,6 @@ def sum_units(
 
 
 @triton.jit
-def _store_or_zero(place, value, seen, inside):
-    """Store ``value`` where a Gaussian is ``seen``, 0 for the others ``inside`` the arrays."""
-    tl.store(place, tl.where(seen, value, 0.0), mask=inside)
-
-
-@triton.jit
-def _store_splitting(place, d00, d01, d11, shear, rows, seen, mask):
-    """Write the splitting matrices F^T U^T (D G D - h D) U F (SteepGS, arXiv 2505.05587).
-
-    F = ``rows`` is the derivative of the projected mean; ``d00``, ``d01`` and ``d11`` are the
-    entries of D G D - h D. The second derivative of alpha by the projected mean is alpha
-    (u u^T - C), with u = C (dx, dy) and the conic C = U^T D U. Its sum with weights h / alpha is
-    U^T (D G D - h D) U.
-    """
-    r1 = rows[1]
-    r0 = plus(rows[0], shear, r1)
-    s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
-    # The matrix is symmetric: entries above the diagonal are written twice.
-    xy = r0[0] * s0[1] + r1[0] * s1[1]
-    xz = r0[0] * s0[2] + r1[0] * s1[2]
-    yz = r0[1] * s0[2] + r1[1] * s1[2]
-    _store_or_zero(place, r0[0] * s0[0] + r1[0] * s1[0], seen, mask)
-    _store_or_zero(place + 1, xy, seen, mask)
-    _store_or_zero(place + 2, xz, seen, mask)
-    _store_or_zero(place + 3, xy, seen, mask)
-    _store_or_zero(place + 4, r0[1] * s0[1] + r1[1] * s1[1], seen, mask)
-    _store_or_zero(place + 5, yz, seen, mask)
-    _store_or_zero(place + 6, xz, seen, mask)
-    _store_or_zero(place + 7, yz, seen, mask)
-    _store_or_zero(place + 8, r0[2] * s0[2] + r1[2] * s1[2], seen, mask)
-
-
-@triton.jit
 def _turned(to, inverse_distance, g_rgb, color_slopes, index, mask, DEGREE: tl.constexpr):
     """The gradient by the mean through the view direction ``to``, which changes the colour."""
     zero = tl.zeros_like(inverse_distance)
@@ -326,7 +294,7 @@ def backproject(
     means,
     log_scales,
     quaternions,
-    logits,
+    opacity_logits,
     count,
     camera,
     record_ints,
@@ -342,21 +310,22 @@ def backproject(
     g_means,
     g_log_scales,
     g_quaternions,
-    g_logits,
+    g_opacity_logits,
     g_sh_dc,
     g_sh_rest,
     g_screen,
     g_absolute,
-    g_splitting,
+    g_extra,
     DEGREE: tl.constexpr,
     ABSOLUTE: tl.constexpr,
-    SPLITTING: tl.constexpr,
+    EXTRA: tl.constexpr,
     GROUP: tl.constexpr,
 ):
     """Write the gradients of Gaussians that are seen: those with a row in ``row_counts``.
 
-    Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_splitting``
-    become 0. See `lists_fit` for ``status``, ``units`` and ``pairs``.
+    Other gradients are not changed, except that ``g_screen``, ``g_absolute`` and ``g_extra``
+    become 0. ``EXTRA`` is the function that writes ``g_extra``, for example that of
+    `raster.triton.splitting`, or None. See `lists_fit` for ``status``, ``units`` and ``pairs``.
     """
     v = load_camera(camera)
     index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
@@ -395,20 +364,19 @@ def backproject(
     g_column = a * h_t
     g_row = shear * g_column + e * h_y
     half_width, half_height = 0.5 * v.width, 0.5 * v.height
-    _store_or_zero(g_screen + 2 * index, g_column * half_width, seen, inside)
-    _store_or_zero(g_screen + 2 * index + 1, g_row * half_height, seen, inside)
+    store_or_zero(g_screen + 2 * index, g_column * half_width, seen, inside)
+    store_or_zero(g_screen + 2 * index + 1, g_row * half_height, seen, inside)
     if ABSOLUTE:
-        _store_or_zero(g_absolute + 2 * index, a * sums[9] * half_width, seen, inside)
-        _store_or_zero(g_absolute + 2 * index + 1, sums[10] * half_height, seen, inside)
+        store_or_zero(g_absolute + 2 * index, a * sums[9] * half_width, seen, inside)
+        store_or_zero(g_absolute + 2 * index + 1, sums[10] * half_height, seen, inside)
 
     # Covariance: M = N S and N = A R. d loss / d M = U^T Q U M with Q = D G D, D = diag(a, e), U =
     # [[1, shear], [0, 1]] and G the second moments of h over (t, dy). For a needle the first row of
     # U M is small, so U N is computed first, before large numbers can cancel.
     q00, q01, q11 = a * a * h_tt, a * e * h_ty, e * e * h_yy
-    if SPLITTING:
+    if EXTRA is not None:
         free = image_rows(free_x, free_y, inverse_z, v)
-        d00, d11 = q00 - a * h, q11 - e * h
-        _store_splitting(g_splitting + 9 * index, d00, q01, d11, shear, free, seen, inside)
+        EXTRA(g_extra, index, q00 - a * h, q01, q11 - e * h, shear, free, seen, inside)
     u0 = plus(n0, shear, n1)
     g0, g1 = mixed(q00, u0, q01, n1), mixed(q01, u0, q11, n1)
     variances = scaled(scales, scales)
@@ -436,7 +404,7 @@ def backproject(
     store_vector(g_means, index, plus(position, 1.0, tangent), seen)
 
     # d log(alpha) / d logit = 1 - opacity
-    g_logit = h / (tl.exp(tl.load(logits + index, mask=seen, other=0.0)) + 1.0)
-    tl.store(g_logits + index, g_logit, mask=seen)
+    g_logit = h / (tl.exp(tl.load(opacity_logits + index, mask=seen, other=0.0)) + 1.0)
+    tl.store(g_opacity_logits + index, g_logit, mask=seen)
     # Last, when few other values need registers.
     store_gradients(to, g_rgb, g_sh_rest, index, seen, DEGREE)

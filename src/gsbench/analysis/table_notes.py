@@ -1,10 +1,11 @@
-"""Notes on trials: who trained them, on what, and doubts about what they are worth."""
+"""The notes below a table: who trained, on what, doubts, and how else the compared arms differ."""
 
 from collections import Counter
 from collections.abc import Sequence
 
+from gsbench.analysis.fairness import caveats
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import TrialResult, group_by, seeds_text
+from gsbench.analysis.results import Experiment, TrialResult, group_by, seeds_text
 from gsbench.events import FEWEST_ROUNDS
 from gsbench.runs.layout import EVENTS
 from gsbench.runs.nested import SHOWN
@@ -20,6 +21,39 @@ ORIGINS = {
     (False, FROM_MODEL): "foreign model",
     (False, FROM_RENDERS): "foreign renders",
 }
+
+
+def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[Note]:
+    """All notes on ``trials`` of an experiment and on its comparisons."""
+    return [
+        *doubt_notes(trials),
+        *origin_notes(trials),
+        *edited_notes(trials),
+        *comparison_notes(experiment),
+        *held_out_notes(trials),
+        *points_notes(trials),
+        *machine_notes(trials),
+        *cloud_notes(trials),
+    ]
+
+
+def comparison_notes(experiment: Experiment) -> list[Note]:
+    """Notes on the compared arms: the verdicts, what no verdict uses, and caveats.
+
+    They are about the whole experiment, so choosing the trials that a table shows cannot change a
+    verdict.
+    """
+    # here, since SciPy is slow to import
+    from gsbench.analysis.comparison import compare
+
+    comparison = compare(experiment)
+    by_arm = group_by(comparison.trials, lambda trial: trial.arm)
+    between = [
+        note
+        for first, second in comparison.pairs
+        for note in caveats([*by_arm[first], *by_arm[second]], first, second)
+    ]
+    return [*comparison.notes(), *between]
 
 
 def doubt_notes(trials: Sequence[TrialResult]) -> list[Note]:

@@ -1,0 +1,105 @@
+"""The settings that determine trials' results, read once for all seeds, and compared as text."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from gsbench.parsing import DamagedError
+from gsbench.runs.config_hash import is_hashed
+from gsbench.runs.layout import CONFIG
+from gsbench.runs.nested import flatten
+from gsbench.runs.trial_folder import TrialFolder
+
+# settings in which repetitions of a trial may differ
+UNCOUNTED = ("eval.primary", "eval.controls", "densify.switches", "scene.path", "hydra.")
+GROUPS = ("scene", "init", "densify")  # groups that every trial's configuration has
+ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
+
+
+class Configurations:
+    """The settings that determine results, of all trials of an experiment.
+
+    Each file is read once for all seeds. ``trial`` is the key that the seeds of a trial share
+    (`TrialResult.key`). ``known`` has, by this key, the settings of trials that have not run
+    and thus have no file.
+    """
+
+    def __init__(self, known: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+        self._known: dict[str, Mapping[str, Any]] = dict(known or {})
+
+    def shared(self, trial: str, folder: Path) -> Mapping[str, Any]:
+        """A trial's settings, read from ``folder`` or from an earlier seed; {} if unreadable."""
+        if trial not in self._known:
+            self.read(trial, [folder])
+        return self._known[trial]
+
+    def read(self, trial: str, folders: Iterable[Path]) -> str:
+        """Read a trial's settings from its first readable folder; return "", or the last fault."""
+        fault = ""
+        for folder in folders:
+            try:
+                config = load_flat_config(folder)
+            except FileNotFoundError:
+                fault = f"{CONFIG} is not there"
+            except DamagedError as error:
+                fault = f"{error.path.name} {error.reason}"
+            else:
+                self._known[trial] = {key: value for key, value in config.items() if is_hashed(key)}
+                return ""
+        self._known.setdefault(trial, {})
+        return fault
+
+
+def load_flat_config(folder: Path) -> dict[str, Any]:
+    """The configuration of the trial in ``folder`` with dotted keys.
+
+    Raises FileNotFoundError and DamagedError.
+    """
+    values = TrialFolder(folder).settings()
+    if not isinstance(values, dict) or not all(
+        isinstance(values.get(group), dict) for group in GROUPS
+    ):
+        raise DamagedError(
+            folder / CONFIG, f"is damaged: it lacks one of the groups {', '.join(GROUPS)}"
+        )
+    return flatten(values)
+
+
+def canonical(value: object) -> str:
+    """JSON text that is equal for equal values."""
+    if type(value) is int or (type(value) is float and math.isfinite(value)):
+        return repr(value)  # the same text as JSON's, but faster: most settings are numbers
+    return ENCODER.encode(value)
+
+
+def settings_text(config: Mapping[str, Any]) -> str:
+    """The settings that determine a result, as text that is equal for equal settings."""
+    # A missing key counts as unset: trials from before a setting existed equal later ones.
+    return canonical(
+        {
+            key: value
+            for key, value in config.items()
+            if value is not None and is_hashed(key) and not key.startswith(UNCOUNTED)
+        }
+    )
+
+
+class Configured(Protocol):
+    """A trial with its place and its settings, finished or only planned."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def scene(self) -> str: ...
+    @property
+    def init(self) -> str: ...
+    @property
+    def densify(self) -> str: ...
+    @property
+    def config_hash(self) -> str: ...
+    @property
+    def config(self) -> Mapping[str, Any]: ...
+    @property
+    def key(self) -> str: ...

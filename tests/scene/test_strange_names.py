@@ -1,0 +1,57 @@
+"""Names of photographs, masks and folders that are not UTF-8: one line, and no traceback."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from gsbench.errors import InputError
+from gsbench.scene.images import list_images
+
+BAD = os.fsdecode(b"a\xff")
+
+
+@pytest.mark.parametrize("place", [f"{BAD}.png", f"{BAD}/a.png", f"b/{BAD}/a.jpg"])
+def test_a_name_that_is_not_utf8_is_named_in_one_line(place, tmp_path):
+    file = tmp_path / place
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.touch()
+    (tmp_path / "good.png").touch()
+    with pytest.raises(InputError, match=r"names that are not UTF-8: .*: rename them$"):
+        list_images(tmp_path)
+
+
+@pytest.mark.parametrize("words", [["tables"], ["status"], ["sync"], ["scene=courtyard"]])
+@pytest.mark.parametrize("where", ["runs", "current"])
+def test_runs_and_current_folder_have_utf8_names(where, words, tmp_path, monkeypatch, refused):
+    folder = tmp_path / BAD
+    folder.mkdir()
+    monkeypatch.chdir(folder if where == "current" else tmp_path)
+    runs = tmp_path / "runs" if where == "current" else folder
+    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    assert "not UTF-8: rename it" in refused(*words) or where == "runs"
+    assert not (folder / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["scene=photos", "scene.path=photos", "init=sfm", "tracking=none"],
+        ["evaluate", "photos", "--truth", "photos"],
+    ],
+)
+def test_where_python_reads_names_as_ascii_the_line_says_so(words, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        (tmp_path / "photos" / f"ü{number}.png").touch()
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-P", "-m", "gsbench", *words]
+    environment = os.environ | ascii_only | {"GSBENCH_RUNS": str(tmp_path / "runs")}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(os.path.isabs, sys.path))
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "set PYTHONUTF8=1: Python reads names as ascii" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
