@@ -165,9 +165,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
         path.unlink()
     verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
     assert verdicts[-1].answer is None
-    assert markdown_table(verdicts)[-1].endswith(
-        "| unknown | unknown | courtyard: seed 0 has no partner |"
-    )
+    assert markdown_table(verdicts)[-1].endswith("| – | – | courtyard: seed 0 has no partner |")
     assert len(markdown_table(verdicts[-1:])) == 3
 
 
