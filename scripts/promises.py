@@ -38,7 +38,7 @@ from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
 from gsbench.claims.pooling import Study, pool
-from gsbench.claims.stopping import NO_RESULTS, KeyAndSeed, run_looks
+from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.runs import ledger as records
 from gsbench.runs.experiments import Declaration, Question, trial_key
 from gsbench.runs.trial_record import TrialRecord
@@ -49,6 +49,12 @@ SECTION = re.compile(r"(<!-- promises -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 ONE_ARM_LIMIT = 0.22
 TIME, MEASURED = "2020-01-01T00:00:00Z", "2021-01-01T00:00:00Z"
 METRIC, LEAST = "psnr", 0.1
+NO_RESULTS: dict[str, Any] = {
+    **dict.fromkeys(("raster", "protocol"), ""),
+    **dict.fromkeys(("iterations", "num_gaussians"), 0),
+    **dict.fromkeys(("num_init_points", "peak_memory_mb")),
+    **{name: {} for name in ("metrics", "unavailable", "seconds", "hashes", "versions")},
+}
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -332,7 +338,7 @@ def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
             nonlocal most
             most = 1 + max(seed for _, seed in planned)
 
-        found = gates.Gate(
+        found = gates.ask_gate(
             asked,
             lambda: [one for one in old if one.seed < most],
             lambda: [one for one in new if one.seed < most],
@@ -377,9 +383,9 @@ def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -
 
             good, last, new = (lambda place=place: read(place) for place in places.values())
             if number == count:
-                (verdict,) = run_looks(asked, gates.Gate(asked, good, new).judged, run)
+                (verdict,) = run_looks(asked, gates.ask_gate(asked, good, new).judged, run)
                 return gates.result_of(verdict)
-            step = gates.Step(asked, share, good, last, new)
+            step = gates.ask_step(asked, share, good, last, new)
             return gates.step_result(run_looks(step.declaration, step.judged, run))
 
         found = gates.first_worse(count, result)
@@ -414,10 +420,8 @@ def attempt(declaration: Declaration, made: Sequence[TrialResult]) -> Verdict:
         nonlocal most
         most = 1 + max(seed for _, seed in planned)
 
-    def judged() -> list[Verdict]:
-        return [rules.judge_idea([one for one in made if one.seed < most], declaration)]
-
-    (verdict,) = run_looks(declaration, judged, run)
+    asked = rules.ask_idea(declaration, lambda: [one for one in made if one.seed < most])
+    (verdict,) = asked.answer(run)
     return verdict
 
 
@@ -614,7 +618,7 @@ def promises() -> Iterator[Promise]:
     for captures in (1, 3):
         name = f"ledger: false discoveries, captures: {captures}, retries correlate by 0.7"
         draw = night(captures, 0.7, 0.7)
-        yield Promise(name, "`next_level`, `judge_idea`", 0.1, 150, draw)
+        yield Promise(name, "`next_level`, `ask_idea`", 0.1, 150, draw)
     for correlation, noise in (
         *product((0.0, 0.39, 0.7, 0.95), ((1.0,),)),
         *product((0.7, 0.95), ((1.0, 1.0, 1.0), (10.0, 1.0, 1.0), (100.0, 1.0, 1.0), (10.0, 1.0))),

@@ -12,6 +12,7 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 try:
     import os
     from contextlib import suppress
+    from pathlib import Path
 
     from gsbench import __version__
     from gsbench.errors import GsbenchError, InputError
@@ -91,7 +92,7 @@ def _refuse(error: GsbenchError, code: int) -> int:
 
 def _verb(name: str, argv: list[str]) -> int:
     if name not in VERBS:
-        from gsbench.config.command_words import hint_for
+        from gsbench.config.groups import hint_for
 
         raise InputError(
             f"{name!r} is neither a verb nor a setting like key=value"
@@ -129,10 +130,13 @@ def _trials(argv: list[str]) -> int:
 
 
 def _help(words: list[str]) -> int:
-    from gsbench.config.command_words import parse, searched_folders
-    from gsbench.config.compose import options_text
+    from gsbench.config.groups import options_text
 
-    folders = searched_folders(parse(words)[0])  # the choices in the user's folders are listed too
+    folders: list[Path] = []
+    if words:  # the choices in the user's folders are listed too
+        from gsbench.config.command_words import parse, searched_folders
+
+        folders = searched_folders(parse(words)[0])
     print(USAGE)
     print("Verbs (gsbench VERB --help):")
     for name, (_, text) in VERBS.items():

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from gsbench.errors import GsbenchError, InputError
-from gsbench.words import is_utf8
+from gsbench.words import is_one_line
 
 CHUNK = 1 << 20
 # Of a file name. File systems allow 255, but the temporary name of a file that is being written is
@@ -220,9 +220,9 @@ def checked_runs_folder(name: str) -> Path:
     advice = "set runs=FOLDER or GSBENCH_RUNS to another folder"
     try:
         # Records of trials have the current folder, too.
-        if strange := [place for place in (name, os.getcwd()) if not is_utf8(place)]:
+        if strange := [place for place in (name, os.getcwd()) if not is_one_line(place)]:
             raise InputError(
-                f"the name of {strange[0]} is not UTF-8: rename it, or start elsewhere"
+                f"the name of {strange[0]} is not UTF-8, or has a line break: rename it"
             )
         folder = Path(name).expanduser().resolve()
         existing = next(place for place in (folder, *folder.parents) if place.exists())
@@ -284,8 +284,7 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     faults = {
         errno.EFBIG: "{0} may not grow any more ({1}): raise `ulimit -f`, or set runs=FOLDER",
         errno.ENOLCK: "the file system of {0} has no locks ({1}), so trials would disturb each "
-        "other: set runs=FOLDER "
-        "or GSBENCH_RUNS to another file system, or start its lock service",
+        "other: set runs=FOLDER or GSBENCH_RUNS to another file system, or start its lock service",
         **dict.fromkeys(
             BROKEN, "{0} cannot be opened ({1}): look at its disk and its links, or set runs=FOLDER"
         ),

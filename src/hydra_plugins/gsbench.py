@@ -1,14 +1,12 @@
-"""Plug-ins by which Hydra finds gsbench's launcher and sweeper; ``gsbench.app`` does their work.
+"""Plug-ins by which Hydra hands trials to gsbench; ``gsbench.app.plugins`` does their work.
 
 Hydra imports this file whenever any Hydra app in the same environment starts, so it imports only
 Hydra.
 """
 
 from collections.abc import Sequence
-from inspect import signature
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
 from hydra.core.utils import JobReturn
 from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
@@ -25,51 +23,30 @@ class GsbenchLauncher(Launcher):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        self.loader = hydra_context.config_loader
-        self.task, self.config = task_function, config
+        self.task: Any = task_function
+        self.config = config
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        from gsbench.app.sweep import Sweep
-
-        return Sweep(self.config, self.task, self.loader).run_jobs(job_overrides)
+        returned: Sequence[JobReturn] = self.task.run_jobs(job_overrides, self.config)
+        return returned
 
 
 class GsbenchSweeper(Sweeper):
     """Runs the grid of all listed values, or several joined grids, as one batch.
 
-    ``tune`` says how intervals are searched first. ``grids`` is always empty here: gsbench reads
-    the grids before Hydra makes this object, because Hydra would resolve them.
+    gsbench has read its settings before Hydra makes this object.
     """
 
-    def __init__(
-        self, params: dict[str, Any] | None, tune: dict[str, Any] | None = None, grids: Any = None
-    ) -> None:
-        self.params, self.tune = params or {}, tune or {}
+    def __init__(self, **settings: Any) -> None:
+        pass
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        from gsbench.app.sweep import Sweep
-
-        self.started = Sweep.begin(hydra_context, task_function, config)
+        self.task: Any = task_function
+        self.context, self.config = hydra_context, config
 
     def sweep(self, arguments: list[str]) -> None:
-        from gsbench.app.grids import run_sweep
-
-        run_sweep(self.started, self.params, self.tune, arguments)
-
-
-LAUNCHER = {"_target_": "hydra_plugins.gsbench.GsbenchLauncher"}
-SWEEPER = {"_target_": "hydra_plugins.gsbench.GsbenchSweeper", "params": {}, "grids": []}
-# The defaults of gsbench.app.tuning.TuneSettings, which cannot be imported here.
-TUNE = {"points": 20, "at_once": 1, "metric": None, "seed": 100}
-# Hydra imports this file more than once. From 1.4 on it warns of that unless ``replace`` is set.
-REPLACE: dict[str, Any] = (
-    {"replace": True} if "replace" in signature(ConfigStore.store).parameters else {}
-)
-for group, node in (("launcher", LAUNCHER), ("sweeper", {**SWEEPER, "tune": TUNE})):
-    ConfigStore.instance().store(
-        group=f"hydra/{group}", name="gsbench", node=node, provider="gsbench", **REPLACE
-    )
+        self.task.run_sweep(self.context, self.config)

@@ -25,6 +25,10 @@ def of_gsbench(**packages):
     return code() | {"rooms": packages}
 
 
+def table_of(runs):
+    return build_table(load_experiment(runs, "exp"), metrics=["psnr"])
+
+
 def finished_at(path, seconds):
     os.utime(path / "results.json", (seconds, seconds))
     return path
@@ -83,48 +87,44 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path
     finished_at(one_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _code=other), 2000)
     assert load_experiment(tmp_path, "exp").trials[0].metrics["psnr"] == 27.0
     (tmp_path / "patient.py").write_text("# a comment\nx  =  1\n")
-    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    table = table_of(tmp_path)
     assert table.rows[0].entries[0].text == "27.00"
     assert not any("edited since" in note for note in table.notes)
     (tmp_path / "patient.py").write_text("x = 2\n")
-    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    table = table_of(tmp_path)
     assert table.rows[0].entries[0].text == "28.00"
     assert (
-        "patient was edited since: 1 trial of sfm-adc are of the old code. Give the command again "
+        "patient was edited since: 1 trial of sfm-adc came from the old code. Give the command again "
         "to run the new one." in table.notes
     )
 
 
-def test_arms_that_share_a_class_in_two_versions_are_not_compared(tmp_path):
-    one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify__views": 5}, psnr=27.0, _code=code(OLD))
-    one_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify__views": 8}, psnr=28.0, _code=code(NEW))
-    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
-    assert not any(entry.bold for row in table.rows for entry in row.entries)
-    assert "garden: not compared, no best marked: code of mine differ." in table.notes
-
-
-def test_a_class_that_only_one_arm_has_is_no_difference(tmp_path):
-    one_trial(tmp_path, 0, psnr=27.0, _code=code())
-    one_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _densify="patient", _code=code(NEW))
-    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
-    assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
+@pytest.mark.parametrize(
+    "first, second, best",
+    [
+        ({"_code": code(OLD)}, {"_code": code(NEW)}, False),
+        ({"_code": code()}, {"_code": code(NEW)}, True),
+        (
+            {"_code": of_gsbench(train="a" * 16)},
+            {"_code": of_gsbench(train="a" * 16, external="b" * 16)},
+            True,
+        ),
+    ],
+    ids=["two versions of a class", "a class of one arm", "a package of one arm"],
+)
+def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, first, second, best):
+    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
+    one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="other", **second)
+    table = table_of(tmp_path)
+    assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
+    said = "garden: not compared, no best marked: code of mine differ."
+    assert (said in table.notes) == (not best)
 
 
 def test_a_scene_in_another_folder_is_no_other_version(tmp_path):
     one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene__path": "/here"}, psnr=27.0, _code=code(NEW))
     one_trial(tmp_path, 1, "bbbbbbbb", MINE | {"scene__path": "/there"}, psnr=28.0, _code=code(NEW))
-    assert (
-        build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"]).rows[0].entries[0].text
-        == "27.50 ± 0.71"
-    )
-
-
-def test_a_package_that_one_arm_alone_uses_is_no_difference(tmp_path):
-    one_trial(tmp_path, 0, psnr=27.0, _code=of_gsbench(train="a" * 16))
-    theirs = of_gsbench(train="a" * 16, external="b" * 16)
-    one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="brush", _code=theirs)
-    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
-    assert [entry.bold for row in table.rows for entry in row.entries] == [False, True]
+    assert table_of(tmp_path).rows[0].entries[0].text == "27.50 ± 0.71"
 
 
 def test_explain_names_the_commit_and_the_edited_packages(tmp_path):

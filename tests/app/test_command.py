@@ -2,17 +2,15 @@
 
 import copy
 import logging
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
-from gsbench.app import command
-from gsbench.app.command import (
-    check_sweep_settings,
-    one_trial_per_scene,
-    summarize,
-    words_for_hydras_files,
-)
+from gsbench.app import command, plugins
+from gsbench.app.command import one_trial_per_scene, summarize
+from gsbench.app.plugins import words_for_hydras_files
+from gsbench.app.sweep import Ended, check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
@@ -65,7 +63,7 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 ):
     caplog.set_level(logging.INFO, "gsbench")
     own = copy.deepcopy(OWN_FILES)
-    monkeypatch.setattr(command.compose, "installed_nodes", lambda words: own)
+    monkeypatch.setattr(plugins, "installed_nodes", lambda words: own)
     runtime = {"choices": {"hydra/launcher": "gsbench"}}
     config = OmegaConf.create(
         {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}
@@ -168,7 +166,10 @@ def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatc
     monkeypatch.setattr(command, "compose_trials", compose_trials)
     assert one_trial_per_scene("gate", ["scene=a,b"], "train_time") == {"a": made[0], "b": made[1]}
     one_trial_per_scene("gate", ["+name=y"], "train_time")
-    assert asked == [(["scene=a,b", "seed=0", "name=gate"], True), (["+name=y", "seed=0"], True)]
+    assert asked == [
+        (["scene=a,b", "seed=0", "name=gate"], True),
+        (["+name=y", "seed=0"], True),
+    ]
     for words, said in (
         (["seed=1"], "seed follows from the other words"),
         (["+eval.primary=psnr"], r"eval\.primary follows from"),
@@ -191,17 +192,28 @@ def test_a_dry_run_explains_a_reference_to_nothing(runs):
         command.compose_trials(["hydra.run.dir=${nope}"])
 
 
-@pytest.mark.parametrize("words, trials, code", [(["--dry-run"], 2, 0), ([], 0, 0), ([], 2, 1)])
-def test_only_trials_that_ran_are_summarized(tmp_path, monkeypatch, words, trials, code):
-    made = [trial(tmp_path, seed) for seed in range(trials)]
-
-    def run_app(words, multirun, task):
-        assert task.look_only == (task.handle is command.list_trials)
-        task.trials = made
-
-    monkeypatch.setattr(command, "run_app", run_app)
-    monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is made))
+@pytest.mark.parametrize(
+    "words, other, trials, did, code",
+    [
+        (["--dry-run"], "", 2, "dry_run", 0),
+        (["--dry-run"], "optuna", 2, "dry_run", 0),
+        ([], "", 0, "own_sweep", 0),
+        ([], "", 2, "own_sweep", 1),
+        ([], "optuna", 2, "other_sweep", 1),
+    ],
+)
+def test_only_trials_that_ran_are_summarized(
+    tmp_path, monkeypatch, words, other, trials, did, code
+):
+    ended, done = Ended([trial(tmp_path, seed) for seed in range(trials)]), []
+    sweep = SimpleNamespace(other_sweeper=other)
+    monkeypatch.setattr(command, "_read", lambda words, multirun: sweep)
+    for name, end in (("dry_run", 0), ("own_sweep", ended), ("other_sweep", ended)):
+        run = lambda asked, *_, did=(name, end): done.append((did[0], asked)) or did[1]  # noqa: E731
+        monkeypatch.setattr(command, name, run)
+    monkeypatch.setattr(command, "summarize", lambda outcomes, trials: int(trials is ended.trials))
     assert command.launch(words) == code
+    assert done == [(did, sweep)]
 
 
 def test_a_dry_run_shows_as_many_log_lines_as_the_run_would(runs, monkeypatch):

@@ -16,6 +16,11 @@ pytestmark = pytest.mark.usefixtures("runs")
 SWEEP = split("densify=adc,none seed=0,1 init=random tracking=none")
 
 
+def test_a_sweep_may_set_what_all_its_choices_have_and_the_default_lacks():
+    trials = compose_trials(["densify=absgs,fastgs", "densify.split_threshold=0.5"], multirun=True)
+    assert [trial.values["densify"]["split_threshold"] for trial in trials] == [0.5, 0.5]
+
+
 def test_now_is_the_same_in_all_trials_of_a_sweep():
     """Microseconds never agree by chance; each densifier is composed by itself."""
     trials = compose_trials(
@@ -90,6 +95,19 @@ def test_settings_can_read_hydras_node():
     ]
     (trial,) = compose_trials(["name=x-${hydra:runtime.choices.densify}"])
     assert trial.values["name"] == "x-volumetric"
+    words = ["+hydra.job.config.override_dirname.exclude_keys=[name]", "init=random", "seed=0,1"]
+    trials = compose_trials([*words, "name='${hydra:job.override_dirname}'"], multirun=True)
+    assert [trial.values["name"] for trial in trials] == [
+        "init=random,seed=0",
+        "init=random,seed=1",
+    ]
+
+
+@pytest.mark.parametrize("value", ["x-${seed}", "x-${oc.select:seed,5}", "x-${${scene.name}}"])
+def test_settings_can_read_the_seed(value):
+    words = ["init=random", "scene.name=seed", f"name='{value}'", "seed=3,4"]
+    trials = compose_trials(words, multirun=True)
+    assert [trial.values["name"] for trial in trials] == ["x-3", "x-4"]
 
 
 def test_a_dry_run_calls_an_interval_a_search_and_not_a_trial(said):

@@ -1,6 +1,5 @@
 """Tuning parity, with trials that take no time: what is declared, searched and chosen for arms."""
 
-import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -15,7 +14,6 @@ from gsbench.analysis.fairness import fairness_table
 from gsbench.analysis.report.build import build_report, search_summary
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from gsbench.app.tuning import TuneSettings
 from gsbench.errors import GsbenchError
 from gsbench.launch.jobs import outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
@@ -23,7 +21,6 @@ from gsbench.parsing import read_typed
 from gsbench.runs.experiments import Arm, TuningRecord
 from gsbench.runs.layout import CONFIG, RESULTS, TUNING
 from gsbench.runs.trial_record import record_from
-from hydra_plugins.gsbench import TUNE
 from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.launch.test_declare import TINY
 
@@ -427,13 +424,3 @@ def test_mistakes_are_one_line_before_any_work(file, word, part, sweep, runs, ca
     assert part in line
     assert not fake.batches
     assert not runs.exists()
-
-
-def test_hydra_shows_the_defaults_of_the_class():
-    defaults = {
-        field.name: field.default
-        if field.default_factory is dataclasses.MISSING
-        else field.default_factory()
-        for field in dataclasses.fields(TuneSettings)
-    }
-    assert defaults == TUNE

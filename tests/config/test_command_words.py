@@ -11,12 +11,10 @@ from gsbench.config.command_words import (
     check_text,
     check_words,
     grid_points,
-    hint_for,
     is_interval,
     is_sweep,
     key_of,
     makes_other_trials,
-    options,
     parse,
     parse_word,
     search_path,
@@ -24,6 +22,7 @@ from gsbench.config.command_words import (
     typed_permissions,
     value_text,
 )
+from gsbench.config.groups import hint_for, options
 from gsbench.errors import InputError
 
 

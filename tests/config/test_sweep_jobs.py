@@ -1,12 +1,17 @@
 """A job of a sweep has the configuration of its own words, whatever it shares with other jobs."""
 
 import pickle
+import re
 
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
-from gsbench.config.compose import _plain_values, compose_one
+from gsbench.config import compose
+from gsbench.config.command_words import parse_word
+from gsbench.config.compose import compose_one
+from gsbench.config.explain import explained
 from gsbench.errors import InputError
 from gsbench.launch.jobs import job_of
 
@@ -22,15 +27,15 @@ SWEEPS = {  # words, and how often Hydra composes for them
     "a value made of the seed": (["scene=colmap", "scene.path='/x/${seed}'", "seed=0,1,2"], 1),
     "a value made of another": (
         ["scene.width='${scene.height}','1${scene.height}'", "scene.height=30,40"],
-        2,
+        1,
     ),
     "a name that is made": (
         ["scene=colmap", "scene.path='/${${name}}'", "name=seed,device", "seed=1,2"],
-        2,
+        1,
     ),
-    "added": ([ARMS, "+densify.growth_cap=3,4", "seed=0,1"], 4),
-    "null": (["densify.max_gaussians=null,5", "seed=0,1"], 2),
-    "lists": (["eval.at=[],[3]", "train.iterations=10,20"], 2),
+    "added": ([ARMS, "+densify.growth_cap=3,4", "seed=0,1"], 2),
+    "null": (["densify.max_gaussians=null,5", "seed=0,1"], 1),
+    "lists": (["eval.at=[],[3]", "train.iterations=10,20"], 1),
     "a choice after its values": (["densify.max_gaussians=7,8", ARMS], 2),
     "quotes": (['name="1"', "train.iterations=8,'9'", "seed=0,1"], 1),
 }
@@ -38,15 +43,15 @@ SWEEPS = {  # words, and how often Hydra composes for them
 
 @pytest.fixture
 def compositions(monkeypatch):
-    """The words of each of Hydra's compositions of a job."""
+    """The words of each of Hydra's compositions."""
     asked = []
-    compose = ConfigLoaderImpl.load_sweep_config
+    real = ConfigLoaderImpl.load_configuration
 
-    def counted(self, master_config, sweep_overrides):
-        asked.append(sweep_overrides)
-        return compose(self, master_config, sweep_overrides)
+    def counted(self, config_name, overrides, **settings):
+        asked.append(overrides)
+        return real(self, config_name, overrides, **settings)
 
-    monkeypatch.setattr(ConfigLoaderImpl, "load_sweep_config", counted)
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
     return asked
 
 
@@ -71,28 +76,53 @@ def test_a_bad_value_is_refused_in_a_shared_composition(words):
 
 
 @pytest.mark.parametrize(
-    "words, values",
+    "words, others, seed",
     [
-        (["a.b=1", "seed=2", "c=3", "d.e='4'"], {"a.b": 1, "seed": 2, "d.e": "4"}),
-        (["a.b={c:1}", "d.e=2"], {}),  # a mapping, whose order matters
-        (["+a.b.c=1", "a.b=2"], {}),
-        (["a.b=1", "~a.b"], {}),
-        (
-            [
-                "a._target_=x.Y",
-                "hydra.job.name=x",
-                "a.b=${c}",
-                "a.c=[1]",
-                "a.d=null",
-                "+a.e=1",
-                "a/f=g",
-            ],
-            {},
-        ),
+        (["a.b=1", "seed=2"], ("a.b=1",), 2),
+        (["a.b=1"], ("a.b=1",), None),
+        (["seed=1", "++seed=2"], ("seed=1", "++seed=2"), None),  # the later one counts
+        (["++seed=2"], ("++seed=2",), None),
+        (["seed='${x}'"], ("seed='${x}'",), None),
+        (["seed='1'"], ("seed='1'",), None),
     ],
 )
-def test_plain_values_are_those_that_may_be_set_after_composition(words, values):
-    assert _plain_values(words) == values
+def test_only_a_plain_seed_is_set_apart(words, others, seed):
+    assert compose._without_seed(words) == (others, seed)
+
+
+@pytest.mark.parametrize(
+    "word, found",
+    [
+        ("a.b=2", {"a": {"b": 2, "c": [1]}}),
+        ("+a.d=2", {"a": {"b": 1, "c": [1], "d": 2}}),
+        ("++a.b=2", {"a": {"b": 2, "c": [1]}}),
+        ("++a.d={e: 2}", {"a": {"b": 1, "c": [1], "d": {"e": 2}}}),
+        ("+a.c=[2]", {"a": {"b": 1, "c": [2]}}),
+        ("a.c.0=2", {"a": {"b": 1, "c": [2]}}),
+        ("a={b: 2}", {"a": {"b": 2, "c": [1]}}),
+        ("~a.b", {"a": {"c": [1]}}),
+        ("~a.b=1", {"a": {"c": [1]}}),
+        ("~a.b=2", "there is no a.b=2"),
+        ("~a.d", "there is no a.d"),
+        ("+a.b=2", "a.b has a value already: leave out the plus"),
+        ("a.d=2", "a.d is not a setting"),
+        ("a={d: 2}", "a.d is not a setting"),
+        ("e=2", "e is not a setting"),
+    ],
+)
+def test_a_value_is_set_added_or_removed_as_by_hydra(word, found):
+    config = OmegaConf.create({"a": {"b": 1, "c": [1]}})
+    OmegaConf.set_struct(config, True)
+    if isinstance(found, dict):
+        compose.set_value(config, parse_word(word))
+        assert OmegaConf.to_container(config) == found
+        hydras = OmegaConf.create({"a": {"b": 1, "c": [1]}})
+        OmegaConf.set_struct(hydras, True)
+        ConfigLoaderImpl._apply_overrides_to_config([parse_word(word)], hydras)
+        assert hydras == config
+    else:
+        with pytest.raises(InputError, match=re.escape(found)), explained([word]):
+            compose.set_value(config, parse_word(word))
 
 
 def test_a_pickled_job_is_small():

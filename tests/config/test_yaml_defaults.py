@@ -1,4 +1,9 @@
-"""A value that YAML and a class both state is the same, unless `DELIBERATE` lists it."""
+"""Each default has one source.
+
+A group's settings have the defaults of its dataclass, and a file states only what it changes. The
+file of a densifier or initialiser states all options, since its class would load torch: they are
+the class's own defaults. A file that is built on another of the same class states what it changes.
+"""
 
 import dataclasses
 import importlib
@@ -11,31 +16,7 @@ from gsbench.settings import option_fields
 from gsbench.system.install import conf_dir
 
 # keys that tell the files of a group apart
-NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")
-# group/file: the keys whose values differ from the class's own; a file that is built on another has
-# the other's too
-DELIBERATE = {
-    "densify/absgrad": {"gradient", "gradient_threshold"},
-    "densify/longaxis": {"gradient", "gradient_threshold"},
-    "densify/revised": {"revised_opacity"},
-    "densify/volumetric_once": {"split_isotropic"},
-    "eval/standard": {"lpips"},
-    "init/dim_paper": {"max_keypoints", "min_inlier_ratio", "pairs"},
-    "init/sfm_preview": {"first_octave", "max_image_size", "max_num_features", "pairs"},
-    "launch/local": {"parallel"},
-    "launch/slurm": {"cpus_per_trial", "gpus_per_trial", "parallel", "timeout_min"},
-    "train/7k": {"iterations", "volume_histogram"},
-    "train/late2024": {"opacity"},
-    "train/none": {"iterations"},
-}
-# Files that are built on another one, but have the defaults of a class of their own.
-OWN_CLASS = {"densify/edgeaware", "densify/gns"}
-# Files that differ in most keys: a shortened schedule, and the schedules of other authors, which
-# tests/densify compares with their code.
-WHOLE = {
-    "train/quick",
-    *(f"train/{name}" for name in ("fastgs", "improved_gs", "mrnf", "resgs", "taming")),
-}
+NAMES = ("name", "kind", "protocol", "path", "_target_", "enabled")
 
 
 def read(path):
@@ -79,10 +60,10 @@ FILES = [
 ]
 
 
-def stated(path):
-    """The values that a file and its bases state, except names and references to other settings."""
+def stated(*paths):
+    """The values that files state, except names and references to other settings."""
     values = {}
-    for file in (*reversed(list(bases(path))), path):
+    for file in paths:
         values |= read(file)
     given = {
         key: value for key, value in values.items() if key not in ("defaults", "_target_", *NAMES)
@@ -90,18 +71,12 @@ def stated(path):
     return {key: value for key, value in given.items() if not str(value).startswith(("${", "???"))}
 
 
-def allowed(path):
-    if path in OWN_CLASS:
-        return DELIBERATE.get(path, set())
-    return set().union(*(DELIBERATE.get(file, set()) for file in (path, *bases(path))))
-
-
 def plain(value):
     return list(value) if isinstance(value, tuple) else value
 
 
-@pytest.mark.parametrize("path", [path for path in FILES if path not in WHOLE])
-def test_yaml_values_equal_the_defaults_of_the_class(path):
+@pytest.mark.parametrize("path", FILES)
+def test_each_default_has_one_source(path):
     cls = class_of(path)
     if cls is None:  # a function, or a class without options
         return
@@ -111,22 +86,19 @@ def test_yaml_values_equal_the_defaults_of_the_class(path):
         else field.default_factory()
         for field in option_fields(cls)
     }
-    differing = {
-        key
-        for key, value in stated(path).items()
-        if key in defaults
-        and defaults[key] is not dataclasses.MISSING
-        and plain(value) != plain(defaults[key])
-    }
-    assert differing == allowed(path), (
-        f"{path}: a value differs from the class's: correct it, or say so in DELIBERATE"
-    )
+    above = list(bases(path))
+    introduces = cls not in (GROUP_SCHEMAS.get(path.partition("/")[0]), *map(class_of, above))
+    values = stated(*reversed(above), path) if introduces else stated(path)
+    for key in values.keys() & {key for key, v in defaults.items() if v is not dataclasses.MISSING}:
+        same = plain(values[key]) == plain(defaults[key])
+        assert same == introduces, f"{path}: {key}={values[key]}, by default {defaults[key]}"
 
 
-def test_the_lists_name_existing_files():
-    assert DELIBERATE.keys() | WHOLE <= set(FILES)
+def test_files_are_told_apart_by_their_classes():
     assert {class_of(path).__name__ for path in ("eval/paper", "train/paper", "init/sfm")} == {
         "EvalConfig",
         "TrainConfig",
         "Sfm",
     }
+    assert class_of("densify/absgrad") is class_of("densify/adc")
+    assert class_of("densify/edgeaware") is not class_of("densify/longaxis")

@@ -53,7 +53,7 @@ def halves(rows, mean_gradient):
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_round_of_long_axis_matches_the_restatement(seed, step):
-    densifier = LongAxis(gradient="absolute", gradient_threshold=0.0008)
+    densifier = LongAxis()
     trainable, _ = prepared(densifier, seed)
     gradient = np.random.default_rng(seed).uniform(0, 0.0016, len(trainable))
     gathered(densifier, gradient)

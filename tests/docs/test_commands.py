@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gsbench.config.command_words import GROUPS, OPTIONS, options
+from gsbench.config.command_words import OPTIONS
+from gsbench.config.groups import GROUPS, options
 from gsbench.config.schema import ComponentConfig, LaunchConfig, TrackingConfig
 from gsbench.eval.options import EvalConfig
 from gsbench.external.settings import External

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from gsbench.config.command_words import options
+from gsbench.config.groups import options
 from tests.conftest import script
 
 fidelity = script("fidelity")

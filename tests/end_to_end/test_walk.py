@@ -11,6 +11,7 @@ from collections import Counter
 from pathlib import Path
 from shlex import split
 
+import hydra
 import pytest
 
 import gsbench
@@ -24,7 +25,7 @@ from tests.end_to_end.conftest import SMALL
 pytestmark = pytest.mark.slow
 
 PACKAGE = Path(gsbench.__file__).parent
-MAX_CROSSINGS = 18
+MAX_CROSSINGS = 10
 KEY = "densify.volume_threshold"
 TRIAL = [
     *SMALL,
@@ -103,20 +104,25 @@ def test_a_setting_is_checked_twice_and_crosses_few_folders_from_yaml_to_use(tmp
 
         monkeypatch.setattr(owner, name, watched)
 
-    compositions = 0
-    enforce_permissions = compose.enforce_permissions  # for the command line, and for each job
+    def count(owner, name):
+        real = getattr(owner, name)
 
-    def counted(*given):
-        nonlocal compositions
-        compositions += 1
-        return enforce_permissions(*given)
+        def counted(*given, **named):
+            calls[name] += 1
+            return real(*given, **named)
 
-    monkeypatch.setattr(compose, "enforce_permissions", counted)
+        monkeypatch.setattr(owner, name, counted)
+
+    count(hydra, "compose")
+    count(compose, "check_composed")
+    count(compose, "check_permissions")
     watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
     watch(Volumetric, "split_by_volume")
     watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)
     assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
-    assert compositions == 2  # before the sweep: not again when a trial begins
+    assert calls["compose"] == 1  # before the sweep: not again when a trial begins
+    # the values of the command, and of the trial; and what these are resolved to
+    assert (calls["check_composed"], calls["check_permissions"]) == (2, 1)
     assert calls["_converted"] == 2  # checked before the sweep, built when the trial begins
     assert len(stacks) == 3
     passed = way(stacks)

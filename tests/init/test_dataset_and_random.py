@@ -165,6 +165,5 @@ def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_p
     with refusal(r"init\.path=nowhere\.ply"):
         Ply(path="nowhere.ply")
     (tmp_path / "words.ply").write_text("no model")
-    said = r"words\.ply: not a readable PLY of Gaussians \(it has no header\)"
-    with refusal(said):
+    with refusal(r"words\.ply: not a readable PLY of Gaussians \(it has no header\)"):
         Ply(path=str(tmp_path / "words.ply"))  # refused before any photograph is read

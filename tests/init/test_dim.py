@@ -308,8 +308,7 @@ def test_detection_settings_are_the_extractors_own_unless_given(
 
 def test_missing_weights_are_named_before_any_work(courtyard, tmp_path):
     with pytest.raises(
-        MissingWeightsError,
-        match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth",
+        MissingWeightsError, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"
     ):
         Dim(download=False).run(courtyard, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -386,14 +385,8 @@ def test_an_empty_image_has_no_matches():
             "init.extractor must be 'superpoint', 'aliked' or 'disk', got 'sift'",
         ),
         ({"matcher": "superglue"}, "init.matcher must be .* got 'superglue'"),
-        (
-            {"extractor": "aliked", "aliked_model": "t16"},
-            "init.matcher=lightglue has no weights",
-        ),
-        (
-            {"filter_threshold": -1},
-            r"init.filter_threshold must be a number in \[0, 1\], got -1",
-        ),
+        ({"extractor": "aliked", "aliked_model": "t16"}, "init.matcher=lightglue has no weights"),
+        ({"filter_threshold": -1}, r"init.filter_threshold must be a number in \[0, 1\], got -1"),
         ({"max_keypoints": 0}, "init.max_keypoints must be a whole number above 0, got 0"),
     ],
 )

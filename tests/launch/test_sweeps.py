@@ -12,8 +12,9 @@ import pytest
 import yaml
 
 from gsbench.app.command import compose_trials, launch, run_trials
-from gsbench.config.command_words import GROUPS, options, parse
+from gsbench.config.command_words import parse
 from gsbench.config.compose import Trial, compose_one
+from gsbench.config.groups import GROUPS, options
 from gsbench.config.trust import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError

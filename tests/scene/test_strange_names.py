@@ -6,19 +6,22 @@ import sys
 
 import pytest
 
+from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.scene.images import list_images
 
 BAD = os.fsdecode(b"a\xff")
 
 
-@pytest.mark.parametrize("place", [f"{BAD}.png", f"{BAD}/a.png", f"b/{BAD}/a.jpg"])
+@pytest.mark.parametrize("place", [f"{BAD}.png", f"{BAD}/a.png", f"b/{BAD}/a.jpg", "a\nb.png"])
 def test_a_name_that_is_not_utf8_is_named_in_one_line(place, tmp_path):
     file = tmp_path / place
     file.parent.mkdir(parents=True, exist_ok=True)
     file.touch()
     (tmp_path / "good.png").touch()
-    with pytest.raises(InputError, match=r"names that are not UTF-8: .*: rename them$"):
+    with pytest.raises(
+        InputError, match=r"(?s)names that are not UTF-8, or have line breaks: .*: rename them$"
+    ):
         list_images(tmp_path)
 
 
@@ -30,7 +33,7 @@ def test_runs_and_current_folder_have_utf8_names(where, words, tmp_path, monkeyp
     monkeypatch.chdir(folder if where == "current" else tmp_path)
     runs = tmp_path / "runs" if where == "current" else folder
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    assert "not UTF-8: rename it" in refused(*words) or where == "runs"
+    assert "not UTF-8, or has a line break: rename it" in refused(*words) or where == "runs"
     assert not (folder / "runs").exists()
 
 
@@ -55,3 +58,22 @@ def test_where_python_reads_names_as_ascii_the_line_says_so(words, tmp_path):
     assert done.returncode == 2
     assert "set PYTHONUTF8=1: Python reads names as ascii" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("level", range(4))
+def test_a_folders_name_cannot_write_lines_of_its_own(level, tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
+    parts = ["x", "scene", "a-b", "00000000-seed0"]
+    parts[level] += "\nFORGED"
+    folder = tmp_path.joinpath(*parts)
+    folder.mkdir(parents=True)
+    (folder / "failed.json").write_text('{"message": "bad\\nFORGED"}')
+    for words in (["status"], ["status", "x"], ["tables"], ["tables", "x"], ["sync"]):
+        run(words)
+    said = capfd.readouterr()
+    assert not [line for line in (said.out + said.err).splitlines() if line.startswith("FORGED")]
+
+
+def test_a_photograph_may_have_the_spaces_of_screenshots(tmp_path):
+    (tmp_path / "Screenshot 3.15\u202fPM.png").touch()
+    assert len(list_images(tmp_path)) == 1

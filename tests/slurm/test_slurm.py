@@ -12,10 +12,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from shlex import split
 
 import pytest
 
 from tests.end_to_end.conftest import SMALL
+from tests.helpers import read_json
 
 pytestmark = [pytest.mark.slurm, pytest.mark.slow]
 
@@ -68,7 +70,7 @@ def slurm():
         )
     try:
         states = subprocess.run(
-            ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=120, check=True
+            split("sinfo -h -o %T"), capture_output=True, text=True, timeout=120, check=True
         ).stdout
     except (subprocess.SubprocessError, OSError) as error:
         pytest.skip(f"Slurm does not answer: {error}")
@@ -111,7 +113,7 @@ def job_logs(runs):
 
 def queue():
     listing = subprocess.run(
-        ["squeue", "--me", "-h", "-r", "-o", "%i"], capture_output=True, text=True, check=True
+        split("squeue --me -h -r -o %i"), capture_output=True, text=True, check=True
     )
     return listing.stdout.split()
 
@@ -261,8 +263,8 @@ def test_failed_trial_and_killed_job_are_reported(place, environment):
     (folder,) = [
         path.parent for path in runs.glob("cluster/*/*/*/.submitted.json") if "seed0" in str(path)
     ]
-    job = json.loads((folder / ".submitted.json").read_text())["job"]
-    holder = json.loads((folder / ".lock.holder").read_text())
+    job = read_json(folder / ".submitted.json")["job"]
+    holder = read_json(folder / ".lock.holder")
     status = subprocess.run(
         [sys.executable, "-m", "gsbench.cli", "status", "cluster"],
         env=environment | {"GSBENCH_RUNS": str(runs)},

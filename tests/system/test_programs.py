@@ -2,7 +2,6 @@
 
 import ast
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 
 from gsbench.system import install, programs, resources
 from tests.helpers import write
+from tests.processes import completed
 
 SRC = Path(programs.__file__).parents[1]
 
@@ -165,8 +165,6 @@ def test_no_library_reads_what_lies_in_the_current_folder(path, tmp_path):
     environment = os.environ | {"PATH": path + os.environ["PATH"], "PYTHONPATH": str(SRC.parent)}
     for words in (TINY.split(), ["sync"], ["tables", "tiny"], ["report", "tiny"], ["doctor"]):
         command = [sys.executable, "-P", "-c", WATCHED, *words]
-        done = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
+        done = completed(command, code=None, cwd=tmp_path, env=environment)
         assert done.stdout.splitlines()[-1] == "seen [] code 0", done.stderr
     assert not (tmp_path / "exploded").exists()

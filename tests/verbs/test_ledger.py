@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from shlex import split
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ from scripts import ledger_rates
 from tests.composed import composed
 from tests.finished import write_results
 
-SETTINGS = ["scene=courtyard", "init=random", "densify=adc", "tracking=none", "eval.lpips=[]"]
-NEW = ["new", "night", "--metric", "psnr", "--least", "0.5", *SETTINGS, "seed=0,1,2,3"]
+SETTINGS = split("scene=courtyard init=random densify=adc tracking=none eval.lpips=[]")
+NEW = [*split("new night --metric psnr --least 0.5"), *SETTINGS, "seed=0,1,2,3"]
 SPLIT = "densify.split_size"  # its value chooses a made-up effect
 
 
@@ -167,10 +168,10 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, capsys):
         (["eval.flip=false"], "eval.flip: an idea may change"),
         (["name=x", f"{SPLIT}=0.02"], "name: an idea may change"),
         ([], "needs the idea's settings"),
-        ([f"{SPLIT}=0.02", "--least", "0.01"], "ledger try takes no --least"),
-        ([f"{SPLIT}=0.02", "--fdr", "0.2"], "ledger try takes no --fdr"),
+        (split(f"{SPLIT}=0.02 --least 0.01"), "ledger try takes no --least"),
+        (split(f"{SPLIT}=0.02 --fdr 0.2"), "ledger try takes no --fdr"),
         (["densify=adc"], "the idea is baseline itself"),
-        ([f"{SPLIT}=0.02", "--against", "nobody"], "--against nobody: it must be one of baseline"),
+        (split(f"{SPLIT}=0.02 --against nobody"), "--against nobody: it must be one of baseline"),
         ([f"{SPLIT}=0.02,0.03"], "compares one arm at a time"),
         (["densify=nothing_like_it"], "nothing_like_it"),
     ],
@@ -187,27 +188,24 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, re
     [
         (["seed=0"], "needs at least 2 seeds"),
         (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
-        (["seed=0,1", "--metric", "psmr"], "there is no such metric"),
-        (["seed=0,1", "--fdr", "1"], "must be above 0 and below 1"),
-        (["seed=0,1", "--fdr", "0"], "must be above 0 and below 1"),
-        (["seed=0,1", "--fdr", "5%"], "must be above 0 and below 1, got '5%'"),
-        (["seed=0,1", "--ideas", "0"], "must be a whole number from 1 to 10000"),
+        (split("seed=0,1 --metric psmr"), "there is no such metric"),
+        (split("seed=0,1 --fdr 1"), "must be above 0 and below 1"),
+        (split("seed=0,1 --fdr 0"), "must be above 0 and below 1"),
+        (split("seed=0,1 --fdr 5%"), "must be above 0 and below 1, got '5%'"),
+        (split("seed=0,1 --ideas 0"), "must be a whole number from 1 to 10000"),
         (["seed=0,1", "eval.primary=psnr"], "eval.primary follows from the ledger"),
         (["seed=0,1", "launch.wait=false"], "launch.wait=false"),
     ],
 )
-def test_a_ledger_that_could_not_decide_is_refused(trainings, words, reason, capsys):
-    assert run(["ledger", "new", "night", *SETTINGS, *words]) == 2
-    assert reason in capsys.readouterr().err
+def test_a_ledger_that_could_not_decide_is_refused(trainings, words, reason, refused):
+    assert reason in refused("ledger", "new", "night", *SETTINGS, *words)
     assert not Path("runs/night").exists()
 
 
-def test_a_ledger_is_declared_once(home, trainings, capsys):
+def test_a_ledger_is_declared_once(home, trainings, refused):
     assert run(["ledger", *NEW]) == 0
-    assert run(["ledger", *NEW, "--fdr", "0.2"]) == 2
-    assert "is another ledger already" in capsys.readouterr().err
-    assert run(["ledger", "show", "other"]) == 2
-    assert "has no ledger" in capsys.readouterr().err
+    assert "is another ledger already" in refused("ledger", *NEW, "--fdr", "0.2")
+    assert "has no ledger" in refused("ledger", "show", "other")
 
 
 def test_trials_that_the_ledger_does_not_know_are_refused(home, capsys):
@@ -226,7 +224,7 @@ def test_edited_code_of_the_baseline_is_noticed(home, monkeypatch, capsys):
 
 def test_a_ledger_cannot_allow_code_to_run(home, tmp_path, capsys):
     (tmp_path / "mine.py").write_text("from gsbench.densify import ADC\nclass Mine(ADC): pass\n")
-    own = ["densify._target_=mine.Mine", "densify.name=mine", "allow_targets=[mine]"]
+    own = split("densify._target_=mine.Mine densify.name=mine allow_targets=[mine]")
     assert attempt(*own, f"{SPLIT}=0.02") == 0
     assert attempt(f"{SPLIT}=0.03", "--against", "mine") == 2
     assert "mine runs code of yours: add allow_targets=[mine]" in capsys.readouterr().err
@@ -240,7 +238,7 @@ def test_a_kill_between_any_two_lines_changes_nothing(home, monkeypatch):
     def commands():
         for size in (0.02, 0.04, 0.05):
             attempt(f"{SPLIT}={size}")
-        run(["ledger", "confirm", "night", "scene=photos", "scene.path=/park", "seed=0,1,2"])
+        run(split("ledger confirm night scene=photos scene.path=/park seed=0,1,2"))
 
     kills = 0
     for allowed in range(9):
@@ -274,7 +272,7 @@ def confirm(*words):
     return run(["ledger", "confirm", "night", *words])
 
 
-PARK = ["scene=photos", "scene.path=/captures/park", "seed=5,6,7"]
+PARK = split("scene=photos scene.path=/captures/park seed=5,6,7")
 
 
 def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, trainings, capsys):
@@ -290,7 +288,6 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, traini
     assert re.search(r"^\| adc-3 \| .+ \| dropped \|$", shown, re.MULTILINE)
     ((asked, results),) = read_ledger(home).confirmations
     assert list(asked.keys) == ["baseline", "adc", "adc-3"]
-    assert results is not None
     assert results.results == {"adc": "kept", "adc-3": "dropped"}
     assert results.differences["adc"].mean == pytest.approx(3, abs=0.1)
     count = len(trainings.trained)
@@ -332,9 +329,9 @@ def test_a_second_confirmation_needs_other_captures(home, capsys):
 # ---- the report, the archive, and the simulated rule
 
 
-def test_report_and_archive_have_the_ledger(home, trainings):
+def test_report_and_archive_have_the_ledger(home, trainings, said):
     attempt(f"{SPLIT}=0.02", "--as", "larger splits")
-    assert run(["report", "night"]) == 0
+    said("report", "night")
     page = (home / "report.html").read_text()
     assert 'id="ledger"' in page
     assert "1 larger splits" in page
@@ -344,13 +341,12 @@ def test_report_and_archive_have_the_ledger(home, trainings):
     assert "the ledger&#39;s tests decide (gsbench ledger show night)" in page
 
 
-def test_a_kept_idea_with_more_gaussians_says_so(home, trainings, capsys):
+def test_a_kept_idea_with_more_gaussians_says_so(home, trainings, capsys, said):
     trainings.effects[0.8] = 3.0  # of 1,800 Gaussians
     assert attempt(f"{SPLIT}=0.8") == 0
     words = "better; with 1.78 times the Gaussians, so not at equal counts"
     assert f"adc: kept: {words}; psnr +" in capsys.readouterr().out
-    assert run(["ledger", "show", "night"]) == 0
-    assert words in capsys.readouterr().out
+    assert words in said("ledger", "show", "night")
 
 
 def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_path):
@@ -365,11 +361,10 @@ def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_p
     assert "tracking=none" not in shared.opened.words
 
 
-def test_show_prints_all_for_programs(home, capsys):
+def test_show_prints_all_for_programs(home, capsys, said):
     attempt(f"{SPLIT}=0.02")
     capsys.readouterr()
-    assert run(["ledger", "show", "night", "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)
+    shown = json.loads(said("ledger show night --json"))
     assert [one["result"] for one in shown["ideas"]] == ["kept"]
     assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])
 
@@ -377,7 +372,7 @@ def test_show_prints_all_for_programs(home, capsys):
 def test_show_prints_the_rule_and_a_row_for_each_idea(home, said):
     attempt(f"{SPLIT}=0.02", "--as", "good")
     attempt(f"{SPLIT}=0.04", "--as", "bad")
-    lines = said("ledger", "show", "night").splitlines()
+    lines = said("ledger show night").splitlines()
     good, bad = (line.strip("| ").split(" | ") for line in lines if line[:4] in ("| 1 ", "| 2 "))
     assert good[:4] == ["1 good", "baseline", "0.00083", "3"]
     assert good[-3:] == ["×1.00", "kept", "better"]
@@ -391,19 +386,19 @@ def test_show_prints_the_rule_and_a_row_for_each_idea(home, said):
 def test_names_of_ledgers_and_ideas_are_not_given_twice(home, trainings, refused):
     attempt(f"{SPLIT}=0.02", "--as", "mine")
     for name in ("mine", "baseline"):
-        line = refused("ledger", "try", "night", f"{SPLIT}=0.04", "--as", name)
+        line = refused(f"ledger try night {SPLIT}=0.04 --as", name)
         assert f"--as {name}: another idea has this name" in line
-    assert "'store' cannot be the name" in refused("ledger", "show", "store")
+    assert "'store' cannot be the name" in refused("ledger show store")
     folder = home.parent / "used" / "courtyard" / "random-adc" / "12345678-seed0"
     write_results(folder, composed(NEW[6:])[0].values | {"name": "used"})
-    assert "used has trials already" in refused("ledger", "new", "used", *NEW[2:])
+    assert "used has trials already" in refused("ledger new used", *NEW[2:])
 
 
 @pytest.mark.parametrize("code, kind", [(1, 1), (2, 2)])
 def test_nothing_is_confirmed_if_trials_fail(home, monkeypatch, code, kind, capsys):
     attempt(f"{SPLIT}=0.02")
     monkeypatch.setattr(verb, "run_trials", lambda trials: code)
-    assert run(["ledger", "confirm", "night", "scene=photos", "scene.path=x"]) == kind
+    assert run(split("ledger confirm night scene=photos scene.path=x")) == kind
     assert "trials fail: nothing is confirmed" in capsys.readouterr().err
 
 

@@ -14,18 +14,12 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.app.sweep import Sweep
+from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep, run_looks
-from gsbench.config.command_words import (
-    GROUPS,
-    bare_key,
-    grid_points,
-    is_interval,
-    key_of,
-    value_text,
-)
+from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep
+from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
 from gsbench.config.compose import Trial
+from gsbench.config.groups import GROUPS
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions
@@ -37,67 +31,67 @@ GRIDS = "hydra.sweeper.grids"
 log = logging.getLogger(__name__)
 
 
-def run_sweep(
-    sweep: Sweep, params: Mapping[str, Any], tune: Mapping[str, Any], words: Sequence[str]
-) -> None:
-    """Run all points that ``words`` and ``params`` (``hydra.sweeper.params``) span.
+def run_sweep(sweep: Sweep, run: Run) -> None:
+    """Run all points that the words of ``sweep`` and its files span, perhaps in looks."""
+    trials, _ = planned_trials(sweep, run)
+    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        _run_until_decided(trials, run)
+    else:
+        run(trials)
 
-    ``tune`` (``hydra.sweeper.tune``) says how intervals among them are searched first
-    (`gsbench.app.tuning`).
+
+def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
+    """The trials of all points, and whether these are known, or depend on a search to come.
+
+    ``hydra.sweeper.tune`` says how intervals are searched first, by trials that ``run`` runs; with
+    None, in a dry run, only their plan is printed.
     """
-    grids = checked_grids(sweep.task.grids or [])
+    node = sweep.config.hydra.sweeper
+    tune: Any = OmegaConf.to_container(node.tune, resolve=True)
+    params: Any = OmegaConf.to_container(node.params, resolve=True) if node.params else {}
+    # not resolved: their ${…} are for each trial's values
+    raw: Any = OmegaConf.to_container(node, resolve=False)
+    grids = checked_grids(raw["grids"] or [])
     jobs: list[list[str]] = []
     # for each job, the settings that are searched for its arm
     intervals: list[dict[str, Override]] = []
-    for grid_words in words_of_grids(params, grids, words):
-        by_key = {
-            bare_key(override.get_key_element()): override for override in sweep.parse(grid_words)
-        }
-        points = grid_points(
-            [override for override in by_key.values() if not is_interval(override)]
-        )
+    for grid_words in words_of_grids(params, grids, sweep.own_words):
+        own = {bare_key(word.get_key_element()): word for word in sweep.parse(grid_words)}.values()
+        points = grid_points([word for word in own if not is_interval(word)])
         jobs += points
-        searched = {
-            override.get_key_element(): override
-            for override in by_key.values()
-            if is_interval(override)
-        }
+        searched = {word.get_key_element(): word for word in own if is_interval(word)}
         intervals += [searched] * len(points)
     try:
-        trials = sweep.trials(tuned_jobs(sweep, tune, jobs, intervals))
+        jobs, are_known = tuned_jobs(sweep, tune or {}, jobs, intervals, run)
+        trials = sweep.composer.trials(jobs)
     except InputError as error:
-        typed = {bare_key(one.get_key_element()): one for one in sweep.parse(words)}
+        typed = {bare_key(one.get_key_element()): one for one in sweep.parse(sweep.own_words)}
         if grids or not (advice := _advise_grids(sweep, typed)):
             raise
         raise InputError(advice) from error
-    if any(trial.values["launch"]["stop_when_decided"] for trial in trials):
-        _run_until_decided(sweep, trials)
-    else:
-        sweep.launch(trials)
+    if run is None and any(trial.values["launch"]["stop_when_decided"] for trial in trials):
+        print(plan_sweep(trials).describe())
+    return trials, are_known
 
 
-def _run_until_decided(sweep: Sweep, trials: Sequence[Trial]) -> None:
+def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
     """Run the trials in the looks that the sequential test plans.
 
     Decided pairs of arms get no further trials. Raises InputError for a sweep that cannot be tested
     in this way.
     """
     stopping = plan_sweep(trials)
-    if sweep.task.look_only:
-        print(stopping.describe())
-        sweep.launch(trials)
-        return
     make_runs_folder(checked_runs_folder(trials[0].values["runs"]))
     stopping = replace(stopping, declaration=declare_questions(stopping.home, stopping.declaration))
     launched: set[Path] = set()
 
-    def run(planned: Sequence[KeyAndSeed]) -> None:
+    def run_planned(planned: Sequence[KeyAndSeed]) -> None:
         batch = [trial for key in planned if (trial := stopping.trials[key]).folder not in launched]
         launched.update(trial.folder for trial in batch)
         if batch:
-            sweep.launch(batch)
+            run(batch)
 
-    run_looks(stopping.declaration, stopping.judged, run)
+    stopping.asked.answer(run_planned)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [
@@ -173,7 +167,7 @@ def _advise_grids(sweep: Sweep, typed: Mapping[str, Override]) -> str:
             continue
         lacking: dict[tuple[str, ...], list[str]] = {}  # {settings: the choices that lack them}
         for choice in map(str, choices.sweep_string_iterator()):
-            node = sweep.loader.load_sweep_config(sweep.config, [f"{group}={choice}"])
+            node = sweep.composer.settings([f"{group}={choice}"])
             lacking.setdefault(tuple(key for key in own if not _has(node, key)), []).append(choice)
         words = [choices.input_line, *(typed[key].input_line for key in own)]
         if len(lacking) == 1 or any(mark in str(word) for word in words for mark in "'\""):

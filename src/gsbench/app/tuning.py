@@ -24,11 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.types import Override
-from omegaconf import OmegaConf
-from pydantic import NonNegativeInt, PositiveInt
 
-from gsbench.app.sweep import DEFAULT_METRIC, Sweep
-from gsbench.claims.stopping import facts_for
+from gsbench.app.sweep import DEFAULT_METRIC, Run, Sweep, better_direction
 from gsbench.config.command_words import (
     bare_key,
     check_makes_trials,
@@ -36,14 +33,15 @@ from gsbench.config.command_words import (
     key_of,
     parse_word,
 )
-from gsbench.config.compose import Trial
+from gsbench.config.compose import Composer, Trial
+from gsbench.config.schema import TUNE, TuneSettings
 from gsbench.errors import GsbenchError, InputError
 from gsbench.eval.facts import known_keys
 from gsbench.files import checked_runs_folder, make_runs_folder, write_json
 from gsbench.runs.experiments import SearchPoint, TuningRecord, make_home, metric_and_question
 from gsbench.runs.layout import TUNING
 from gsbench.runs.nested import flatten
-from gsbench.settings import check_settings, check_values
+from gsbench.settings import check_values
 from gsbench.system.install import install_command
 from gsbench.words import counted, did_you_mean, listed
 
@@ -54,31 +52,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PLACE = "hydra.sweeper.tune"
-DEFAULT_POINTS = 20
 SEED = "seed"
 # groups that say how all arms are run and judged
 NOT_TUNED = ("scene", "eval", "launch", "tracking", "hydra")
 # settings that have their own values in the trials of a point
-REPLACED = (SEED, "name", "scene.validation", "eval.primary")
+RETUNED = (SEED, "name", "scene.validation", "eval.primary")
 DIGITS = 4  # significant digits of a value, so that people can type it
-
-
-@dataclass(frozen=True)
-class TuneSettings:
-    """Settings of a tuning.
-
-    ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out. ``seed``
-    lists the seeds of a point's trials. The sweep may have none of them.
-    """
-
-    points: NonNegativeInt = DEFAULT_POINTS
-    at_once: PositiveInt = 1  # points of an arm that are proposed and trained together
-    metric: str | None = None  # None: eval.primary, else PSNR
-    seed: int | str = 100
-
-    def __post_init__(self) -> None:
-        check_settings(self, PLACE)
 
 
 @dataclass(frozen=True)
@@ -86,7 +65,7 @@ class ArmSearch:
     """The search for the values of an arm, in the experiment whose folder is ``home``.
 
     ``record`` says what is searched and by which metric, and gets the judged points. ``jobs`` are
-    the arm's jobs in the sweep without the settings `REPLACED`. ``first`` are the arm's own values,
+    the arm's jobs in the sweep without the settings `RETUNED`. ``first`` are the arm's own values,
     None if they lie outside the ranges.
     """
 
@@ -149,40 +128,41 @@ class ArmSearch:
 
 def tuned_jobs(
     sweep: Sweep,
-    settings: Any,
+    settings: Mapping[str, Any],
     jobs: Sequence[Sequence[str]],
     intervals: Sequence[Mapping[str, Override]],
-) -> list[list[str]]:
+    run: Run | None,
+) -> tuple[list[list[str]], bool]:
     """Tune each arm in the ``intervals`` of its jobs; returns the jobs with the values found.
 
+    In a dry run (``run`` is None) they may not be known yet: then the second value is False.
     Raises InputError for wrong ``settings`` (``hydra.sweeper.tune``) or intervals, and GsbenchError
     if no point of an arm could be judged.
     """
-    given: Any = OmegaConf.to_container(OmegaConf.create(settings))
-    tune = TuneSettings(**check_values(TuneSettings, given, PLACE))
+    tune = TuneSettings(**check_values(TuneSettings, settings, TUNE))
     untuned = [list(job) for job in jobs]
     if not tune.points or not any(intervals):
-        return untuned
+        return untuned, True
     if not sweep.config.launch.wait:
-        raise InputError(f"{PLACE} learns from results, so launch.wait must be true")
-    trials = sweep.trials(jobs)
+        raise InputError(f"{TUNE} learns from results, so launch.wait must be true")
+    trials = sweep.composer.trials(jobs)
     searches = _plan(tune, jobs, intervals, trials)
     tuned = {search.record.arm: search for search in searches if search.ranges}
-    if sweep.task.look_only:
+    if run is None:
         print(_describe(searches))
-    if not _search(sweep, list(tuned.values())):
+    if not _search(sweep.composer, list(tuned.values()), run):
         print(
             f"then the trials of the sweep ({len(jobs)}) with the values found, which are not "
             "known yet"
         )
-        sweep.task.handle = lambda trials: []  # trials with other values are not listed
-        return untuned
+        return untuned, False
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
     arms = (trial.folder.parent.name for trial in trials)
-    return [[*job, *best_words.get(arm, ())] for job, arm in zip(jobs, arms, strict=True)]
+    tuned_words = (best_words.get(arm, ()) for arm in arms)
+    return [[*job, *own] for job, own in zip(jobs, tuned_words, strict=True)], True
 
 
-def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
+def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) -> bool:
     """Propose, train and judge the points of all arms side by side.
 
     A dry run judges only points whose trials are done already, and returns False at the first other
@@ -194,17 +174,17 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
             points += [(search, one, search.jobs_of(one.params)) for one in search.propose()]
         if not points:
             break
-        # Composed together, because `compose_jobs` composes only once what trials share.
-        composed = iter(sweep.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
+        # Composed together, because the trials of a point share all but the seed.
+        composed = iter(composer.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
         trials = [list(itertools.islice(composed, len(jobs))) for _, _, jobs in points]
         missing: list[Trial] = []
         for (search, _, _), own in zip(points, trials, strict=True):
             missing += [trial for trial in own if search.value_of(trial) is None]
-        if missing and sweep.task.look_only:
+        if missing and run is None:
             return False
-        if missing:
+        if missing and run is not None:
             _write(searches)  # before training, so that the ranges were on record before any result
-            sweep.task.launch(missing)
+            run(missing)
         for (search, proposal, _), own in zip(points, trials, strict=True):
             point, record = search.judge(proposal, own), search.record
             if missing:
@@ -212,7 +192,7 @@ def _search(sweep: Sweep, searches: Sequence[ArmSearch]) -> bool:
                 title = f"{search.home.name}: point {len(record.points)} of {record.wanted}"
                 settings = ", ".join(words_of_values(point.settings))
                 log.info("%s: %s: %s %s", title, settings, record.metric, value)
-    if not sweep.task.look_only:
+    if run is not None:
         _write(searches)
     return True
 
@@ -230,7 +210,7 @@ def _best_words(search: ArmSearch) -> list[str]:
     record, best, name = search.record, search.record.best, search.home.name
     if best is None:
         raise GsbenchError(
-            f"{PLACE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says "
+            f"{TUNE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says "
             "why)"
         )
     words = words_of_values(best.settings)
@@ -283,12 +263,12 @@ def _plan(
     homes = {trial.files.home for trial in trials}
     if len(homes) > 1:
         raise InputError(
-            f"{PLACE}: all trials of the sweep need one name, got "
+            f"{TUNE}: all trials of the sweep need one name, got "
             f"{listed(sorted(h.name for h in homes))}"
         )
     if any(trial.values["scene"]["validation"] for trial in trials):
         raise InputError(
-            f"{PLACE} searches on validation views by itself: leave scene.validation out"
+            f"{TUNE} searches on validation views by itself: leave scene.validation out"
         )
     metric, direction, seeds = _goal(tune, trials)
     (home,) = homes
@@ -300,7 +280,7 @@ def _plan(
         arm_jobs = []
         for i in indices:
             found |= intervals[i]
-            arm_jobs.append(tuple(word for word in jobs[i] if key_of(word) not in REPLACED))
+            arm_jobs.append(tuple(word for word in jobs[i] if key_of(word) not in RETUNED))
         arm_intervals = {key: found[key] for key in sorted(found)}
         fixed = set(map(key_of, itertools.chain(*arm_jobs)))
         if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
@@ -344,13 +324,9 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
     known = (*known_keys(), *(values["eval"].get("extra") or ()))
     if metric not in known:
         raise InputError(
-            f"{PLACE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}"
+            f"{TUNE}.metric={metric}: there is no such metric{did_you_mean(metric, known)}"
         )
-    sign = facts_for(metric, values).direction
-    if not sign:
-        raise InputError(
-            f"{PLACE}.metric={metric}: whether more or less of it is better is not known"
-        )
+    direction = better_direction(metric, values, f"{TUNE}.metric")
     try:
         seeds = [
             int(word.partition("=")[2])
@@ -358,14 +334,14 @@ def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1,
         ]
     except ValueError:
         raise InputError(
-            f"{PLACE}.seed must list whole numbers, as 100,101, got {tune.seed!r}"
+            f"{TUNE}.seed must list whole numbers, as 100,101, got {tune.seed!r}"
         ) from None
     if both := sorted(set(seeds) & {trial.values["seed"] for trial in trials}):
         raise InputError(
-            f"{PLACE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
+            f"{TUNE}.seed: {listed(list(map(str, both)))} is a seed of the sweep, too: tune with "
             "others"
         )
-    return metric, 1 if sign > 0 else -1, seeds
+    return metric, direction, seeds
 
 
 # ---- ranges
@@ -380,7 +356,7 @@ def distribution(override: Override) -> BaseDistribution:
 
     check_makes_trials(override)
     key = override.get_key_element()
-    if bare_key(key).partition(".")[0] in (*NOT_TUNED, *REPLACED):
+    if bare_key(key).partition(".")[0] in (*NOT_TUNED, *RETUNED):
         raise InputError(f"{key} belongs to what all arms share, not to one arm: give it a value")
     sweep: Any = override.value()
     low, high, log_scale = sweep.start, sweep.end, "log" in sweep.tags

@@ -12,15 +12,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
+from gsbench.config.groups import GROUPS, options
 from gsbench.config.schema import COMPONENTS
 from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
-from gsbench.system.install import conf_dir
 from gsbench.words import did_you_mean
 
-GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
-EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
 # not in the configuration's hash, but in the path of the trial's folder
 IN_TRIAL_PATH = ("name", "seed")
 OPTIONS = (
@@ -86,8 +84,8 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
                 else did_you_mean(word, OPTIONS)
             )
             raise InputError(
-                f"{word} is not an option{near} "
-                "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"
+                f"{word} is not an option{near} (there are -m, --dry-run, --config-dir FOLDER, "
+                "--cfg job, --info, --help)"
             )
         else:
             overrides.append(word)
@@ -192,32 +190,42 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
     return allowed
 
 
-def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> None:
-    """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
+def search_places(words: Sequence[str]) -> list[str]:
+    """The places that ``hydra.searchpath`` names.
 
-    Hydra imports such a package while it composes. Hydra 1.4 also takes ``hydra[searchpath]`` and
-    ``extend_list(pkg://package)``.
+    Hydra 1.4 also takes ``hydra[searchpath]`` and ``extend_list(pkg://package)``.
     """
+    places: list[str] = []
     for word in words:
         override = parse_word(word)
         key = key_of(word).replace("[", ".").replace("]", "")
-        if key != "hydra.searchpath" or override.is_sweep_override():
+        if key == "hydra.searchpath" and not override.is_sweep_override():
+            value: Any = override.value()
+            places += map(str, value if isinstance(value, list) else getattr(value, "values", ()))
+    return places
+
+
+def check_search_path(words: Sequence[str], allowed: Sequence[str]) -> list[str]:
+    """Refuse ``hydra.searchpath=[pkg://package]`` for a package that is not ``allowed``.
+
+    Hydra imports such a package while it composes. Returns the packages.
+    """
+    packages: list[str] = []
+    for place in search_places(words):
+        scheme, colon, path = place.partition("://")
+        if not colon or scheme == "file":
             continue
-        value: Any = override.value()
-        for place in value if isinstance(value, list) else getattr(value, "values", ()):
-            scheme, colon, path = str(place).partition("://")
-            if not colon or scheme == "file":
-                continue
-            package = path.replace("/", ".")
-            if scheme != "pkg":
-                raise InputError(
-                    f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)"
-                )
-            if not is_allowed(package, (PACKAGE, *allowed)):
-                advice = permission_advice([package.split(".")[0]], allowed)
-                raise InputError(
-                    f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
-                )
+        packages.append(path.replace("/", "."))
+        if scheme != "pkg":
+            raise InputError(
+                f"hydra.searchpath: {place} is neither a folder (file://…) nor a package (pkg://…)"
+            )
+        if not is_allowed(packages[-1], (PACKAGE, *allowed)):
+            advice = permission_advice([packages[-1].split(".")[0]], allowed)
+            raise InputError(
+                f"hydra.searchpath: {place} imports a package; if you trust it, {advice}"
+            )
+    return packages
 
 
 @cache
@@ -261,18 +269,6 @@ def value_text(value: object) -> str:
     return (
         "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
     )
-
-
-def hint_for(word: str) -> str:
-    """A hint for a word that is no setting: the nearest choice, or how to choose in a group.
-
-    Empty for any other word.
-    """
-    if word in GROUPS:
-        return f"; {word} is a group: choose one by {word}=NAME ({', '.join(options(word))})"
-    groups = [group for group in GROUPS if word in options(group)]
-    meant = [f"{'+' * (group == 'experiment')}{group}={word}" for group in groups]
-    return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def _quoted(word: str) -> str:
@@ -364,26 +360,10 @@ def makes_other_trials(key: str) -> bool:
     return not without_effect and (first not in NOT_HASHED or first in IN_TRIAL_PATH)
 
 
-def options(group: str, folders: Sequence[Path] = ()) -> list[str]:
-    """The choices of a group: gsbench's YAML files, then those in the user's ``folders``.
-
-    Other programs are named with their subfolder, ``external/NAME``.
-    """
-    names: dict[str, None] = {}  # a set that keeps its order
-    for folder in (Path(conf_dir()), *folders):
-        names |= dict.fromkeys(sorted(path.stem for path in Path(folder, group).glob("*.yaml")))
-        programs = Path(folder, group, EXTERNAL_FOLDER).glob("*.yaml")
-        names |= dict.fromkeys(sorted(f"{EXTERNAL_FOLDER}/{path.stem}" for path in programs))
-    return list(names)
-
-
 def searched_folders(words: Sequence[str]) -> list[Path]:
     """The user's folders that ``hydra.searchpath`` among ``words`` names."""
-    values = [parse_word(word).value() for word in words if word.startswith("hydra.searchpath=")]
-    places = [str(place) for value in values if isinstance(value, list) for place in value]
-    return [
-        Path(place.removeprefix("file://")) for place in places if not place.startswith("pkg://")
-    ]
+    places = search_places(words)
+    return [Path(place.removeprefix("file://")) for place in places if "pkg://" not in place]
 
 
 def _check_experiment_word(word: str, override: Override, folders: Sequence[Path]) -> None:

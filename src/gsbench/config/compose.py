@@ -1,55 +1,48 @@
-"""Compose and check the configuration of a command line with Hydra, and make its trials.
+"""Compose the configurations of a command with Hydra, and make its trials.
 
-Also runs gsbench as a Hydra app, and rewrites Hydra's errors as one line.
+Words go one way: Hydra composes once for each choice of groups, the values of single settings are
+set in a copy, and the resolved copy is checked: a trial.
 """
 
-import copy
 import os
-import re
-import sys
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import (
-    AbstractContextManager,
-    contextmanager,
-    nullcontext,
-    redirect_stderr,
-    suppress,
-)
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import hydra
-import hydra.utils
 import yaml
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import command_words
-from gsbench.config.command_words import GROUPS, options, parse_word
-from gsbench.config.schema import Config, checked_values, register_schemas
-from gsbench.config.trust import (
-    HYDRAS_CALLBACKS,
-    MADE_NODES,
-    PERMISSIONS,
-    check_composed,
-    check_permissions,
+from gsbench.config.command_words import bare_key, key_of, parse_word
+from gsbench.config.explain import explained, not_a_setting
+from gsbench.config.groups import GROUPS
+from gsbench.config.schema import (
+    ROOT_SETTINGS,
+    Config,
+    check,
+    checked_values,
+    plain,
+    register_schemas,
 )
-from gsbench.errors import GsbenchError, InputError
+from gsbench.config.trust import MADE_NODES, PERMISSIONS, check_composed, check_permissions
+from gsbench.errors import InputError
 from gsbench.parsing import MAX_VALUES
-from gsbench.runs.nested import targets_in
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import check_values
 from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
-from gsbench.words import did_you_mean
 
 CONFIG_NAME = "config"  # conf/config.yaml
 # Hydra 1.3 warns unless it is told which version's defaults hold; Hydra 1.4 has one set and warns
@@ -57,13 +50,9 @@ CONFIG_NAME = "config"  # conf/config.yaml
 VERSION_BASE: dict[str, Any] = (
     {"version_base": "1.3"} if hydra.__version__.startswith("1.3.") else {}
 )
-# Within this context, Hydra 1.4 and later instantiates only the named classes (``mine.*``: all of a
-# module).
-WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
-    hydra.utils, "execution_whitelist", lambda names: nullcontext()
-)
 MADE_GROUPS = tuple(f"hydra/{name}" for name in MADE_NODES)
-HYDRAS_LINE = "Error executing job with overrides"
+# stands for the seed while settings are resolved that all seeds share: reading it is an error
+ANY_SEED = "${no_seed}"
 
 
 @dataclass(frozen=True)
@@ -96,49 +85,230 @@ class Trial:
         return self.files.path
 
 
-def compose_whole(
-    words: Sequence[str], typed: Sequence[str] | None = None, modules: str | None = None
-) -> DictConfig:
-    """Compose the configuration of ``words`` with Hydra's node, and check what it may run.
+class Composer:
+    """Composes the configurations and the trials of one command.
 
-    Only the words ``typed`` by the user (default: all ``words``) give permissions. Words that list
-    several values are left out. From here on Python finds the modules that are allowed in the
-    folder ``modules`` (default: the current one). Raises InputError with one line. Call it within
-    `hydra_ready`.
+    ``config`` is the whole configuration of the words that list no values, with Hydra's node.
+    Only the words ``typed`` by the user (default: all ``words``) give permissions. From here on
+    Python finds the modules that are allowed in the folder ``modules`` (default: the current one).
+    Raises InputError with one line.
     """
-    # The order matters: Hydra imports packages of the search path while it composes, so they are
-    # checked first.
-    typed = words if typed is None else typed
-    allowed = command_words.typed_permissions(typed)
-    command_words.check_search_path(words, allowed)
-    check_files(command_words.searched_folders(words))
-    allow_modules(allowed, os.getcwd() if modules is None else modules)
-    with explained(words), warnings.catch_warnings():
-        # Hydra only warns of a folder in its search path that does not exist.
-        warnings.filterwarnings("error", message=r".* is not available\.", module="hydra")
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        typed: Sequence[str] | None = None,
+        modules: str | None = None,
+    ) -> None:
+        # The order matters: Hydra imports packages of the search path while it composes, so they
+        # are checked first.
+        self.typed = words if typed is None else typed
+        self.allowed = command_words.typed_permissions(self.typed)
+        packages = command_words.check_search_path(words, self.allowed)
+        allow_modules(self.allowed, os.getcwd() if modules is None else modules)
+        check_places(command_words.searched_folders(words), packages)
         single = [word for word in words if not command_words.is_sweep(word)]
-        config = hydra.compose(CONFIG_NAME, single, return_hydra_config=True)
-        if config.tracking.get("uri"):
-            allowed += typed_address(typed)
-        return enforce_permissions(config, allowed)
+        self.hydra_words = tuple(word for word in single if parse_word(word).is_hydra_override())
+        self._chosen: dict[tuple[str, ...], DictConfig] = {}
+        self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
+        own = [word for word in single if word not in self.hydra_words]
+        self._own_choices = _choices(own)
+        # The settings of a group whose choices are listed are checked with each choice.
+        listed = set(map(key_of, words)) - set(map(key_of, single))
+        values = [word for word in own if key_of(word).partition(".")[0] not in listed]
+        self.config = self.settings(values)
+        with explained(words):
+            is_sent = self.config.tracking.get("uri")
+        if is_sent:
+            self.allowed += typed_address(self.typed)
+            self.config[PERMISSIONS] = list(self.allowed)
+        with open_dict(self.config):
+            self.config.hydra = self._choose(values).hydra
+
+    def settings(self, words: Sequence[str]) -> DictConfig:
+        """The configuration of ``words`` without Hydra's node; what it may run is checked."""
+        chosen = self._choose(words)
+        config = OmegaConf.masked_copy(chosen, [str(key) for key in chosen if key != "hydra"])
+        OmegaConf.set_struct(config, True)
+        values = [word for word in words if _is_value(word)]
+        with explained(words):
+            for word in values:
+                set_value(config, parse_word(word))
+        if values:
+            check_composed(config, self.allowed, {})
+        config[PERMISSIONS] = list(self.allowed)  # any in a file counts nothing
+        return config
+
+    def has_key(self, key: str) -> bool:
+        """Return whether the whole configuration has a value for the dotted ``key``."""
+        return OmegaConf.select(self.config, key) is not None
+
+    def trials(self, jobs: Sequence[Sequence[str]]) -> list[Trial]:
+        """The trials of ``jobs``, each the list of its words.
+
+        Jobs that differ only in the seed are resolved once, unless a setting reads the seed.
+        """
+        any_seed: dict[tuple[str, ...], Trial | None] = {}
+        trials = []
+        for number, words in enumerate(jobs):
+            others, seed = _without_seed(words)
+            if others not in any_seed:
+                any_seed[others] = self._trial(words, others, seed)
+            trial = any_seed[others]
+            if trial is None:
+                trial = self._trial(words, words) or self._trial_of_hydra(words, number)
+            trials.append(trial if seed is None else with_seed(trial, seed))
+        return trials
+
+    def trial(self, overrides: Sequence[str]) -> Trial:
+        """The single trial of the command's words, which are its ``overrides``."""
+        words = [word for word in overrides if not parse_word(word).is_hydra_override()]
+        trial = self._trial(words, words) or self._trial_of_hydra(words)
+        return replace(trial, overrides=tuple(overrides))
+
+    def keep_times(self, config: DictConfig) -> None:
+        """Let ``${now:…}`` in ``config`` stand for what it stands for in the trials."""
+        OmegaConf.set_cache(config, defaultdict(dict, now=self._times))
+
+    def _trial(
+        self, words: Sequence[str], others: Sequence[str], seed: int | None = None
+    ) -> Trial | None:
+        """The trial of ``words``, which are the ``others`` and the ``seed``.
+
+        None if a setting reads this seed, or Hydra's node.
+        """
+        config = self.settings(others)
+        if seed is not None:
+            config.seed = ANY_SEED
+        with suppress(OmegaConfBaseException):  # or it has a fault: Hydra's composition says it
+            return self._checked(config, None, words, {} if seed is None else {"seed": seed})
+        return None
+
+    def _trial_of_hydra(self, words: Sequence[str], number: int | None = None) -> Trial:
+        """The trial of ``words`` as Hydra composes its job, with its number and its node."""
+        with hydra_ready(), explained(words):
+            config = hydra.compose(
+                CONFIG_NAME, [*self.hydra_words, *words], return_hydra_config=True
+            )
+            with open_dict(config):
+                config[PERMISSIONS] = list(self.allowed)
+                config.hydra.mode = self.config.hydra.mode
+                if number is not None:
+                    config.hydra.job.num, config.hydra.job.id = number, f"job_id_for_{number}"
+            return self._checked(config, config, words, {})
+
+    def _checked(
+        self,
+        config: DictConfig,
+        hydras: DictConfig | None,
+        words: Sequence[str],
+        given: Mapping[str, Any],
+    ) -> Trial:
+        self.keep_times(config)
+        with hydra_config(hydras):
+            values = plain(config, given)
+        self._times = OmegaConf.get_cache(config)["now"]
+        return Trial(check(values), (*self.hydra_words, *words))
+
+    def _choose(self, words: Sequence[str]) -> DictConfig:
+        """Hydra's composition of the choices among ``words``, checked; do not change it."""
+        choices = _choices(words)
+        if self._are_own(choices):
+            choices = self._own_choices
+        key = tuple(choices.values())
+        if key not in self._chosen:
+            with hydra_ready():
+                self._chosen[key] = self._compose(key, words)
+        return self._chosen[key]
+
+    def _compose(self, choices: Sequence[str], words: Sequence[str]) -> DictConfig:
+        folders = [word for word in self.hydra_words if key_of(word) == "hydra.searchpath"]
+        for key in map(key_of, choices):
+            group = key.partition("@")[0]
+            if group not in GROUPS and not config_loader().get_group_options(
+                group, None, CONFIG_NAME, folders
+            ):
+                raise InputError(not_a_setting(key, self._choose([]), words))
+        with explained([*self.hydra_words, *words]):
+            config = hydra.compose(
+                CONFIG_NAME, [*self.hydra_words, *choices], return_hydra_config=True
+            )
+        if self.hydra_words:  # without them, all files are gsbench's own
+            # for the check, which tells what is typed from what a file sets
+            config.hydra.overrides.task = list(map(key_of, words))
+            check_permitted(config, self.allowed)
+        return config
+
+    def _are_own(self, choices: Mapping[str, str]) -> bool:
+        """Return whether ``choices`` give the files of the command's own composition."""
+        own = self._chosen.get(tuple(self._own_choices.values()))
+        return (
+            own is not None
+            and choices.keys() >= self._own_choices.keys()
+            and all(
+                str(own.hydra.runtime.choices.get(bare_key(key))) == word.partition("=")[2]
+                for key, word in choices.items()
+            )
+        )
 
 
-def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
-    """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
-    own = ("tracking", "hydra.searchpath")
-    words = [word for word in typed if command_words.key_of(word).startswith(own)]
-    config = hydra.compose(CONFIG_NAME, words)
-    return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
+def _is_value(word: str) -> bool:
+    """Return whether a word sets a value, instead of choosing a file of a group."""
+    override = parse_word(word)
+    key = override.key_or_group
+    return "." in key or key in ROOT_SETTINGS or isinstance(override.value(), dict)
 
 
-def check_files(folders: Sequence[Path]) -> None:
-    """Refuse a file of the user's ``folders`` whose YAML aliases stand for too many values.
+def _choices(words: Sequence[str]) -> dict[str, str]:
+    """The words that choose in groups, by their keys with signs; the later one counts."""
+    return {parse_word(word).get_key_element(): word for word in words if not _is_value(word)}
+
+
+def _without_seed(words: Sequence[str]) -> tuple[tuple[str, ...], int | None]:
+    """The words without the seed, and the seed; all words and None unless it is a plain number."""
+    seeds = [word for word in words if key_of(word) == "seed"]
+    seed: Any = parse_word(seeds[-1]).value() if len(seeds) == 1 else None
+    if not isinstance(seed, int) or not seeds[0].startswith("seed="):
+        return tuple(words), None
+    return tuple(word for word in words if word != seeds[0]), seed
+
+
+def set_value(config: DictConfig, override: Override) -> None:
+    """Set, add or remove a setting, as Hydra does.
+
+    Raises InputError for a setting that is added twice or removed without being there, and
+    OmegaConf's errors for one that does not exist.
+    """
+    key, word, value = override.key_or_group, override.input_line, override.value()
+    is_added = override.is_add()
+    present = OmegaConf.select(config, key) if is_added or override.is_delete() else None
+    if override.is_delete():
+        parent, _, name = key.rpartition(".")
+        if present is None or value not in (None, present):
+            raise InputError(f"{word}: there is no {key}{'' if value is None else f'={value}'}")
+        with open_dict(config):
+            del OmegaConf.select(config, parent)[name]
+    elif is_added and present is not None and not isinstance(value, dict | list):
+        raise InputError(f"{word}: {key} has a value already: leave out the plus to replace it")
+    else:
+        OmegaConf.update(config, key, value, force_add=is_added or override.is_force_add())
+
+
+def check_places(folders: Sequence[Path], packages: Sequence[str]) -> None:
+    """Refuse a missing place of files, and a file whose YAML aliases stand for too many values.
 
     A few lines of nested aliases can stand for billions of values ("billion laughs"), and Hydra
     would expand them.
     """
     files: list[Path] = []
+    for package in packages:
+        with explained([]):
+            spec = find_spec(package)
+        if spec is None:
+            raise InputError(f"hydra.searchpath names {package}: no such package")
     for folder in folders:
+        if not folder.is_dir():  # Hydra only warns
+            raise InputError(f"hydra.searchpath names {folder}: no such folder")
         for pattern in ("*.yaml", "*/*.yaml", "*/*/*.yaml"):
             files += folder.glob(pattern)
     for file in files:
@@ -169,157 +339,54 @@ def _expanded_size(node: yaml.Node | None, sizes: dict[int, int]) -> int:
     return sizes[id(node)]
 
 
-def enforce_permissions(config: DictConfig, allowed: Sequence[str]) -> DictConfig:
-    """Refuse a configuration that would run what is not ``allowed``, and set ``allow_targets``.
-
-    This discards any ``allow_targets`` from a file.
-    """
-    check_permitted(config, allowed)
-    with read_write(config), open_dict(config):
-        config[PERMISSIONS] = list(allowed)
-    return config
-
-
 def check_permitted(config: DictConfig, allowed: Sequence[str]) -> None:
     """Run `check_composed` against Hydra's nodes as the installed packages write them."""
-    choices = config.hydra.runtime.choices if "hydra" in config else {}
-    words = [
-        f"{group}={choice}"
-        for group, choice in sorted(choices.items())
-        if str(group).startswith(MADE_GROUPS)
-    ]
-    check_composed(config, allowed, installed_nodes(tuple(words)))
+    choices = config.hydra.runtime.choices
+    made = tuple(f"{group}={choices[group]}" for group in MADE_GROUPS)
+    check_composed(config, allowed, installed_nodes(made))
 
 
 @cache
-def installed_nodes(words: tuple[str, ...]) -> Mapping[str, Any]:
-    """Hydra's node for the choices ``words``, from installed packages only.
+def installed_nodes(choices: tuple[str, ...]) -> Mapping[str, Any]:
+    """Hydra's node for ``choices`` of plug-ins and logs, from installed packages only.
 
-    It includes what gsbench's own ``conf/config.yaml`` sets. Choices from a user's folder are left
-    out.
+    It includes what gsbench's own ``conf/config.yaml`` sets. Choices that only a user's folder has
+    are left out.
     """
     with hydra_ready():
-        try:
-            config = hydra.compose(CONFIG_NAME, list(words), return_hydra_config=True)
-        except (HydraException, OmegaConfBaseException):
-            if len(words) < 2:
-                return installed_nodes(())
-            # One by one, so that a choice that no package has does not drop the others.
-            nodes: dict[str, Any] = {}
-            for word in words:
-                own = installed_nodes((word,))
-                nodes |= {name: own[name] for name in own if name in word}
-            return nodes
-        return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
+        known = [
+            word
+            for word in choices
+            if word.partition("=")[2] in config_loader().get_group_options(word.partition("=")[0])
+        ]
+        config = hydra.compose(CONFIG_NAME, known, return_hydra_config=True)
+    return OmegaConf.to_container(config.hydra, resolve=False)  # type: ignore[return-value]
 
 
 def compose_one(
     overrides: Sequence[str], typed: Sequence[str] | None = None, modules: str | None = None
 ) -> Trial:
-    """The single trial that ``overrides`` describe; `compose_whole` says what the others mean."""
+    """The single trial that ``overrides`` describe; `Composer` says what the others mean."""
     command_words.check_single(overrides, "choose one")
-    with hydra_ready():
-        return resolve_trial(compose_whole(overrides, typed, modules), overrides)
+    return Composer(overrides, typed, modules).trial(overrides)
 
 
-def resolve_trial(config: DictConfig, overrides: Sequence[str]) -> Trial:
-    """The trial of a composed configuration, with interpolations resolved in a copy."""
-    if "hydra" in config:  # for ${hydra:…} among the settings
-        HydraConfig.instance().set_config(config)
+def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
+    """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
+    own = ("tracking", "hydra.searchpath")
+    words = [word for word in typed if key_of(word).startswith(own)]
+    with hydra_ready(), explained(words):
+        config = hydra.compose(CONFIG_NAME, words)
+        return (str(config.tracking.uri),) if config.tracking.get("uri") else ()
+
+
+def trial_of_job(config: DictConfig, allowed: Sequence[str], overrides: Sequence[str]) -> Trial:
+    """The trial of a configuration that Hydra composed for a job, without Hydra's node."""
+    check_composed(config, allowed, {})
+    with open_dict(config):
+        config[PERMISSIONS] = list(allowed)
     with explained(overrides):
         return Trial(checked_values(config), tuple(overrides))
-
-
-def has_key(config: DictConfig, key: str) -> bool:
-    """Return whether a configuration has the dotted ``key``."""
-    return OmegaConf.select(config, key) is not None
-
-
-def options_text(folders: Sequence[Path] = ()) -> str:
-    """The choices of every group: gsbench's own, and those in the user's ``folders``."""
-    lines = ["Groups:"]
-    for group in GROUPS:
-        prefix = "+experiment" if group == "experiment" else group
-        lines.append(f"  {prefix + '=':<13}{', '.join(options(group, folders))}")
-    return "\n".join(lines)
-
-
-# ---- the trials of a sweep
-#
-# Hydra takes a tenth of a second for a composition, and a sweep may have ten thousand trials. So
-# what trials share is composed once. Hydra applies values after the files that groups choose.
-# Trials that choose the same files share their composition, and trials that differ only in the seed
-# share the resolved values too.
-
-# settings that `gsbench.app.command` adds to the typed ones
-ADDED = ("hydra.mode", "hydra.sweeper.grids")
-SEED = re.compile(r"seed=(\d+)")
-# The seed, or a setting of a group, except settings that name a class (``_target_``).
-PLAIN_KEY = re.compile(r"seed|(?!hydra\b)[a-zA-Z]\w*(\.[a-zA-Z]\w*)+")
-# An interpolation that may read the seed: it names the seed, or its own name is an interpolation.
-MAY_READ_SEED = re.compile(r"\$\{[^}]*(seed|\$\{)")
-# An interpolation that may read Hydra's node, which has the number and the words of a job.
-READS_HYDRA = re.compile(r"\$\{\s*hydra\b")
-
-
-def compose_jobs(
-    loader: ConfigLoader, sweep: DictConfig, jobs: Sequence[Sequence[str]], first: int = 0
-) -> list[Trial]:
-    """Compose the trials of ``jobs``, each a list of words; ``sweep`` is the whole configuration.
-
-    ``first`` is the number of the first job, for ``${hydra:job.num}``.
-    """
-    by_files: dict[tuple[str, ...], DictConfig] = {}
-    by_settings: dict[tuple[str, ...], Trial] = {}
-    trials = []
-    hydra_words, allowed = typed_words(sweep.hydra.overrides)[0], tuple(sweep.allow_targets)
-    for number, words in enumerate(jobs, first):
-        overrides = (*hydra_words, *words)
-        seeds = [int(match.group(1)) for word in words if (match := SEED.fullmatch(word))]
-        without_seed = tuple(word for word in words if not SEED.fullmatch(word))
-        if seeds and without_seed in by_settings:
-            trials.append(
-                replace(with_seed(by_settings[without_seed], seeds[-1]), overrides=overrides)
-            )
-            continue
-        values = _plain_values(words)
-        files = (*(word for word in words if word.partition("=")[0] not in values), *values)
-        with explained(overrides):
-            if files in by_files:
-                composed = copy.deepcopy(by_files[files])
-                for key, value in values.items():
-                    OmegaConf.update(composed, key, value)
-            else:
-                command_words.check_search_path(words, allowed)
-                composed = enforce_permissions(
-                    loader.load_sweep_config(sweep, list(words)), allowed
-                )
-                with read_write(composed), open_dict(composed):
-                    composed.hydra.job.num, composed.hydra.job.id = number, f"job_id_for_{number}"
-                    HydraConfig.instance().set_config(composed)
-                    composed.pop("hydra")  # large, and trials read it only by ${hydra:…}
-            settings = repr(OmegaConf.to_container(composed, resolve=False))
-            trials.append(resolve_trial(composed, overrides))
-        reads_hydra = READS_HYDRA.search(settings)
-        if not reads_hydra:
-            by_files.setdefault(files, composed)
-        if not reads_hydra and not MAY_READ_SEED.search(settings):
-            by_settings[without_seed] = trials[-1]
-    return trials
-
-
-def resolve_times(sweep: DictConfig) -> None:
-    """Resolve a sweep's settings once, so that ``${now:…}`` is the same for all its trials."""
-    for key in [str(key) for key in sweep if key != "hydra"]:
-        with suppress(OmegaConfBaseException):  # such as a setting that only the words of a job set
-            if OmegaConf.is_config(sweep[key]):
-                OmegaConf.to_container(sweep[key], resolve=True)
-
-
-def typed_words(overrides: DictConfig) -> tuple[list[str], list[str]]:
-    """The typed words in a node ``hydra.overrides``: those for Hydra, and those for gsbench."""
-    words: Any = OmegaConf.to_container(overrides, resolve=False)
-    return [word for word in words["hydra"] if word.partition("=")[0] not in ADDED], words["task"]
 
 
 def with_seed(trial: Trial, seed: int) -> Trial:
@@ -332,35 +399,6 @@ def with_seed(trial: Trial, seed: int) -> Trial:
     return replace(trial, values=trial.values | {"seed": seed}, overrides=words)
 
 
-def _plain_values(words: Sequence[str]) -> Mapping[str, Any]:
-    """Numbers and texts that words give to settings; empty if the order of the words may matter."""
-    values = [_key_and_value(word) for word in words]
-    keys = [key.lstrip("+~") for key, _ in values if "." in key]
-    parents = {key[:dot] for key in keys for dot in range(len(key)) if key[dot] == "."}
-    if (
-        len(set(keys)) < len(keys)
-        or parents & set(keys)
-        or any(isinstance(value, dict) for _, value in values)
-    ):
-        return {}
-    plain = {
-        key: value
-        for key, value in values
-        if PLAIN_KEY.fullmatch(key) and isinstance(value, int | float | str)
-    }
-    return {key: value for key, value in plain.items() if "$" not in str(value)}
-
-
-@cache
-def _key_and_value(word: str) -> tuple[str, Any]:
-    """The key of a word, with the signs ``+`` and ``~``, and the value as Hydra reads it."""
-    override = parse_word(word)
-    return word.partition("=")[0], None if override.is_sweep_override() else override.value()
-
-
-# ---- Hydra's entry points
-
-
 @contextmanager
 def hydra_ready() -> Iterator[None]:
     """Initialise Hydra with gsbench's configuration folder within the block."""
@@ -368,11 +406,8 @@ def hydra_ready() -> Iterator[None]:
     if GlobalHydra.instance().is_initialized():  # within `hydra.main`, or in a block of this kind
         yield
         return
-    try:
-        with hydra.initialize_config_dir(str(conf_dir()), job_name="gsbench", **VERSION_BASE):
-            yield
-    finally:
-        HydraConfig.instance().cfg = None
+    with hydra.initialize_config_dir(str(conf_dir()), job_name="gsbench", **VERSION_BASE):
+        yield
 
 
 def config_loader() -> ConfigLoader:
@@ -380,215 +415,14 @@ def config_loader() -> ConfigLoader:
     return GlobalHydra.instance().config_loader()
 
 
-def run_main(
-    task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
-) -> None:
-    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what it raises.
-
-    Hydra may instantiate its own callbacks, the plug-ins that the checked ``config`` chooses, and
-    the classes that it allows.
-    """
-    names = (
-        []
-        if config is None
-        else [*config[PERMISSIONS], *(target for _, target in targets_in(plugins_of(config)))]
-    )
-    names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
-    register_schemas()
-    saved_argv, sys.argv = sys.argv, ["gsbench", *argv]
-    saved_full_error = os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself and exits
-    whitelist = WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)])
-    try:
-        with whitelist, redirect_stderr(_WithoutHydrasLine(sys.stderr)):
-            hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
-    finally:
-        sys.argv = saved_argv
-        os.environ.pop("HYDRA_FULL_ERROR")
-        if saved_full_error is not None:
-            os.environ["HYDRA_FULL_ERROR"] = saved_full_error
-        HydraConfig.instance().cfg = None
-
-
-def plugins_of(config: DictConfig) -> dict[str, Any]:
-    """The nodes of a configuration from which Hydra makes the launcher and the sweeper."""
-    return {
-        key: OmegaConf.to_container(config.hydra[key], resolve=False)
-        for key in ("launcher", "sweeper")
-    }
-
-
-class _WithoutHydrasLine:
-    """Standard error without Hydra's line about a job's error, which gsbench prints itself."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        return len(text) if text.startswith(HYDRAS_LINE) else int(self._stream.write(text))
-
-
-# ---- errors
-
-MAX_MESSAGE = 400  # characters of a Hydra error that `explain` does not recognise
-# for a choice that does not exist, by group: the word may name a user's class or a missing plug-in
-HINTS = {
-    **{
-        group: f"; a class of your own is named by {group}._target_"
-        for group in ("densify", "init", "raster")
-    },
-    "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm "
-    "need none",
-    "hydra/sweeper": "; gsbench has its own; a search is an interval and hydra.sweeper.tune.points",
-}
-
-Errors = type[Exception] | tuple[type[Exception], ...]
-
-
 @contextmanager
-def explained(overrides: Sequence[str], errors: Errors = Exception) -> Iterator[None]:
-    """Raise the block's ``errors`` as InputError: one line in terms of the words ``overrides``.
-
-    By default these are all errors, since any error while Hydra composes comes from the user's
-    input.
-    """
+def hydra_config(config: DictConfig | None) -> Iterator[None]:
+    """Let ``${hydra:…}`` read the node of ``config`` within the block; with None it is an error."""
+    instance = HydraConfig.instance()
+    before, instance.cfg = instance.cfg, None
     try:
+        if config is not None:
+            instance.set_config(config)
         yield
-    except GsbenchError:
-        raise
-    except errors as error:
-        raise InputError(explain(error, overrides)) from error
-
-
-def explain(error: BaseException, overrides: Sequence[str]) -> str:
-    """Hydra's error in one line that names the key, what is allowed, and the nearest choice."""
-    text = " ".join(_chain(error))
-    override = re.search(r"Could not override '([^']+)'", text)
-    unknown = re.search(r"Key '([^']+)' (?:is not in struct|not in '[^']+')", text)
-    if unknown:
-        return _unknown_setting(
-            unknown.group(1), override.group(1) if override else None, text, overrides
-        )
-    group = re.search(
-        r"Could not override '([\w/]+)'\.?\s*(?:Did you mean to override|No match in the defaults "
-        r"list)",
-        text,
-    )
-    if group:
-        word = group.group(1)
-        keys = [*GROUPS, *_keys_below("", overrides)]
-        return (
-            f"{word} is not a group or setting{did_you_mean(word, keys)} (groups: "
-            f"{', '.join(GROUPS)})"
-        )
-    missing = re.search(
-        r"Could not find '([^']+)'.*?Available options in '([^']+)':\s*(.*?)(?:\n\n|Config "
-        r"search|$)",
-        text,
-        re.S,
-    )
-    if missing:
-        wanted, name = missing.group(1), missing.group(2)
-        choices = sorted({*options(name), *re.findall(r"[\w.-]+", missing.group(3))})
-        word = wanted.rpartition("/")[2]
-        near = did_you_mean(word, choices) or HINTS.get(name, "")
-        return f"{name}={word} does not exist{near} (choose: {', '.join(choices)})"
-    absent = re.search(r"[Mm]issing mandatory value: ([\w.]+)(?:\s+full_key: ([\w.]+))?", text)
-    if absent:
-        return f"{absent.group(2) or absent.group(1)} is not set: give it a value"
-    folder = re.search(r"provider=.* path=(.*) is not available", text)
-    if folder:
-        return f"hydra.searchpath names {folder.group(1)}: no such folder"
-    place = re.search(r"full_key: ([\w.\[\]]+)", text)
-    text = re.sub(r"\s*(full_key|reference_type|object_type)[:=].*", "", text)
-    return (f"{place.group(1)}: " if place else "") + " ".join(text.split())[:MAX_MESSAGE]
-
-
-def _unknown_setting(bad: str, given: str | None, text: str, overrides: Sequence[str]) -> str:
-    """The error for an unknown key ``bad``.
-
-    ``given`` is the command line's whole key; None for a key in a file.
-    """
-    if given and given.startswith("hydra.sweeper.params."):
-        return (
-            f"{given}: params are for files of experiments; type "
-            f"{given.partition('params.')[2]}=… itself, with -m"
-        )
-    if bad in ("grids", "tune"):
-        what = "joins grids" if bad == "grids" else "tunes arms"
-        return (
-            f"hydra.sweeper.{bad}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
-        )
-    key = given or bad
-    parent = key[: key.rindex(bad)].rstrip(".") if bad in key else key.rpartition(".")[0]
-    where = re.search(r"In '([^']+)'", text)
-    file = ""
-    # A YAML file's folder is the group. In an experiment's file, Hydra's full_key says where the
-    # key stands.
-    if where and not given:
-        group, _, name = where.group(1).rpartition("/")
-        full = re.search(r"full_key: ([\w.]+)", text)
-        key = full.group(1) if full and full.group(1).endswith(bad) else f"{group}.{bad}"
-        file, parent = f" in {group}/{name}.yaml", key.rpartition(".")[0]
-    keys = _keys_below(parent, overrides)
-    is_users_class = any(word.startswith(f"{parent}._target_=") for word in overrides)
-    hint = (
-        f"; a key that only your class has is added with a plus: +{key}=…" if is_users_class else ""
-    )
-    near = _belongs_to(parent, bad) or did_you_mean(bad, keys) or _groups_with(key)
-    return (
-        f"{key} is not a setting{file}{near}{hint} ({parent or 'top level'} has: "
-        f"{', '.join(keys) or 'no settings'})"
-    )
-
-
-def _groups_with(key: str) -> str:
-    """``; did you mean scene.path?`` for a key that lacks its group; else nothing."""
-    groups = [group for group in GROUPS if group != "experiment"] if "." not in key else []
-    places = [f"{group}.{key}" for group in groups if key in _keys_below(group, [])]
-    return f"; did you mean {' or '.join(places)}?" if places else ""
-
-
-def _belongs_to(group: str, key: str) -> str:
-    """``; it belongs to densify=volumetric`` if other choices have the setting, else ""."""
-    if group not in GROUPS:
-        return ""
-    key_line = re.compile(rf"^{re.escape(key)}:", re.M)
-    files = {
-        name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name
-    }
-    choices = [
-        name for name, file in files.items() if key_line.search(file.read_text(encoding="utf-8"))
-    ]
-    return f"; it belongs to {group}={' or '.join(choices[:3])}" if choices else ""
-
-
-def _chain(error: BaseException | None) -> list[str]:
-    """The messages of an error and of its causes."""
-    messages = []
-    while error is not None:
-        messages.append(str(error))
-        error = error.__cause__
-    return messages
-
-
-def _keys_below(parent: str, overrides: Sequence[str]) -> list[str]:
-    """The settings below ``parent``, with the group choices of ``overrides`` if they compose."""
-    groups = (*GROUPS, "hydra/launcher", "hydra/sweeper")
-    choices = [
-        word
-        for word in overrides
-        if re.fullmatch(r"[\w/]+=[\w/-]+", word) and word.split("=")[0] in groups
-    ]
-    with hydra_ready():
-        try:
-            config = hydra.compose(CONFIG_NAME, choices, return_hydra_config=True)
-        except Exception:  # noqa: BLE001 - a choice itself may be wrong
-            config = hydra.compose(CONFIG_NAME, [], return_hydra_config=True)
-    node = OmegaConf.select(config, parent) if parent else config
-    # Hydra's plug-ins are chosen by name, not by class
-    hidden = "_target_" if parent.startswith("hydra") else "hydra"
-    return [str(key) for key in node if key != hidden] if isinstance(node, DictConfig) else []
+    finally:
+        instance.cfg = before

@@ -7,9 +7,10 @@ mechanism checks every value.
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from annotated_types import Interval, Predicate, doc
@@ -22,7 +23,7 @@ from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.raster.executors import RasterConfig
 from gsbench.runs.layout import IN_RUNS
-from gsbench.runs.nested import entries_of
+from gsbench.runs.nested import GSBENCH, entries_of
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (
     MAX_INTEGER,
@@ -40,7 +41,7 @@ from gsbench.system.resources import trials_at_once
 from gsbench.train.options import TrainConfig, scale_steps
 
 NO_DENSIFIER = "gsbench.densify.NoDensifier"
-
+TUNE = "hydra.sweeper.tune"
 
 ExperimentName = Annotated[
     str,
@@ -69,7 +70,8 @@ class ComponentConfig:
 class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
-    sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
+    # the tracker; further keys are options of a class of your own (`gsbench.tracking.Sink`)
+    _target_: TargetName = "gsbench.tracking.MLflow"
     # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     uri: Address | None = None
     flush_seconds: PositiveFloat = 10.0
@@ -133,6 +135,23 @@ class LaunchConfig:
             )
 
 
+@dataclass(frozen=True)
+class TuneSettings:
+    """Settings of a tuning, ``hydra.sweeper.tune`` (`gsbench.app.tuning`).
+
+    ``points`` is the number for each arm; 0: nothing is tuned, and intervals are left out. ``seed``
+    lists the seeds of a point's trials. The sweep may have none of them.
+    """
+
+    points: NonNegativeInt = 20
+    at_once: PositiveInt = 1  # points of an arm that are proposed and trained together
+    metric: str | None = None  # None: eval.primary, else PSNR
+    seed: int | str = 100
+
+    def __post_init__(self) -> None:
+        check_settings(self, TUNE)
+
+
 @dataclass
 class Config:
     """The root of the configuration.
@@ -163,11 +182,16 @@ GROUP_SCHEMAS: dict[str, Any] = {
     if dataclasses.is_dataclass(entry.default_factory)
 }
 COMPONENTS = ("init", "densify")  # groups whose keys are the options of a class
+ROOT_SETTINGS = frozenset(
+    entry.name
+    for entry in dataclasses.fields(Config)
+    if entry.name not in (*GROUP_SCHEMAS, *COMPONENTS)
+)
 
 
 @cache
 def register_schemas() -> None:
-    """Register the schemas with Hydra.
+    """Register the schemas and gsbench's plug-ins with Hydra.
 
     The root's schema has those of the groups. They are registered by themselves, too, for files of
     users that name one (``defaults: [/schema/scene/base@_here_, _self_]``), under ``schema/``, so
@@ -177,6 +201,10 @@ def register_schemas() -> None:
     store.store(name="config_schema", node=_names_and_defaults(Config))
     for group, schema in GROUP_SCHEMAS.items():
         store.store(group=f"schema/{group}", name="base", node=_names_and_defaults(schema))
+    settings = {"params": {}, "grids": [], "tune": dataclasses.asdict(TuneSettings())}
+    for plugin, own in (("Launcher", {}), ("Sweeper", settings)):
+        target = {"_target_": f"hydra_plugins.gsbench.Gsbench{plugin}"}
+        store.store(group=f"hydra/{plugin.lower()}", name="gsbench", node=target | own)
 
 
 @cache
@@ -187,6 +215,8 @@ def _names_and_defaults(schema: type) -> type:
         factory: Any = entry.default_factory
         if schema is Config and entry.name in GROUP_SCHEMAS:
             factory = _names_and_defaults(GROUP_SCHEMAS[entry.name])
+            if hasattr(factory, "_target_"):  # takes the options of a user's class, too
+                factory = partial(OmegaConf.structured, factory, flags={"struct": False})
         elif factory is dict:  # takes any key, without Hydra's plus
             factory = partial(DictConfig, {}, flags={"struct": False})
         fields.append((entry.name, Any, field(default=entry.default, default_factory=factory)))
@@ -199,89 +229,136 @@ def checked_values(config: DictConfig) -> dict[str, Any]:
     Hydra's node is left out. The classes that ``init`` and ``densify`` name check their options
     themselves, when they are made. Raises InputError naming the key.
     """
-    values = plain(config)
-    # also options of components, which their classes check later
+    return check(plain(config))
+
+
+def check(values: dict[str, Any]) -> dict[str, Any]:
+    """Apply all `RULES` to the values of a configuration, in place; returns them."""
+    for rule in RULES:
+        rule(values)
+    return values
+
+
+def plain(values: Any, given: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """Settings as plain Python values of JSON's types.
+
+    A configuration is resolved, except the root's settings that are ``given``, and Hydra's node is
+    left out; its ``train`` is changed in place. Tuples, which OmegaConf 2.4 keeps, become lists.
+    """
+    if isinstance(values, DictConfig):
+        if OmegaConf.is_dict(values.get("train")):
+            # before ${train.…} is resolved, by which densifiers get their steps
+            scale_steps(values.train)
+        resolved = {
+            str(key): given[str(key)] if key in given else values[key]
+            for key in values
+            if key != "hydra"
+        }
+        return {
+            key: plain(
+                OmegaConf.to_container(value, resolve=True, throw_on_missing=True, enum_to_str=True)
+                if OmegaConf.is_config(value)
+                else value
+            )
+            for key, value in resolved.items()
+        }
+    if isinstance(values, dict):
+        return {key: plain(value) for key, value in values.items()}
+    return [plain(value) for value in values] if isinstance(values, list | tuple) else values
+
+
+FIXED_IN_PROGRAMS: tuple[tuple[str, str, Any, str], ...] = (
+    ("eval", "at", [], "shows its model only at the end: leave eval.at empty"),
+    ("train", "max_seconds", None, "cannot be stopped early: give it fewer train.iterations"),
+    ("train", "resolution_schedule", "none", "has its own sizes: leave it at none"),
+)
+
+# ---- rules: each checks the values of a configuration, or converts some in place
+
+
+def whole_numbers_fit(values: dict[str, Any]) -> None:
+    """Refuse a number of more than 64 bits, also among options that a class checks later."""
     for place, key, value in entries_of(values):
         if isinstance(value, int) and abs(value) > MAX_INTEGER:
             raise InputError(
                 f"{'.'.join((*place, key))}={value} is not a whole number of 64 bits: give a "
                 "nearer one"
             )
+
+
+def groups_are_chosen(values: dict[str, Any]) -> None:
     for group in (*GROUP_SCHEMAS, *COMPONENTS):
         if not isinstance(values.get(group), dict):
             raise InputError(
                 f"{group} must be chosen, as {group}=NAME (see gsbench --help), got "
                 f"{values.get(group)!r}"
             )
+
+
+def groups_keep_their_schemas(values: dict[str, Any]) -> None:
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
-        if given.get("_target_") is not None:  # the other keys are options of the user's class
-            given = {key: given.get(key) for key in ("name", "_target_")}
+        target = given.get("_target_") or GSBENCH
+        if not str(target).startswith(GSBENCH):  # keys that are no settings are its options
+            known = {one.name for one in dataclasses.fields(schema)}
+            given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})
+    if values["scene"].get("_target_") is None:  # as in configurations before it was a setting
+        values["scene"].pop("_target_", None)
+
+
+def root_keeps_its_schema(values: dict[str, Any]) -> None:
     root = {key: value for key, value in values.items() if key not in (*GROUP_SCHEMAS, *COMPONENTS)}
     values |= check_values(Config, root, "")
+
+
+def components_name_classes(values: dict[str, Any]) -> None:
     for group in COMPONENTS:
-        check_values(
-            ComponentConfig, {key: values[group].get(key) for key in ("name", "_target_")}, group
-        )
-    scene, train, densify, launch = (
-        values["scene"],
-        values["train"],
-        values["densify"],
-        values["launch"],
-    )
-    if late := [step for step in values["eval"]["at"] if step > train["iterations"]]:
-        raise InputError(
-            f"eval.at names iteration {late[0]}, and train.iterations is {train['iterations']}"
-        )
-    if scene["transparent"] == "white" and train["background"] != [1, 1, 1]:
+        named = {key: values[group].get(key) for key in ("name", "_target_")}
+        check_values(ComponentConfig, named, group)
+
+
+def measurements_lie_in_the_training(values: dict[str, Any]) -> None:
+    iterations = values["train"]["iterations"]
+    if late := [step for step in values["eval"]["at"] if step > iterations]:
+        raise InputError(f"eval.at names iteration {late[0]}, and train.iterations is {iterations}")
+
+
+def white_pictures_have_a_white_background(values: dict[str, Any]) -> None:
+    if values["scene"]["transparent"] == "white" and values["train"]["background"] != [1, 1, 1]:
         raise InputError(
             "scene.transparent=white: the model must be rendered over white, too: add "
             "train.background=[1,1,1]"
         )
-    if train["iterations"] == 0 and densify.get("_target_") != NO_DENSIFIER:
+
+
+def nothing_grows_untrained(values: dict[str, Any]) -> None:
+    if values["train"]["iterations"] == 0 and values["densify"]["_target_"] != NO_DENSIFIER:
         raise InputError("train.iterations=0 trains nothing, so nothing grows: add densify=none")
-    if is_external(densify):
-        check_external(values)
-    if launch["parallel"] == "auto":
-        launch["parallel"] = trials_at_once(densify.get("max_gaussians"), values["device"])
-    return values
 
 
-def check_external(values: Mapping[str, Any]) -> None:
-    """Raise InputError for settings that another program cannot follow."""
-    if values["eval"]["at"]:
-        raise InputError(
-            "eval.at: another program shows its model only at the end: leave eval.at empty"
-        )
-    if values["train"]["max_seconds"] is not None:
-        raise InputError(
-            "train.max_seconds: another program cannot be stopped early: give it fewer "
-            "train.iterations"
-        )
-    if values["train"]["resolution_schedule"] != "none":
-        raise InputError(
-            "train.resolution_schedule: another program has its own sizes: leave it at none"
-        )
+def another_program_can_follow(values: dict[str, Any]) -> None:
+    for group, key, free, why in FIXED_IN_PROGRAMS if is_external(values["densify"]) else ():
+        if values[group][key] != free:
+            raise InputError(f"{group}.{key}: another program {why}")
 
 
-def plain(values: Any) -> Any:
-    """Settings as plain Python values of JSON's types.
+def machine_decides_auto(values: dict[str, Any]) -> None:
+    if values["launch"]["parallel"] == "auto":
+        gaussians = values["densify"].get("max_gaussians")
+        values["launch"]["parallel"] = trials_at_once(gaussians, values["device"])
 
-    A configuration is resolved, and Hydra's node left out. Tuples, which OmegaConf 2.4 keeps,
-    become lists.
-    """
-    if isinstance(values, DictConfig):
-        own = OmegaConf.masked_copy(values, [str(key) for key in values if key != "hydra"])
-        OmegaConf.copy_cache(values, own)  # keeps ${now:…} the same for all trials of a sweep
-        if OmegaConf.is_dict(own.get("train")) and own.train.get("steps_scaler", 1.0) != 1.0:
-            # before ${train.…} is resolved, by which densifiers get their steps
-            own.train = own.train.copy()
-            scale_steps(own.train)
-        return plain(
-            OmegaConf.to_container(own, resolve=True, throw_on_missing=True, enum_to_str=True)
-        )
-    if isinstance(values, dict):
-        return {key: plain(value) for key, value in values.items()}
-    return [plain(value) for value in values] if isinstance(values, list | tuple) else values
+
+RULES: tuple[Callable[[dict[str, Any]], None], ...] = (
+    whole_numbers_fit,
+    groups_are_chosen,
+    groups_keep_their_schemas,
+    root_keeps_its_schema,
+    components_name_classes,
+    measurements_lie_in_the_training,
+    white_pictures_have_a_white_background,
+    nothing_grows_untrained,
+    another_program_can_follow,
+    machine_decides_auto,
+)

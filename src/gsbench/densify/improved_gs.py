@@ -38,6 +38,8 @@ class LongAxis(ADC):
         "opacity_reset": OPACITY_RESET,
     }
 
+    gradient: Literal["signed", "absolute"] = "absolute"
+    gradient_threshold: PositiveFloat = 8e-4
     split_distance: OpenFraction = 0.45
     opacity_factor: Annotated[float, Interval(gt=0, le=1)] = 0.6
 
@@ -143,7 +145,6 @@ class EdgeAware(LongAxis):
 
     prunes_by_size = False
 
-    gradient: Literal["signed", "absolute"] = "absolute"
     gradient_threshold: PositiveFloat = 3e-4
     score_views: PositiveInt = 10
     cap: Literal["root", "curve", "hard"] = "root"  # type: ignore[assignment]
@@ -354,9 +355,8 @@ class GNS(EdgeAware):
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
                 "the opacity pressure was too short: it ended with %d Gaussians, and %d of them "
-                "were removed at "
-                "random; raise densify.pressure_length, or lower densify.interval (the pressure's "
-                "is half of it)",
+                "were removed at random; raise densify.pressure_length, or lower densify.interval "
+                "(the pressure's is half of it)",
                 len(opacities),
                 int((~kept).sum()),
             )

@@ -90,53 +90,39 @@ def _settings(folder: Path) -> dict[str, Any] | None:
 
 def _state(folder: Path, planned: PlannedTrial | None, queue: Queue | None) -> TrialState:
     """The state of the trial in ``folder``; ``planned`` is its entry in the plan."""
-    state = TrialFolder(folder).state()
-    if state == "done":
-        return TrialState(
-            folder, state, _changed(folder / RESULTS), TrialFolder(folder).record().remark
-        )
+    files = TrialFolder(folder)
+    state, lost = files.state(), ""
     if state == "running":
         holder = read_holder(folder / LOCK)
-        since, process = (
-            (None, "process ? on ?") if holder is None else (holder.since, holder.description)
-        )
+        process = "process ? on ?" if holder is None else holder.description
+        since = None if holder is None else holder.since
         return TrialState(folder, state, since, f"{_progress(folder)} {process}".strip())
-    if state == "damaged":
-        return TrialState(
-            folder,
-            state,
-            _changed(folder / RESULTS),
-            str(TrialFolder(folder).change() or TrialFolder(folder).why_not_done({})),
-        )
-    submission = read_submission(folder)
-    lost = ""
-    if submission:
+    if state not in ("done", "damaged") and (submission := read_submission(folder)):
         if in_queue := state_in_queue(folder, queue):
             job = queue.get(submission.job) if queue is not None else None
-            words = job.words if job else "Slurm does not answer"
-            note = f"{_progress(folder)} Slurm job {submission.job}, {words}".strip()
+            answer = job.words if job else "Slurm does not answer"
+            note = f"{_progress(folder)} Slurm job {submission.job}, {answer}".strip()
             return TrialState(folder, in_queue, _changed(folder / SUBMITTED), note)
         lost = f"; Slurm job {submission.job} has ended, log: {submission.log}"
-    if state == "failed":
-        return TrialState(
-            folder, state, _changed(folder / FAILED), TrialFolder(folder).failure().reason
-        )
-    if state == "partial":
-        return TrialState(
-            folder, state, _changed(folder / CONFIG), f"stopped {_progress(folder)}".strip() + lost
-        )
-    since = None if planned is None else planned.time
-    return TrialState(folder, state, since, "never started" + lost)
+    if state == "done":
+        file, note = RESULTS, files.record().remark
+    elif state == "damaged":
+        file, note = RESULTS, str(files.change() or files.why_not_done({}))
+    elif state == "failed":
+        file, note = FAILED, files.failure().reason
+    elif state == "partial":
+        file, note = CONFIG, f"stopped {_progress(folder)}".strip() + lost
+    else:
+        since = None if planned is None else planned.time
+        return TrialState(folder, state, since, "never started" + lost)
+    return TrialState(folder, state, _changed(folder / file), note)
 
 
 def _progress(folder: Path) -> str:
     """``in train at iteration 7000``; "" if no stage has begun."""
     stage, step = TrialFolder(folder).stage_and_step()
-    return (
-        f"in {stage}" + (f" at iteration {step}" if stage == "train" and step else "")
-        if stage
-        else ""
-    )
+    text = f"in {stage}" if stage else ""
+    return f"{text} at iteration {step}" if stage == "train" and step else text
 
 
 def _changed(path: Path) -> float | None:

@@ -130,15 +130,18 @@ def lacks(name: str, own: object, needs_footprint: bool, extra: str | None) -> s
     not an executor of gsbench, the attributes of the rasterizer ``own`` decide.
     """
     known: dict[str, object] = {executor.name: executor for executor in EXECUTORS}
-    for wanted, output, gives in (
-        (needs_footprint, "footprints", lambda one: getattr(one, "has_footprint", False)),
-        (extra, f"the extra output {extra}", lambda one: extra in getattr(one, "extras", ())),
-    ):
-        if wanted and not gives(known.get(name, own)):
-            able = " or ".join(f"raster={other}" for other in known if gives(known[other]))
-            remedy = f"take {able}" if able else "take a rasterizer of your own that gives it"
-            return f"needs {output}, which raster={name} does not give; {remedy}"
-    return None
+
+    def lack(one: object) -> str | None:
+        if needs_footprint and not getattr(one, "has_footprint", False):
+            return "footprints"
+        without = extra is not None and extra not in getattr(one, "extras", ())
+        return f"the extra output {extra}" if without else None
+
+    if (output := lack(known.get(name, own))) is None:
+        return None
+    able = [f"raster={other}" for other in known if lack(known[other]) is None]
+    remedy = " or ".join(able) or "a rasterizer of your own that gives it"
+    return f"needs {output}, which raster={name} does not give; take {remedy}"
 
 
 def resolve(name: str, device_type: str) -> Executor:

@@ -18,6 +18,7 @@ from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
 from gsbench.runs.layout import DECLARED, IN_RUNS
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_record import Declared, read_rows
+from gsbench.words import is_one_line
 
 log = logging.getLogger(__name__)
 
@@ -55,17 +56,21 @@ def trial_folders(home: Path) -> Iterator[str]:
 
 
 def folders_in(folder: str | Path) -> list[str]:
-    """The paths of the folders in ``folder``, without links and hidden folders."""
+    """The paths of the folders in ``folder``, without links, hidden folders and strange names."""
     try:
         with os.scandir(folder) as entries:
-            return [
-                entry.path
+            found = [
+                entry
                 for entry in entries
                 if entry.is_dir(follow_symlinks=False) and not entry.name.startswith(".")
             ]
     except OSError as error:
         log.warning("left out: %s cannot be read (%s)", folder, error.strerror)
         return []
+    for entry in found:
+        if not is_one_line(entry.name):  # its line breaks would be lines about other folders
+            log.warning("left out: %r: gsbench gives no folder such a name", entry.path)
+    return [entry.path for entry in found if is_one_line(entry.name)]
 
 
 # ---- the search for the settings of an arm
@@ -166,10 +171,6 @@ class Arm:
         """Return whether a trial of the arm called ``name`` with these settings belongs to it."""
         own = f"{self.init}-{self.densify}"
         return name == own and all(str(config.get(key)) == value for key, value in self.variant)
-
-    def answers_to(self, word: str) -> bool:
-        """Return whether ``word`` names this arm, with or without initialiser and settings."""
-        return word in (str(self), self.short, f"{self.init}-{self.densify}", self.densify)
 
 
 @dataclass(frozen=True, kw_only=True)

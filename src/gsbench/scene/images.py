@@ -27,7 +27,7 @@ from PIL import Image, UnidentifiedImageError
 from gsbench.errors import InputError
 from gsbench.files import MAX_NAME_BYTES, require_regular
 from gsbench.scene.options import Backdrop
-from gsbench.words import counted, is_utf8, some_of
+from gsbench.words import counted, is_one_line, some_of
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def list_images(folder: Path) -> list[str]:
     """The sorted image files below a folder, relative, with "/" as separator, without hidden files.
 
     Links to folders are followed, and no folder is read twice. Raises InputError for a name that is
-    not UTF-8, since no file of results could have it.
+    not UTF-8 or has line breaks, since no file of results could have it.
     """
     names: list[str] = []
     unread = 0
@@ -88,11 +88,13 @@ def list_images(folder: Path) -> list[str]:
     if unread:
         files = f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
         log.warning("%s: %s not read: save as JPEG", folder, files)
-    if strange := sorted(name for name in names if not is_utf8(name)):
+    if strange := sorted(name for name in names if not is_one_line(name)):
         advice = "rename them"
         if sys.getfilesystemencoding() != "utf-8":
             advice += f", or set PYTHONUTF8=1: Python reads names as {sys.getfilesystemencoding()}"
-        raise InputError(f"{folder}: names that are not UTF-8: {some_of(strange)}: {advice}")
+        raise InputError(
+            f"{folder}: names that are not UTF-8, or have line breaks: {some_of(strange)}: {advice}"
+        )
     return sorted(names)
 
 

@@ -9,7 +9,14 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
+from gsbench.settings import (
+    MISSING,
+    FolderName,
+    PathName,
+    TargetName,
+    check_settings,
+    is_folder_name,
+)
 
 MAX_IMAGES = 200  # the paper's limit per scene
 MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
@@ -126,7 +133,8 @@ MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
 # Kinds of scenes, and the settings that only they read.
 READ_BY = {
-    ("colmap", "photos", "transforms"): ("images", "masks"),
+    ("colmap", "photos", "transforms"): ("images",),
+    ("colmap", "photos", "transforms", "reader"): ("masks",),
     ("colmap",): ("sparse",),
     ("courtyard",): ("views", "width", "height", "seed"),
 }
@@ -141,7 +149,9 @@ def folder_name(path: str | None) -> str:
 @dataclass
 class SceneConfig:
     name: FolderName | None = MISSING  # null: the name of the folder `path`
-    kind: Literal["colmap", "photos", "transforms", "courtyard"] = MISSING
+    kind: Literal["colmap", "photos", "transforms", "courtyard", "reader"] = MISSING
+    # scene=reader: a class of your own that reads the capture; its options are further keys
+    _target_: TargetName | None = None
     path: PathName | None = None  # folder of the capture
     # image folder below path; null: images, or what transforms.json names
     images: PathName | None = None
@@ -166,9 +176,11 @@ class SceneConfig:
     validation: bool = False  # drop the test views, and measure on views held out of the rest
     # centred: moved to the image centre, as 3DGS assumes
     principal_point: Literal["used", "centred"] = "used"
-    views: Annotated[int, Interval(ge=3, le=9999)] = 48  # courtyard only, as are the next three
-    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400
-    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300
+    # courtyard only, as are the next three: in steps of 7.5 degrees; 48 close the ring
+    views: Annotated[int, Interval(ge=3, le=9999)] = 48
+    width: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 400  # px
+    height: Annotated[int, Interval(ge=MIN_SIZE, le=MAX_SIZE)] = 300  # px
+    # of the small variations: every seed has the same plan
     seed: Annotated[int, Interval(ge=0, le=2**31 - 1)] = 0
 
     def __post_init__(self) -> None:
@@ -184,6 +196,11 @@ class SceneConfig:
             raise InputError(
                 f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos "
                 "(bare photographs), scene=colmap or scene=transforms"
+            )
+        if (self.kind == "reader") != (self._target_ is not None):
+            raise InputError(
+                f"scene.kind={self.kind} with scene._target_={self._target_}: a reader of your own "
+                "is scene=reader scene._target_=mine.MyReader"
             )
         self._check_that_all_is_read()
         self.split_rule.check()

@@ -16,7 +16,7 @@ from gsbench.eval.ssim import ssim_map
 from gsbench.raster.executors import find_executor
 
 SSIM_WEIGHT = 0.2
-# Whether the kernels for CPU and GPU compute what ``torch_photometric_loss`` does. Without them,
+# False if the kernels for CPU and GPU do not compute what ``torch_photometric_loss`` does: then
 # every device uses that function, and steps on a GPU are not recorded.
 HAS_KERNELS = True
 

@@ -5,6 +5,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from gsbench.app.plugins import run_main
 from gsbench.config.command_words import (
     check_search_path,
     check_single,
@@ -12,7 +13,7 @@ from gsbench.config.command_words import (
     search_path,
     typed_permissions,
 )
-from gsbench.config.compose import compose_whole, has_key, hydra_ready, run_main
+from gsbench.config.compose import Composer
 from gsbench.errors import InputError
 from gsbench.verbs.arguments import ArgumentParser
 
@@ -49,9 +50,8 @@ def ask_hydra(argv: list[str]) -> int:
     else:
         folders = [options.config_dir] if options.config_dir else []
         check_single(options.overrides, "choose one whose configuration is shown")
-        with hydra_ready():
-            config = compose_whole([*search_path(folders, options.overrides), *options.overrides])
-        if options.package is not None and not has_key(config, options.package):
+        composer = Composer([*search_path(folders, options.overrides), *options.overrides])
+        if options.package is not None and not composer.has_key(options.package):
             raise InputError(
                 f"--package {options.package}: there is no such part of the configuration"
             )

@@ -110,6 +110,19 @@ def _log2_alpha(dx, dy, shear, curve_t, curve_y, log2_opacity):
 
 
 @inlined
+def _log2_alpha_again(records, base, dx, dy):
+    """`_log2_alpha` of the record at ``base``, for passes behind the first."""
+    return _log2_alpha(
+        dx,
+        dy,
+        records[base + at.SHEAR],
+        records[base + at.CURVE_T],
+        records[base + at.CURVE_Y],
+        records[base + at.LOG2_OPACITY],
+    )
+
+
+@inlined
 def _touched_blocks(records, base, tile_x, tile_y, column, row):
     """The blocks of the tile at pixel (tile_x, tile_y) that may have a pixel with alpha >= 1/255.
 
@@ -360,14 +373,7 @@ def composite_backward_tiles(memory, first, past, frame, g_image, g_alpha, all_r
                 place = block * np.uint64(LANES)
                 dx = load(PIXEL_X, place) + offset_x
                 dy = load(PIXEL_Y, place) + offset_y
-                power, t = _log2_alpha(
-                    dx,
-                    dy,
-                    records[base + at.SHEAR],
-                    records[base + at.CURVE_T],
-                    records[base + at.CURVE_Y],
-                    records[base + at.LOG2_OPACITY],
-                )
+                power, t = _log2_alpha_again(records, base, dx, dy)
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 raw = select(blended, exp2(power), ZERO)
                 opacity = minimum(raw, splat(ALPHA_MAX))
@@ -480,14 +486,7 @@ def cover_tiles(memory, first, past, frame, values, covered, sums, distances):
                 place = block * np.uint64(LANES)
                 dx = load(PIXEL_X, place) + offset_x
                 dy = load(PIXEL_Y, place) + offset_y
-                power, _ = _log2_alpha(
-                    dx,
-                    dy,
-                    records[base + at.SHEAR],
-                    records[base + at.CURVE_T],
-                    records[base + at.CURVE_Y],
-                    records[base + at.LOG2_OPACITY],
-                )
+                power, _ = _log2_alpha_again(records, base, dx, dy)
                 blended = (power >= LOG2_ALPHA_MIN) & (number <= load(frame.last, state + place))
                 count += select(blended, splat(ONE), ZERO)
                 total += select(blended, load(own, place), ZERO)

@@ -166,7 +166,7 @@ class CpuRasterizer(StagedRasterizer[ForwardPass]):
         def pair(first: int, past: int) -> None:
             pair_shards(first, past, *in_order, view.tiles_x, LOG2_ALPHA_MIN, counts, pairs, made)
 
-        # How many pairs there are is known only when all are made. So they are made with the room
+        # The number of pairs is known only when all are made. So they are made with the room
         # that has sufficed so far; a second pass is needed only if the scene has grown.
         room = self._pairs_of_shard
         pairs = arena.take("pairs", (GAUSSIAN_SHARDS, room), np.uint64)

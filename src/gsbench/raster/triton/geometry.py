@@ -17,41 +17,20 @@ BLUR = tl.constexpr(CONSTANTS.blur)
 F0, F1 = tl.constexpr(C0), tl.constexpr(C1)
 D0, D1, D2, D3, D4 = (tl.constexpr(value) for value in C2)
 T0, T1, T2, T3, T4, T5, T6 = (tl.constexpr(value) for value in C3)
+NUM_CAMERA = tl.constexpr(len(CameraNumbers._fields))
 NUM_SH = tl.constexpr(NUM_SH_REST)  # vectors of one Gaussian in ``sh_rest``
 
 
 @triton.jit
 def load_camera(numbers):
-    """The camera whose ``numbers`` [24] are in memory, in the order of `CameraNumbers`.
+    """The camera whose ``numbers`` [NUM_CAMERA] are in memory, in the order of `CameraNumbers`.
 
     They are in memory, not among the arguments, so that a recorded launch serves every view.
     """
-    return CameraNumbers(
-        tl.load(numbers + 0),
-        tl.load(numbers + 1),
-        tl.load(numbers + 2),
-        tl.load(numbers + 3),
-        tl.load(numbers + 4),
-        tl.load(numbers + 5),
-        tl.load(numbers + 6),
-        tl.load(numbers + 7),
-        tl.load(numbers + 8),
-        tl.load(numbers + 9),
-        tl.load(numbers + 10),
-        tl.load(numbers + 11),
-        tl.load(numbers + 12),
-        tl.load(numbers + 13),
-        tl.load(numbers + 14),
-        tl.load(numbers + 15),
-        tl.load(numbers + 16),
-        tl.load(numbers + 17),
-        tl.load(numbers + 18),
-        tl.load(numbers + 19),
-        tl.load(numbers + 20),
-        tl.load(numbers + 21),
-        tl.load(numbers + 22),
-        tl.load(numbers + 23),
-    )
+    loaded = ()
+    for k in tl.static_range(NUM_CAMERA):
+        loaded = loaded + (tl.load(numbers + k),)  # type: ignore[assignment]  # noqa: RUF005
+    return CameraNumbers(*loaded)  # type: ignore[call-arg]
 
 
 @triton.jit

@@ -20,16 +20,8 @@ def store_splitting(g_extra, index, d00, d01, d11, shear, rows, seen, inside):
     r1 = rows[1]
     r0 = plus(rows[0], shear, r1)
     s0, s1 = mixed(d00, r0, d01, r1), mixed(d01, r0, d11, r1)
-    # The matrix is symmetric: entries above the diagonal are written twice.
-    xy = r0[0] * s0[1] + r1[0] * s1[1]
-    xz = r0[0] * s0[2] + r1[0] * s1[2]
-    yz = r0[1] * s0[2] + r1[1] * s1[2]
-    store_or_zero(place, r0[0] * s0[0] + r1[0] * s1[0], seen, inside)
-    store_or_zero(place + 1, xy, seen, inside)
-    store_or_zero(place + 2, xz, seen, inside)
-    store_or_zero(place + 3, xy, seen, inside)
-    store_or_zero(place + 4, r0[1] * s0[1] + r1[1] * s1[1], seen, inside)
-    store_or_zero(place + 5, yz, seen, inside)
-    store_or_zero(place + 6, xz, seen, inside)
-    store_or_zero(place + 7, yz, seen, inside)
-    store_or_zero(place + 8, r0[2] * s0[2] + r1[2] * s1[2], seen, inside)
+    # The matrix is symmetric, bit for bit: entries below the diagonal repeat those above it.
+    for i in tl.static_range(3):
+        for j in tl.static_range(3):
+            entry = r0[i] * s0[j] + r1[i] * s1[j] if i <= j else r0[j] * s0[i] + r1[j] * s1[i]
+            store_or_zero(place + 3 * i + j, entry, seen, inside)

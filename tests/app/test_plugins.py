@@ -1,4 +1,4 @@
-"""Hydra's task and a sweep, with stand-ins for compositions and trials."""
+"""Hydra's task and its launchers, with stand-ins for compositions and trials."""
 
 import logging
 import os
@@ -10,13 +10,13 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from gsbench.app import sweep
-from gsbench.app.sweep import Objective, Sweep, TrialTask, metric_of
+from gsbench.app import plugins, sweep
+from gsbench.app.plugins import Objective, TrialTask, metric_of
+from gsbench.app.sweep import Ended
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
 from tests.app.stand_ins import done, trial
 from tests.finished import write_results
-from tests.helpers import refusal
 
 # ---- the value of a job
 
@@ -51,7 +51,7 @@ def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_
     with pytest.raises(GsbenchError, match="has no lpips_vgg"):
         Objective(1).value([*trials, third])
     monkeypatch.setattr(sweep, "facts_for", lambda metric, values: SimpleNamespace(direction=0))
-    with refusal("whether more or less of it is better is not known"):
+    with pytest.raises(InputError, match="whether more or less of it is better is not known"):
         metric_of(third.values)
 
 
@@ -64,22 +64,27 @@ def job(tmp_path, monkeypatch):
     state = SimpleNamespace(mode=RunMode.RUN, log={}, did=[])
 
     def instance():
-        node = {"job_logging": state.log, "verbose": "x", "overrides": ["w"], "mode": state.mode}
+        overrides = OmegaConf.create({"hydra": ["hydra.mode=RUN", "hydra.x=1"], "task": ["a=1"]})
+        node = {
+            "job_logging": state.log,
+            "verbose": "x",
+            "overrides": overrides,
+            "mode": state.mode,
+        }
         return SimpleNamespace(cfg=SimpleNamespace(hydra=SimpleNamespace(**node)))
 
-    def resolve(config, words):
+    def resolve(config, allowed, words):
+        state.did.append(("composed", allowed))
         return trial(tmp_path / "runs", config.seed, words)
 
     def note(name):
         return lambda *given: state.did.append((name, *given[-2:]))
 
-    monkeypatch.setattr(sweep.HydraConfig, "instance", instance)
-    monkeypatch.setattr(sweep.compose, "check_permitted", note("checked"))
-    monkeypatch.setattr(sweep.compose, "enforce_permissions", note("enforced"))
-    monkeypatch.setattr(sweep, "allow_modules", note("allowed"))
-    monkeypatch.setattr(sweep, "set_up_logging", note("logs"))
-    monkeypatch.setattr(sweep.compose, "typed_words", lambda words: (["hydra.x=1"], ["a=1"]))
-    monkeypatch.setattr(sweep.compose, "resolve_trial", resolve)
+    monkeypatch.setattr(plugins.HydraConfig, "instance", instance)
+    monkeypatch.setattr(plugins, "check_permitted", note("checked"))
+    monkeypatch.setattr(plugins, "allow_modules", note("allowed"))
+    monkeypatch.setattr(plugins, "set_up_logging", note("logs"))
+    monkeypatch.setattr(plugins, "trial_of_job", resolve)
     (tmp_path / "given").mkdir()
     monkeypatch.chdir(tmp_path)
     state.folder = str(tmp_path / "given")
@@ -92,10 +97,10 @@ def test_a_single_trial_is_run_where_the_command_was_given(job, caplog):
     task = TrialTask(done, allowed=("mine",), folder=job.folder)
     assert task(job.config) is None
     assert os.getcwd() == job.folder
-    (one,) = task.trials
+    (one,) = task.ended.trials
     assert (one.values["seed"], one.overrides) == (4, ("hydra.x=1", "a=1"))
-    assert [outcome.folder for outcome in task.outcomes] == [one.folder]
-    assert [name for name, *_ in job.did] == ["allowed", "checked", "logs", "enforced"]
+    assert [outcome.folder for outcome in task.ended.outcomes] == [one.folder]
+    assert [name for name, *_ in job.did] == ["allowed", "checked", "logs", "composed"]
     assert job.did[0] == ("allowed", ("mine",), job.folder)
     assert job.did[1][-1] == job.did[3][-1] == ("mine",)
     assert job.did[2] == ("logs", "x", False)
@@ -110,7 +115,7 @@ def test_a_job_of_a_sweep_raises_its_failure_and_returns_its_value(job, tmp_path
     job.mode = RunMode.MULTIRUN
     task = TrialTask(done, folder=job.folder)
     assert task(job.config) is None
-    assert (task.trials, task.outcomes) == ([], [])  # whoever launched it collects them
+    assert task.ended == Ended()  # whoever launched it collects them
     for bad_input, kind in ((True, InputError), (False, GsbenchError)):
 
         def failing(trials, bad_input=bad_input):
@@ -127,19 +132,17 @@ def test_a_job_of_a_sweep_raises_its_failure_and_returns_its_value(job, tmp_path
 
     task = TrialTask(measured, folder=job.folder, objective=Objective(-1, ("seed=1", "seed=4")))
     assert task(job.config) == pytest.approx(-22.5)
-    assert [one.overrides[-1] for one in task.trials] == ["seed=1", "seed=4"]
-    assert len(task.outcomes) == 2
+    assert [one.overrides[-1] for one in task.ended.trials] == ["seed=1", "seed=4"]
+    assert len(task.ended.outcomes) == 2
     assert job.config.seed == 4
     alone = TrialTask(measured, folder=job.folder, objective=Objective(1))
     assert alone(job.config) == pytest.approx(24)
 
 
 def test_a_task_is_pickled_without_what_it_collected(tmp_path):
-    task = TrialTask(done, True, ("a",), "/f", [{"a": 1}], Objective(1, ("seed=1",)))
-    task.launch([trial(tmp_path)])
-    assert (len(task.trials), len(task.outcomes)) == (1, 1)
-    again = pickle.loads(pickle.dumps(task))
-    assert again == TrialTask(done, True, ("a",), "/f", None, Objective(1, ("seed=1",)))
+    given = (done, ("a",), "/f", Objective(1, ("seed=1",)))
+    task = TrialTask(*given, sweep=object(), ended=Ended([trial(tmp_path)]))
+    assert pickle.loads(pickle.dumps(task)) == TrialTask(*given)
 
 
 # ---- a sweep
@@ -148,23 +151,26 @@ def test_a_task_is_pickled_without_what_it_collected(tmp_path):
 @pytest.fixture
 def begun(monkeypatch):
     begun = []
-    monkeypatch.setattr(sweep, "begin_for_another_launcher", begun.append)
+    monkeypatch.setattr(plugins, "begin_for_another_launcher", begun.append)
     return begun
 
 
-def sweep_of(task, launcher, launch=None, **more):
-    hydra = {"runtime": {"choices": {"hydra/launcher": launcher}}}
-    config = OmegaConf.create({"hydra": hydra | more})
-    made = launch and SimpleNamespace(launch=launch)
-    return Sweep(config, task, None, made)
+def run_by(monkeypatch, trials, name, launch=None):
+    """Run ``trials`` twice as gsbench's sweeper does by the launcher ``name``."""
+    hydra = {"runtime": {"choices": {"hydra/launcher": name}}, "verbose": False}
+    config = OmegaConf.create({"hydra": hydra})
+    own = SimpleNamespace(composer=SimpleNamespace(keep_times=lambda config: None))
+    task = TrialTask(done, sweep=own)
+    hydras = SimpleNamespace(instantiate_launcher=lambda **_: SimpleNamespace(launch=launch))
+    monkeypatch.setattr(plugins.Plugins, "instance", lambda: hydras)
+    monkeypatch.setattr(plugins, "run_sweep", lambda sweep, run: [run(trials), run(trials)])
+    task.run_sweep(None, config)
+    return task.ended
 
 
-def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
+def test_trials_go_to_the_chosen_launcher(tmp_path, monkeypatch, begun):
     trials = [trial(tmp_path, seed, ["hydra.x=1", f"seed={seed}"]) for seed in (0, 1)]
-    for name, look_only in (("gsbench", False), ("joblib", True)):
-        task = TrialTask(done, look_only=look_only)
-        sweep_of(task, name).launch(trials)
-        assert task.trials == trials
+    assert run_by(monkeypatch, trials, "gsbench") == Ended(trials * 2, done(trials * 2))
     assert begun == []
     asked = []
 
@@ -174,14 +180,12 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
         good._return_value, bad._return_value = 1.0, InputError("no photos")
         return [good, bad]
 
-    task = TrialTask(done)
-    for _ in range(2):
-        sweep_of(task, "joblib", launch).launch(trials)
+    ended = run_by(monkeypatch, trials, "joblib", launch)
     words = [["seed=0"], ["seed=1"]]
     assert asked == [(words, 0), (words, 2)]
     assert begun == [trials, trials]
-    assert task.trials == trials * 2
-    assert task.outcomes[:2] == [
+    assert ended.trials == trials * 2
+    assert ended.outcomes[:2] == [
         Outcome(trials[0].folder, "done"),
         Outcome(trials[1].folder, "failed", "no photos", True),
     ]
@@ -195,18 +199,18 @@ def test_trials_go_to_the_chosen_launcher(tmp_path, begun):
         (ValueError(), "^hydra/launcher=joblib: ValueError "),
     ],
 )
-def test_any_error_of_another_launcher_is_one_line(tmp_path, begun, error, said):
+def test_any_error_of_another_launcher_is_one_line(tmp_path, monkeypatch, begun, error, said):
     def launch(jobs, initial_job_idx):
         raise error
 
     with pytest.raises(GsbenchError, match=said):
-        sweep_of(TrialTask(done), "joblib", launch).launch([trial(tmp_path)])
+        run_by(monkeypatch, [trial(tmp_path)], "joblib", launch)
 
 
-def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
+def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
     composed = []
 
-    def compose_jobs(loader, config, jobs):
+    def compose_jobs(jobs):
         composed.extend(jobs)
         seeds = [int(dict(word.split("=") for word in job).get("seed", "7")) for job in jobs]
         name = lambda job: {"name": job[0].replace("=", "")}  # noqa: E731
@@ -215,8 +219,7 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
             for seed, job in zip(seeds, jobs, strict=True)
         ]
 
-    monkeypatch.setattr(sweep.compose, "compose_jobs", compose_jobs)
-    monkeypatch.setattr(sweep.OverridesParser, "create", lambda loader: None)
+    own = SimpleNamespace(composer=SimpleNamespace(trials=compose_jobs))
 
     def run(trials):
         outcomes = []
@@ -229,9 +232,9 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
         return outcomes[::-1]
 
     jobs = [["a=1"], ["a=2"], ["a=3"]]
-    task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")))
-    found = sweep_of(task, "gsbench", sweep={"dir": str(tmp_path / "new" / "dir")})
-    first, second, third = found.run_jobs(jobs)
+    task = TrialTask(run, objective=Objective(1, ("seed=1", "seed=2")), sweep=own)
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "new" / "dir")}}})
+    first, second, third = task.run_jobs(jobs, config)
     assert composed == [[*job, seed] for job in jobs for seed in ("seed=1", "seed=2")]
     assert (tmp_path / "new" / "dir").is_dir()
     assert [one.overrides for one in (first, second, third)] == jobs
@@ -240,6 +243,6 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path, monkeypatch):
     assert third.status is JobStatus.FAILED
     assert isinstance(third._return_value, InputError)
     task.objective = Objective(-1)
-    other, alone = found.run_jobs([["a=1"], ["a=2"]])
+    other, alone = task.run_jobs([["a=1"], ["a=2"]], config)
     assert (other.return_value, alone.return_value) == (-27.0, -37.0)
     assert composed[-1] == ["a=2"]

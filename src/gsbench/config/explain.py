@@ -1,0 +1,149 @@
+"""Errors of a composition as one line, in terms of the user's words and files."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.errors import MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
+
+from gsbench.config.command_words import key_of, searched_folders
+from gsbench.config.groups import EXTERNAL_FOLDER, GROUPS, options
+from gsbench.errors import GsbenchError, InputError
+from gsbench.system.install import conf_dir
+from gsbench.words import did_you_mean
+
+UNKNOWN = (ConfigAttributeError, ConfigKeyError)  # OmegaConf's errors for a key that is not there
+MAX_MESSAGE = 400  # characters of an error that is quoted
+# for a choice that does not exist, by group: the word may name a user's class or a missing plug-in
+HINTS = {
+    **{
+        group: f"; a class of your own is named by {group}._target_"
+        for group in ("densify", "init", "raster")
+    },
+    "hydra/launcher": "; other launchers are separate packages; launch=serial, local or slurm "
+    "need none",
+    "hydra/sweeper": "; gsbench has its own; a search is an interval and hydra.sweeper.tune.points",
+}
+
+Errors = type[Exception] | tuple[type[Exception], ...]
+
+
+@contextmanager
+def explained(words: Sequence[str], errors: Errors = Exception) -> Iterator[None]:
+    """Raise the block's ``errors`` as InputError: one line in terms of the ``words``.
+
+    By default these are all errors, since any error while Hydra composes comes from the user's
+    input.
+    """
+    try:
+        yield
+    except GsbenchError:
+        raise
+    except errors as error:
+        raise InputError(explain(error, words)) from error
+
+
+def explain(error: BaseException, words: Sequence[str]) -> str:
+    """An error of Hydra's or OmegaConf's in one line.
+
+    It names the key, what is allowed, and the nearest choice.
+    """
+    causes = [error]
+    while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
+        causes.append(cause)
+    for one in causes:
+        if isinstance(one, MissingConfigException) and one.missing_cfg_file:
+            return _missing_choice(one.missing_cfg_file, one.options or ())
+        if isinstance(one, UNKNOWN):
+            return unknown_setting(one, words)
+        if isinstance(one, MissingMandatoryValue) and one.full_key:
+            return f"{one.full_key} is not set: give it a value"
+        if isinstance(one, OmegaConfBaseException):  # its other lines say what it says itself
+            place = f"{one.full_key}: " if one.full_key else ""
+            return place + " ".join(str(one).partition("\n    ")[0].split())[:MAX_MESSAGE]
+    return " ".join(" ".join(map(str, causes)).split())[:MAX_MESSAGE]
+
+
+def _missing_choice(file: str, known: Sequence[str]) -> str:
+    group, _, name = file.rpartition("/")
+    group = group.removesuffix(f"/{EXTERNAL_FOLDER}")
+    choices = sorted({*options(group), *known})
+    near = did_you_mean(name, choices) or HINTS.get(group, "")
+    return f"{group}={name} does not exist{near} (choose: {', '.join(choices)})"
+
+
+def unknown_setting(error: Any, words: Sequence[str]) -> str:
+    """The line for a key that does not exist, from OmegaConf's ``error``."""
+    key, node = str(error.full_key or error.key), error.parent_node
+    parent, _, name = key.rpartition(".")
+    if parent == "hydra.sweeper.params":
+        return f"{key}: params are for files of experiments; type {name}=… itself, with -m"
+    if key in ("hydra.sweeper.grids", "hydra.sweeper.tune"):
+        what = "joins grids" if name == "grids" else "tunes arms"
+        return f"{key}: gsbench's own sweeper alone {what}, so leave out hydra/sweeper"
+    typed = any(key == own or own.startswith(f"{key}.") for own in map(key_of, words))
+    return not_a_setting(key, node, words, "" if typed else _file_that_sets(key, words))
+
+
+def not_a_setting(key: str, node: Any, words: Sequence[str], file: str = "") -> str:
+    """The line for a ``key`` that the ``node``, which should have it, does not have."""
+    parent, _, name = key.rpartition(".")
+    # Hydra's plug-ins are chosen by name, not by class
+    hidden = "_target_" if parent.startswith("hydra") else "hydra"
+    keys = [str(own) for own in node if own != hidden] if isinstance(node, DictConfig) else []
+    near = _belongs_to(parent, name) or did_you_mean(name, keys)
+    if not parent:
+        near = near or did_you_mean(name, GROUPS) or _groups_with(key, node)
+    if any(word.startswith(f"{parent}._target_=") for word in words):
+        near += f"; a key that only your class has is added with a plus: +{key}=…"
+    return (
+        f"{key} is not a setting{file}{near} ({parent or 'top level'} has: "
+        f"{', '.join(keys) or 'no settings'})"
+    )
+
+
+def _groups_with(key: str, root: DictConfig) -> str:
+    """``; did you mean scene.path?`` for a key that lacks its group; else nothing."""
+    nodes = {group: OmegaConf.select(root, group) for group in GROUPS}
+    places = [f"{group}.{key}" for group, node in nodes.items() if node is not None and key in node]
+    return f"; did you mean {' or '.join(places)}?" if places else ""
+
+
+def _belongs_to(group: str, key: str) -> str:
+    """``; it belongs to densify=volumetric`` if other choices have the setting, else ""."""
+    if group not in GROUPS:
+        return ""
+    key_line = re.compile(rf"^{re.escape(key)}:", re.M)
+    files = {
+        name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name
+    }
+    choices = [
+        name for name, file in files.items() if key_line.search(file.read_text(encoding="utf-8"))
+    ]
+    return f"; it belongs to {group}={' or '.join(choices[:3])}" if choices else ""
+
+
+def _file_that_sets(key: str, words: Sequence[str]) -> str:
+    """`` in experiment/mine.yaml``: the user's file that sets ``key``; "" if none does."""
+    group, _, rest = key.partition(".")
+    for folder in searched_folders(words):
+        for file in sorted([*folder.glob("*/*.yaml"), *folder.glob("*/*/*.yaml")]):
+            place = file.relative_to(folder)
+            own_key = rest if place.parts[0] == group else key
+            try:
+                found = OmegaConf.select(OmegaConf.load(file), own_key, default="")
+            except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException):
+                continue
+            if found != "":
+                return f" in {place.as_posix()}"
+    return ""
