@@ -21,6 +21,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import ledger_rates
 import numpy as np
 import regions
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
 from gsbench.claims.pooling import Study, pool
-from gsbench.claims.stopping import NO_RESULTS, KeyAndSeed, run_looks
+from gsbench.claims.stopping import KeyAndSeed, run_looks
 from gsbench.runs import ledger as records
 from gsbench.runs.experiments import Declaration, Question, trial_key
 from gsbench.runs.trial_record import TrialRecord
@@ -48,6 +49,12 @@ SECTION = re.compile(r"(<!-- promises -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 ONE_ARM_LIMIT = 0.22
 TIME, MEASURED = "2020-01-01T00:00:00Z", "2021-01-01T00:00:00Z"
 METRIC, LEAST = "psnr", 0.1
+NO_RESULTS: dict[str, Any] = {
+    **dict.fromkeys(("raster", "protocol"), ""),
+    **dict.fromkeys(("iterations", "num_gaussians"), 0),
+    **dict.fromkeys(("num_init_points", "peak_memory_mb")),
+    **{name: {} for name in ("metrics", "unavailable", "seconds", "hashes", "versions")},
+}
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator
@@ -331,7 +338,7 @@ def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
             nonlocal most
             most = 1 + max(seed for _, seed in planned)
 
-        found = gates.Gate(
+        found = gates.ask_gate(
             asked,
             lambda: [one for one in old if one.seed < most],
             lambda: [one for one in new if one.seed < most],
@@ -376,9 +383,9 @@ def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -
 
             good, last, new = (lambda place=place: read(place) for place in places.values())
             if number == count:
-                (verdict,) = run_looks(asked, gates.Gate(asked, good, new).judged, run)
+                (verdict,) = run_looks(asked, gates.ask_gate(asked, good, new).judged, run)
                 return gates.result_of(verdict)
-            step = gates.Step(asked, share, good, last, new)
+            step = gates.ask_step(asked, share, good, last, new)
             return gates.step_result(run_looks(step.declaration, step.judged, run))
 
         found = gates.first_worse(count, result)
@@ -391,7 +398,7 @@ def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -
 GRID = tuple(
     product((4, 16, 64), (1, 3, 8), (2, 6, 12), (0.3, 0.6, 1.0, 2.0), (0.1, 0.3, 1.0))
 )  # commits, scenes, seeds, loss, deviation
-SCREENED, WORST = 24, 8  # draws in each cell; cells with the most wrong names, which are drawn anew
+SCREENED, WORST = 12, 8  # draws in each cell; cells with the most wrong names, which are drawn anew
 
 
 def worst_bisect(share: float) -> tuple[float, float]:
@@ -399,7 +406,7 @@ def worst_bisect(share: float) -> tuple[float, float]:
     cells = GRID[:: max(1, round(1 / share / 4))] if share < 1 else GRID
     first = {case: repeated(bisect(*case), SCREENED, 11)[0] for case in cells}
     worst = sorted(first, key=lambda case: first[case])[-WORST if share == 1 else -1 :]
-    return max(repeated(bisect(*case), max(20, round(300 * share)), 12) for case in worst)
+    return max(repeated(bisect(*case), max(20, round(200 * share)), 12) for case in worst)
 
 
 # ---- ledger
@@ -413,25 +420,17 @@ def attempt(declaration: Declaration, made: Sequence[TrialResult]) -> Verdict:
         nonlocal most
         most = 1 + max(seed for _, seed in planned)
 
-    def judged() -> list[Verdict]:
-        return [rules.judge_idea([one for one in made if one.seed < most], declaration)]
-
-    (verdict,) = run_looks(declaration, judged, run)
+    asked = rules.ask_idea(declaration, lambda: [one for one in made if one.seed < most])
+    (verdict,) = asked.answer(run)
     return verdict
 
 
 def night(
-    captures: int,
-    retried: float,
-    correlation: float,
-    ratio: float = 1.0,
-    ideas: int = 40,
-    seeds: int = 6,
+    captures: int, retried: float, correlation: float, ideas: int = 40, seeds: int = 6
 ) -> Draw:
     """A night of ideas without any effect; 1 if an idea is kept.
 
-    A share of them are other tries of what looked best so far, with correlated noise. The first
-    capture is ``ratio`` times as noisy as the others.
+    A share of them are other tries of what looked best so far, with correlated noise.
     """
     keys = {
         name: {f"scene{k}": trial_key(f"scene{k}", f"sfm-{name}", "aaaa") for k in range(captures)}
@@ -441,7 +440,7 @@ def night(
         time=TIME,
         metric=METRIC,
         sign=1,
-        least=0.05 * ratio / (1 if ratio == 1 else captures),
+        least=0.05,
         ideas=ideas,
         rate=0.1,
         seeds=tuple(range(seeds)),
@@ -451,7 +450,7 @@ def night(
 
     def draw(rng: Rng) -> float:
         entries: list[records.Entry] = [opened]
-        noise, shape = noise_of(captures, ratio) * math.sqrt(0.5), (captures, seeds)
+        noise, shape = 0.1 * math.sqrt(0.5), (captures, seeds)
         baseline = trials("adc", 25 + noise * rng.standard_normal(shape))
         best, best_noise = -math.inf, np.zeros(shape)
         for number in range(ideas):
@@ -475,11 +474,28 @@ def night(
             entries.append(rules.end_of(name, verdict, TIME))
             if rules.result_of(verdict) == records.KEPT:
                 return 1.0  # of ideas without an effect, the first one kept makes the share 1
-            if (mean := float((noise * own)[:, :2].mean())) > best:
+            if (mean := float(own[:, :2].mean())) > best:
                 best, best_noise = mean, own
         return 0.0
 
     return draw
+
+
+def nights_at_once(noise: tuple[float, ...], correlation: float) -> Measure:
+    """The same of many nights at once, by the rule as `ledger_rates` restates it."""
+    rule = ledger_rates.RULES["the ledger"]
+    # The gain that matters is half a deviation of the mean of a pair on each capture.
+    least = 0.5 * math.sqrt(sum(one**2 for one in noise) / len(noise))
+
+    def found(share: float) -> tuple[float, float]:
+        nights, asked = (
+            round(100 + 1900 * share),
+            ledger_rates.Night(least, retried=0.7, correlation=correlation, noise=noise),
+        )
+        rate = ledger_rates.simulate(rule, asked, nights).false
+        return rate, math.sqrt(max(rate * (1 - rate), 1 / nights) / nights)
+
+    return found
 
 
 # ---- plans
@@ -596,24 +612,21 @@ def promises() -> Iterator[Promise]:
         f"bisect: wrong name, the worst of {len(GRID)} cells",
         "`first_worse`, `Step`",
         0.05,
-        300,
+        200,
         found=worst_bisect,
     )
-    for captures, correlation, ratio in (
-        (1, 0.0, 1.0),
-        (1, 0.39, 1.0),
-        (1, 0.7, 1.0),
-        (1, 0.95, 1.0),
-        (3, 0.7, 1.0),
-        (3, 0.7, 10.0),
-        (3, 0.7, 100.0),
-        (3, 0.95, 10.0),
+    for captures in (1, 3):
+        name = f"ledger: false discoveries, captures: {captures}, retries correlate by 0.7"
+        draw = night(captures, 0.7, 0.7)
+        yield Promise(name, "`next_level`, `ask_idea`", 0.1, 150, draw)
+    for correlation, noise in (
+        *product((0.0, 0.39, 0.7, 0.95), ((1.0,),)),
+        *product((0.7, 0.95), ((1.0, 1.0, 1.0), (10.0, 1.0, 1.0), (100.0, 1.0, 1.0), (10.0, 1.0))),
     ):
-        name = f"ledger: false discoveries, captures: {captures}, retries correlate by "
-        name += f"{correlation:g}" + (f", one {ratio:g} times as noisy" if ratio > 1 else "")
-        yield Promise(
-            name, "`next_level`, `judge_idea`", 0.1, 150, night(captures, 0.7, correlation, ratio)
-        )
+        name = f"ledger: false discoveries, noise {' : '.join(f'{one:g}' for one in noise)}, "
+        name += f"retries correlate by {correlation:g}"
+        measure = nights_at_once(noise, correlation)
+        yield Promise(name, "`in_looks`", 0.1, 2000, found=measure)
     for command in PURPOSES:
         name = f"plan for a {command}: shows the difference on three scenes"
         yield Promise(name, "`Purpose`", 0.8, 500, planned(command, 0.1), True)

@@ -215,3 +215,18 @@ def test_what_an_encoding_lacks_is_escaped(encoding, shown):
     stream = PrintableStream(io.TextIOWrapper(raw, encoding=encoding))
     print("\u2191 \xe9", end="", file=stream, flush=True)
     assert raw.getvalue() == shown
+
+
+def test_a_note_about_a_scene_is_shown_once_in_a_command_and_is_in_every_log(tmp_path, capsys):
+    for _ in range(2):
+        with printable_output():
+            set_up_logging()
+            for seed in range(3):
+                set_up_logging()
+                with log_to(tmp_path / f"{seed}.txt"):
+                    logging.getLogger("gsbench.scene.load").warning("scene %s: no pose", "a")
+                    logging.getLogger("gsbench.train.growth").warning("growth stopped")
+                    logging.getLogger("gsbench.scene.load").info("a step")
+    said = capsys.readouterr().err
+    assert (said.count("no pose"), said.count("growth"), said.count("step")) == (2, 6, 6)
+    assert [(tmp_path / f"{k}.txt").read_text().count("no pose") for k in range(3)] == [2, 2, 2]

@@ -24,7 +24,7 @@ from scipy import stats
 
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
 from gsbench.analysis.table_formats import to_markdown
-from gsbench.analysis.verdicts import p_text
+from gsbench.analysis.verdict_words import p_text
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.check import ClaimVerdict, recheck
 from gsbench.claims.file import read_claims
@@ -170,7 +170,7 @@ def verdicts(name: str) -> dict[str, ClaimVerdict]:
     """The verdicts on the claims ``NAME.yaml`` by the trials of ``NAME.zip``, by claim."""
     with tempfile.TemporaryDirectory() as folder:
         file = read_claims(FINDINGS / "claims" / f"{name}.yaml")
-        found, _, _ = recheck(file, ARCHIVES / f"{name}.zip", Path(folder))
+        found = recheck(file, ARCHIVES / f"{name}.zip", Path(folder)).verdicts
     return {verdict.claim.id: verdict for verdict in found}
 
 

@@ -73,8 +73,8 @@ def test_the_pages_statements_on_seeds_are_true():
     assert of("full", "volumetric_once", "bonsai", cap="soft")[1] < 0
     clouds = tables.differences(tables.read_trials("initialisers"), "sfm", "random", tables.LPIPS)
     assert (clouds < 0).all()
-    assert tables.verdicts("full_count")["once_at_as_many"].verdict.late
-    assert not any(one.verdict.late for one in tables.verdicts("volume").values())
+    assert tables.verdicts("full_count")["once_at_as_many"].verdict.seen
+    assert not any(one.verdict.seen for one in tables.verdicts("volume").values())
 
 
 def test_files_that_the_page_names_exist():

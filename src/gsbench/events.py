@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from typing import ClassVar
 
+from gsbench.words import FORM
+
 
 class Cause(IntEnum):
     """Cause of a Gaussian's existence.
@@ -40,15 +42,15 @@ class Cause(IntEnum):
 
 
 FEWEST_ROUNDS = 5  # with fewer, a densifier has hardly acted
+FEW_ROUNDS = (
+    "{arm}: {rounds:n round} of refinement in {iterations} iterations, too few to judge a "
+    "densifier: train longer, or shorten the schedule as a whole, as by train.steps_scaler=0.1."
+)
 
 
 def few_rounds(arm: str, rounds: int, iterations: int) -> str:
     """The warning that a training had fewer than `FEWEST_ROUNDS` rounds of refinement."""
-    of_refinement = "1 round" if rounds == 1 else f"{rounds} rounds"
-    return (
-        f"{arm}: {of_refinement} of refinement in {iterations} iterations are too few to judge a "
-        "densifier: train longer, or shorten the schedule as a whole, as by train.steps_scaler=0.1."
-    )
+    return FORM.format(FEW_ROUNDS, arm=arm, rounds=rounds, iterations=iterations)
 
 
 @dataclass

@@ -284,8 +284,7 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     faults = {
         errno.EFBIG: "{0} may not grow any more ({1}): raise `ulimit -f`, or set runs=FOLDER",
         errno.ENOLCK: "the file system of {0} has no locks ({1}), so trials would disturb each "
-        "other: set runs=FOLDER "
-        "or GSBENCH_RUNS to another file system, or start its lock service",
+        "other: set runs=FOLDER or GSBENCH_RUNS to another file system, or start its lock service",
         **dict.fromkeys(
             BROKEN, "{0} cannot be opened ({1}): look at its disk and its links, or set runs=FOLDER"
         ),

@@ -17,6 +17,10 @@ from gsbench.files import open_plain
 from gsbench.words import printable
 
 LOGGER = logging.getLogger("gsbench")
+# Loggers of warnings about a scene, which all trials of a sweep would repeat: the terminal shows
+# each once in a command, and every trial's log has it.
+OF_SCENES = ("gsbench.scene.", "gsbench.train.start.")
+_shown_of_scenes: set[str] = set()
 
 
 class _Printable(logging.Formatter):
@@ -51,6 +55,7 @@ class PrintableStream:
 @contextmanager
 def printable_output() -> Iterator[None]:
     """Make everything that the block and its libraries print `printable`."""
+    _shown_of_scenes.clear()
     out, err = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = PrintableStream(out), PrintableStream(err)
     try:
@@ -91,7 +96,7 @@ def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bo
 
     def shown(record: logging.LogRecord) -> bool:
         named = any(f"{record.name}.".startswith(f"{name}.") for name in names)
-        return record.levelno >= logging.INFO or verbose is True or named
+        return (record.levelno >= logging.INFO or verbose is True or named) and _is_new(record)
 
     others = logging.getLogger().handlers if through_root else []
     consoles = [other for other in others if type(other) is logging.StreamHandler]
@@ -114,6 +119,17 @@ def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bo
         logger.handlers = [*handlers, *kept]
     LOGGER.setLevel(logging.DEBUG)
     LOGGER.propagate = False
+
+
+def _is_new(record: logging.LogRecord) -> bool:
+    """Return whether a warning about a scene has not been shown by this command."""
+    if record.levelno < logging.WARNING or not f"{record.name}.".startswith(OF_SCENES):
+        return True
+    known = vars(record)
+    if "is_new" not in known:  # several handlers ask about one record
+        known["is_new"] = record.getMessage() not in _shown_of_scenes
+        _shown_of_scenes.add(record.getMessage())
+    return bool(known["is_new"])
 
 
 def _make_printable(record: logging.LogRecord) -> bool:

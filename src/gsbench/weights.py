@@ -87,8 +87,7 @@ def find_all_weights(
         places = ", ".join(str(place) for place, _ in folders)
         raise MissingWeightsError(
             f"weights not found: {names} (looked in {places}; {reasons[0]}): get them from "
-            f"{sources}, put them into a "
-            f"folder and set {WEIGHTS_VARIABLE} to it"
+            f"{sources}, put them into a folder and set {WEIGHTS_VARIABLE} to it"
         )
     return [path for spec in specs if (path := paths[spec]) is not None]
 

@@ -2,9 +2,11 @@
 
 import difflib
 import re
+import string
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
+from typing import Any
 
 MAX_NAMED = 3  # names that a message lists; further ones are only counted
 # Characters that a terminal acts on instead of showing: control characters except line feed and
@@ -22,6 +24,18 @@ PATH_IN_TEXT = re.compile(r"""(?<![^\s=(['"`])(?:~[\w.-]*)?/[^\s,;:'"`)\]]+""")
 def counted(count: int, noun: str) -> str:
     """A number with its noun: ``1 trial``, ``2 trials``."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def split_outside_brackets(text: str, mark: str) -> list[str]:
+    """The parts of ``text`` between ``mark``; a value in brackets may have the mark itself."""
+    parts, depth = [""], 0
+    for letter in text:
+        depth += (letter in "[{(") - (letter in "]})")
+        if letter == mark and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
 
 
 def readable_time(seconds: float) -> str:
@@ -119,3 +133,24 @@ def some_of(names: Sequence[str]) -> str:
     """The first few names and the number of further ones, for messages."""
     more = len(names) - MAX_NAMED
     return ", ".join(names[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+class _Form(string.Formatter):
+    """The format of facts in sentences.
+
+    ``{count:n trial}`` gives ``2 trials``, ``{names:few}`` the first names and a count of the rest.
+    All names come by ``{names:all}`` with "and" before the last, by ``{names:list}`` with commas
+    and by ``{names:parts}`` with semicolons. ``{name:if: by %}`` gives `` by NAME``, or nothing if
+    the fact is empty.
+    """
+
+    def format_field(self, value: Any, spec: str) -> str:
+        if spec.startswith("n "):
+            return counted(value, spec[2:])
+        if spec.startswith("if:"):
+            return spec[3:].replace("%", str(value)) if value else ""
+        joined = {"few": some_of, "all": listed, "list": ", ".join, "parts": "; ".join}.get(spec)
+        return joined([*map(str, value)]) if joined else str(super().format_field(value, spec))
+
+
+FORM = _Form()

@@ -14,7 +14,7 @@ from gsbench.analysis.differences import (
     departures,
     ingredients,
     ingredients_between,
-    ingredients_sentence,
+    ingredients_note,
     is_mixed,
     representatives,
     shipped_arms,
@@ -64,7 +64,7 @@ def trials_of(runs, arms, **settings):
 def sentence(trials, first, second):
     pair = Arm("sfm", first), Arm("sfm", second)
     found = ingredients_between(trials, *pair)
-    return ingredients_sentence(found, *pair) if is_mixed(found) else ""
+    return str(ingredients_note(found, *pair)) if is_mixed(found) else ""
 
 
 # --- ingredients
@@ -73,9 +73,9 @@ def sentence(trials, first, second):
 def test_a_sentence_names_six_ingredients_and_counts_the_rest():
     first, second = Arm("sfm", "adc"), Arm("sfm", "mine")
     said = "sfm-mine differs from sfm-adc by 0, 1, 2, 3, 4"
-    assert ingredients_sentence("012345", first, second) == f"{said} and 5."
-    assert ingredients_sentence("01234567", first, second) == f"{said}, 5 and 2 more."
-    assert ingredients_sentence("0", first, second) == "sfm-mine differs from sfm-adc by 0 alone."
+    assert str(ingredients_note("012345", first, second)) == f"{said} and 5."
+    assert str(ingredients_note("01234567", first, second)) == f"{said}, 5 and 2 more."
+    assert str(ingredients_note("0", first, second)) == "sfm-mine differs from sfm-adc by 0 alone."
 
 
 def test_settings_of_the_first_configuration_come_first():

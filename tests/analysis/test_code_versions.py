@@ -94,7 +94,7 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path
     table = table_of(tmp_path)
     assert table.rows[0].entries[0].text == "28.00"
     assert (
-        "patient was edited since: 1 trial of sfm-adc are of the old code. Give the command again "
+        "patient was edited since: 1 trial of sfm-adc came from the old code. Give the command again "
         "to run the new one." in table.notes
     )
 

@@ -1,7 +1,5 @@
 """One question, one answer: what was done before or beside an arm never changes its verdict."""
 
-from __future__ import annotations
-
 import html
 import json
 import os
@@ -19,11 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import t_test
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import sentence
+from gsbench.analysis.verdict_words import sentence
 from gsbench.claims.export import write_archive
 from gsbench.claims.site import write_site
 from gsbench.runs.experiments import Declaration, open_question, record_text
@@ -158,7 +157,7 @@ def test_every_arm_is_compared_by_the_settings_that_both_have(tmp_path, arms, pa
         write(tmp_path, grid(densify, **options))
     found = answer(tmp_path)
     assert against(found) == pairs
-    assert named in "\n".join(found.unused)
+    assert named in "\n".join(texts(found.unused))
 
 
 def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
@@ -166,7 +165,7 @@ def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
     write(tmp_path, [*grid("adc"), *grid("mine"), *alone])
     reason = "random-mine is not compared: there is no random-adc."
     experiment = load_experiment(tmp_path, "exp")
-    assert answer(tmp_path).unused == [reason]
+    assert texts(answer(tmp_path).unused) == [reason]
     plan(["exp"], tmp_path)
     tables(["exp", "--format", "json"], tmp_path)
     said = capsys.readouterr().out
@@ -225,12 +224,12 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
     declare(tmp_path, (1, [*adc, *old]), (5, new))
     found = answer(tmp_path)
     assert found.answers[0].beforehand
-    assert "missing" not in "\n".join(found.declaration_lines)
+    assert "missing" not in "\n".join(texts(found.declared_notes))
     assert "made by an earlier mine" in found.experiment.warnings[0]
     # the old code failed before any result: its folder has settings, but no results
     folder = tmp_path / "exp" / old[0].key
     (folder.parent / f"{folder.name}-seed0" / "results.json").unlink()
-    assert "missing" not in "\n".join(answer(tmp_path).declaration_lines)
+    assert "missing" not in "\n".join(texts(answer(tmp_path).declared_notes))
 
 
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
@@ -342,7 +341,7 @@ def check_all_is_named(comparison):
     }
     without = {str(one.second) for one in comparison.answers if not one.verdicts}
     without |= {str(one.first) for one in comparison.answers if not one.verdicts}
-    named = "\n".join(comparison.unused)
+    named = "\n".join(texts(comparison.unused))
     for trial in comparison.trials:
         label = f"{trial.experiment}/{trial.scene}/{trial.init}-{trial.densify}"
         known = trial.path in used or str(trial.arm) in without
@@ -368,7 +367,7 @@ def test_all_surfaces_state_the_same(made):
             assert f"Verdict, {sentence}" in notes
             assert f"<strong>{sentence}" in page
             assert sentence in told or len(told) > 4000  # cut to what a tag may hold
-        for line in comparison.unused:
+        for line in texts(comparison.unused):
             assert line in notes
             assert line in page
     finally:

@@ -11,11 +11,12 @@ import pytest
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.declaration import active_declaration
+from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
-from gsbench.analysis.verdicts import families, in_words, p_text
+from gsbench.analysis.verdict_words import families, in_words, p_text
 from gsbench.runs.experiments import (
     STAMP,
     Arm,
@@ -57,7 +58,7 @@ def standing(experiment):
 
 
 def lines(experiment):
-    return "\n".join(compare(experiment).declaration_lines)
+    return "\n".join(texts(compare(experiment).declared_notes))
 
 
 def test_a_declaration_about_one_question_says_so(tmp_path):
@@ -195,7 +196,7 @@ def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_
     (one,) = judged(experiment)
     assert "lpips_alex" not in [verdict.quantity.key for verdict in one.verdicts]
     assert {one.role(verdict) for verdict in one.verdicts} == {"secondary"}
-    assert one.notes == ("LPIPS Alex: weights file alexnet.pth not found",)
+    assert texts(one.notes) == ["LPIPS Alex: weights file alexnet.pth not found"]
     assert families([one]) == [
         "All other metrics are secondary and do not decide the verdict; Holm adjusts them for 4 "
         "tests."
@@ -428,4 +429,4 @@ def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
         "no verdict yet, not all of the first 2 seeds are there in both arms"
         in (answers.sentences[0])
     )
-    assert "since garden has no more" in answers.unused[0]
+    assert "there are no more of garden" in str(answers.unused[0])

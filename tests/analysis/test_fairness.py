@@ -12,7 +12,8 @@ import pytest
 
 from gsbench.analysis import fairness
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.fairness import NOTHING, UNLIKE, _shown, fairness_table
+from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
+from gsbench.analysis.notes import Note
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import to_latex
@@ -116,7 +117,7 @@ def test_long_values_are_cut():
 def test_the_notes_name_the_ingredients_and_the_tuning(tmp_path, paths):
     notes = sheet(tmp_path).notes
     assert notes[0] == "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
-    assert f"Tuning. {NOTHING}" in notes
+    assert f"Tuning. {Note.of('no tuning')}" in notes
 
 
 def test_a_users_own_arm_has_its_class_and_version(tmp_path):

@@ -6,7 +6,8 @@ from shlex import split
 
 import pytest
 
-from gsbench.analysis.fairness import counts_sentence
+from gsbench.analysis.fairness import counts_note
+from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_notes import doubt_notes, held_out_notes, origin_notes, points_notes
@@ -56,12 +57,12 @@ def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path,
         with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"])
         for trial in made
     ]
-    sentence = counts_sentence(trials, ADC, VOLUMETRIC)
+    note = counts_note(trials, ADC, VOLUMETRIC)
     least = min(filter(None, itertools.chain(*counts.values())))
     words = f"densify.max_gaussians={least} and another name."
     expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}{words}"
-    assert sentence == (expected if said else "")
-    assert counts_sentence(trials, ADC, Arm("sfm", "mcmc")) == ""
+    assert str(note or "") == (expected if said else "")
+    assert counts_note(trials, ADC, Arm("sfm", "mcmc")) is None
 
 
 DEMO, MINE = (
@@ -114,7 +115,7 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         for trial in trials
     }
     write(tmp_path / "exp" / "plan.json", {"trials": planned})
-    sentence = counts_sentence(trials, ADC, VOLUMETRIC)
+    sentence = str(counts_note(trials, ADC, VOLUMETRIC))
     assert f"To do so: {command}" in sentence
     assert sentence.endswith("densify.cap=governor densify.max_gaussians=12300 name=exp_equal`.")
 
@@ -139,23 +140,24 @@ def test_each_way_of_holding_views_out_is_stated_with_scenes_if_there_are_severa
         with_record(trial, held_out="every 8th image", test_views=6, train_views=42)
         for trial in made
     ]
-    assert held_out_notes(alike) == ["Held out: every 8th image; 6 of 48 views."]
+    (note,) = held_out_notes(alike)
+    assert str(note) == "Held out: every 8th image; 6 of 48 views."
     unlike = [
         with_record(trial, held_out="by lists", test_views=5) if trial.scene == "garden" else trial
         for trial in alike
     ]
-    assert held_out_notes(unlike) == [
+    assert texts(held_out_notes(unlike)) == [
         "Held out, garden: by lists; 5 of 47 views.",
         "Held out, courtyard: every 8th image; 6 of 48 views.",
     ]
     one_scene = [trial for trial in unlike if trial.scene == "garden"]
     one_scene[0] = with_record(one_scene[0], held_out="by hand")
-    assert held_out_notes(one_scene) == [
-        "Held out: by lists; 5 of 47 views.",
-        "Held out: by hand; 5 of 47 views.",
+    assert [(note["rule"], note["scenes"]) for note in held_out_notes(one_scene)] == [
+        ("by lists", ""),
+        ("by hand", ""),
     ]
     uneven = [with_record(trial, test_views=6 + trial.seed) for trial in alike]
-    assert held_out_notes(uneven) == ["Held out: every 8th image; 6 of 48 views and 7 of 49 views."]
+    assert held_out_notes(uneven)[0]["views"] == "6 of 48 views and 7 of 49 views"
     assert held_out_notes([with_record(trial, held_out="") for trial in made]) == []
 
 
@@ -169,15 +171,11 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
         )
         write(path / "config.yaml", config)
     made = load_experiment(tmp_path, "exp").trials
-    assert points_notes(made) == [
-        "Initial points of dim: from training views alone (init.points_from=train).",
-        "Initial points of sfm: from all views, test views included (init.points_from=all).",
-    ]
+    some, every = points_notes(made)
+    assert some == Note.of("points of some", init="dim", choice="train")
+    assert every == Note.of("points of all", init="sfm", choice="all")
     observed = [with_record(trial, init_report={"mean_track_length": 3.1}) for trial in made]
-    assert (
-        "Initial points of random: from all views, test views included (init.points_from=all)."
-        in points_notes(observed)
-    )
+    assert Note.of("points of all", init="random", choice="all") in points_notes(observed)
     assert points_notes([trial for trial in made if trial.init == "random"]) == []
 
 
@@ -196,7 +194,7 @@ def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted)
         config["scene"] |= {"images": images, "downscale": downscale}
         write(path / "config.yaml", config)
     notes = doubt_notes(load_experiment(tmp_path, "exp").trials)
-    assert ["different filters" in note for note in notes] == [True] * noted
+    assert notes == [Note.of("filters")] * noted
 
 
 def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
@@ -212,7 +210,7 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
     }
     psnr = f"{made[0].metrics['psnr']:.2f}"
     second = with_record(made[1], **{**changes, "one_color_psnr": made[1].metrics["psnr"] - 0.1})
-    assert doubt_notes([with_record(made[0], **changes), second]) == [
+    assert texts(doubt_notes([with_record(made[0], **changes), second])) == [
         f"(!) {made[0].label} is not better than one colour: PSNR {psnr} dB, the training views' "
         f"mean colour has {psnr}.",
         "raster=triton is not used: alpha is off.",
@@ -245,12 +243,12 @@ def test_who_trained_an_arm_and_what_was_measured_is_said(tmp_path):
     program = ExternalTrainer(program="brush", version="1.2")
     here = with_record(first, trained_by=program, evaluated_from=FROM_MODEL)
     assert origin_notes([first]) == []
-    assert origin_notes([here, with_record(second, evaluated_from=FROM_RENDERS)]) == [
+    assert texts(origin_notes([here, with_record(second, evaluated_from=FROM_RENDERS)])) == [
         "Trained here by another program, its model rendered by gsbench (its time is that of the "
         "whole program, and it sets its own budget): sfm-adc (version 1.2).",
         "Renders of another program, measured as they are (its conditions are not known): sfm-adc.",
     ]
     renders = with_record(first, trained_by=program, evaluated_from=FROM_RENDERS)
     own, elsewhere = origin_notes([renders, with_record(third, evaluated_from=FROM_MODEL)])
-    assert own.startswith("Trained here by another program, its own renders measured as they are (")
-    assert elsewhere.startswith("A model that another program trained, rendered here (its cond")
+    assert (own.kind, own["arms"]) == ("program's renders", ("sfm-adc (version 1.2)",))
+    assert (elsewhere.kind, elsewhere["arms"]) == ("foreign model", ("sfm-adc",))

@@ -51,8 +51,8 @@ def test_two_clouds_of_one_initialiser_are_noted(tmp_path):
     for seed, densify, cloud in ((0, "adc", A), (1, "adc", B), (0, "volumetric", A)):
         one_trial(tmp_path, seed, psnr=27.0, _densify=densify, _hashes=hashes(cloud))
     assert (
-        "garden: trials of init sfm started from 2 different clouds "
-        "(aaaaaaaa: adc seed 0; volumetric seed 0; bbbbbbbb: adc seed 1)."
+        "garden: trials of init sfm started from 2 different clouds (aaaaaaaa: adc seed 0; "
+        "volumetric seed 0; bbbbbbbb: adc seed 1)."
     ) in notes_of(tmp_path)
 
 

@@ -34,7 +34,8 @@ from gsbench.analysis.report.build import (
 from gsbench.analysis.report.charts import Axis, ForestRow, forest_plot, line_chart, short_number
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval
-from gsbench.analysis.verdicts import by_scene_lines, judge_pairs, sentence
+from gsbench.analysis.verdict_words import by_scene_lines, sentence
+from gsbench.analysis.verdicts import judge_pairs
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm
 from gsbench.runs.trial_record import Histogram
@@ -684,8 +685,8 @@ def test_a_search_is_summed_up_in_a_line_and_a_chart(tmp_path):
     )
     assert "each point from 27.5 at 1 to 27.9 at 3." in chart
     assert summary(27.5)[0].endswith(
-        "(point 1). 1 of 2 points, each 1 seed. Judged by "
-        "validation views; no test view was looked at."
+        "(point 1). 1 of 2 points, each 1 seed. Judged by validation views; no test view was "
+        "looked at."
     )
     assert summary(None) == ("1 of 2 points, each 1 seed; 1 failed; none has a result yet.", "")
 

@@ -8,6 +8,7 @@ import pytest
 from gsbench.analysis.differences import between_scenes_notes, ingredients_between
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import judge
+from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
@@ -114,7 +115,7 @@ def test_versions_that_a_gate_compares_are_no_difference_between_scenes(tmp_path
             write(tmp_path / str(version), scene, code=code)
     old, new = (load_experiment(tmp_path / str(version), "exp").trials for version in (1, 2))
     assert between_scenes_notes(old, new) == []
-    assert between_scenes_notes([*old[:2], *new[2:]]) == [
+    assert texts(between_scenes_notes([*old[:2], *new[2:]])) == [
         "Scenes of sfm-adc differ in more than the scene: the version of stage train."
     ]
 
@@ -152,7 +153,7 @@ def test_a_verdict_on_named_trials_says_how_the_scenes_differ(tmp_path):
     trials = load_experiment(tmp_path, "exp").trials
     declaration = Declaration(time="2020-01-01T00:00:00Z", questions=(asked,))
     (verdict,) = judge(trials, declaration)
-    assert verdict.notes == (
+    assert tuple(texts(verdict.notes)) == (
         "Scenes of sfm-adc and sfm-mcmc differ in more than the scene: iterations (2000 on park, "
         "7000 on room).",
     )
@@ -180,7 +181,7 @@ def test_arms_differ_by_one_setting_alone_only_if_they_do_on_every_scene(tuned_o
     park = [trial for trial in tuned_on_room if trial.scene == "park"]
     assert ingredients_between(park, FIRST, SECOND) == ("grow",)
     said = "sfm-mcmc differs from sfm-adc by grow and split_size."
-    assert said in caveats(tuned_on_room, FIRST, SECOND)
+    assert said in texts(caveats(tuned_on_room, FIRST, SECOND))
 
 
 def test_a_fairness_sheet_has_the_values_of_all_scenes(tuned_on_room):

@@ -85,7 +85,7 @@ def test_a_clear_difference_ends_at_the_first_look(sweep, runs):
     assert sweep(fake) == 0
     assert fake.batches == [[("adc", 0), ("volumetric", 0), ("adc", 1), ("volumetric", 1)]]
     (verdict,) = verdicts_of(runs)
-    assert (verdict.outcome, verdict.pairs.seeds, verdict.late) == ("supported", 2, 0)
+    assert (verdict.outcome, verdict.pairs.seeds, verdict.seen) == ("supported", 2, ())
 
 
 def test_a_decided_sweep_given_again_runs_nothing(sweep, runs, caplog):
@@ -137,7 +137,7 @@ def test_looks_over_a_baseline_that_existed_give_one_verdict(sweep, runs, psnr, 
     assert sentence.endswith("The metric was declared beforehand.")
     assert sentence in caplog.text  # the sweep's end
     assert f"Verdict, {sentence}" in said("tables", "stop")
-    assert verdicts_of(runs)[0].late == 0
+    assert verdicts_of(runs)[0].seen == ()
 
 
 def test_a_decided_pair_gets_no_more_seeds_and_pairs_share_the_error_rate(sweep, runs, caplog):
@@ -158,7 +158,7 @@ def test_a_stopped_sweep_continues_with_the_same_plan(sweep, runs):
     # finished trials are handed over, and skipped there
     assert [len(batch) for batch in fake.batches] == [4, 2, 2]
     assert read_declarations(runs / "stop") == [plan]
-    assert not any(verdict.late for verdict in verdicts_of(runs))
+    assert not any(verdict.seen for verdict in verdicts_of(runs))
 
 
 def test_a_failed_seed_ends_the_looks_and_repeating_it_decides(sweep, runs):
@@ -180,7 +180,7 @@ def test_more_seeds_after_looking_are_a_new_plan_whose_verdict_is_late(sweep, ru
     assert sweep(Fake(noise), "seed=0,1,2,3,4,5") == 0
     assert len(read_declarations(runs / "stop")) == 2
     (verdict,) = verdicts_of(runs)
-    assert verdict.late
+    assert verdict.seen
 
 
 @pytest.mark.slow

@@ -7,8 +7,14 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsbench.app import command, plugins
-from gsbench.app.plugins import Objective, prepare_other_sweeper, words_without_sweeper
+from gsbench.app.plugins import (
+    Objective,
+    best_line,
+    prepare_other_sweeper,
+    words_without_sweeper,
+)
 from gsbench.errors import InputError
+from tests.app.stand_ins import trial
 
 
 def sweep_of(words, name="optuna", **sweeper):
@@ -58,6 +64,32 @@ def test_another_sweeper_gets_all_seeds_of_a_job(caplog, sweeper, sign):
     )
     assert (words[0], objective) == ("seed=9", Objective(sign, ("seed=1", "seed=2")))
     assert prepare_other_sweeper(sweep_of(["a=1"])) == (["a=1"], Objective(-1))
+
+
+@pytest.mark.parametrize(
+    "primary, sign, decay, best",
+    [("psnr", 1, "0.3", "22"), ("psnr", -1, "0.3", "22"), ("lpips_vgg", -1, "0.1", "20")],
+)
+def test_the_best_values_are_said_with_the_command_that_repeats_them(
+    tmp_path, primary, sign, decay, best
+):
+    def record_of(files):
+        number = {"0.1": 20.0, "0.2": None, "0.3": 22.0}[files.decay]
+        return None if number is None else SimpleNamespace(metrics={primary: number})
+
+    trials = []
+    for value in ("0.1", "0.2", "0.3"):
+        for seed in (0, 1):
+            words = ["hydra/sweeper=optuna", "name=x y", "densify=m", f"densify.decay={value}"]
+            one = trial(tmp_path, seed, [*words, f"seed={seed}"], eval={"primary": primary})
+            one.files.decay = value
+            one.files.sound_record = lambda files=one.files: record_of(files)
+            trials.append(one)
+    assert best_line(trials, Objective(sign, ("seed=0", "seed=1"))) == (
+        f"best: densify.decay={decay}, {primary} {best} of test views (2 seeds); again: "
+        f"gsbench -m 'name=x y' densify=m densify.decay={decay} seed=0,1"
+    )
+    assert best_line(trials[2:4], Objective(sign)) == ""
 
 
 def test_hydras_grid_sweeper_asks_for_no_value_and_choices_are_limited(monkeypatch):

@@ -15,11 +15,11 @@ from gsbench.claims.ablation import (
     off_settings,
     runs_to_train,
 )
+from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
 from tests.analysis.synthetic import Plan, trial_data, write_trial
@@ -165,9 +165,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
         path.unlink()
     verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
     assert verdicts[-1].answer is None
-    assert markdown_table(verdicts)[-1].endswith(
-        "| unknown | unknown | courtyard: seed 0 has no partner |"
-    )
+    assert markdown_table(verdicts)[-1].endswith("| – | – | courtyard: seed 0 has no partner |")
     assert len(markdown_table(verdicts[-1:])) == 3
 
 

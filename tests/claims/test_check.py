@@ -8,12 +8,17 @@ import pytest
 import yaml
 
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.statistics import Answer, StudentT
-from gsbench.claims.check import ClaimVerdict, _late_words, _number, make_page, prepare, to_html
+from gsbench.claims.check import (
+    Checked,
+    ClaimVerdict,
+    prepare,
+)
+from gsbench.claims.check_page import _number, make_page, to_html
 from gsbench.claims.file import parse_claims
-from gsbench.claims.stopping import run_looks
 from gsbench.cli import run
 from gsbench.config.compose import with_seed
 from gsbench.errors import InputError
@@ -24,6 +29,10 @@ from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.claims.test_file import GOOD, changed, without
 from tests.launch.test_declare import TINY
 
+SENTENCE = (
+    "volumetric against adc: better in PSNR (dB) on this scene: +1.000 (interval +0.996 to +1.004), "
+    "with 2 of at most 4 seeds"
+)
 EFFECT = 1.0  # dB, of "volumetric" in the made-up trials
 
 
@@ -75,7 +84,7 @@ def looked(check, runner):
             runner(left)
 
     check = replace(check, declaration=replace(check.declaration, time="2020-01-01T00:00:00Z"))
-    return check.verdicts(run_looks(check.declaration, check.judged, run))
+    return list(check.checked(check.asked.answer(run)).verdicts)
 
 
 def test_a_clear_effect_ends_at_the_first_look_and_a_repeated_check_runs_nothing(tmp_path):
@@ -99,8 +108,8 @@ def test_a_claim_waits_for_a_failed_seed_and_is_decided_once_it_succeeds(tmp_pat
     check, runner = check_of(tmp_path), FakeRunner(noise=0.001, fails=1)
     (verdict,) = looked(check, runner)
     assert (verdict.word, runner.batches) == ("undecided", [4])
-    assert "the next look waits for them; failed: " in verdict.reason
-    assert verdict.reason.endswith("no room")  # once, since both arms failed for the same reason
+    assert "the next look waits for trials that are missing; failed: " in verdict.sentence
+    assert verdict.sentence.endswith("no room")  # once, since both arms failed for the same reason
     runner.fails = None
     for failed in list(tmp_path.rglob("failed.json")):
         shutil.rmtree(failed.parent)
@@ -116,9 +125,9 @@ def test_scenes_that_cannot_be_tested_are_named_and_not_run(tmp_path):
     assert list(check.declaration.questions[0].scenes) == ["courtyard"]
     (verdict,) = looked(check, FakeRunner(noise=0.001))
     assert verdict.word == "supported"
-    assert verdict.missing == ("garden: no data",)
+    assert texts(verdict.verdict.notes) == ["garden: no data"]
     nothing = prepare(file, tmp_path / "b", lambda trials: ["no data"])
-    assert looked(nothing, FakeRunner(0.1))[0].reason == "courtyard, garden: no data"
+    assert looked(nothing, FakeRunner(0.1))[0].sentence == "courtyard, garden: no data"
     assert "not testable here  lpips: courtyard, garden: no data" in describe(nothing)
     # the hash depends on what can be tested here
     assert nothing.declaration.hash != check.declaration.hash
@@ -154,7 +163,8 @@ def test_the_page_has_verdicts_looks_and_declarations(tmp_path):
     check = check_of(tmp_path, says="it is <better> | by far")
     verdicts = looked(check, FakeRunner(noise=0.001))
     older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
-    page = make_page(check.file, verdicts, check.declaration, [older, check.declaration])
+    declared = check.declaration
+    page = make_page(Checked(check.file, verdicts, declared, [older, declared]))
     for part in (
         "supported",
         "PSNR",
@@ -185,47 +195,43 @@ def judged(outcome, mean=0.0, error=0.0, direction="higher", **more):
 
 
 @pytest.mark.parametrize(
-    "one, reason",
+    "one, said",
     [
-        (judged("supported", 1.0), "it is higher"),
-        (judged("supported", 0.3), "it is higher"),
-        (judged("supported", 0.29), "it is higher; by 0.3 or more is not shown"),
-        (judged("supported", 0.5, 0.15), "it is higher; by 0.3 or more is not shown"),
-        (judged("supported", -0.3, direction="lower"), "it is lower"),
-        (judged("supported", -0.29, direction="lower"), "it is lower; by 0.3 or more is not shown"),
-        (
-            judged("supported", 0.0, direction="same"),
-            "any effect is smaller than the least that matters (0.3)",
-        ),
-        (
-            judged("too small to matter", 0.1),
-            "any effect is smaller than the least that matters (0.3); it is higher",
-        ),
-        (
-            judged("too small to matter", -0.1),
-            "any effect is smaller than the least that matters (0.3); it is lower",
-        ),
-        (
-            judged("too small to matter", 0.1, 0.1),
-            "any effect is smaller than the least that matters (0.3)",
-        ),
-        (judged("refuted", -1.0), "it is the opposite of higher"),
-        (judged("refuted", 1.0, direction="same"), "it differs by more than 0.3"),
-        (judged("undecided"), "all 0 seeds show neither a difference nor that it is below 0.3"),
+        (judged("supported", 1.0), "better"),
+        (judged("supported", 0.3), "better"),
+        (judged("supported", 0.29), "better; by 0.3 or more is not shown"),
+        (judged("supported", 0.5, 0.15), "better; by 0.3 or more is not shown"),
+        (judged("supported", -0.3, direction="lower"), "lower"),
+        (judged("supported", -0.29, direction="lower"), "lower; by 0.3 or more is not shown"),
+        (judged("supported", 0.0, direction="same"), "too small to matter"),
+        (judged("too small to matter", 0.1), "too small to matter, though better"),
+        (judged("too small to matter", -0.1), "too small to matter, though worse"),
+        (judged("too small to matter", 0.1, 0.1), "too small to matter"),
+        (judged("refuted", -1.0), "worse"),
+        (judged("refuted", -1.0, direction="lower"), "higher"),
+        (judged("refuted", 1.0, direction="same"), "different by more than 0.3"),
+        (judged("undecided"), "undecided"),
         (
             judged("undecided", rests_on_outlying=True),
-            "it depends on trials far outside the others",
+            "undecided, since it depends on trials far outside the others",
         ),
         (
-            judged("undecided", rests_on_outlying=True, final=False),
-            "trials are missing: the next look waits for them",
+            judged("undecided", final=False),
+            "undecided; the next look waits for trials that are missing",
         ),
-        (judged("undecided", untestable="no data"), "no data"),
     ],
 )
-def test_each_verdict_has_its_reason(one, reason):
-    assert one.reason == reason
-    assert one.word == ("not testable here" if reason == "no data" else one.verdict.outcome)
+def test_each_verdict_has_its_sentence(one, said):
+    word, _, more = said.partition("; ")
+    start, end = f"volumetric against adc: {word} in PSNR (dB) on ", "of at most 4 seeds"
+    assert one.sentence.startswith(start)
+    assert one.sentence.rpartition(end)[2] == ("; " * bool(more)) + more
+    assert one.word == one.verdict.outcome
+
+
+def test_what_cannot_be_tested_says_why():
+    one = judged("undecided", untestable=Note.of("as given", text="no data"))
+    assert (one.word, one.sentence) == ("not testable here", "no data")
 
 
 def test_the_page_shows_short_numbers_and_late_trials():
@@ -235,8 +241,8 @@ def test_the_page_shows_short_numbers_and_late_trials():
         "999.9",
         "0.5",
     ]
-    assert _late_words(judged("undecided")) == ""
-    assert _late_words(judged("undecided", late=2)).startswith("2 trials had been measured before")
+    two = Note.of("seen", trials=2)
+    assert str(two).startswith("2 trials had been measured before this was declared")
 
 
 def test_check_judges_made_up_trials_and_their_archive_alike(
@@ -256,13 +262,13 @@ def test_check_judges_made_up_trials_and_their_archive_alike(
     home = runs / "check_it"
     assert (
         capsys.readouterr().out
-        == f"supported            lpips: it is higher\n{home / 'claims.html'}\n"
+        == f"supported            lpips: {SENTENCE}\n{home / 'claims.html'}\n"
     )
     assert "supported" in (home / "claims.html").read_text()
     assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
     capsys.readouterr()
     out = said("check", path, "--from", archive)
-    assert "supported            lpips: PSNR (dB) of volumetric against adc: +1.0" in out
+    assert f"supported            lpips: {SENTENCE}" in out
     assert "judged on 4 trials: 1 scene, 2 seeds, two arms; looks planned at 2, 3, 4 seeds" in out
     assert run(["check", str(path), "--from", str(archive), "--out", str(page)]) == 0
     assert page.read_text().count("supported") == (home / "claims.html").read_text().count(

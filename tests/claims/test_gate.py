@@ -16,8 +16,8 @@ from gsbench.claims.gate import (
     PASSED,
     SPARE,
     WORSE,
-    Gate,
-    Step,
+    ask_gate,
+    ask_step,
     declare_gate,
     describe,
     describe_step,
@@ -28,7 +28,6 @@ from gsbench.claims.gate import (
     step_result,
     too_small_to_place,
 )
-from gsbench.claims.stopping import run_looks
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.runs.trial_record import Code
@@ -68,19 +67,19 @@ def gate(tmp_path, effect, noise, declared=None):
     def run_them(planned):
         most[0] = max(seed for _, seed in planned) + 1
 
-    found = Gate(
+    found = ask_gate(
         declared or asked(), lambda: old, lambda: [one for one in new if one.seed < most[0]]
     )
-    (verdict,) = run_looks(found.declaration, found.judged, run_them)
+    (verdict,) = found.answer(run_them)
     return verdict, most[0]
 
 
 @pytest.mark.parametrize(
     "effect, noise, result, words, seeds",
     [
-        (-1.0, 0.01, WORSE, "worse in PSNR (dB): −0.99", 2),
-        (1.0, 0.01, PASSED, "passed, better in PSNR", 2),
-        (0.01, 0.002, PASSED, "any difference is below 0.1", 2),
+        (-1.0, 0.01, WORSE, "worse: worse in PSNR (dB) on these scenes: −0.99", 2),
+        (1.0, 0.01, PASSED, "passed: better in PSNR", 2),
+        (0.01, 0.002, PASSED, "passed: too small to matter in PSNR (dB)", 2),
         (-0.3, 1.0, NOT_DECIDED, "with 4 of at most 4 seeds", 4),
         (0.0, 1.0, PASSED, "equal to the last bit in all 4 pairs of trials", 2),
     ],
@@ -120,7 +119,7 @@ def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(sign
 
 def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
     old = trials(tmp_path, 0, 0.1)
-    (verdict,) = Gate(
+    (verdict,) = ask_gate(
         asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]
     ).judged()
     assert not verdict.final
@@ -137,13 +136,13 @@ def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp
 
     old = made_by(trials(tmp_path / "a", 0, 0.01), "one", "2019-01-01T00:00:00Z")
     new = made_by(trials(tmp_path / "b", -1, 0.01), "two", "2021-01-01T00:00:00Z")
-    (verdict,) = Gate(asked(), lambda: old, lambda: new).judged()
-    assert (result_of(verdict), verdict.late) == (WORSE, 0)
-    (other,) = Gate(asked(), lambda: new, lambda: old).judged()
-    assert other.late == 8
+    (verdict,) = ask_gate(asked(), lambda: old, lambda: new).judged()
+    assert (result_of(verdict), verdict.seen) == (WORSE, ())
+    (other,) = ask_gate(asked(), lambda: new, lambda: old).judged()
+    assert len(other.seen) == 8
     mixed = [*new[:1], *made_by(new[1:], "three", "2021-01-01T00:00:00Z")]
-    (refused,) = Gate(asked(), lambda: old, lambda: mixed).judged()
-    assert "different versions" in refused.notes[0]
+    (refused,) = ask_gate(asked(), lambda: old, lambda: mixed).judged()
+    assert "different versions" in str(refused.notes[0])
     assert result_of(refused) == NOT_DECIDED
 
 
@@ -206,7 +205,7 @@ def test_bad_input_of_gate_is_refused(tmp_path, monkeypatch, capsys, words, mess
 
 
 @pytest.mark.parametrize(
-    "effect, code, words", [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed, better in PSNR")]
+    "effect, code, words", [(-1.0, 1, "worse in PSNR"), (1.0, 0, "passed: better in PSNR")]
 )
 def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effect, code, words):
     trained = []
@@ -279,7 +278,7 @@ def step(tmp_path, loss, place, noise=0.01):
     good, last = trials(tmp_path / "a", 0.0, noise), trials(tmp_path / "b", -loss, noise)
     # the same noise would make two versions equal to the last bit
     new = trials(tmp_path / "c", -losses[place] + 0.0017, noise)
-    asked_step = Step(asked(), 0.05 / 7, lambda: good, lambda: last, lambda: new)
+    asked_step = ask_step(asked(), 0.05 / 7, lambda: good, lambda: last, lambda: new)
     verdicts = asked_step.judged()
     assert len({one.final for one in verdicts}) == 1
     return step_result(verdicts), describe_step(verdicts)
@@ -302,13 +301,13 @@ def test_a_commit_between_both_ends_or_within_the_noise_is_undecided(tmp_path):
 def test_a_commit_that_is_equal_to_an_end_is_like_it(tmp_path):
     good, last = trials(tmp_path / "a", 0.0, 0.01), trials(tmp_path / "b", -0.3, 0.01)
     for new, result in ((good, PASSED), (last, WORSE)):
-        verdicts = Step(asked(), 0.01, lambda: good, lambda: last, lambda new=new: new).judged()
+        verdicts = ask_step(asked(), 0.01, lambda: good, lambda: last, lambda new=new: new).judged()
         assert step_result(verdicts) == result
         assert "equal to the last bit" in describe_step(verdicts)
 
 
 def test_a_loss_that_steps_cannot_see_is_said_before_they_begin(tmp_path):
     good, *bad = (trials(tmp_path / str(loss), -loss, 0.1) for loss in (0.0, 0.1, 0.5))
-    small, large = (Gate(asked(), lambda: good, lambda one=one: one).judged()[0] for one in bad)
+    small, large = (ask_gate(asked(), lambda: good, lambda one=one: one).judged()[0] for one in bad)
     assert too_small_to_place(large, 0.05 / 7) == ""
     assert "the search may end with a range" in too_small_to_place(small, 0.05 / 7)

@@ -6,7 +6,8 @@ import pytest
 
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.results import read_experiment
-from gsbench.claims.check import claim_verdicts, make_page, to_html, to_text
+from gsbench.claims.check import Checked, claim_verdicts
+from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
 from gsbench.runs.experiments import Declaration
 from tests.analysis.synthetic import Plan, write_runs
@@ -34,18 +35,15 @@ def page_of(trials):
         file.claims[0], {name: (keys[name, "adc"], keys[name, "volumetric"]) for name in names}
     )
     declared = Declaration(time=EARLY, questions=(question,), looks=file.looks)
-    return make_page(
-        file, claim_verdicts(file, declared, judge(trials, declared)), declared, [declared]
-    )
+    verdicts = claim_verdicts(file, declared, judge(trials, declared))
+    return make_page(Checked(file, verdicts, declared, [declared]))
 
 
 @pytest.mark.parametrize("scenes", ["abcde", "abcdef"])
 def test_from_six_scenes_on_the_page_has_a_statement_about_scenes_like_these(tmp_path, scenes):
     page = page_of(made(tmp_path, tuple(scenes)))
     assert page.sections[0].verdict.word == "supported"
-    assert ("scenes like these: supported; it is higher in 6 of 6" in to_text(page)) == (
-        len(scenes) == 6
-    )
+    assert ("scenes like these: better; it helps in 6 of 6" in to_text(page)) == (len(scenes) == 6)
     assert "A verdict is about these scenes" in to_text(page)
     assert f"The paper: {SIZE}." in to_text(page)
 

@@ -95,7 +95,7 @@ def test_studies_are_rows_of_a_table():
         pool([Study("a", 1.0, Interval(0.9, 1.25), "paper-1"), Study("b", -0.5)])
     )
     assert first == "| a | +1 | +0.9 to +1.25 | paper-1 |"
-    assert second == "| b | -0.5 | unknown |  |"
+    assert second == "| b | -0.5 | – |  |"
 
 
 def archive(tmp_path, name, seed=0, protocol="paper-1", budget=None, **plan):
@@ -261,7 +261,9 @@ def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
     adc, other = Arm("sfm", "adc"), Arm("dim", "adc")
 
     def pairs(*arms, arm="volumetric", baseline="adc"):
-        trials = [SimpleNamespace(arm=one) for one in arms]
+        trials = [
+            SimpleNamespace(arm=one, init=one.init, config={}, variant=one.variant) for one in arms
+        ]
         return _arm_pairs(trials, replace(WANTED, arm=(arm,), baseline=(baseline,)), Path("a.zip"))
 
     assert pairs(adc, other, plain) == [(adc, plain)]

@@ -244,7 +244,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
         (["make", "exp", "--out", "new", "--arms", "adc"], "sfm-adc alone"),
         (
             ["make", "exp", "--out", "new", "--arms", "adc,mcmc"],
-            "'mcmc' names 0 arms; there are sfm-adc",
+            "'mcmc' names 0 arms; choose one of sfm-adc",
         ),
         (["make", "exp", "--out", "new", "--pairs", "0"], "from 1 to 1000"),
         (["make", "exp", "x.json", "--out", "new"], "takes no files"),
@@ -264,7 +264,7 @@ def test_bad_input_of_vote_is_refused_in_one_line(
 def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
     write_runs(tmp_path, Plan(experiment="bare"))
     trials = load_experiment(tmp_path, "bare").trials
-    arms = choose_arms(sorted({trial.arm for trial in trials}), ())
+    arms = choose_arms(trials, ())
     with pytest.raises(InputError, match="holds no renders"):
         make_round(trials, arms, 4, 9, tmp_path / "page", random.Random(0))
     assert not (tmp_path / "page").exists()

@@ -9,12 +9,12 @@ import yaml
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
+from gsbench.config.build import build
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.trust import check_permissions
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
-from gsbench.pipeline.parts import build
 from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import ADDRESS_VARIABLES, foreign_address
@@ -34,7 +34,7 @@ STRANGE = {
     "an address": ({"tracking.uri": ADDRESS}, f"add allow_targets=[{ADDRESS}]"),
     "a database": ({"tracking.uri": DATABASE}, f"add allow_targets=[{DATABASE}]"),
     "an address of W&B": (
-        {"tracking.sink": "wandb", "tracking.uri": ADDRESS},
+        {"tracking._target_": "gsbench.tracking.WandB", "tracking.uri": ADDRESS},
         f"add allow_targets=[{ADDRESS}]",
     ),
     "a class": ({"densify._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
@@ -45,6 +45,11 @@ STRANGE = {
     "a class and its permission": (
         {"allow_targets": ["bomb"], "densify._target_": "bomb.Bomb"},
         "allow_targets=[",
+    ),
+    "a tracker": ({"tracking._target_": "bomb.Bomb"}, "add allow_targets=[bomb]"),
+    "a reader": (
+        {"scene.kind": "reader", "scene._target_": "bomb.Bomb"},
+        "add allow_targets=[bomb]",
     ),
     "a program": (
         {"densify._target_": "gsbench.densify.External", **PROGRAM_OF_A_FILE},
@@ -192,12 +197,27 @@ def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     assert not Path("theirs").exists()
 
 
-@pytest.mark.parametrize("case", ["an address", "a class", "a metric", "a program"])
+@pytest.mark.parametrize(
+    "case", ["an address", "a class", "a metric", "a program", "a tracker", "a reader"]
+)
 def test_verbs_that_only_read_run_nothing_of_a_strangers_folder(case):
     strange_runs(STRANGE[case][0])
-    for verb in ("status", "tables", "report", *["sync"] * (case == "an address")):
+    for verb in ("status", "tables", "report", *["sync"] * (case in ("an address", "a tracker"))):
         cli.run([verb, "x"])
     assert not Path("exploded").exists()
+
+
+def test_sync_shows_trials_by_a_class_that_its_command_allows(capfd):
+    folder = strange_runs(STRANGE["a tracker"][0])
+    assert cli.run(["sync", "x"]) == 0
+    assert "add allow_targets=[bomb] to the command; no file can" in capfd.readouterr().out
+    values = yaml.safe_load((folder / "config.yaml").read_text())
+    values["tracking"]["_target_"] = "mine.Mine"
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    assert cli.run(["sync", "allow_targets=[mine]"]) == 0  # it was imported
+    assert "mine.Mine is not a class for tracking: it has no open, " in capfd.readouterr().out
+    assert cli.run(["sync", "x", "name=y"]) == 2
+    assert "sync reads only allow_targets, not name=y" in capfd.readouterr().err
 
 
 def test_permissions_in_a_trials_configuration_are_dropped():

@@ -11,11 +11,12 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gsbench.app.command import compose_trials
+from gsbench.config.build import build
 from gsbench.config.command_words import check_words, key_of, parse_word
 from gsbench.config.compose import compose_one
 from gsbench.config.schema import checked_values, plain, register_schemas
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build, build_metrics
+from gsbench.pipeline.parts import build_metrics
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.install import conf_dir
 from gsbench.train.options import STEPS, TrainConfig

@@ -12,11 +12,11 @@ import pytest
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
+from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variables, load_class
 from gsbench.errors import InputError
-from gsbench.pipeline.parts import build
 from gsbench.runs.user_code import module_digest
 from gsbench.system.own_modules import allow_modules
 from tests.strange import BOMB, ask, experiment
@@ -169,6 +169,8 @@ STRANGE = {
     ),
     "a densifier": ({"densify": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a package": ({"densify": {"_target_": "bombs.Bomb"}}, "allow_targets=[bombs]"),
+    "a tracker": ({"tracking": {"_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
+    "a reader": ({"scene": {"kind": "reader", "_target_": "bomb.Bomb"}}, "allow_targets=[bomb]"),
     "a module of a package": ({"densify": {"_target_": "bombs.one.Bomb"}}, "allow_targets=[bombs]"),
     "a densifier that allows itself": (
         {"allow_targets": ["bomb"], "densify": {"_target_": "bomb.Bomb"}},

@@ -16,7 +16,7 @@ from gsbench.settings import option_fields
 from gsbench.system.install import conf_dir
 
 # keys that tell the files of a group apart
-NAMES = ("name", "kind", "protocol", "path", "sink", "enabled")
+NAMES = ("name", "kind", "protocol", "path", "_target_", "enabled")
 
 
 def read(path):

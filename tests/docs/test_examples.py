@@ -45,7 +45,13 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("mine", "shell", "told", "untiled"):  # of other tests, or of another document
+    for name in (
+        "kept",
+        "llff",
+        "mine",
+        "shell",
+        "untiled",
+    ):  # of other tests, or of another document
         monkeypatch.delitem(sys.modules, name, raising=False)
     before = set(sys.modules)
     yield tmp_path
@@ -126,14 +132,33 @@ def test_the_initialiser_of_its_document_runs(folder, capsys):
 def test_the_tracker_of_its_document_gets_every_trial(folder, capsys):
     found = run_blocks(ROOT / "docs" / "hydra.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
-    labels = [line.rpartition(",") for line in Path("told.csv").read_text().splitlines()]
-    results = sorted(Path("runs").glob("told/courtyard/random-none/*/results.json"))
-    assert [label for label, *_ in labels] == [
-        f"told/courtyard/random-none/{p.parent.name}" for p in results
-    ]
-    values = [json.loads(path.read_text())["metrics"]["psnr"] for path in results]
-    assert [float(value) for *_, value in labels] == pytest.approx(values, abs=1e-3)
-    assert len(values) == 2
+    shown = {one["tags"]["seed"]: one for one in map(_json, Path("runs/told/shown").iterdir())}
+    results = {one["seed"]: one for one in map(_json, Path("runs/told").rglob("results.json"))}
+    assert set(shown) == {"0", "1"}
+    for seed, one in results.items():
+        told = shown[str(seed)]
+        assert told["metrics"]["eval/psnr_dB 5"] == one["metrics"]["psnr"]
+        assert told["end"] == {"status": "FINISHED", "reason": None}
+        assert "kept" not in one["code"]["sources"]  # a tracker changes no result
+
+
+def _json(path):
+    return json.loads(path.read_text())
+
+
+def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):
+    """The same training as with the cameras' COLMAP model, but for rounding."""
+    found = run_blocks(ROOT / "docs" / "library.md", folder)
+    assert found["status"] == 0, capsys.readouterr().err
+    scene = ["scene=colmap", "scene.path=library/courtyard", "scene.name=courtyard"]
+    assert run([*scene, *found["quick"], "tracking=none", "name=colmap"]) == 0
+    (own,), (colmap,) = (
+        list(Path("runs", name).rglob("results.json")) for name in ("llff", "colmap")
+    )
+    assert _json(own)["metrics"]["psnr"] == pytest.approx(
+        _json(colmap)["metrics"]["psnr"], abs=1e-3
+    )
+    assert list(_json(own)["code"]["sources"]) == ["llff"]
 
 
 def test_the_densifier_of_its_document_resumes_to_the_bit(folder):

@@ -62,7 +62,7 @@ def test_verbs_that_run_nothing_start_no_program(place, monkeypatch):
         "vote": ["make", FINISHED, "--arms", "adc,volumetric", "--out", "vote"],
     }
     (nothing,) = [row[0] for row in RUNS if row[0].startswith("`tables`")]
-    assert re.findall(r"`(\w+)`", nothing) == list(commands)
+    assert re.findall(r"`(\w+)`", nothing) == [verb for verb in commands if verb != "status"]
     for verb, words in commands.items():
         assert run([verb, *words]) in (0, 2), verb
 

@@ -62,7 +62,7 @@ def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "helper.py").write_text("said = 2\n")
     assert "2 trials: 2 superseded" in ask("status", "edited")
-    assert "helper was edited since: 2 trials of random-mine are of the old code" in ask(
+    assert "helper was edited since: 2 trials of random-mine came from the old code" in ask(
         "tables", "edited"
     )
     train(2)

@@ -36,7 +36,7 @@ def capture(tmp_path):
     return folder
 
 
-def gsbench(folder, *words, start=("../gsbench",)):
+def gsbench(folder, *words, code=0, start=("../gsbench",)):
     kept = {
         key: value
         for key, value in os.environ.items()
@@ -47,7 +47,7 @@ def gsbench(folder, *words, start=("../gsbench",)):
         "TORCH_HOME": str(folder.parent / "hub"),
     }
     command = [sys.executable, *start, *words]
-    return completed(command, cwd=folder, env=environment, timeout=SECONDS)
+    return completed(command, code, cwd=folder, env=environment, timeout=SECONDS)
 
 
 def test_no_module_of_the_current_folder_is_imported(capture):
@@ -106,6 +106,6 @@ def test_a_version_command_imports_no_module_of_the_current_folder(capture):
     ]
     (capture / "plyfile_absent.py").write_text(BOMB.format(mark=str(capture.parent / "exploded")))
     small = [word for word in TINY if not word.startswith("densify")]
-    done = gsbench(capture, *small, *words, "name=three")
+    done = gsbench(capture, *small, *words, "name=three", code=1)
     assert "Error: trained with what lies beside it" in done.stderr
     assert not (capture.parent / "exploded").exists()

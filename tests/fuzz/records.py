@@ -21,7 +21,7 @@ from pathlib import Path
 from random import Random
 
 from gsbench.analysis.cells import to_frame
-from gsbench.analysis.fairness import tuning_lines
+from gsbench.analysis.fairness import tuning_notes
 from gsbench.analysis.report.build import (
     event_charts,
     search_summary,
@@ -39,7 +39,8 @@ from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.tracking.sinks import MirrorState, TrackedTrial
+from gsbench.tracking.sinks import Run
+from gsbench.tracking.trial import TrackedTrial
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
 from tests.finished import record_of
@@ -305,7 +306,7 @@ def look(runs, places):
         attempt(lambda: event_charts(experiment.trials, arms))
         attempt(lambda: volume_charts(experiment.trials, arms))
         for first, second in itertools.pairwise(arms):
-            attempt(lambda pair=(first, second): tuning_lines(experiment.trials, pair))
+            attempt(lambda pair=(first, second): tuning_notes(experiment.trials, pair))
         for trial in experiment.trials:
             attempt(lambda trial=trial: read_views(trial))
 
@@ -319,7 +320,7 @@ def look(runs, places):
     for folder in {path.parent for path in places.values()} - {home}:
         attempt(lambda folder=folder: TrialFolder(folder).configuration())
         attempt(lambda folder=folder: TrialFolder(folder).stage_and_step())
-        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", MirrorState))
+        attempt(lambda folder=folder: read_if_sound(folder / "mlflow.json", Run))
         attempt(lambda folder=folder: _mirror(folder))
     attempt(lambda: TrialFolder.of(v := values_of(runs, "adc", 0, 0.03)).why_not_done(v))
     return refused

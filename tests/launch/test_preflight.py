@@ -52,7 +52,7 @@ def test_a_users_class_under_a_name_of_gsbench_gets_a_warning(group, name, targe
 def trial(runs, seed=0, launch=None, **settings):
     courtyard = {"name": "courtyard", "path": "", "kind": "courtyard"}
     launch = launch or LOCAL | {"name": "serial"}
-    tracking = {"enabled": False, "sink": "nosuch"}
+    tracking = {"enabled": False, "_target_": "gsbench.tracking.NoSuch"}
     settings = {"scene": courtyard, "tracking": tracking} | settings
     one = bare_trial(runs, seed, launch, **settings)
     return Trial(one.values, (f"seed={seed}",))
@@ -115,10 +115,10 @@ def test_unfinished_trials_go_to_their_launcher_once_checked_and_planned(
 def test_what_is_missing_here_matters_unless_the_trials_run_elsewhere(tmp_path, called):
     runs = tmp_path / "runs"
     photos = {"name": "mine", "path": str(tmp_path / "photos"), "kind": "images"}
-    tracked = {"enabled": True, "sink": "nosuch"}
+    tracked = {"enabled": True, "_target_": "gsbench.tracking.TensorBoard", "x": 1}
     for wrong, said in (
         ({"scene": photos}, "scene mine: the folder"),
-        ({"tracking": tracked}, r"tracking\.sink=nosuch needs a package: .*pip install nosuch"),
+        ({"tracking": tracked}, r"tracking\.x is not a setting"),
         ({"eval": {"weights": "nosuch"}}, r"eval\.weights=nosuch: no such folder"),
     ):
         with refusal(said):
@@ -134,7 +134,7 @@ def test_what_is_missing_here_matters_unless_the_trials_run_elsewhere(tmp_path, 
     called.clear()
     run_batch([trial(runs, 0, SLURM, eval={"weights": "nosuch"})])
     assert [name for name, *_ in called] == ["check_parts", "run_slurm"]
-    check_trackers([trial(runs, tracking=tracked | {"sink": "json"})])
+    check_trackers([trial(runs, tracking={"enabled": True})])
 
 
 def test_each_missing_folder_is_named_once_with_the_way_to_get_it(tmp_path, monkeypatch):

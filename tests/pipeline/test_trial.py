@@ -6,10 +6,11 @@ from types import ModuleType
 
 import pytest
 
+from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.densify import ADC
 from gsbench.errors import TrainingError
-from gsbench.pipeline.parts import Parts, build, build_own_rasterizer
+from gsbench.pipeline.parts import Parts, build_own_rasterizer
 from gsbench.pipeline.trial import _recorded_failures, run_trial
 from gsbench.runs import layout
 from gsbench.runs.trial_folder import TrialFolder

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.pipeline.parts import locate
+from gsbench.config.build import locate
 from gsbench.raster import create_rasterizer, executors
 from gsbench.raster.contract import CASES, departures
 from gsbench.raster.executors import EXECUTORS, RasterConfig, find_executor, resolve

@@ -150,7 +150,7 @@ def test_photographs_are_found_by_trial_folder_and_address(trial, runs, tmp_path
     (tmp_path / "empty").mkdir()
     for place, words in (
         (tmp_path / "empty", "holds no pictures"),
-        ("gardn", "is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene; did you mean"),
+        ("gardn", "is no folder, no trial EXPERIMENT:SCENE:ARM and no scene; did you mean"),
     ):
         assert words in refused("evaluate", renders, "--truth", place)
     results = read_json(trial / "results.json")

@@ -56,6 +56,12 @@ def test_the_code_of_a_users_class_includes_all_allowed_modules(home):
         n: digest(home / f"{n}.py") for n in ("own_code", "helper")
     }
     assert user_modules(values_of("nowhere_to_be_found.X", allowed=("bash", "json", "yaml"))) == {}
+    # a tracker changes no result
+    tracked = {"tracking": {"_target_": "helper.Tracker"}}
+    assert user_modules(values_of("gsbench.densify.ADC") | tracked) == {}
+    assert list(user_modules(values_of("own_code.Mine") | tracked)) == ["own_code"]
+    same = {"tracking": {"_target_": "own_code.Tracker"}}
+    assert list(user_modules(values_of("own_code.Mine") | same)) == ["helper", "own_code"]
 
 
 def test_a_package_is_hashed_by_all_its_code_files(home):

@@ -14,6 +14,7 @@ from gsbench.tracking.mirror import mirror_ended
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150
+STATE = "mlflow.json"  # in the trial's folder
 
 
 def options(uri=None, patience=30.0):
@@ -55,9 +56,9 @@ def following(settings, folder):
         yield
 
 
-def mirror_trial(settings, folder, values):
+def mirror_trial(settings, folder, values, allowed=()):
     """Mirror an ended trial; False if nothing was missing. Raises any error of the tracker."""
-    return mirror_ended(TrialFolder(folder), settings, values)
+    return mirror_ended(TrialFolder(folder), settings, values, allowed)
 
 
 def write_trial(folder, values, records=RECORDS, psnr=20.0):

@@ -7,8 +7,9 @@ import pytest
 from gsbench.cli import run
 from gsbench.errors import InputError
 from gsbench.tracking import connect, default_uri, tracker_uri
-from gsbench.tracking.mlflow_sink import STATE, VARIABLE
+from gsbench.tracking.mlflow_sink import VARIABLE
 from tests.tracking.helpers import (
+    STATE,
     begin_trial,
     found_runs,
     free_port,

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import mlflow
 import numpy as np
 import pytest
-from mlflow.exceptions import MlflowException
 from PIL import Image
 
 from gsbench.analysis.results import read_experiment
@@ -129,26 +128,6 @@ def test_a_long_description_is_cut_at_a_line(tmp_path):
 @pytest.mark.parametrize("version", ["2.22.0", "3.1.0", "3.170.0", "4.0.0"])
 def test_other_versions_of_mlflow_get_the_plain_page(version):
     assert addresses("http://a/", "7", version) == {"experiment": "http://a/#/experiments/7"}
-
-
-@pytest.mark.parametrize("limit", [500, 250])
-def test_a_server_that_refuses_long_parameters_gets_shortened_ones(limit, runs, monkeypatch):
-    send = mlflow.MlflowClient.log_batch
-
-    def strict(self, run_id, **sent):
-        if any(len(param.value) > limit for param in sent.get("params", ())):
-            raise MlflowException(f"Param value exceeded length {limit}")
-        send(self, run_id, **sent)
-
-    monkeypatch.setattr(mlflow.MlflowClient, "log_batch", strict)
-    values = trial_values(runs, seed=1000 + limit) | {"long": "x" * 700}
-    folder = TrialFolder.of(values).path
-    write_trial(folder, values)
-    assert mirror_trial(options(), folder, values)
-    run = run_of(connect(None, runs), 1000 + limit)
-    assert run.info.status == "FINISHED"
-    assert run.data.params["long"] == "x" * limit
-    assert run.data.params["densify.name"] == "a_densify"
 
 
 @pytest.mark.slow

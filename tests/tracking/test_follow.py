@@ -17,8 +17,7 @@ import pytest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from gsbench.tracking import Mirror, mirror
-from gsbench.tracking.mirror import MirrorError, TrackerRun, mirror_ended, refusal, sync
-from gsbench.tracking.sinks import MirrorState
+from gsbench.tracking.mirror import MirrorError, mirror_ended, refusal, sync
 from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
 
 # ---- the sweep's side
@@ -91,7 +90,7 @@ def test_a_stopped_sweep_waits_less_for_a_slow_tracker(
 
     def sweep():
         with Mirror() as one:
-            one.follow(tmp_path, options(patience=7.0) | {"sink": "wandb"})
+            one.follow(tmp_path, options(patience=7.0) | {"_target_": "gsbench.tracking.WandB"})
             if error is not None:
                 raise error
 
@@ -102,9 +101,7 @@ def test_a_stopped_sweep_waits_less_for_a_slow_tracker(
             sweep()
     assert processes[0].did == [seconds, "killed", "closed"]
     assert processes[0].stderr.closed
-    assert caplog.messages == [
-        "tracking: Weights & Biases is slow; `gsbench sync` mirrors the rest later"
-    ]
+    assert caplog.messages == ["tracking: WandB is slow; `gsbench sync` mirrors the rest later"]
 
 
 REST = "; the files are complete, `gsbench sync` mirrors them later"
@@ -157,33 +154,37 @@ def test_a_mirror_that_cannot_start_harms_nothing(tmp_path, caplog, monkeypatch)
 class Tracker:
     """A tracker that keeps what it is told."""
 
-    name, state_file = "a tracker", "tracker.json"
     told: list[Any]
-    refuses = ""
+    refuses: BaseException | None = None
 
-    def __init__(self, settings, trial):
+    def open(self, trial, run):
+        self.told.append(("open", run.complete))
+        return f"run {run.token}"
+
+    def params(self, values):
         pass
 
-    def open(self, state, results):
-        self.told.append(("open", state.complete, results))
-        return MirrorState(logged=dict(state.logged), complete=state.complete, token="t")
+    def tags(self, values):
+        if "note" in values:
+            self.told.append(("note", values["note"]))
 
-    def log(self, scalars):
+    def metrics(self, scalars):
         if self.refuses:
-            raise ValueError(self.refuses)
-        self.told.append(("log", {scalar.key.split("/")[1] for scalar in scalars}, len(scalars)))
+            raise self.refuses
+        self.told.append(("log", {one.key.split("/")[1] for one in scalars}, len(scalars)))
 
-    def complete(self, summary):
-        self.told.append(("complete", len(summary.pictures), [name for _, name in summary.files]))
+    def artifacts(self, files, pictures):
+        self.told.append(("files", list(files)))
 
-    def stop(self, status, reason):
+    def close(self, status, reason):
         self.told.append((status, reason))
 
 
 @pytest.fixture
 def told(monkeypatch):
     monkeypatch.setattr(Tracker, "told", [], raising=False)
-    monkeypatch.setitem(mirror.SINKS, "mlflow", Tracker)
+    monkeypatch.setattr(mirror, "make_sink", lambda settings, allowed: Tracker())
+    monkeypatch.setattr(mirror, "publish", lambda home, uri: None)
     return Tracker.told
 
 
@@ -191,55 +192,19 @@ def words(told):
     return [word for word, *_ in told]
 
 
-def test_a_run_gets_each_record_once_and_its_end(told, tmp_path):
-    values = trial_values(tmp_path)
-    folder = begin_trial(values)
-    files = TrialFolder(folder)
-    run = TrackerRun(files, options(), values)
-    assert told == [("open", None, None)]
-    assert json.loads((folder / "tracker.json").read_text()) == {"token": "t"}
-    with pytest.raises(BusyError):
-        TrackerRun(files, options(), values)
-    run.end()
-    assert told[1:] == [("KILLED", None)]
-    (folder / "failed.json").write_text(json.dumps({"message": "no luck\nat all"}))
-    run.end()
-    assert told[2:] == [("FAILED", "no luck")]
-    write_trial(folder, values)
-    (folder / "failed.json").unlink()
-    run.add_curves()
-    assert words(told[3:]) == ["log", "log"]
-    logged = json.loads((folder / "tracker.json").read_text())["logged"]
-    assert logged == {"metrics.jsonl": 150, "events.jsonl": 100}
-    assert not run.is_complete
-    run.end()
-    assert words(told[5:]) == ["complete"]  # nothing is logged again
-    assert run.is_complete
-    run.end()
-    run.add_curves()
-    assert len(told) == 6
-    run.close()
-    assert not mirror_ended(files, options(), values)
-    first = json.loads((folder / "tracker.json").read_text())["complete"]
-    write_trial(folder, values, psnr=33.0)  # new results replace the run
-    del told[:]
-    assert mirror_ended(files, options(), values)
-    assert words(told)[-1] == "complete"
-    assert told[0][:2] == ("open", first)
-    assert told[0][2] != first
-    assert json.loads((folder / "tracker.json").read_text())["complete"] == told[0][2]
+ENDED = ["log", "note", "files", "FINISHED"]
 
 
 def test_a_tracker_that_fails_frees_the_trial(told, tmp_path, monkeypatch):
     values = trial_values(tmp_path)
     write_trial(TrialFolder.of(values).path, values)
-    monkeypatch.setattr(Tracker, "refuses", "no\nmore")
+    monkeypatch.setattr(Tracker, "refuses", ValueError("no\nmore"))
     for _ in range(2):
         with pytest.raises(ValueError, match="no"):
             mirror_ended(TrialFolder.of(values), options(), values)
     error = refusal(TrialFolder.of(values), options(), ValueError("x" * 201 + "\nmore"))
     label = TrialFolder.of(values).label
-    assert str(error) == f"{label} could not be sent to a tracker (ValueError: {'x' * 200})"
+    assert str(error) == f"{label} could not be sent to MLflow (ValueError: {'x' * 200})"
     assert str(refusal(TrialFolder.of(values), options(), KeyError())).endswith("(KeyError: )")
 
 
@@ -268,10 +233,12 @@ def test_sync_mirrors_ended_trials_and_counts_them(told, tmp_path, monkeypatch):
     ]
     assert list(sync(folders[:1], None)) == ["0 trials mirrored now, 1 before"]
     assert list(sync([folders[4]], "http://strange"))[-1] == "1 trial mirrored now, 0 before"
-    monkeypatch.setattr(Tracker, "refuses", "no")
     (busy / "events.jsonl").unlink()
-    with pytest.raises(MirrorError, match=r"could not be sent to a tracker \(ValueError: no\)"):
-        list(sync(folders[5:], None))
+    for error in (ValueError("no"), SystemExit("no")):  # code of a user's may end the process
+        monkeypatch.setattr(Tracker, "refuses", error)
+        line = rf"could not be sent to MLflow \({type(error).__name__}: no\)"
+        with pytest.raises(MirrorError, match=line):
+            list(sync(folders[5:], None))
 
 
 def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypatch):
@@ -280,7 +247,7 @@ def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypa
     folder = TrialFolder.of(trial_values(tmp_path))
     pages = {
         (folder.home, "u"): (folder, options("u")),
-        (folder.home, "w"): (folder, options("w") | {"sink": "wandb"}),
+        (folder.home, "w"): (folder, options("w") | {"_target_": "gsbench.tracking.WandB"}),
     }
     mirror._renew(pages)
     assert published == [(folder.home, "u")]
@@ -301,7 +268,7 @@ class Followed:
     """Stands in for a trial that ends at its second reading, or raises ``error``."""
 
     made: list["Followed"]
-    error: Exception | None = None
+    error: BaseException | None = None
 
     def __init__(self, folder, options):
         self.folder, self.options, self.has_ended = folder, options, False
@@ -358,7 +325,7 @@ def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
     assert renewed == [[], [page], [page]]
 
 
-@pytest.mark.parametrize("error", [ValueError("down"), BusyError("other")])
+@pytest.mark.parametrize("error", [ValueError("down"), SystemExit("down"), BusyError("other")])
 def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
     monkeypatch.setattr(Followed, "error", error)
     monkeypatch.setattr(mirror, "_renew", lambda pages: None)
@@ -366,7 +333,7 @@ def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
     if isinstance(error, BusyError):
         mirror._follow(lines, 0)
     else:
-        with pytest.raises(MirrorError, match=r"could not be sent to MLflow \(ValueError: down\)"):
+        with pytest.raises(MirrorError, match=r"could not be sent to MLflow \(\w+: down\)"):
             mirror._follow(lines, 0)
     assert followed[0].calls == [False, False, True]
 
@@ -383,11 +350,11 @@ def test_a_trial_is_opened_once_it_runs_or_has_ended_now(told, tmp_path):
     assert told == []
     with hold(folder / ".lock", "a trial"):
         one.catch_up(last=False)
-        assert words(told) == ["open", "log", "log"]
+        assert words(told) == ["open"]
         one.catch_up(last=False)
         assert not one.has_ended
     one.catch_up(last=False)
-    assert words(told[3:]) == ["complete"]
+    assert words(told[1:]) == ["log", "log", *ENDED]
     assert one.has_ended
     assert mirror_ended(TrialFolder(folder), options(), values) is False  # it was let go
 

@@ -1,7 +1,6 @@
 """What users of MLflow expect of a run: its address, user, reason of a failure, and files."""
 
 import getpass
-import json
 import shutil
 import subprocess
 import sys
@@ -12,11 +11,9 @@ from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, default_uri
 from tests.tracking.helpers import (
-    RECORDS,
     begin_trial,
     child_environment,
     following,
-    history,
     mirror_trial,
     options,
     run_of,
@@ -55,28 +52,6 @@ def test_a_trial_goes_to_the_tracker_in_the_environment(runs, tmp_path, monkeypa
     assert run.data.tags["mlflow.user"] == getpass.getuser()
 
 
-def test_a_failed_run_has_its_reason_until_the_trial_succeeds(runs):
-    values = trial_values(runs, seed=22)
-    folder = begin_trial(values)
-    (folder / "log.txt").write_text("what happened\n")
-    with pytest.raises(RuntimeError), following(options(), folder):  # noqa: PT012
-        (folder / "failed.json").write_text(
-            json.dumps({"message": "the loss became nan", "traceback": "…"})
-        )
-        raise RuntimeError
-    client = connect(None, runs)
-    run = run_of(client, 22)
-    assert run.info.status == "FAILED"
-    assert run.data.tags["error"] == "the loss became nan"
-    assert artifacts(client, run) == {"config.yaml", "failed.json", "log.txt"}
-    (folder / "failed.json").unlink()
-    with following(options(), folder):
-        write_trial(folder, values)
-    run = client.get_run(run.info.run_id)
-    assert run.info.status == "FINISHED"
-    assert "error" not in run.data.tags
-
-
 def test_the_model_is_an_artifact_if_asked_for(runs):
     client, run = mirrored(runs, seed=23)
     assert "point_cloud.ply" not in artifacts(client, run)
@@ -105,16 +80,3 @@ def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
     )
     assert f"mirrored {TrialFolder(folder).label}" in done.stdout.splitlines(), done.stderr
     assert list((moved / "mlartifacts" / "tracked").rglob("results.json"))
-
-
-def test_a_deleted_run_is_mirrored_again(runs):
-    client, run = mirrored(runs, seed=28)
-    client.delete_run(run.info.run_id)
-    values = trial_values(runs, seed=28)
-    assert mirror_trial(options(), TrialFolder.of(values).path, values)
-    again = run_of(client, 28)
-    assert again.info.run_id != run.info.run_id
-    assert history(client, again.info.run_id, "train/loss") == [
-        (i, 1 / i) for i in range(1, RECORDS + 1)
-    ]
-    assert "results.json" in artifacts(client, again)

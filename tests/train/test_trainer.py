@@ -147,7 +147,7 @@ def test_a_rasterizer_without_an_output_that_the_densifier_needs_is_refused_at_o
 
 def test_too_few_rounds_of_a_densifier_cause_a_warning(lab, caplog):
     lab.train(ADC(start=500), "adc", iterations=15)
-    assert "ADC: 0 rounds of refinement in 15 iterations are too few" in caplog.text
+    assert "ADC: 0 rounds of refinement in 15 iterations, too few" in caplog.text
     caplog.clear()
     lab.train(NoDensifier(), "none", iterations=15)
     assert "refinement" not in caplog.text

@@ -128,9 +128,8 @@ def test_the_legend_counts_the_large_gaussians_of_each_trial_by_cause(viewer):
     larger = (other.log10_volumes > threshold).sum()
     viewer._threshold.value = threshold
     assert viewer._legend.content == (
-        f"V > {10**threshold:.3g}"
-        f"<br><span style='color:#56b4e9'>&#9679;</span> clone: 3 | {larger}"
-        "<br><span style='color:#0072b2'>&#9679;</span> added: 1 | 0"
+        f"V > {10**threshold:.3g}<br><span style='color:#56b4e9'>&#9679;</span> clone: 3 | "
+        f"{larger}<br><span style='color:#0072b2'>&#9679;</span> added: 1 | 0"
     )
 
 

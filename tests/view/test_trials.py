@@ -275,9 +275,9 @@ def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs, tmp_path):
         "small:garden:adc": "names 2 trials; choose one of small:garden:random-adc, small:garden:sfm-adc",
         "small:courtyard:mcmc": "small:courtyard:random-adc:0",
         "small:courtyard:adc:7": "small:courtyard:random-adc:0",
-        "small:courtyard": "EXPERIMENT:SCENE:DENSIFY",
-        "small:courtyard:": "EXPERIMENT:SCENE:DENSIFY",
-        "small:courtyard:adc:0:0": "EXPERIMENT:SCENE:DENSIFY",
+        "small:courtyard": "EXPERIMENT:SCENE:ARM",
+        "small:courtyard:": "EXPERIMENT:SCENE:ARM",
+        "small:courtyard:adc:0:0": "EXPERIMENT:SCENE:ARM",
         "nothing:courtyard:adc": "nothing",
         str(first.path.parent): "is not a trial's folder",
     }.items():

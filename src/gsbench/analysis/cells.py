@@ -19,6 +19,7 @@ from gsbench.analysis.differences import (
 )
 from gsbench.analysis.quantities import Quantity, metric_keys
 from gsbench.analysis.results import Experiment, TrialResult, group_by
+from gsbench.analysis.trial_settings import Configured
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import is_hashed
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 K = TypeVar("K", bound=Hashable)
+C = TypeVar("C", bound=Configured)
 
 TRIAL_FIELDS = (
     "scene",
@@ -138,13 +140,13 @@ def check_averageable(trials: Sequence[TrialResult], where: str) -> None:
         raise _refusal(where, {key: list(values) for key, values in across.items()}, trials)
 
 
-def swept_settings(trials: Iterable[TrialResult]) -> list[str]:
+def swept_settings(trials: Iterable[Configured]) -> list[str]:
     """The settings in which trials of one scene and arm differ, without `IGNORED_SETTINGS`."""
     groups = group_by(trials, lambda trial: (trial.scene, trial.init, trial.densify)).values()
     return sorted(set().union(*map(differing_settings, groups)))
 
 
-def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
+def with_variants(trials: Sequence[C]) -> list[C]:
     """The trials, each with its values of the swept settings as `TrialResult.variant`.
 
     Trials with different values thus belong to different arms. Only settings that were swept for
@@ -155,7 +157,7 @@ def with_variants(trials: Sequence[TrialResult]) -> list[TrialResult]:
     if not any(swept.values()):
         return list(trials)
 
-    def variant(trial: TrialResult) -> tuple[tuple[str, str], ...]:
+    def variant(trial: C) -> tuple[tuple[str, str], ...]:
         own = swept[trial.init, trial.densify]
         return tuple((key, str(trial.config.get(key))) for key in own)
 

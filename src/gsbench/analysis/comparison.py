@@ -4,13 +4,15 @@ A `Comparison` has the trials that count, what was declared, the verdicts on eac
 arms, and a line for each arm and trial that no verdict uses.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
+from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairing import (
     BASELINE,
     baseline_settings,
@@ -20,11 +22,12 @@ from gsbench.analysis.pairing import (
     uncompared,
 )
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
-from gsbench.analysis.verdicts import PairVerdicts, judge_pairs, sentence
+from gsbench.analysis.verdict_words import sentence
+from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
+from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
-from gsbench.words import some_of
 
-VERDICT = "Verdict, "  # prefix of the lines below a table that state verdicts
+VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Pairing:
 
     trials: tuple[TrialResult, ...]
     pairs: tuple[tuple[Arm, Arm], ...]
-    uncompared: tuple[str, ...]
+    uncompared: tuple[Note, ...]
 
 
 def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
@@ -80,52 +83,67 @@ class Comparison:
         return [sentence(one) for one in self.answers]
 
     @cached_property
-    def unused(self) -> list[str]:
-        """A line with its reason for each arm and each trial that no verdict uses."""
-        return [*self.arms.uncompared, *dict.fromkeys(self._unused_trials())]
-
-    def _unused_trials(self) -> Iterator[str]:
-        used = {
-            trial.path
-            for one in self.answers
-            for verdict in one.verdicts
-            for trial in verdict.pairs.trials
-        }
-        for arm, own in group_by(self.trials, lambda trial: trial.arm).items():
-            left_out = [trial.label for trial in own if trial.path not in used]
-            answers = [one for one in self.answers if arm in (one.first, one.second)]
-            # Where an arm has no verdict at all, its sentence says why.
-            if left_out and any(one.verdicts for one in answers):
-                notes = [note for one in answers for own in one.verdicts for note in own.notes]
-                reasons = some_of(list(dict.fromkeys(notes))) or NOT_PLANNED
-                yield f"In no verdict: {some_of(left_out)} ({reasons})."
+    def unused(self) -> list[Note]:
+        """A note with the reason for each arm and each trial that no verdict uses."""
+        verdicts = [verdict for one in self.answers for verdict in one.verdicts]
+        # Where an arm has no verdict at all, its sentence says why.
+        asked = {arm for one in self.answers if one.verdicts for arm in (one.first, one.second)}
+        trials = [trial for trial in self.trials if trial.arm in asked]
+        return [*self.arms.uncompared, *unused_trials(trials, verdicts)]
 
     @cached_property
-    def declaration_lines(self) -> list[str]:
-        """Sentences on what was declared, and how much of it is still to come."""
+    def declared_notes(self) -> list[Note]:
+        """Notes on what was declared, and how much of it is still to come."""
         if self.declared is None or not self.answers:
             return []
         metric = self.answers[0].declared
         name = self.declared.metric if metric is None else metric.name
         standings = [one.standing for one in self.answers if one.standing is not None]
         progress = self.declared.progress(self.trials)
-        return [*self.declared.sentences(name, standings), *progress]
+        return [*self.declared.notes(name, standings), *progress]
 
-    def lines(self) -> list[str]:
-        """The lines below a table: verdicts, what no verdict uses, and what was declared."""
+    def notes(self) -> list[Note]:
+        """The notes below a table: verdicts, what no verdict uses, and what was declared."""
         return [
-            *(f"{VERDICT}{one}" for one in self.sentences),
+            *(Note.of("verdict", sentence=one) for one in self.sentences),
             *self.unused,
-            *self.declaration_lines,
+            *self.declared_notes,
         ]
 
     def to_json(self) -> dict[str, Any]:
         """The verdicts on each compared pair of arms and what is left out, for other programs."""
-        left_out = [*self.unused, *self.experiment.warnings]
+        left_out = texts([*self.unused, *self.experiment.warnings])
         return {"pairs": [_as_json(one) for one in self.answers], "left_out": left_out}
 
 
-NOT_PLANNED = "seeds after an undeclared or missing one do not count"
+def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) -> list[Note]:
+    """A note with the reasons for the trials of each arm that are in none of ``verdicts``."""
+    used = {trial.path for verdict in verdicts for trial in verdict.pairs.trials}
+    left_out = [trial for trial in trials if trial.path not in used]
+    found = []
+    for own in group_by(left_out, lambda trial: trial.arm).values():
+        asked = [one for one in verdicts if any(_asks(one.question, trial) for trial in own)]
+        reasons = [reason for verdict in asked for reason in _reasons(verdict)]
+        if not reasons:
+            reasons = [Note.of("not planned" if asked else "not asked").sentence]
+        labels = [trial.label for trial in own]
+        found.append(Note.of("unused", trials=labels, reasons=list(dict.fromkeys(reasons))))
+    return found
+
+
+def _asks(question: Question, trial: TrialResult) -> bool:
+    """Return whether a question is about a trial."""
+    if question.scenes:
+        return any(trial.key in keys for keys in question.scenes.values())
+    return trial.arm in (question.baseline, question.arm)
+
+
+def _reasons(verdict: Verdict) -> list[str]:
+    """The reasons why a verdict leaves trials of its question out."""
+    reasons = [note.sentence for note in (verdict.untestable, *verdict.notes) if note]
+    if verdict.question.seeds and verdict.answer is not None and verdict.final:
+        reasons.append(Note.of("decided before", seeds=verdict.pairs.seeds).sentence)
+    return reasons
 
 
 def _as_json(one: PairVerdicts) -> dict[str, Any]:
@@ -149,7 +167,7 @@ def _as_json(one: PairVerdicts) -> dict[str, Any]:
         "baseline": str(one.first),
         "sentence": sentence(one),
         "verdicts": verdicts,
-        "notes": list(one.notes),
+        "notes": texts(one.notes),
     }
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 
+from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.trial_settings import load_flat_config, settings_text
 from gsbench.parsing import DamagedError
@@ -104,8 +105,8 @@ class ActiveDeclaration:
         declaration = in_looks[-1] if in_looks else naming[0]
         return Standing(declaration, tuple(seen), tuple(added), len(arm))
 
-    def progress(self, trials: Sequence[TrialResult]) -> list[str]:
-        """A sentence on the declared trials that are missing; none if all are there."""
+    def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
+        """A note on the declared trials that are missing; none if all are there."""
         planned = reduce(merge_planned, (one.planned for one in self.records))
         done = {(trial.key, trial.seed) for trial in trials}
         replaced = {trial.key for trial in self.older}
@@ -119,15 +120,8 @@ class ActiveDeclaration:
         missing = sum(one not in done for one in wanted)
         if not missing:
             return []
-        counts = f"{missing} of the {counted(len(wanted), 'declared trial')}"
-        if any(one.looks for one in self.records):
-            return [
-                f"Seeds come in planned looks (launch.stop_when_decided); {counts} are not there."
-            ]
-        return [
-            f"{counts} are still missing, so this is an early look. Do not stop here because the "
-            "result pleases: that finds effects that do not exist."
-        ]
+        kind = "looks to come" if any(one.looks for one in self.records) else "early look"
+        return [Note.of(kind, missing=missing, declared=len(wanted))]
 
     def _is_replaced(self, key: str, seeds: Iterable[int], trials: Sequence[TrialResult]) -> bool:
         """Return whether trials with a planned trial's settings, but other code, have finished.
@@ -145,20 +139,16 @@ class ActiveDeclaration:
             return any(one.key != key and settings_text(one.config) == text for one in same_arm)
         return False
 
-    def sentences(self, name: str, standings: Iterable[Standing]) -> list[str]:
-        """Sentences that say when the metric called ``name`` was declared, and for which trials."""
+    def notes(self, name: str, standings: Iterable[Standing]) -> list[Note]:
+        """Notes that say when the metric called ``name`` was declared, and for which trials."""
         name += f" at {self.question}" if self.question else ""
         when = self.records[0].when
-        doubts = [one.doubt for one in standings if one.doubt]
-        how = "was declared beforehand" if not doubts else "was declared"
-        lines = [f"{name} {how} (eval.primary, {when})."]
-        if doubts:
-            lines.append(
-                "An arm whose metric or trials were declared after its first result is judged in "
-                f"all metrics, adjusted for their number. To test {name} alone, run other seeds "
-                "under another name, all by one command."
-            )
-        return lines + [f"Declared before it: {one.primary} ({one.when})." for one in self.earlier]
+        doubted = any(one.doubt for one in standings)
+        notes = [Note.of("declared" if doubted else "declared beforehand", metric=name, when=when)]
+        notes += [Note.of("doubted", metric=name)] if doubted else []
+        return notes + [
+            Note.of("replaced", metric=one.primary, when=one.when) for one in self.earlier
+        ]
 
 
 def _places(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:

@@ -16,15 +16,16 @@ from typing import Any
 
 import yaml
 
+from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
-from gsbench.analysis.trial_settings import canonical
+from gsbench.analysis.trial_settings import Configured, canonical
 from gsbench.gaussians.paper_values import RATES
 from gsbench.parsing import LOADER
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED
 from gsbench.runs.freshness import Change, Part, code_changes, present_version
 from gsbench.runs.nested import SHOWN
 from gsbench.system.install import conf_dir
-from gsbench.words import counted, listed, some_of
+from gsbench.words import counted, some_of
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
 ScenesByValue = dict[str, list[str]]  # value of a setting or condition -> the scenes that have it
@@ -115,7 +116,7 @@ def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> di
     return {key: sorted(values) for key, values in values_by_condition.items() if len(values) > 1}
 
 
-def differing_settings(trials: Sequence[TrialResult]) -> dict[str, list[str]]:
+def differing_settings(trials: Sequence[Configured]) -> dict[str, list[str]]:
     """The settings in which trials differ, with their values, without `IGNORED_SETTINGS`.
 
     A missing key counts as unset (null): trials from before a setting existed equal later ones that
@@ -178,8 +179,8 @@ def _between_scenes(
     return differing
 
 
-def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[str]:
-    """Lines on arms that have other settings, conditions or code on other scenes.
+def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[Note]:
+    """Notes on arms that have other settings, conditions or code on other scenes.
 
     A mean over the scenes hides these: an arm may have been tuned for each scene. ``sides`` are
     trials with their variants; arms of one name on two sides are two arms.
@@ -196,7 +197,7 @@ def between_scenes_notes(*sides: Sequence[TrialResult]) -> list[str]:
             if texts:
                 arms_by_text.setdefault(some_of(texts), []).append(str(arm))
     return [
-        f"Scenes of {listed(list(dict.fromkeys(arms)))} differ in more than the scene: {text}."
+        Note.of("scenes differ", arms=list(dict.fromkeys(arms)), differences=text)
         for text, arms in arms_by_text.items()
     ]
 
@@ -341,15 +342,14 @@ def compared_trials(trials: Iterable[TrialResult], first: Arm, second: Arm) -> l
     return [representatives(group, first, second) for group in shared] or alone
 
 
-def ingredients_sentence(names: Sequence[str], first: Arm, second: Arm) -> str:
+def ingredients_note(names: Sequence[str], first: Arm, second: Arm) -> Note:
     """``sfm-longaxis differs from sfm-adc by split, gradient and threshold.``"""
     if not names:
-        return f"{second} and {first} differ in no recorded setting."
-    shown = [
-        *names[:MAX_NAMED],
-        *([f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []),
-    ]
-    return f"{second} differs from {first} by {listed(shown)}{'' if is_mixed(names) else ' alone'}."
+        return Note.of("no ingredient", arm=second, baseline=first)
+    more = [f"{len(names) - MAX_NAMED} more"] if len(names) > MAX_NAMED else []
+    alone = "" if is_mixed(names) else " alone"
+    shown = [*names[:MAX_NAMED], *more]
+    return Note.of("ingredients", arm=second, baseline=first, ingredients=shown, alone=alone)
 
 
 def is_mixed(names: Sequence[str]) -> bool:

@@ -15,9 +15,10 @@ from gsbench.analysis.differences import (
     compared_trials,
     differing_keys,
     ingredients_between,
-    ingredients_sentence,
+    ingredients_note,
     is_mixed,
 )
+from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
@@ -26,7 +27,7 @@ from gsbench.analysis.trial_settings import canonical
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
-from gsbench.words import counted, listed
+from gsbench.words import counted
 
 LONGEST = 60  # the most characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
@@ -35,10 +36,6 @@ DIFFERS = "differs"  # heading of the column that marks differing rows
 # relative difference up to which counts are equal; densify.cap=governor holds counts closer
 EQUAL_COUNTS = 0.02
 MAX_VALUES = 8  # the most points of a search that are shown
-NOTHING = (
-    "No tuning is recorded: each arm ran with one choice of settings. What was tried "
-    "elsewhere is not known."
-)
 VIEWS = "validation views"  # every search judges its points on them
 
 
@@ -47,33 +44,31 @@ def caveats(
     first: Arm,
     second: Arm,
     advise: Advice = equal_counts_command,
-) -> str:
-    """Sentences on unequal counts, several differing ingredients and unequal tuning, or "".
+) -> list[Note]:
+    """Notes on unequal counts, several differing ingredients and unequal tuning.
 
     ``advise`` says how to compare at equal counts.
     """
     names = ingredients_between(trials, first, second)
-    mixed = ingredients_sentence(names, first, second) if is_mixed(names) else ""
-    counts = counts_sentence(trials, first, second, advise)
-    return " ".join(filter(None, [counts, mixed, tuning_sentence(trials, (first, second))]))
+    mixed = ingredients_note(names, first, second) if is_mixed(names) else None
+    counts = counts_note(trials, first, second, advise)
+    return [note for note in (counts, mixed, tuning_note(trials, (first, second))) if note]
 
 
-def counts_sentence(
+def counts_note(
     trials: Sequence[TrialResult],
     first: Arm,
     second: Arm,
     advise: Advice = equal_counts_command,
-) -> str:
-    """Say how many more Gaussians the second arm has over common scenes; "" if counts are equal."""
+) -> Note | None:
+    """A note on how many more Gaussians the second arm has over common scenes, if it has."""
     baseline, other = ([trial for trial in trials if trial.arm == arm] for arm in (first, second))
     change = relative_change(baseline, other, COSTS["gaussians"][1])
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
-        return ""
+        return None
     more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
-    return (
-        f"{second} has {more} Gaussians than {first}, so this does not compare at equal counts. "
-        f"To do so: {advise(baseline, other)}."
-    )
+    how = advise(baseline, other)
+    return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
 
 
 def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
@@ -95,13 +90,13 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     for index, key in enumerate(dict.fromkeys(keys)):
         shown = [_shown_in(side, key) for side in sides]
         rows.append(_row(key, shown, rule_above=index == 0))
-    notes = [ingredients_sentence(ingredients_between(trials, first, second), first, second)]
+    notes = [ingredients_note(ingredients_between(trials, first, second), first, second)]
     notes += between_scenes_notes(*groups)
-    notes += [f"Compared: {counted(len(pairs), 'pair')} of trials of one scene and seed."]
-    notes += [f"Tuning. {line}" for line in tuning_lines(trials, (first, second))]
+    notes += [Note.of("compared", pairs=len(pairs))]
+    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second))]
     columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), DIFFERS))
     title = f"Fairness sheet: {second} against {first}"
-    return Table(title, ("what",), columns, tuple(rows), tuple(notes), wrapped=True)
+    return Table(title, ("what",), columns, tuple(rows), (*map(str, notes), *tuning), wrapped=True)
 
 
 def _row(what: str, values: Sequence[str], rule_above: bool = False) -> Row:
@@ -203,32 +198,32 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
 }
 
 
-def tuning_lines(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[str]:
+def tuning_notes(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[Note]:
     """List, for each arm of a pair, its searches, and the settings that these trials vary.
 
     These trials are measured on the test views, so varying settings among them is tuning on the
     verdict's own views.
     """
-    lines = [sentence] if (sentence := tuning_sentence(trials, pair)) else []
+    unlike = tuning_note(trials, pair)
+    notes = [unlike] if unlike else []
     for arm in pair:
         own = [trial for trial in trials if trial.arm == arm]
-        lines += [_search_line(own, name, record) for name, record in _searches(own[0]).items()]
-        lines += _varied_settings(trials, own[0])
-    return lines or [NOTHING]
+        notes += [_search_note(own, name, record) for name, record in _searches(own[0]).items()]
+        notes += _varied_settings(trials, own[0])
+    return notes or [Note.of("no tuning")]
 
 
-def tuning_sentence(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> str:
-    """Say that a pair's arms were not tuned alike; "" if both had the same tuning budget.
+def tuning_note(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> Note | None:
+    """Say that a pair's arms were not tuned alike; None if both had the same tuning budget.
 
-    For example ``They were not tuned alike: sfm-adc none and sfm-volumetric 6 points of 1 seed
-    …``. A search counts if its best point has exactly the arm's settings. Settings that were
-    all run as arms are no search, since each has its own verdict.
+    A search counts if its best point has exactly the arm's settings. Settings that were all run as
+    arms are no search, since each has its own verdict.
     """
     budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
     if len(set(budgets)) < 2:
-        return ""
-    each = listed([f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)])
-    return f"They were not tuned alike: {each}."
+        return None
+    each = [f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)]
+    return Note.of("unlike tuning", arms=each)
 
 
 def _tuning_budget(trial: TrialResult) -> str:
@@ -262,25 +257,31 @@ def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
     return searches
 
 
-def _search_line(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> str:
+def _search_note(own: Sequence[TrialResult], experiment: str, search: TuningRecord) -> Note:
     """Say what a search tried and chose, and whether its arm's trials ``own`` came later."""
     best = search.best
     if best is None:
-        return f"{search.arm}: the search {experiment} found nothing."
-    chosen = listed([f"{key.lstrip('+~')}={value}" for key, value in sorted(best.settings.items())])
+        return Note.of("vain search", arm=search.arm, experiment=experiment)
+    chosen = [f"{key.lstrip('+~')}={value}" for key, value in sorted(best.settings.items())]
     tried = [
         f"{', '.join(map(str, point.settings.values()))} "
         f"({'failed' if point.value is None else f'{point.value:.4g}'})"
         for point in search.points[:MAX_VALUES]
     ]
-    more = len(search.points) - MAX_VALUES
-    line = (
-        f"{search.arm}: {chosen} is the best of {counted(len(search.points), 'point')} by "
-        f"{search.metric} of {VIEWS} ({listed(search.scenes)}; seed "
-        f"{', '.join(map(str, search.seeds))}; the search {experiment}), {_when(own, experiment)}. "
-        f"Tried: {', '.join(tried)}{f' and {more} more' if more > 0 else ''}."
+    return Note.of(
+        "search",
+        arm=search.arm,
+        chosen=chosen,
+        points=len(search.points),
+        metric=search.metric,
+        scenes=search.scenes,
+        seeds=search.seeds,
+        experiment=experiment,
+        when=_when(own, experiment),
+        tried=tried,
+        more=max(0, len(search.points) - MAX_VALUES),
+        others="" if _has_settings(own[0], best) else " These trials have other values.",
     )
-    return line if _has_settings(own[0], best) else f"{line} These trials have other values."
 
 
 def _when(own: Sequence[TrialResult], experiment: str) -> str:
@@ -298,7 +299,7 @@ def _when(own: Sequence[TrialResult], experiment: str) -> str:
     )
 
 
-def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[str]:
+def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[Note]:
     """Name the settings that vary among arms with one initialiser and densifier class."""
     target = own.config.get("densify._target_")
     same_class = [
@@ -310,10 +311,7 @@ def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[st
     keys = sorted({key for other in choices for key in differing_keys(own.config, other.config)})
     if len(choices) < 2 or not keys:
         return []
-    return [
-        f"{own.arm}: {counted(len(choices), 'choice')} of its settings were run here. They differ "
-        f"in {listed(keys)}, and all were measured on the test views that the verdict uses."
-    ]
+    return [Note.of("varied", arm=own.arm, choices=len(choices), settings=keys)]
 
 
 def _has_settings(trial: TrialResult, point: SearchPoint | None) -> bool:

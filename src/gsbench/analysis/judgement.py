@@ -13,6 +13,7 @@ import numpy as np
 
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.looks import look_levels
+from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import TrialResult, group_by
@@ -30,7 +31,7 @@ from gsbench.analysis.statistics import (
 )
 from gsbench.analysis.unfinished import Unfinished, one_sided
 from gsbench.runs.experiments import Declaration, Question
-from gsbench.words import counted, signed
+from gsbench.words import signed
 
 # deviations from the other trials of its scene and arm, beyond which a trial is outlying
 OUTLYING = 5.0
@@ -62,11 +63,11 @@ class Verdict:
     is False while further planned seeds may decide. ``outlying`` trials lie far outside the others
     of their scene and arm; ``outcome_without`` is the outcome without them. If the mean of the
     other trials contradicts the outcome, the verdict ``rests_on_outlying`` trials and is undecided.
+    ``seen`` are the arm's trials that were measured before the question. If there are any, each
+    metric could have been chosen by its result, and the error rate is divided by the number of
+    metrics.
     ``lacking`` are trials of one arm without a result where the other arm has one; if the outcome
     favoured that arm, the verdict ``favours_lacking`` and is undecided.
-    ``late`` is the number of the arm's trials that were measured before the question. If there are
-    any, each metric could have been chosen by its result, and the error rate is divided by the
-    number of metrics.
     """
 
     question: Question
@@ -78,14 +79,14 @@ class Verdict:
     scenes: tuple[SceneVerdict, ...] = ()
     family: int = 1
     final: bool = True
-    untestable: str = ""
+    untestable: Note | None = None
     outlying: tuple[TrialResult, ...] = ()
     outcome_without: Outcome | None = None
     rests_on_outlying: bool = False
     lacking: tuple[Unfinished, ...] = ()
     favours_lacking: bool = False
-    late: int = 0
-    notes: tuple[str, ...] = ()
+    seen: tuple[TrialResult, ...] = ()
+    notes: tuple[Note, ...] = ()
 
     @property
     def least(self) -> float | None:
@@ -98,7 +99,9 @@ class Verdict:
 
     @property
     def mean(self) -> float | None:
-        return None if self.answer is None else self.answer.mean
+        if self.answer is None:
+            return 0.0 if self.equal else None
+        return self.answer.mean
 
     @property
     def interval(self) -> Interval | None:
@@ -130,6 +133,27 @@ class Verdict:
         # Before the first look, the rows of a sweep in looks have no pairs yet.
         differences = self.pairs.differences
         return differences.size > 0 and not differences.any()
+
+    @property
+    def loss_excluded(self) -> bool:
+        """Return whether the interval excludes a loss of the least difference that matters.
+
+        A verdict that rests on outlying trials shows nothing.
+        """
+        if self.interval is None or self.least is None or self.rests_on_outlying:
+            return False
+        sign = self.question.sign
+        return min(sign * self.interval.low, sign * self.interval.high) > -self.least
+
+    def gain_excluded(self, error_rate: float) -> bool:
+        """Return whether a gain of the least difference that matters is excluded.
+
+        ``error_rate`` is the chance that such a gain is excluded although it is there.
+        """
+        if self.answer is None or self.answer.test is None or self.least is None:
+            return False
+        sign, interval = self.question.sign, self.answer.test.interval(2 * error_rate)
+        return max(sign * interval.low, sign * interval.high) < self.least
 
     def shown(self, value: float) -> str:
         """A difference as text: ``−0.0123``, or ``+28.4 %`` if the question is relative."""
@@ -197,13 +221,13 @@ def _with_pairs(
     """The question with its pairs of trials, not judged yet."""
     pairs = pair(trials, question)
     # the baseline's trials alone show no difference, so they may be older
-    late = sum(trial.measured < declaration.moment for trial in pairs.trials[1::2])
+    seen = tuple(trial for trial in pairs.of_arm if trial.measured < declaration.moment)
     quantity = asked_quantity(question.metric, trials)
     notes = pairs.left_out
     if question.scenes:  # other questions are below tables, which say it themselves
-        notes += tuple(between_scenes_notes(pairs.trials[::2], pairs.trials[1::2]))
+        notes += tuple(between_scenes_notes(pairs.of_baseline, pairs.of_arm))
     verdict = Verdict(
-        question, quantity, pairs, notes=notes, late=late, final=not declaration.looks
+        question, quantity, pairs, notes=notes, seen=seen, final=not declaration.looks
     )
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
@@ -215,12 +239,7 @@ def _with_pairs(
         and all(are_equal(*both) for row in pairs.rows for both in row.trials)
     ):
         count = sum(len(row.trials) for row in pairs.rows)
-        reason = (
-            f"both arms of {counted(count, 'pair')} of trials are equal to the last bit: the "
-            "settings that differ had "
-            "no effect at this size"
-        )
-        return replace(verdict, untestable=reason, final=True)
+        return replace(verdict, untestable=Note.of("equal", pairs=count), final=True)
     return verdict
 
 
@@ -229,7 +248,7 @@ def _candidate_metrics(verdict: Verdict) -> int:
 
     It is 1 if the question was asked beforehand.
     """
-    if not verdict.late:
+    if not verdict.seen:
         return 1
     return len(
         {name for trial in verdict.pairs.trials for name in trial.metrics}

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from gsbench.analysis.cells import check_averageable
 from gsbench.analysis.differences import differing_conditions
+from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import asked_quantity, value_of
 from gsbench.analysis.results import TrialPair, TrialResult, group_by
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Question
-from gsbench.words import counted, some_of
 
 BASELINE = "adc"
 CONTROLS = "eval.controls."
@@ -59,11 +59,11 @@ class ScenePairs:
 class Pairs:
     """The pairs of trials of a question by scene.
 
-    ``left_out`` has a line on each thing that could not be paired.
+    ``left_out`` has a note on each thing that could not be paired.
     """
 
     rows: tuple[ScenePairs, ...]
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[Note, ...] = ()
     relative: bool = False  # compare logarithms
 
     @property
@@ -93,11 +93,24 @@ class Pairs:
         return float(np.mean([row.baseline[: self.seeds].mean() for row in self.rows]))
 
     @property
+    def counting(self) -> tuple[TrialPair, ...]:
+        """The pairs that count, scene by scene."""
+        return tuple(pair for row in self.rows for pair in row.trials[: self.seeds])
+
+    @property
+    def of_baseline(self) -> tuple[TrialResult, ...]:
+        """The baseline's trials that count."""
+        return tuple(baseline for baseline, _ in self.counting)
+
+    @property
+    def of_arm(self) -> tuple[TrialResult, ...]:
+        """The arm's trials that count, each in the place of its partner in `of_baseline`."""
+        return tuple(arm for _, arm in self.counting)
+
+    @property
     def trials(self) -> tuple[TrialResult, ...]:
         """The trials that count, pair by pair."""
-        return tuple(
-            trial for row in self.rows for pair in row.trials[: self.seeds] for trial in pair
-        )
+        return tuple(trial for pair in self.counting for trial in pair)
 
     def first(self, seeds: int) -> Pairs:
         """The pairs of the first ``seeds`` seeds of every scene."""
@@ -117,6 +130,14 @@ class Pairs:
         return replace(self, rows=tuple(row for row in rows if row.seeds))
 
 
+class _UnlikeError(InputError):
+    """Trials of two arms cannot be compared; ``note`` says why."""
+
+    def __init__(self, note: Note) -> None:
+        super().__init__(str(note))
+        self.note = note
+
+
 def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
     """Pair the trials of a question by scene and seed.
 
@@ -126,12 +147,15 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
     those after the first missing seed do not count: a seed that comes late cannot change what
     an earlier look saw.
     """
-    rows, left_out = [], list[str]()
+    rows, left_out = [], list[Note]()
     for scene, sides in _sides(trials, question).items():
         try:
             row, faults = _pair_scene(scene, *sides, question)
+        except _UnlikeError as error:
+            left_out.append(error.note)
+            continue
         except InputError as error:
-            left_out.append(str(error))
+            left_out.append(Note.of("unlike", text=str(error)))
             continue
         left_out += faults
         rows += [row] if row.seeds else []
@@ -139,11 +163,8 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
         len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)
     }:
         least = min(len(row.seeds) for row in rows)
-        few = some_of([row.scene for row in rows if len(row.seeds) == least])
-        left_out.append(
-            f"{counted(least, 'seed')} of each scene count, since {few} has no more (others up to "
-            f"{max(uneven)})"
-        )
+        few = [row.scene for row in rows if len(row.seeds) == least]
+        left_out.append(Note.of("uneven", least=least, scenes=few, most=max(uneven)))
     return Pairs(tuple(rows), tuple(left_out), question.relative)
 
 
@@ -178,8 +199,8 @@ def pair_trials(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> list[
 
 def _match_seeds(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
-) -> tuple[dict[int, TrialPair], list[str]]:
-    """The pairs of one scene by seed, in the planned order, and a line for each unpaired seed.
+) -> tuple[dict[int, TrialPair], list[Note]]:
+    """The pairs of one scene by seed, in the planned order, and a note for each unpaired seed.
 
     Raises InputError if trials of one arm cannot be averaged, or if the arms' conditions
     differ.
@@ -198,17 +219,15 @@ def _match_seeds(
         if question.scenes:
             differing.pop("budget", None)
         if differing:
-            raise InputError(
-                f"{scene}: the arms differ in {', '.join(differing)}, so they are not compared"
-            )
+            raise _UnlikeError(Note.of("conditions", scene=scene, conditions=list(differing)))
     unpaired = () if question.seeds else tuple(seed for seed in wanted if seed not in pairs)
-    return pairs, [f"{scene}: seed {seed} has no partner" for seed in unpaired]
+    return pairs, [Note.of("unpaired", scene=scene, seed=seed) for seed in unpaired]
 
 
 def _pair_scene(
     scene: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], question: Question
-) -> tuple[ScenePairs, list[str]]:
-    """The pairs of one scene that have values, and a line on each thing that was not paired."""
+) -> tuple[ScenePairs, list[Note]]:
+    """The pairs of one scene that have values, and a note on each thing that was not paired."""
     pairs, faults = _match_seeds(scene, baseline, arm, question)
     values: dict[int, tuple[float, float]] = {}
     reasons: dict[str, list[str]] = {}
@@ -217,7 +236,7 @@ def _pair_scene(
             values[seed] = _values(question, *trials)
         except InputError as error:
             reasons.setdefault(str(error), []).append(f"{scene} seed {seed}")
-    faults += [f"{some_of(seeds)}: {reason}" for reason, seeds in reasons.items()]
+    faults += [Note.of("valueless", places=own, reason=why) for why, own in reasons.items()]
     counted_seeds = (
         list(takewhile(values.__contains__, question.seeds)) if question.seeds else list(values)
     )
@@ -305,21 +324,21 @@ def _unlike(arm: Arm, other: Arm, settings: Mapping[Arm, Mapping[str, Any]]) -> 
     return sum(key in one and key in two and one[key] != two[key] for key in swept)
 
 
-def uncompared(arms: Sequence[Arm], pairs: Sequence[tuple[Arm, Arm]], baseline: str) -> list[str]:
-    """A line with the reason for each of ``arms`` that is in none of ``pairs``."""
+def uncompared(arms: Sequence[Arm], pairs: Sequence[tuple[Arm, Arm]], baseline: str) -> list[Note]:
+    """A note with the reason for each of ``arms`` that is in none of ``pairs``."""
     compared = set(itertools.chain(*pairs))
-    lines = []
+    notes = []
     for arm in arms:
         if arm in compared or len(arms) == 1:
             continue
-        if arm.densify == baseline:
-            reason = "it has the baseline's densifier, and no other arm has its initialiser"
-            if any(one.init == arm.init and one.densify != baseline for one in arms):
-                reason = "other arms have a baseline with settings nearer to theirs"
+        if arm.densify != baseline:
+            partner = replace(arm, densify=baseline, variant=())
+            notes.append(Note.of("no partner", arm=arm, partner=partner))
+        elif any(one.init == arm.init and one.densify != baseline for one in arms):
+            notes.append(Note.of("far baseline", arm=arm))
         else:
-            reason = f"there is no {replace(arm, densify=baseline, variant=())}"
-        lines.append(f"{arm} is not compared: {reason}.")
-    return lines
+            notes.append(Note.of("lone baseline", arm=arm))
+    return notes
 
 
 def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:

@@ -24,12 +24,13 @@ from gsbench.analysis.differences import (
     differing_code,
     differing_conditions,
 )
+from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.table_notes import LEARNT_NOTHING, trials_notes
 from gsbench.eval.facts import find_metric
-from gsbench.words import counted, some_of
+from gsbench.words import counted
 
 DEFAULT_ROWS = ("scene", "init", "densify")
 SIDE_BY_SIDE = ("scene.split", "scene.sector")
@@ -88,7 +89,7 @@ def build_table(
     shown = _rows(cells, bold, quantities)
     varied = with_variants(trials)
     if "scene" in rows and len(scenes) > 1 and _have_unlike_scenes(varied):
-        notes.append("No mean over the scenes is shown, since they differ in conditions or code.")
+        notes.append(Note.of("no mean"))
     elif "scene" in rows and len(scenes) > 1:
         place = list(rows).index("scene")
         means = _means(groups, place, row_labels, column_labels, quantities, scenes, expected)
@@ -104,9 +105,9 @@ def build_table(
     notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
     if left_out := experiment.warnings:
-        notes.append(f"Left out ({len(left_out)}): {some_of(left_out)}.")
+        notes.append(Note.of("unusable", count=len(left_out), folders=list(left_out)))
     heading = title or f"Experiment {experiment.name}"
-    return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(notes))
+    return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(map(str, notes)))
 
 
 def format_cell(cell: Cell, quantity: Quantity) -> str:
@@ -149,7 +150,7 @@ def _rows(
 
 def _best(
     cells: Mapping[Position, Cell], quantities: Sequence[Quantity], scene_index: int | None
-) -> tuple[set[Position], list[str]]:
+) -> tuple[set[Position], list[Note]]:
     """The best cells of each scene, and a note for each scene whose cells cannot be compared.
 
     ``scene_index`` is the index of the scene in the labels of row and column; None if all cells are
@@ -161,7 +162,7 @@ def _best(
         return scene, next((trial.split for trial in cells[position].trials), "")
 
     bold: set[Position] = set()
-    notes: list[str] = []
+    notes: list[Note] = []
     for quantity in quantities:
         rivals = group_by(
             (position for position in cells if position[2] == quantity.key), scene_and_split
@@ -172,10 +173,7 @@ def _best(
             by_scene = group_by(shown, lambda trial: trial.scene).values()
             differing = sorted(set().union(*map(differing_conditions, by_scene)))
             if differing:
-                place = scene or "arms"
-                notes.append(
-                    f"{place}: not compared, no best marked: {', '.join(differing)} differ."
-                )
+                notes.append(Note.of("no best", place=scene or "arms", conditions=differing))
             else:
                 bold |= best_cells(compared, quantity)
     return bold, list(dict.fromkeys(notes))
@@ -237,23 +235,21 @@ def _have_unlike_scenes(trials: Sequence[TrialResult]) -> bool:
 
 def _reading_notes(
     cells: Mapping[Position, Cell], quantities: Sequence[Quantity], expected: int, by_scene: bool
-) -> list[str]:
+) -> list[Note]:
     """Notes on how to read the table's numbers and marks."""
     spread = "trials" if by_scene else "the trials' means of scenes"
-    if expected == 1:
-        notes = ["One trial per cell, so there is no deviation."]
-    else:
-        notes = [f"Mean over {expected} trials; ± is the deviation (n − 1) over {spread}."]
-    notes.append("Bold: best mean of a scene after rounding; this is not a test.")
+    one_each = expected == 1
+    notes = [Note.of("one trial") if one_each else Note.of("mean", trials=expected, spread=spread)]
+    notes.append(Note.of("bold"))
     if any(0 < cell.count < expected or not cell.trials for cell in cells.values()):
-        notes.append(f"(k/{expected}): only k of {expected} trials have a value; —: none.")
+        notes.append(Note.of("few values", trials=expected))
     trials = itertools.chain(*(cell.trials for cell in cells.values()))
-    protocols = {trial.record.protocol for trial in trials}
-    notes.append(f"Protocol {', '.join(sorted(protocols))}.")
-    for quantity in quantities:
-        shown = [cell for position, cell in cells.items() if position[2] == quantity.key]
-        reasons = {cell.reason for cell in shown if cell.trials and cell.reason}
-        notes += [f"{quantity.name}: n/a, {reason}." for reason in sorted(reasons)]
+    notes.append(Note.of("protocol", protocols=sorted({t.record.protocol for t in trials})))
+    for one in quantities:
+        own = [cell for position, cell in cells.items() if position[2] == one.key]
+        reasons = {cell.reason for cell in own if cell.trials and cell.reason}
+        missing = [Note.of("not available", reason=reason) for reason in sorted(reasons)]
+        notes += [replace(note, about=one.name) for note in missing]
     return notes
 
 
@@ -291,9 +287,5 @@ def with_agreement(tables: Sequence[Table]) -> list[Table]:
     ]
     if not found:
         return list(tables)
-    note = (
-        "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
-        "3DGS models was "
-        f"{', '.join(found)} in one study (arXiv 2511.06830, table 3). gsbench vote asks people."
-    )
+    note = str(Note.of("agreement", metrics=found))
     return [replace(tables[0], notes=(*tables[0].notes, note)), *tables[1:]]

@@ -10,7 +10,8 @@ from gsbench.analysis.quantities import Quantity, choose_quantities
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.statistics import EXACT_FOR_PEOPLE, UNDECIDED, LikeThese
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
-from gsbench.analysis.verdicts import WORDS, PairVerdicts, p_text
+from gsbench.analysis.verdict_words import WORDS, p_text
+from gsbench.analysis.verdicts import PairVerdicts
 from gsbench.analysis.votes import PairVotes, RoundVerdict, judge_round, view_gains
 from gsbench.errors import InputError
 from gsbench.eval.facts import LPIPS

@@ -9,10 +9,17 @@ import copy
 import itertools
 import logging
 import os
+import shlex
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr
+from contextlib import (
+    AbstractContextManager,
+    contextmanager,
+    nullcontext,
+    redirect_stderr,
+    suppress,
+)
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +33,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from gsbench.analysis.results import group_by
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.sweep import (
     DEFAULT_METRIC,
@@ -54,6 +62,7 @@ from gsbench.runs.experiments import metric_and_question
 from gsbench.runs.nested import targets_in
 from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
+from gsbench.words import counted
 
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
@@ -322,7 +331,43 @@ def other_sweep(sweep: Sweep, run: Callable[[Sequence[Trial]], list[Outcome]]) -
             config.name,
             config.name,
         )
+    elif name != GRID_SWEEPER and (best := best_line(task.ended.trials, objective)):
+        log.info("hydra/sweeper=%s: %s", name, best)
     return task.ended
+
+
+def best_line(trials: Sequence[Trial], objective: Objective) -> str:
+    """The best values that a sweeper proposed, with the command that repeats them.
+
+    It is "" if no job has all of its values.
+    """
+    by_job = group_by(trials, lambda trial: _job_words(trial, without="seed"))
+    values: dict[tuple[str, ...], float] = {}
+    for words, own in by_job.items():
+        with suppress(GsbenchError):  # a job that failed has no value
+            values[words] = objective.value(own)
+    if not values:
+        return ""
+    best = max(values, key=lambda words: objective.sign * values[words])
+    metric, direction = metric_of(trials[0].values)
+    swept = [word for word in best if not all(word in words for words in by_job)]
+    seeds = dict.fromkeys(str(trial.values["seed"]) for trial in by_job[best])
+    command = [*best, f"seed={','.join(seeds)}"]
+    return (
+        f"best: {' '.join(swept) or 'the only job'}, {metric} "
+        f"{values[best] * direction * objective.sign:.4g} of test views "
+        f"({counted(len(seeds), 'seed')}); again: gsbench "
+        f"{'-m ' * (len(seeds) > 1)}{shlex.join(command)}"
+    )
+
+
+def _job_words(trial: Trial, without: str) -> tuple[str, ...]:
+    """The words of a trial's job without Hydra's own and without one key."""
+    return tuple(
+        word
+        for word in trial.overrides
+        if key_of(word) != without and not parse_word(word).is_hydra_override()
+    )
 
 
 def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:

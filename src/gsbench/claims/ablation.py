@@ -13,7 +13,7 @@ from typing import Any
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult
-from gsbench.analysis.verdicts import WORDS
+from gsbench.analysis.verdict_words import reason
 from gsbench.errors import InputError
 from gsbench.runs.experiments import NO_TIME, Arm, Declaration, Question
 from gsbench.settings import Switch, check_values
@@ -66,8 +66,8 @@ def choose_switches(
     if not declared:
         raise InputError(
             f"densify={densify} declares no switch that is on: name one by "
-            "+densify.switches.NAME.off.KEY=VALUE, where "
-            "the setting turns a part off (docs/claims.md)"
+            "+densify.switches.NAME.off.KEY=VALUE, where the setting turns a part off "
+            "(docs/claims.md)"
         )
     chosen = {name: declared[name] for name in names or declared}
     if len(chosen) > MAX_SWITCHES:
@@ -152,9 +152,7 @@ def markdown_table(verdicts: Sequence[Verdict]) -> list[str]:
         "|---|---|---|---|",
     ]
     for one in verdicts:
-        mean = "unknown" if one.mean is None else one.shown(one.mean)
-        interval = "unknown" if one.interval is None else one.shown_interval(one.interval)
-        lines.append(
-            f"| {one.question.arm} | {mean} | {interval} | {one.untestable or WORDS[one.outcome]} |"
-        )
+        mean = "–" if one.mean is None else one.shown(one.mean)
+        interval = "–" if one.interval is None else one.shown_interval(one.interval)
+        lines.append(f"| {one.question.arm} | {mean} | {interval} | {reason(one)} |")
     return lines

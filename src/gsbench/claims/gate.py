@@ -7,21 +7,22 @@ to matter, or if it is shown not to be worse by the least difference that matter
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from gsbench.analysis.designs import POWER, Design, power_of_mean
-from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.looks import FIRST_LOOK, look_levels, plan_looks
 from gsbench.analysis.quantities import COSTS, NO_DIRECTION
 from gsbench.analysis.results import Arm, TrialResult
-from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
+from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL, UNDECIDED
+from gsbench.analysis.verdict_words import in_words, least_words, with_notes
 from gsbench.claims.file import LeastEffect, read_least
-from gsbench.claims.stopping import facts_for
+from gsbench.claims.stopping import Asked, facts_for
 from gsbench.errors import InputError
 from gsbench.eval.facts import known_keys
 from gsbench.runs.experiments import ERROR_RATE, Declaration, Question, declared_now, trial_key
-from gsbench.words import counted, did_you_mean, least_text, listed
+from gsbench.words import counted, did_you_mean, listed
 
 # replace the configuration hash in trials' keys, since versions may share settings
 BASELINE, NEW, LAST = "baseline", "new", "last"
@@ -30,28 +31,22 @@ PASSED, WORSE, NOT_DECIDED = "passed", "worse", "undecided"
 ReadTrials = Callable[[], Iterable[TrialResult]]
 
 
-@dataclass(frozen=True)
-class Gate:
-    """A declared question about two versions.
+def ask_gate(declaration: Declaration, baseline: ReadTrials, new: ReadTrials) -> Asked:
+    """The question of a gate, with functions that read each version's finished trials.
 
-    ``baseline`` and ``new`` are functions that read each version's finished trials.
+    It ends also as soon as the new version is shown not to be worse: a gate asks no more.
     """
+    read = _versions({BASELINE: baseline, NEW: new})
+    return Asked(declaration, read, lambda verdicts: result_of(verdicts[0]) != NOT_DECIDED)
 
-    declaration: Declaration
-    baseline: ReadTrials
-    new: ReadTrials
 
-    def judged(self) -> list[Verdict]:
-        """The verdict so far.
-
-        It is final also as soon as the new version is shown not to be worse: a gate asks no
-        more.
-        """
-        trials = [*_as_version(BASELINE, self.baseline()), *_as_version(NEW, self.new())]
-        return [
-            replace(one, final=one.final or result_of(one) == PASSED)
-            for one in judge(trials, self.declaration)
-        ]
+def _versions(sides: Mapping[str, ReadTrials]) -> ReadTrials:
+    """A function that reads the trials of all versions, with the versions in their keys."""
+    return lambda: [
+        one if one.config_hash == version else replace(one, config_hash=version)
+        for version, read in sides.items()
+        for one in read()
+    ]
 
 
 def declare_gate(
@@ -124,46 +119,25 @@ def asked_difference(
 
 def result_of(verdict: Verdict) -> str:
     """``passed``, ``worse``, or ``undecided``; the result may change until the verdict is final."""
-    if verdict.untestable:  # all pairs are equal, or none can be compared
-        return PASSED if verdict.equal else NOT_DECIDED
-    if verdict.outcome in (SUPPORTED, TOO_SMALL):
+    if verdict.equal or _not_worse(verdict):
         return PASSED
-    if verdict.outcome == REFUTED:
-        return WORSE
-    return PASSED if _not_worse(verdict) else NOT_DECIDED
+    results = {SUPPORTED: PASSED, TOO_SMALL: PASSED, REFUTED: WORSE}
+    return results.get(verdict.outcome, NOT_DECIDED)
+
+
+def _not_worse(verdict: Verdict) -> str:
+    """The reason why an undecided version passes; "" if it does not."""
+    passes = verdict.outcome == UNDECIDED and verdict.loss_excluded
+    return f"not worse by {least_words(verdict)}" if passes else ""
 
 
 def describe(verdict: Verdict) -> str:
     """The result in a sentence.
 
-    For example ``worse in PSNR (dB): −1.20 (95 % interval over all looks −1.50 to −0.90); …``.
+    For example ``worse: worse in PSNR (dB) on this scene: −1.20 (interval −1.50 to −0.90), …``.
     """
-    answer, question = verdict.answer, verdict.question
-    if verdict.untestable:
-        same = (
-            f"equal to the last bit in all {counted(len(verdict.pairs.trials) // 2, 'pair')} "
-            "of trials"
-        )
-        return f"{PASSED}: {same}" if verdict.equal else f"not testable: {verdict.untestable}"
-    if answer is None or answer.interval is None:
-        return f"{NOT_DECIDED}: {'; '.join(('trials are missing', *verdict.notes))}"
-    least = least_text(question.least or 0.0, question.relative)
-    words = {
-        SUPPORTED: f"{PASSED}, better",
-        TOO_SMALL: f"{PASSED}, any difference is below {least}",
-        REFUTED: WORSE,
-    }
-    word = words.get(
-        verdict.outcome, f"{PASSED}, not worse by {least}" if _not_worse(verdict) else NOT_DECIDED
-    )
-    return (
-        f"{word} in {verdict.quantity.name}: {verdict.shown(answer.mean)} "
-        f"({100 * (1 - answer.level):.3g} % interval "
-        f"over all looks {verdict.shown_interval(answer.interval)}) on "
-        f"{counted(len(verdict.pairs.rows), 'scene')}, "
-        f"with {verdict.pairs.seeds} of at most {counted(len(question.seeds), 'seed')}"
-        + "".join(f"; {note}" for note in verdict.notes)
-    )
+    sentence = in_words(verdict, _not_worse(verdict))
+    return with_notes(f"{result_of(verdict)}: {sentence}", verdict)
 
 
 def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> list[str]:
@@ -172,10 +146,9 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
     kinds = [sorted({trial.machine or "not recorded" for trial in own}) for own in (baseline, new)]
     if kinds[0] != kinds[1]:
         lines.append(
-            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than "
-            "the new trials "
-            f"({listed(kinds[1])}); this alone changes last digits and, after long training, "
-            "results"
+            f"deviation: the baseline ran on another kind of machine ({listed(kinds[0])}) than the "
+            f"new trials ({listed(kinds[1])}); this alone changes last digits and, after long "
+            "training, results"
         )
     libraries = {name for trial in (*baseline, *new) for name in trial.record.versions} - {
         "gsbench"
@@ -188,27 +161,9 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
         if versions[0] != versions[1]:
             lines.append(
                 f"deviation: the baseline was made with {name} {listed(versions[0])}, the new "
-                "trials with "
-                f"{listed(versions[1])}"
+                f"trials with {listed(versions[1])}"
             )
     return lines
-
-
-def _not_worse(verdict: Verdict) -> bool:
-    """Return whether the interval excludes a loss that matters.
-
-    A verdict that rests on outlying trials shows nothing.
-    """
-    if verdict.interval is None or verdict.least is None or verdict.rests_on_outlying:
-        return False
-    sign = verdict.question.sign
-    return min(sign * verdict.interval.low, sign * verdict.interval.high) > -verdict.least
-
-
-def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult]:
-    return [
-        one if one.config_hash == version else replace(one, config_hash=version) for one in trials
-    ]
 
 
 # ---- bisection: the search for the commit that made a trainer worse
@@ -219,39 +174,24 @@ def _as_version(version: str, trials: Iterable[TrialResult]) -> list[TrialResult
 # answered wrongly, and only on one side.
 
 
-@dataclass(frozen=True)
-class Step:
-    """A commit between a first one and a worse last one.
+def ask_step(
+    gate: Declaration, share: float, good: ReadTrials, last: ReadTrials, new: ReadTrials
+) -> Asked:
+    """The questions about a commit against a first one and a worse last one.
 
     ``gate`` is the declaration of the last commit; ``share`` is the chance that a step is wrong.
+    Both questions end as soon as the step has a result.
     """
-
-    gate: Declaration
-    share: float
-    good: ReadTrials
-    last: ReadTrials
-    new: ReadTrials
-
-    @property
-    def declaration(self) -> Declaration:
-        """The questions against the first and the last commit."""
-        (question,) = self.gate.questions
-        of_last = {
-            scene: (old.removesuffix(BASELINE) + LAST, new)
-            for scene, (old, new) in question.scenes.items()
-        }
-        against_last = replace(question, baseline=Arm("", LAST), scenes=of_last, name="last")
-        # The two share the error rate, and half of a share is that of one side.
-        questions = (question, against_last)
-        return replace(self.gate, questions=questions, error_rate=4 * self.share)
-
-    def judged(self) -> list[Verdict]:
-        """The two verdicts so far; both are final as soon as the step has a result."""
-        sides = {BASELINE: self.good, LAST: self.last, NEW: self.new}
-        trials = [trial for side, read in sides.items() for trial in _as_version(side, read())]
-        verdicts = judge(trials, self.declaration)
-        known = step_result(verdicts) != NOT_DECIDED
-        return [replace(one, final=one.final or known) for one in verdicts]
+    (question,) = gate.questions
+    of_last = {
+        scene: (old.removesuffix(BASELINE) + LAST, own)
+        for scene, (old, own) in question.scenes.items()
+    }
+    against_last = replace(question, baseline=Arm("", LAST), scenes=of_last, name="last")
+    # The two share the error rate, and half of a share is that of one side.
+    declaration = replace(gate, questions=(question, against_last), error_rate=4 * share)
+    read = _versions({BASELINE: good, LAST: last, NEW: new})
+    return Asked(declaration, read, lambda verdicts: step_result(verdicts) != NOT_DECIDED)
 
 
 def step_result(verdicts: Sequence[Verdict]) -> str:
@@ -266,11 +206,9 @@ def step_result(verdicts: Sequence[Verdict]) -> str:
 
 def describe_step(verdicts: Sequence[Verdict]) -> str:
     """The result with both verdicts in a sentence."""
-    parts = [
-        f"{end}: {_size(one)}"
-        for end, one in zip(("against the first", "against the last"), verdicts, strict=True)
-    ]
-    return f"{step_result(verdicts)}; {'; '.join(parts)}"
+    ends = zip(("first", "last"), verdicts, strict=True)
+    parts = [f"against the {end}: {with_notes(in_words(one), one)}" for end, one in ends]
+    return "; ".join([step_result(verdicts), *parts])
 
 
 def too_small_to_place(verdict: Verdict, share: float) -> str:
@@ -296,15 +234,6 @@ def _known_side(verdict: Verdict) -> int:
     if verdict.outcome != TOO_SMALL or interval is None or not interval.excludes_zero():
         return 0
     return sign if interval.low > 0 else -sign
-
-
-def _size(verdict: Verdict) -> str:
-    if verdict.equal:
-        return "equal to the last bit"
-    if verdict.mean is None or verdict.interval is None:
-        return "; ".join(("trials are missing", *verdict.notes))
-    interval = verdict.shown_interval(verdict.interval)
-    return f"{verdict.shown(verdict.mean)} ({interval}), {counted(verdict.pairs.seeds, 'seed')}"
 
 
 SPARE = 2  # undecided commits that the search skips before it ends with a range

@@ -9,14 +9,17 @@ the ideas that were kept before they began, as the same paper does. `scripts/led
 simulates it (docs/night.md).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from gsbench.analysis.comparison import unused_trials
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import plan_looks
+from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
+from gsbench.analysis.verdict_words import least_words, reason, with_notes
+from gsbench.claims.stopping import Asked
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.ledger import (
@@ -33,7 +36,7 @@ from gsbench.runs.ledger import (
     Opened,
     Result,
 )
-from gsbench.words import counted, least_text, listed
+from gsbench.words import counted, listed
 
 IDEAS, RATE = 40, 0.1  # the defaults of a ledger
 # The chance, at each look, that an idea as good as the least difference that matters is given up.
@@ -110,33 +113,31 @@ def _question(
     )
 
 
-def judge_idea(trials: Iterable[TrialResult], declaration: Declaration) -> Verdict:
-    """The verdict on an idea so far; it is final also as soon as the idea is given up."""
-    (verdict,) = judge(list(trials), declaration)
-    return replace(verdict, final=verdict.final or result_of(verdict) != UNDECIDED)
+def ask_idea(declaration: Declaration, read: Callable[[], Iterable[TrialResult]]) -> Asked:
+    """The question of an idea; it ends also as soon as the idea is given up."""
+    return Asked(declaration, read, lambda verdicts: result_of(verdicts[0]) != UNDECIDED)
 
 
 def result_of(verdict: Verdict) -> Result:
     """``kept``, ``dropped`` or ``undecided``; an undecided idea may change with more seeds."""
     if verdict.outcome == SUPPORTED:
         return KEPT
-    if verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or _is_hopeless(verdict):
+    if verdict.equal or verdict.outcome in (REFUTED, TOO_SMALL) or _hopeless(verdict):
         return DROPPED
     return UNDECIDED
 
 
-def _is_hopeless(verdict: Verdict) -> bool:
-    """Return whether a gain of the least difference that matters is unlikely (`GIVE_UP`)."""
-    answer, least, sign = verdict.answer, verdict.least, verdict.question.sign
-    if answer is None or answer.test is None or least is None:
-        return False
-    interval = answer.test.interval(2 * GIVE_UP)
-    return max(sign * interval.low, sign * interval.high) < least
+def _hopeless(verdict: Verdict) -> str:
+    """The reason why an undecided idea is given up (`GIVE_UP`); "" if it is not."""
+    given_up = verdict.outcome not in (SUPPORTED, REFUTED, TOO_SMALL)
+    if not given_up or not verdict.gain_excluded(GIVE_UP):
+        return ""
+    return f"a gain of {least_words(verdict)} is unlikely"
 
 
 def end_of(idea: str, verdict: Verdict, time: str) -> Ended:
     """The ledger's entry for a final verdict."""
-    baseline, new = verdict.pairs.trials[::2], verdict.pairs.trials[1::2]
+    baseline, new = verdict.pairs.of_baseline, verdict.pairs.of_arm
     ratios = {}
     for cost in ("gaussians", "train_time"):
         change = relative_change(baseline, new, COSTS[cost][1])
@@ -145,7 +146,7 @@ def end_of(idea: str, verdict: Verdict, time: str) -> Ended:
         time=time,
         idea=idea,
         result=result_of(verdict),
-        reason=reason_of(verdict),
+        reason=with_notes(reason(verdict, _hopeless(verdict)), verdict),
         seeds=verdict.pairs.seeds,
         difference=difference_of(verdict),
         gaussians=ratios["gaussians"],
@@ -171,22 +172,12 @@ def difference_of(verdict: Verdict) -> Difference | None:
     return Difference(mean=verdict.mean, low=verdict.interval.low, high=verdict.interval.high)
 
 
-def reason_of(verdict: Verdict) -> str:
-    """The result in a few words."""
-    size = least_text(verdict.question.least or 0.0, verdict.question.relative)
-    if verdict.equal:
-        words = "equal to the last bit: the idea had no effect"
-    elif verdict.untestable or verdict.answer is None:
-        words = verdict.untestable or "trials are missing"
-    elif verdict.outcome in (SUPPORTED, REFUTED):
-        words = "better" if verdict.outcome == SUPPORTED else "worse"
-    elif verdict.outcome == TOO_SMALL:
-        words = f"any difference is below {size}"
-    elif _is_hopeless(verdict):
-        words = f"a gain of {size} is unlikely"
-    else:
-        words = "not decided by all seeds" if verdict.final else "not decided yet"
-    return "; ".join([words, *verdict.notes])
+def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
+    """A note with the reason for the trials that are in no verdict on an idea."""
+    declarations = [declaration_of(ledger, idea) for idea in ledger.started]
+    declarations += [confirmation_of(ledger.opened, asked) for asked, _ in ledger.confirmations]
+    verdicts = [verdict for one in declarations for verdict in judge(trials, one)]
+    return unused_trials(trials, verdicts)
 
 
 def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:
@@ -200,7 +191,7 @@ def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:
             continue
         seeds = ledger.opened.seeds[: ended.seeds]
         own = [trial for trial in trials if trial.seed in seeds]
-        verdict = judge_idea(own, declaration_of(ledger, idea))
+        (verdict,) = ask_idea(declaration_of(ledger, idea), own.copy).judged()
         now = result_of(verdict)
         if verdict.pairs.seeds == ended.seeds and now != ended.result:
             lines.append(

@@ -16,9 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gsbench.analysis.addresses import fitting
 from gsbench.analysis.cells import select_trials, with_variants
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.fairness import budget_words
+from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import Pairs, ScenePairs, pair
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import Interval, StudentT, t_test
@@ -91,7 +93,7 @@ def markdown_table(pooled: Pooled) -> list[str]:
     lines = ["| study | difference | 95 % interval | protocol |", "|---|---|---|---|"]
     for study in pooled.studies:
         interval = (
-            "unknown"
+            "–"
             if study.interval is None
             else f"{study.interval.low:+.4g} to {study.interval.high:+.4g}"
         )
@@ -195,7 +197,7 @@ def read_studies(
                 qualifiers += [arms[0][0].init] if len(groups) > 1 else []
                 label = f"{name} ({', '.join(qualifiers)})" if qualifiers else name
                 rows: list[ScenePairs] = []
-                left_out: list[str] = []
+                left_out: list[Note] = []
                 for baseline, arm in arms:
                     pairs = pair(own, Question(metric=question.metric, baseline=baseline, arm=arm))
                     count = sum(len(row.seeds) for row in pairs.rows)
@@ -204,8 +206,8 @@ def read_studies(
                         f"{', '.join(pairs.scenes)}; {_size(own)}"
                     )
                     notes += [f"{label}: left out, {line}" for line in pairs.left_out]
-                    sides = pairs.trials[::2], pairs.trials[1::2]
-                    notes += [f"{label}: {line}" for line in between_scenes_notes(*sides)]
+                    unlike = between_scenes_notes(pairs.of_baseline, pairs.of_arm)
+                    notes += [f"{label}: {line}" for line in unlike]
                     rows += pairs.rows
                     left_out += pairs.left_out
                 if not rows:
@@ -233,15 +235,11 @@ def _group_into_studies(
 def _arm_pairs(
     trials: Sequence[TrialResult], question: PooledQuestion, path: Path
 ) -> list[tuple[Arm, Arm]]:
-    """The pair (baseline, arm) of each initialiser that has both.
-
-    A name of an arm is its densifier, its densifier with its variant, or its full name.
-    """
+    """The pair (baseline, arm) of each initialiser that has both."""
     arms = sorted({trial.arm for trial in trials})
 
     def named(init: str, names: Sequence[str]) -> list[Arm]:
-        own = [arm for arm in arms if arm.init == init]
-        return [arm for arm in own if any(map(arm.answers_to, names))]
+        return sorted(fitting([trial for trial in trials if trial.init == init], names))
 
     pairs = []
     for init in sorted({arm.init for arm in arms}):

@@ -1,4 +1,4 @@
-"""Adding seeds in planned looks until every question is decided, for checks and for sweeps.
+"""Adding seeds in planned looks until every question is decided: checks, sweeps, gates, ledgers.
 
 In a sweep, each compared pair of arms is a question about ``eval.primary``.
 """
@@ -16,24 +16,17 @@ from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
+from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import choose_pairs
 from gsbench.analysis.results import Arm, TrialResult, group_by, newest_code, read_experiment
-from gsbench.analysis.trial_settings import Configurations
+from gsbench.analysis.trial_settings import GROUPS
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric
-from gsbench.runs.experiments import Declaration, Question, declared_now
+from gsbench.runs.experiments import Declaration, Question, declared_now, trial_key
 from gsbench.runs.layout import SEED
 from gsbench.runs.nested import flatten
-from gsbench.runs.trial_record import TrialRecord
 from gsbench.words import counted
-
-NO_RESULTS: dict[str, Any] = {
-    **dict.fromkeys(("raster", "protocol"), ""),
-    **dict.fromkeys(("iterations", "num_gaussians"), 0),
-    **dict.fromkeys(("num_init_points", "peak_memory_mb")),
-    **{name: {} for name in ("metrics", "unavailable", "seconds", "hashes", "versions")},
-}
 
 log = logging.getLogger(__name__)
 
@@ -83,6 +76,28 @@ def run_looks(
 
 
 @dataclass(frozen=True)
+class Asked:
+    """A declaration with the trials that answer it so far, which ``read`` gives.
+
+    ``ends`` tells if verdicts give a result although a question is undecided.
+    """
+
+    declaration: Declaration
+    read: Callable[[], Iterable[TrialResult]]
+    ends: Callable[[Sequence[Verdict]], bool] = lambda verdicts: False
+
+    def judged(self) -> list[Verdict]:
+        """The verdicts so far; all are final as soon as they give a result."""
+        verdicts = judge(list(self.read()), self.declaration)
+        ended = self.ends(verdicts)
+        return [replace(one, final=one.final or ended) for one in verdicts]
+
+    def answer(self, run: Callable[[list[KeyAndSeed]], object]) -> list[Verdict]:
+        """The verdicts after all looks that are needed (`run_looks`)."""
+        return run_looks(self.declaration, self.judged, run)
+
+
+@dataclass(frozen=True)
 class SweepInLooks:
     """The trials of a sweep that stops when decided, with its declaration."""
 
@@ -90,9 +105,9 @@ class SweepInLooks:
     home: Path
     trials: Mapping[KeyAndSeed, Trial]
 
-    def judged(self) -> list[Verdict]:
-        """The verdicts on the pairs of arms from the trials that are done."""
-        return judge(read_experiment(self.home).trials, self.declaration)
+    @property
+    def asked(self) -> Asked:
+        return Asked(self.declaration, lambda: read_experiment(self.home).trials)
 
     def describe(self) -> str:
         """A line about the looks for a dry run."""
@@ -131,7 +146,7 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
             f"launch.stop_when_decided: {metric} has no usual least difference that matters: give "
             "launch.least_difference"
         )
-    expected = with_variants([_expected(trial) for trial in trials])
+    expected = with_variants([_planned(trial) for trial in trials])
     seeds = _seeds(expected)
     settings = {trial.arm: trial.config for trial in expected}
     chosen = choose_pairs(sorted(settings), settings=settings)
@@ -180,23 +195,36 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what no verdict uses."""
     for home in dict.fromkeys(trial.files.home for trial in trials):
         comparison = compare(newest_code(read_experiment(home)))
-        for line in [*comparison.sentences, *comparison.unused]:
+        for line in [*comparison.sentences, *texts(comparison.unused)]:
             log.info("%s", line)
 
 
-def _expected(trial: Trial) -> TrialResult:
-    """A `TrialResult` without results for a trial that has not run, to pair arms beforehand."""
-    values, folder = trial.values, trial.folder
-    record = TrialRecord(
-        status="complete",  # the only status that the type allows; no file has this record
-        experiment=values["name"],
-        **{group: values[group]["name"] for group in ("scene", "init", "densify")},
-        seed=values["seed"],
-        **NO_RESULTS,
-    )
-    result = TrialResult(folder, folder.name.partition(SEED)[0], record)
-    settings = Configurations({result.key: flatten(yaml.safe_load(trial.yaml))})
-    return replace(result, settings=settings)
+@dataclass(frozen=True)
+class PlannedTrial:
+    """A trial that has not run: what is known of a `TrialResult` beforehand."""
+
+    scene: str
+    init: str
+    densify: str
+    seed: int
+    config_hash: str
+    config: Mapping[str, Any]
+    variant: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def arm(self) -> Arm:
+        return Arm(self.init, self.densify, self.variant)
+
+    @property
+    def key(self) -> str:
+        return trial_key(self.scene, f"{self.init}-{self.densify}", self.config_hash)
+
+
+def _planned(trial: Trial) -> PlannedTrial:
+    names = {group: trial.values[group]["name"] for group in GROUPS}
+    config_hash = trial.folder.name.partition(SEED)[0]
+    config = flatten(yaml.safe_load(trial.yaml))
+    return PlannedTrial(**names, seed=trial.values["seed"], config_hash=config_hash, config=config)
 
 
 def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
@@ -213,7 +241,7 @@ def facts_for(metric: str, values: Mapping[str, Any]) -> MetricFacts:
     return facts_of(metric, build_metrics(values["eval"], values["allow_targets"])[metric])
 
 
-def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
+def _seeds(trials: Sequence[PlannedTrial]) -> tuple[int, ...]:
     """The seeds of all scenes and arms, in the order of the sweep.
 
     Raises InputError if they differ.
@@ -235,7 +263,7 @@ def _seeds(trials: Sequence[TrialResult]) -> tuple[int, ...]:
     return first
 
 
-def _scenes(trials: Sequence[TrialResult], baseline: Arm, arm: Arm) -> dict[str, tuple[str, str]]:
+def _scenes(trials: Sequence[PlannedTrial], baseline: Arm, arm: Arm) -> dict[str, tuple[str, str]]:
     """The keys of both arms' trials on each scene that has both."""
     scenes = {}
     for scene, group in group_by(trials, lambda trial: trial.scene).items():

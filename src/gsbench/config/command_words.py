@@ -84,8 +84,8 @@ def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
                 else did_you_mean(word, OPTIONS)
             )
             raise InputError(
-                f"{word} is not an option{near} "
-                "(there are -m, --dry-run, --config-dir FOLDER, --cfg job, --info, --help)"
+                f"{word} is not an option{near} (there are -m, --dry-run, --config-dir FOLDER, "
+                "--cfg job, --info, --help)"
             )
         else:
             overrides.append(word)

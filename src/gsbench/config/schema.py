@@ -23,7 +23,7 @@ from gsbench.errors import InputError
 from gsbench.eval.options import EvalConfig
 from gsbench.raster.executors import RasterConfig
 from gsbench.runs.layout import IN_RUNS
-from gsbench.runs.nested import entries_of
+from gsbench.runs.nested import GSBENCH, entries_of
 from gsbench.scene.options import SceneConfig
 from gsbench.settings import (
     MAX_INTEGER,
@@ -70,7 +70,8 @@ class ComponentConfig:
 class TrackingConfig:
     name: str = MISSING
     enabled: bool = True
-    sink: Literal["mlflow", "tensorboard", "wandb"] = "mlflow"
+    # the tracker; further keys are options of a class of your own (`gsbench.tracking.Sink`)
+    _target_: TargetName = "gsbench.tracking.MLflow"
     # null: $MLFLOW_TRACKING_URI, else sqlite in the runs folder; W&B: $WANDB_BASE_URL
     uri: Address | None = None
     flush_seconds: PositiveFloat = 10.0
@@ -214,6 +215,8 @@ def _names_and_defaults(schema: type) -> type:
         factory: Any = entry.default_factory
         if schema is Config and entry.name in GROUP_SCHEMAS:
             factory = _names_and_defaults(GROUP_SCHEMAS[entry.name])
+            if hasattr(factory, "_target_"):  # takes the options of a user's class, too
+                factory = partial(OmegaConf.structured, factory, flags={"struct": False})
         elif factory is dict:  # takes any key, without Hydra's plus
             factory = partial(DictConfig, {}, flags={"struct": False})
         fields.append((entry.name, Any, field(default=entry.default, default_factory=factory)))
@@ -295,10 +298,14 @@ def groups_are_chosen(values: dict[str, Any]) -> None:
 def groups_keep_their_schemas(values: dict[str, Any]) -> None:
     for group, schema in GROUP_SCHEMAS.items():
         given = values[group]
-        if given.get("_target_") is not None:  # the other keys are options of the user's class
-            given = {key: given.get(key) for key in ("name", "_target_")}
+        target = given.get("_target_") or GSBENCH
+        if not str(target).startswith(GSBENCH):  # keys that are no settings are its options
+            known = {one.name for one in dataclasses.fields(schema)}
+            given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})
+    if values["scene"].get("_target_") is None:  # as in configurations before it was a setting
+        values["scene"].pop("_target_", None)
 
 
 def root_keeps_its_schema(values: dict[str, Any]) -> None:

@@ -31,7 +31,7 @@ from gsbench.words import did_you_mean
 PERMISSIONS = "allow_targets"
 PACKAGE = "gsbench"
 # groups that name one class each; `eval.extra` names any number
-COMPONENTS = ("init", "densify", "raster")
+COMPONENTS = ("init", "densify", "raster", "tracking")
 # import paths of one class
 EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")
 # the permissions for shell lines, and for unusual options of Slurm

@@ -144,8 +144,7 @@ class Budgeted(Densifier):
         if self.most_gaussians is not None and self.most_gaussians < len(gaussians):
             raise InputError(
                 "densify.max_gaussians must be at least the size of the initial cloud "
-                f"({len(gaussians)}), got "
-                f"{self.most_gaussians}"
+                f"({len(gaussians)}), got {self.most_gaussians}"
             )
         super().begin(gaussians, context)
 

@@ -355,9 +355,8 @@ class GNS(EdgeAware):
         if len(opacities) > CLOSE * self.max_gaussians:
             log.warning(
                 "the opacity pressure was too short: it ended with %d Gaussians, and %d of them "
-                "were removed at "
-                "random; raise densify.pressure_length, or lower densify.interval (the pressure's "
-                "is half of it)",
+                "were removed at random; raise densify.pressure_length, or lower densify.interval "
+                "(the pressure's is half of it)",
                 len(opacities),
                 int((~kept).sum()),
             )

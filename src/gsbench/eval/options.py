@@ -81,8 +81,7 @@ class EvalConfig:
             if not METRIC_NAME.fullmatch(name) or name in RESERVED_NAMES:
                 raise InputError(
                     f"eval.extra.{name}: name your metric in small letters, digits and "
-                    "underscores, and none of "
-                    f"{', '.join(RESERVED_NAMES)}"
+                    f"underscores, and none of {', '.join(RESERVED_NAMES)}"
                 )
             if not isinstance(options, Mapping) or "_target_" not in options:
                 raise InputError(
@@ -106,8 +105,7 @@ class EvalConfig:
             known = [*known_keys(), *self.extra]
             raise InputError(
                 f"eval.primary={key} is not a metric{did_you_mean(key, known)} (known are "
-                f"{', '.join(known)}; your own "
-                "metric by its name under eval.extra)"
+                f"{', '.join(known)}; your own metric by its name under eval.extra)"
             )
         if facts.setting == "eval.flip" and not self.flip:
             raise InputError("eval.primary=flip is not measured with eval.flip=false")

@@ -93,8 +93,7 @@ def _no_match(photographs: Sequence[str], pictures: Sequence[str], by_order: str
     )
     return (
         f"{len(missing)} of {counted(len(photographs), 'photograph')} have no picture of their "
-        "name "
-        f"({some_of(missing)}); the pictures are {called}: rename them{hint}"
+        f"name ({some_of(missing)}); the pictures are {called}: rename them{hint}"
     )
 
 

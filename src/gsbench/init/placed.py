@@ -287,8 +287,8 @@ class Points(FromFile, PlacedCloud):
         if (seen < 0).all():
             raise InputError(
                 f"init.path={self.path}: no point is in view of a training camera of scene "
-                f"{capture.name}: the cloud "
-                "lies in other coordinates; bring it into those of the cameras"
+                f"{capture.name}: the cloud lies in other coordinates; bring it into those of the "
+                "cameras"
             )
         if colors is None:
             return PointCloud(points, np.where(seen < 0, GREY, seen).astype(np.uint8))

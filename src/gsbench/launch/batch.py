@@ -1,6 +1,5 @@
 """A batch of trials: skip finished ones, check the others before any work, and run them."""
 
-import importlib.util
 import json
 import logging
 import re
@@ -10,6 +9,7 @@ from pathlib import Path
 from gsbench.config.compose import Trial
 from gsbench.config.groups import options
 from gsbench.config.schema import COMPONENTS
+from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.dry_run import unavailable_now
@@ -20,9 +20,9 @@ from gsbench.runs.keys import STAGES
 from gsbench.runs.layout import STORE
 from gsbench.runs.nested import GSBENCH
 from gsbench.runs.store import Store
-from gsbench.system.install import install_command
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
+from gsbench.tracking.mirror import make_sink
 
 log = logging.getLogger(__name__)
 
@@ -146,14 +146,10 @@ def check_parts(trials: Sequence[Trial], on_this_machine: bool) -> None:
 
 
 def check_trackers(trials: Sequence[Trial]) -> None:
-    """Raise InputError if a trial's tracker needs a package that is not installed."""
-    tracking = [trial.values["tracking"] for trial in trials]
-    for sink in sorted({settings["sink"] for settings in tracking if settings["enabled"]}):
-        if importlib.util.find_spec(sink) is None:
-            raise InputError(
-                f"tracking.sink={sink} needs a package: {install_command(sink)} (or pip install "
-                f"{sink})"
-            )
+    """Raise InputError for a tracker that cannot be made, or needs a package that is missing."""
+    for trial in trials:
+        if (options := trial.values["tracking"])["enabled"]:
+            make_sink(options, trial.values.get(PERMISSIONS) or ())
 
 
 def borrowed_names(trials: Sequence[Trial]) -> list[str]:

@@ -1,10 +1,7 @@
 """The parts of a trial: the objects that its configuration describes. Errors name its keys."""
 
-import dataclasses
-import inspect
-import logging
-import sys
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -12,14 +9,8 @@ from typing import Any
 
 import torch
 
-from gsbench.config.trust import (
-    check_permissions,
-    check_program,
-    check_target,
-    is_external,
-    load_class,
-    packages_allowed_at,
-)
+from gsbench.config.build import build
+from gsbench.config.trust import check_permissions
 from gsbench.densify import Densifier
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
@@ -32,25 +23,14 @@ from gsbench.init.base import Initializer
 from gsbench.raster import EXECUTORS, Rasterizer
 from gsbench.raster.executors import AUTO, lacks, resolve
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.nested import GSBENCH, targets_in
-from gsbench.runs.user_code import UserCode, module_digest, unnamed_modules, user_modules
+from gsbench.runs.nested import GSBENCH, TARGET, targets_in
+from gsbench.runs.user_code import UserCode, user_modules
 from gsbench.scene.options import SceneConfig
-from gsbench.settings import check_values, unknown_setting
+from gsbench.scene.own_reader import SceneReader
 from gsbench.system.device import select_device
 from gsbench.system.resources import available_threads
 from gsbench.train.options import TrainConfig
 from gsbench.train.proof import Proven, create_proven
-from gsbench.words import did_you_mean
-
-log = logging.getLogger(__name__)
-
-RESERVED = ("_target_", "name", "switches")  # keys of a group that are not options of its class
-REQUIRED_METHODS = {  # of a user's class, by the group that names it
-    "init": ("needs_reference", "content", "run"),
-    "densify": ("prepare", "begin", "observe", "refine", "after_step"),
-    "raster": ("render",),
-    "eval": ("measure",),
-}
 
 
 class Parts:
@@ -69,7 +49,15 @@ class Parts:
 
     @cached_property
     def scene(self) -> SceneConfig:
-        return SceneConfig(**self.values["scene"])
+        values, known = self.values["scene"], {one.name for one in fields(SceneConfig)}
+        return SceneConfig(**{key: value for key, value in values.items() if key in known})
+
+    @cached_property
+    def reader(self) -> SceneReader | None:
+        """The user's own reader of the capture; None for gsbench's own readers."""
+        known = {one.name for one in fields(SceneConfig)} - {TARGET}
+        values = {key: value for key, value in self.values["scene"].items() if key not in known}
+        return build("scene", values, self._allowed) if values.get(TARGET) else None
 
     @cached_property
     def train(self) -> TrainConfig:
@@ -156,7 +144,7 @@ class Parts:
         With ``on_this_machine`` the trial will run on this machine, so its devices and programs are
         checked too.
         """
-        _ = self.initializer, self.trainer, self.metrics
+        _ = self.reader, self.initializer, self.trainer, self.metrics
         name, own = self.values["raster"]["name"], self.own_rasterizer
         if on_this_machine and self.program is not None:
             self.program.executable()
@@ -174,44 +162,6 @@ class Parts:
         extra = getattr(self.trainer, "needs_extra", None)
         if lack := lacks(raster, self.own_rasterizer, footprint, extra):
             raise InputError(f"densify={self.values['densify']['name']} {lack}")
-
-
-def build(group: str, values: dict[str, Any], allow_targets: list[str]) -> Any:
-    """The object that ``values`` of ``group`` (init, densify, raster, eval.extra.NAME) describes.
-
-    ``_target_`` names a class by its import path; the other keys are its arguments. gsbench's own
-    classes check them against their annotations. For a user's dataclass this is done here, before
-    its code sees them. Raises InputError naming the key that is unknown or wrong.
-    """
-    target = values["_target_"]
-    for place, nested_target in targets_in(values, tuple(group.split("."))):
-        check_target(nested_target, ".".join(place), allow_targets, packages_allowed_at(place))
-    external = group == "densify" and is_external(values)
-    if external:
-        check_program(values, allow_targets)
-    cls = External if external else locate(target, group, allow_targets)
-    options = {key: value for key, value in values.items() if key not in RESERVED}
-    own = target.startswith(GSBENCH)
-    _check_names(cls, target, options, group)
-    if dataclasses.is_dataclass(cls) and not own:
-        options = check_values(cls, options, group)
-    elif options and not own:
-        raise InputError(
-            f"{group}._target_={target} has options but is not a dataclass: make it one, so that "
-            "results are stored under their values"
-        )
-    try:
-        return cls(**options)
-    except InputError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{group}: {error}") from error
-    except (Exception, SystemExit) as error:  # a user's class may raise anything
-        if own:
-            raise
-        raise InputError(
-            f"{group}: {target} cannot be made ({type(error).__name__}: {error})"
-        ) from error
 
 
 def build_own_rasterizer(values: dict[str, Any], allow_targets: list[str]) -> Rasterizer | None:
@@ -243,58 +193,6 @@ def build_metrics(values: dict[str, Any], allow_targets: list[str]) -> dict[str,
                 "is better (direction), so no verdict can be about it"
             )
     return metrics
-
-
-def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> None:
-    """Raise InputError for an option that the constructor of ``cls`` does not take.
-
-    If a user's class lacks an option, it usually belongs to the choice (``densify=adc``) whose
-    class the user replaced.
-    """
-    parameters = inspect.signature(cls).parameters
-    unknown = next((name for name in options if name not in parameters), None)
-    if unknown is None or any(
-        parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()
-    ):
-        return
-    key = f"{group}.{unknown}"
-    if target.startswith(GSBENCH):
-        raise InputError(unknown_setting(key, unknown, parameters))
-    raise InputError(
-        f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
-        f"{', '.join(parameters) or 'none'}); remove it by ~{key}, or start from another choice, "
-        f"{group}=NAME"
-    )
-
-
-def locate(target: str, group: str, allow_targets: list[str]) -> type:
-    """The class at the import path ``package.module.Class``.
-
-    Raises InputError if ``group`` cannot use it. Warns of code whose version the results cannot
-    record.
-    """
-    loaded_before = set(sys.modules)
-    cls = load_class(target, group, allow_targets)
-    required = REQUIRED_METHODS[group.partition(".")[0]]
-    lacking = [method for method in required if not callable(getattr(cls, method, None))]
-    if not isinstance(cls, type) or lacking:
-        without = f": it has no {', '.join(lacking)}()" if lacking else ""
-        raise InputError(f"{group}._target_={target} is not a class for {group}{without}")
-    if target.startswith(GSBENCH):
-        return cls
-    module, permitted = target.split(".")[0], {name.split(".")[0] for name in allow_targets}
-    # The first call keeps the digest of the files. It must come right after the import: later they
-    # may be edited, and the digest would be of code that does not run.
-    if module_digest(module) is None:
-        log.warning("no file of %s was found: results do not record its version", target)
-    if unnamed := unnamed_modules(loaded_before, {module, *permitted}):
-        log.warning(
-            "%s imports %s, and results do not record their versions: name them in allow_targets "
-            "too",
-            target,
-            ", ".join(unnamed),
-        )
-    return cls
 
 
 def make_evaluator(

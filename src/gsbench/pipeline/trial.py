@@ -108,7 +108,7 @@ class TrialSteps:
         that renders them is the last.
         """
         parts, store = self.parts, self.store
-        source = CaptureSource(parts.scene)
+        source = CaptureSource(parts.scene, parts.reader, parts.user_code)
         capture_step = source.step
         if capture_step is not None:
             yield capture_step

@@ -17,8 +17,10 @@ import torch
 import yaml
 from PIL import Image
 
+from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import TrialResult, read_experiment, read_views
+from gsbench.analysis.trial_settings import load_flat_config
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
@@ -30,6 +32,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Matching, PicturePair, match_by_order, match_pictures, measure
 from gsbench.files import atomic, file_sha256, storage_errors, write_text
 from gsbench.logs import progress
+from gsbench.parsing import DamagedError
 from gsbench.pipeline.parts import Parts, build_metrics, make_evaluator
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import TrialSteps, versions
@@ -90,13 +93,14 @@ class ReferenceImages:
 
 @dataclass(frozen=True)
 class Destination:
-    """The trial that renders become: experiment, scene, arm (initialiser, densifier), seed."""
+    """The trial that renders become; ``settings`` (dotted keys) tell apart arms of one name."""
 
     experiment: str
     scene: str
     init: str
     densify: str
     seed: int
+    settings: tuple[tuple[str, Any], ...] = ()
 
 
 def measure_renders(options: argparse.Namespace, runs: Path) -> None:
@@ -225,7 +229,7 @@ def _as_dict(
 
 
 def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
-    """The photographs of a folder, a trial (folder or EXPERIMENT:SCENE:DENSIFY), or a scene.
+    """The photographs of a folder, a trial (folder or EXPERIMENT:SCENE:ARM), or a scene.
 
     ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of
     these.
@@ -241,7 +245,7 @@ def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> Re
     scenes = options("scene")
     if place not in scenes:
         raise InputError(
-            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:DENSIFY and no scene"
+            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:ARM and no scene"
             f"{did_you_mean(place, scenes)} (scenes: {', '.join(scenes)})"
         )
     return _scene(place, settings)
@@ -315,12 +319,14 @@ def _folder(folder: Path, settings: Sequence[str]) -> ReferenceImages:
 def find_destination(
     word: str, scene: str | None, seed: int, truth: ReferenceImages, runs: Path
 ) -> Destination:
-    """The destination that ``EXPERIMENT:ARM`` names; ARM is a name, or INIT-NAME.
+    """The destination that ``EXPERIMENT:ARM`` names: NAME or INIT-NAME, perhaps with [KEY=VALUE].
 
     If ARM names no initialiser, it is taken from the experiment's trials of the scene, else from
     the trial of ``truth``. Raises `InputError` if several are possible.
     """
-    experiment, _, arm = word.partition(":")
+    experiment, _, typed = word.partition(":")
+    typed_arm = ArmName.read(typed)
+    arm = typed_arm.name
     scene_name = scene or truth.scene
     if not is_folder_name(experiment) or not is_folder_name(arm):
         raise InputError(f"--as {word} is not EXPERIMENT:ARM, such as table1:sfm-mine")
@@ -353,7 +359,11 @@ def find_destination(
                 f"--as {experiment}:{inits[0]}-{arm}"
             )
         init = inits[0] if inits else init or "renders"
-    return Destination(experiment, scene_name, init, name, seed)
+    settings = tuple(
+        (key if "." in key else f"densify.{key}", yaml.safe_load(value))
+        for key, value in typed_arm.settings.items()
+    )
+    return Destination(experiment, scene_name, init, name, seed, settings)
 
 
 def check_destination(destination: Destination, truth: ReferenceImages, runs: Path) -> None:
@@ -391,8 +401,11 @@ def import_trial(
     name = f"{destination.init}-{destination.densify}"
     arm = runs / destination.experiment / destination.scene / name
     folder = arm / f"{identity[:8]}{SEED}{destination.seed}"
+    config = _config(destination, truth, runs)
     # Two trainings with one seed would count as one pair in every comparison.
-    if taken := [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]:
+    others = [other for other in arm.glob(f"*{SEED}{destination.seed}") if other != folder]
+    own = dict(destination.settings)
+    if taken := [other for other in others if _has(other, own)]:
         raise InputError(
             f"seed {destination.seed} of {name} on {destination.scene} is taken ({taken[0]}): "
             "give another --seed, or remove that folder"
@@ -405,7 +418,6 @@ def import_trial(
             (folder / kind).mkdir(parents=True, exist_ok=True)
             with atomic(folder / kind / png_name(pair.view), sync=False) as temporary:
                 Image.fromarray(read_image(file)).save(temporary, format="PNG")
-    config = _config(destination, truth, runs)
     write_text(folder / CONFIG, yaml.safe_dump(config, sort_keys=False))
     write_per_view(folder / PER_VIEW, per_view)
     TrialFolder(folder).write_finished(
@@ -425,7 +437,11 @@ def _results(
     evaluation = summary_of(evaluator, per_view)
     return TrialRecord(
         status="complete",
-        **vars(destination),
+        experiment=destination.experiment,
+        scene=destination.scene,
+        init=destination.init,
+        densify=destination.densify,
+        seed=destination.seed,
         evaluated_from=FROM_RENDERS,
         raster="unknown",
         protocol=evaluator.protocol.id,
@@ -452,7 +468,7 @@ def _results(
 def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dict[str, Any]:
     groups = {group: truth.config[group] for group in KEPT_GROUPS}
     own = truth.config["init"]
-    return {
+    config = {
         "name": destination.experiment,
         "seed": destination.seed,
         "runs": str(runs),
@@ -461,6 +477,19 @@ def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dic
         "init": own if own["name"] == destination.init else {"name": destination.init},
         "densify": {"name": destination.densify, "evaluated_from": FROM_RENDERS},
     }
+    for key, value in destination.settings:
+        group, _, name = key.partition(".")
+        config[group] = dict(config.get(group, {})) | {name: value}
+    return config
+
+
+def _has(folder: Path, settings: Mapping[str, Any]) -> bool:
+    """Return whether a trial has these settings, or none that tell its arm apart."""
+    try:
+        own = load_flat_config(folder)
+    except (FileNotFoundError, DamagedError):
+        return True
+    return all(own.get(key) == value for key, value in settings.items())
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:

@@ -172,10 +172,6 @@ class Arm:
         own = f"{self.init}-{self.densify}"
         return name == own and all(str(config.get(key)) == value for key, value in self.variant)
 
-    def answers_to(self, word: str) -> bool:
-        """Return whether ``word`` names this arm, with or without initialiser and settings."""
-        return word in (str(self), self.short, f"{self.init}-{self.densify}", self.densify)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Question(Record):

@@ -49,14 +49,15 @@ NO_USER_CODE = UserCode()
 def user_modules(values: Mapping[str, Any]) -> dict[str, str]:
     """``{module: sha256}`` of the user's code behind a configuration; {} if there is none.
 
-    These are the modules of its classes, and the modules in ``allow_targets``, which the classes
-    may import. An installed module is included only if a class comes from it.
+    These are the modules of its classes, without trackers, and the modules in ``allow_targets``,
+    which the classes may import. An installed module is included only if a class comes from it.
     """
-    targets = {target for _, target in targets_in(values) if not target.startswith(GSBENCH)}
-    of_classes = {target.split(".")[0] for target in targets}
+    named = [(place, name) for place, name in targets_in(values) if not name.startswith(GSBENCH)]
+    of_classes = {name.split(".")[0] for place, name in named if place[0] != "tracking"}
     if not of_classes:
         return {}
-    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()} - of_classes
+    helpers = {name.split(".")[0] for name in values.get("allow_targets") or ()}
+    helpers -= {name.split(".")[0] for _, name in named}
     helpers = {
         name
         for name in helpers

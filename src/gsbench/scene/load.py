@@ -265,8 +265,8 @@ def _model_cameras(
     if len(cameras) < MIN_IMAGES:
         raise InputError(
             f"scene {capture.name}: {len(cameras)} of {len(wanted)} images have a pose in "
-            f"{model_dir}, but at least "
-            f"{MIN_IMAGES} are needed: take more overlapping photos, or another init"
+            f"{model_dir}, but at least {MIN_IMAGES} are needed: take more overlapping photos, or "
+            "another init"
         )
     if not set(cameras) & set(capture.train_names):
         raise InputError(

@@ -9,7 +9,14 @@ from annotated_types import Ge, Interval
 from pydantic import NonNegativeInt, PositiveInt
 
 from gsbench.errors import InputError
-from gsbench.settings import MISSING, FolderName, PathName, check_settings, is_folder_name
+from gsbench.settings import (
+    MISSING,
+    FolderName,
+    PathName,
+    TargetName,
+    check_settings,
+    is_folder_name,
+)
 
 MAX_IMAGES = 200  # the paper's limit per scene
 MIN_IMAGES = 3  # with two views, no third one can reveal a wrong geometry
@@ -126,7 +133,8 @@ MAX_SIZE = 16_384  # px, the longest side of a view of the courtyard
 
 # Kinds of scenes, and the settings that only they read.
 READ_BY = {
-    ("colmap", "photos", "transforms"): ("images", "masks"),
+    ("colmap", "photos", "transforms"): ("images",),
+    ("colmap", "photos", "transforms", "reader"): ("masks",),
     ("colmap",): ("sparse",),
     ("courtyard",): ("views", "width", "height", "seed"),
 }
@@ -141,7 +149,9 @@ def folder_name(path: str | None) -> str:
 @dataclass
 class SceneConfig:
     name: FolderName | None = MISSING  # null: the name of the folder `path`
-    kind: Literal["colmap", "photos", "transforms", "courtyard"] = MISSING
+    kind: Literal["colmap", "photos", "transforms", "courtyard", "reader"] = MISSING
+    # scene=reader: a class of your own that reads the capture; its options are further keys
+    _target_: TargetName | None = None
     path: PathName | None = None  # folder of the capture
     # image folder below path; null: images, or what transforms.json names
     images: PathName | None = None
@@ -186,6 +196,11 @@ class SceneConfig:
             raise InputError(
                 f"scene.path={self.path} is not read by the built-in courtyard: add scene=photos "
                 "(bare photographs), scene=colmap or scene=transforms"
+            )
+        if (self.kind == "reader") != (self._target_ is not None):
+            raise InputError(
+                f"scene.kind={self.kind} with scene._target_={self._target_}: a reader of your own "
+                "is scene=reader scene._target_=mine.MyReader"
             )
         self._check_that_all_is_read()
         self.split_rule.check()

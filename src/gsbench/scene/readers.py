@@ -31,6 +31,7 @@ from gsbench.scene.options import (
     TRAIN_LIST,
     SplitRule,
 )
+from gsbench.scene.own_reader import PosedImages
 from gsbench.scene.side_files import photographs_among
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.twins import copies_by_name, copies_of_test_views, report_left_out
@@ -129,13 +130,10 @@ def read_transforms(
     the views of Blender's file of test views. ``masks`` is the folder of the masks. Raises
     InputError if the file names masks and no folder was given.
     """
-    from gsbench.scene.colmap import read_model, reference_cameras
-
     root = existing_folder(name, path)
-    names = list(transforms.images)
     lacking = f", while {some_of(transforms.missing)} have no file" if transforms.missing else ""
     _require_enough(
-        len(names),
+        len(transforms.images),
         root,
         f"with a file and a camera in {transforms.files[0].name}{lacking}",
         transforms.remedy,
@@ -145,8 +143,26 @@ def read_transforms(
             f"{transforms.files[0]}: mask_path is not read: give the folder of the masks as "
             "scene.masks"
         )
-    if transforms.split is not None and not split.asks_the_capture and not split.by_lists:
-        log.warning("%s has its own split: scene.split=list uses it", transforms.files[0])
+    posed = PosedImages(transforms.images, files=transforms.sources, split=transforms.split)
+    return read_posed(name, root, posed, model, max_images, split, masks)
+
+
+def read_posed(
+    name: str,
+    root: Path,
+    posed: PosedImages,
+    model: Path,
+    max_images: int = MAX_IMAGES,
+    split: SplitRule = EVERY_NTH,
+    masks: str | None = None,
+) -> Capture:
+    """Read the photographs ``posed`` below ``root``, whose cameras the COLMAP ``model`` has."""
+    from gsbench.scene.colmap import read_model, reference_cameras
+
+    names = list(posed.images)
+    _require_enough(len(names), root, "with a camera")
+    if posed.split is not None and not split.asks_the_capture and not split.by_lists:
+        log.warning("%s has its own split: scene.split=list uses it", [*posed.files, root][0])
     capture = _make_capture(
         name,
         root,
@@ -157,11 +173,11 @@ def read_transforms(
         mask_folder=None if masks is None else require_subfolder(root, masks, "scene.masks"),
         model=model,
         cameras=lambda chosen: reference_cameras(read_model(model), chosen),
-        own_split=transforms.split,
+        own_split=posed.split,
     )
-    centers = [-rotation.T @ translation for _, rotation, translation in transforms.images.values()]
+    centers = [-rotation.T @ translation for _, rotation, translation in posed.images.values()]
     return replace(
-        capture, read_from=transforms.sources, advised_normalization=find_normalization(centers)
+        capture, read_from=tuple(posed.files), advised_normalization=find_normalization(centers)
     )
 
 

@@ -439,8 +439,8 @@ def _check_center(
         return
     if not 1 / OTHER_SCALE < ratios[0] < OTHER_SCALE:
         raise InputError(
-            f"{where}: its principal point ({cx:g}, {cy:g}) is the centre of a "
-            f"photograph of another size than {size[0]}x{size[1]} px: add w and h"
+            f"{where}: its principal point ({cx:g}, {cy:g}) is the centre of a photograph "
+            f"of another size than {size[0]}x{size[1]} px: add w and h"
         )
 
 

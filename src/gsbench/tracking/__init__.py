@@ -7,6 +7,29 @@ later what the tracker missed.
 
 from gsbench.tracking.comparison import publish
 from gsbench.tracking.mirror import Mirror
-from gsbench.tracking.mlflow_sink import connect, default_uri, ensure_experiment, tracker_uri
+from gsbench.tracking.mlflow_sink import (
+    MLflow,
+    connect,
+    default_uri,
+    ensure_experiment,
+    tracker_uri,
+)
+from gsbench.tracking.sinks import Run, Sink, TensorBoard, WandB
+from gsbench.tracking.trial import Picture, Scalar, TrackedTrial
 
-__all__ = ["Mirror", "connect", "default_uri", "ensure_experiment", "publish", "tracker_uri"]
+__all__ = [
+    "MLflow",
+    "Mirror",
+    "Picture",
+    "Run",
+    "Scalar",
+    "Sink",
+    "TensorBoard",
+    "TrackedTrial",
+    "WandB",
+    "connect",
+    "default_uri",
+    "ensure_experiment",
+    "publish",
+    "tracker_uri",
+]

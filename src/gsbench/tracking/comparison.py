@@ -22,8 +22,8 @@ from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
-from gsbench.tracking.mlflow_sink import NOTE, connect, ensure_experiment
-from gsbench.tracking.sinks import EVAL, arm_name, eval_name
+from gsbench.tracking.mlflow_sink import DESCRIPTION, connect, ensure_experiment
+from gsbench.tracking.trial import EVAL, arm_name, eval_name
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -54,14 +54,14 @@ def publish(home: Path, uri: str | None) -> str:
         _set(
             client,
             experiment_id,
-            {NOTE: description(experiment), VIEW: packed(view_state(experiment.trials))},
+            {DESCRIPTION: description(experiment), VIEW: packed(view_state(experiment.trials))},
         )
     return experiment_id
 
 
 def _set(client: MlflowClient, experiment_id: str, tags: dict[str, str]) -> None:
     present = client.get_experiment(experiment_id).tags
-    note = present.get(NOTE)
+    note = present.get(DESCRIPTION)
     if note and OWN_NOTE not in note:  # a user wrote the description
         tags = {VIEW: tags[VIEW]}
     for key, value in tags.items():

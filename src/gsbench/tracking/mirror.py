@@ -22,25 +22,29 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Iterable, Iterator
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, chdir, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, NoReturn
 
+from gsbench.config.build import build
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import read_if_sound
-from gsbench.runs.layout import CONFIG, FAILED, RESULTS
+from gsbench.runs.layout import CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import foreign_address
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
+from gsbench.system.own_modules import allowed_modules
 from gsbench.system.programs import own_folder, safe_environment
 from gsbench.tracking.comparison import publish
-from gsbench.tracking.mlflow_sink import VARIABLE, MlflowSink, absolute_address
-from gsbench.tracking.sinks import MirrorState, Sink, TensorBoardSink, TrackedTrial, WandbSink
+from gsbench.tracking.mlflow_sink import VARIABLE, absolute_address
+from gsbench.tracking.sinks import Run, Sink
+from gsbench.tracking.trial import TrackedTrial
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
@@ -49,18 +53,43 @@ log = logging.getLogger(__name__)
 TRACKER_FAILED = 3
 SECONDS_BETWEEN_TABLES = 60.0  # an experiment of thousands of trials takes seconds to read
 SECONDS_TO_STOP = 3.0  # patience after a signal that asks to end
-SINKS: dict[str, Any] = {"mlflow": MlflowSink, "tensorboard": TensorBoardSink, "wandb": WandbSink}
+OWN = "gsbench.tracking."
+MLFLOW = f"{OWN}MLflow"
+# The settings ``tracking`` that are not options of the tracker's class; configurations of earlier
+# versions name it by ``sink``.
+NOT_OPTIONS = ("name", "enabled", "flush_seconds", "patience_seconds", "images", "model", "sink")
 
 
-def sink_of(options: dict[str, Any]) -> Any:
-    """The class of the tracker that the settings ``tracking`` name."""
-    return SINKS[options.get("sink", "mlflow")]
+def class_of(options: Mapping[str, Any]) -> str:
+    """The import path of the tracker's class that the settings ``tracking`` name."""
+    return str(options.get("_target_") or MLFLOW)
+
+
+def tracker_name(options: Mapping[str, Any]) -> str:
+    """The tracker's name in messages."""
+    return class_of(options).removeprefix(OWN)
+
+
+def make_sink(options: Mapping[str, Any], allowed: Sequence[str]) -> Sink:
+    """The tracker that the settings ``tracking`` describe.
+
+    ``allowed`` are the modules whose code may run. Raises InputError naming a wrong setting.
+    """
+    own = {key: value for key, value in options.items() if key not in NOT_OPTIONS}
+    if own.get("uri") is None:
+        own.pop("uri", None)
+    sink: Sink = build("tracking", own | {"_target_": class_of(options)}, list(allowed))
+    return sink
+
+
+# the errors of a tracker's client; a user's class may even end the process
+ERRORS = (Exception, SystemExit)
 
 
 def with_absolute_address(options: dict[str, Any]) -> dict[str, Any]:
     """The settings ``tracking`` for a process in another folder than the command's."""
     uri = options.get("uri")
-    if not uri and sink_of(options) is MlflowSink:
+    if not uri and class_of(options) == MLFLOW:
         uri = os.environ.get(VARIABLE)
     return options | {"uri": absolute_address(uri)} if uri else options
 
@@ -139,7 +168,7 @@ class Mirror:
             except subprocess.TimeoutExpired:
                 log.warning(
                     "tracking: %s is slow; `gsbench sync` mirrors the rest later",
-                    sink_of(self._options).name,
+                    tracker_name(self._options),
                 )
                 return
             finally:  # also where a signal interrupts the wait
@@ -173,21 +202,27 @@ SECONDS_AFTER_PARENT = 10.0
 class TrackerRun:
     """The tracker's run of the trial in ``folder``, new or continued, locked until it is closed.
 
-    ``options`` are the settings ``tracking``, ``values`` the whole configuration. Raises BusyError
-    if another process mirrors the trial, and any error of the tracker.
+    ``options`` are the settings ``tracking``, ``values`` the whole configuration; ``allowed`` are
+    the modules whose code may run. Raises BusyError if another process mirrors the trial, and any
+    error of the tracker.
     """
 
     def __init__(
-        self, folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]
+        self,
+        folder: TrialFolder,
+        options: Mapping[str, Any],
+        values: dict[str, Any],
+        allowed: Sequence[str] = (),
     ) -> None:
         folder.require_no_links()
         self._options, self._trial = options, TrackedTrial(folder, values)
+        name = tracker_name(options)
+        own = class_of(options).startswith(OWN)
+        self._file = folder.path / f"{name.lower() if own else f'tracker-{name}'}.json"
         with ExitStack() as held:
             held.enter_context(hold(folder.path / LOCK, "mirroring", wait=False))
-            self._sink: Sink = sink_of(options)(options, self._trial)
-            self._file = folder.path / self._sink.state_file
-            self._state = read_if_sound(self._file, MirrorState) or MirrorState()
-            self._open()
+            self._sink = make_sink(options, allowed)
+            self._open(read_if_sound(self._file, Run) or Run())
             self._held = held.pop_all()
 
     def close(self) -> None:
@@ -197,52 +232,73 @@ class TrackerRun:
     @property
     def is_complete(self) -> bool:
         """Return whether the run shows the trial's present results."""
-        return self._state.shows(self._trial.results_hash())
+        results = self._trial.results_hash()
+        return results is not None and self._run.complete == results
 
-    def add_curves(self) -> None:
+    def add_curves(self, live: bool = True) -> None:
         """Log the records that were written since the last call.
 
         A run that shows results is left as it is.
         """
-        if self._state.complete is not None:
+        if self._run.complete is not None:
             return
-        for name, newest, scalars in self._trial.curves(self._state.logged):
-            self._sink.log(scalars)
-            self._state.logged[name] = newest
-        self._note()
+        for name, newest, scalars in self._trial.curves(self._run.logged, live):
+            self._sink.metrics(scalars)
+            self._keep(replace(self._run, logged=self._run.logged | {name: newest}))
 
     def end(self) -> None:
         """Log the rest, and close the run as the trial's files say: failed, done, else killed."""
         if self.is_complete:
             return
         # the run shows earlier results, which new ones have replaced
-        if self._state.complete is not None:
-            self._open()
-        self.add_curves()
-        folder = self._trial.folder
+        if self._run.complete is not None:
+            self._open(self._run)
+        self.add_curves(live=False)
+        folder, sink = self._trial.folder, self._sink
         if folder.has_failed():
-            self._sink.stop("FAILED", folder.failure().reason)
+            sink.artifacts(self._trial.files((CONFIG, FAILED, LOG)), ())
+            sink.close("FAILED", folder.failure().reason)
         elif (results := folder.sound_record()) is None:
-            self._sink.stop("KILLED", None)
+            sink.close("KILLED", None)
         else:
             images, with_model = int(self._options["images"]), bool(self._options.get("model"))
-            self._sink.complete(self._trial.summary(results, images, with_model))
-            self._state = replace(self._state, complete=self._trial.results_hash())
-        self._note()
+            summary = self._trial.summary(results, images, with_model)
+            sink.metrics(summary.scalars)
+            sink.tags(summary.tags)
+            sink.artifacts(summary.files, summary.pictures)
+            sink.close("FINISHED", None)
+            self._keep(replace(self._run, complete=self._trial.results_hash()))
 
-    def _open(self) -> None:
-        self._state = self._sink.open(self._state, self._trial.results_hash())
-        self._note()
+    def _open(self, run: Run) -> None:
+        """Open ``run``, or a new one in its place if it shows results that are not the trial's."""
+        if run.token is None or run.complete not in (None, self._trial.results_hash()):
+            now = int(time.time() * 1000)
+            run = Run(token=uuid.uuid4().hex, started=now, replaces=run.token)
+        # Kept before the tracker creates the run, so that the token finds it even if the tracker's
+        # answer is lost.
+        self._keep(run)
+        name = self._sink.open(self._trial, run)
+        if name != run.id:
+            run = Run(token=run.token, started=run.started, id=name)
+        if not run.described:
+            self._sink.params(self._trial.params())
+            self._sink.tags(self._trial.tags())
+        self._keep(replace(run, described=True))
 
-    def _note(self) -> None:
-        write_json(self._file, self._state.to_json())
+    def _keep(self, run: Run) -> None:
+        self._run = run
+        write_json(self._file, run.to_json())
 
 
 # ---- once, after the end
 
 
-def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
+def sync(
+    folders: Iterable[TrialFolder], uri: str | None, allowed: Sequence[str] = ()
+) -> Iterator[str]:
     """Mirror ended trials that the tracker lacks; yields a line for each, and a summary.
+
+    ``allowed`` are the modules whose code may run.
 
     Raises MirrorError if the tracker refuses a trial.
     """
@@ -269,15 +325,20 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
             )
             continue
         options = with_absolute_address(options)
+        try:  # a class of a user's is run only with permission
+            make_sink(options, allowed)
+        except InputError as error:
+            yield f"left out: {folder.label}: {error}"
+            continue
         try:
             # for the same reason as in `Mirror`
             with own_folder() as place, chdir(place):
-                is_new = mirror_ended(folder, options, values)
+                is_new = mirror_ended(folder, options, values, allowed)
             pages[folder.home, options["uri"]] = folder, options
         except BusyError:
             yield f"{folder.label} is being mirrored by another process"
             continue
-        except Exception as error:  # any error of the tracker's client
+        except ERRORS as error:
             raise refusal(folder, options, error) from error
         new, already_there = new + is_new, already_there + (not is_new)
         if is_new:
@@ -286,23 +347,28 @@ def sync(folders: Iterable[TrialFolder], uri: str | None) -> Iterator[str]:
     yield f"{counted(new, 'trial')} mirrored now, {already_there} before"
 
 
-def mirror_ended(folder: TrialFolder, options: dict[str, Any], values: dict[str, Any]) -> bool:
+def mirror_ended(
+    folder: TrialFolder,
+    options: Mapping[str, Any],
+    values: dict[str, Any],
+    allowed: Sequence[str] = (),
+) -> bool:
     """Mirror an ended trial; returns False if the tracker lacks nothing.
 
     Raises the errors of `TrackerRun`.
     """
-    with closing(TrackerRun(folder, options, values)) as run:
+    with closing(TrackerRun(folder, options, values, allowed)) as run:
         if run.is_complete:
             return False
         run.end()
         return True
 
 
-def refusal(folder: TrialFolder, options: dict[str, Any], error: Exception) -> MirrorError:
+def refusal(folder: TrialFolder, options: Mapping[str, Any], error: BaseException) -> MirrorError:
     """A MirrorError, in one line, for an ``error`` of the tracker's client about a trial."""
     lines = str(error).strip().splitlines()
     reason = f"{type(error).__name__}: {lines[0][:200] if lines else ''}"
-    return MirrorError(f"{folder.label} could not be sent to {sink_of(options).name} ({reason})")
+    return MirrorError(f"{folder.label} could not be sent to {tracker_name(options)} ({reason})")
 
 
 # for each experiment and tracker, a trial and its settings ``tracking``
@@ -312,7 +378,7 @@ Pages = dict[tuple[Path, str | None], tuple[TrialFolder, dict[str, Any]]]
 def _renew(pages: Pages) -> None:
     """Show the present table and verdict of experiments on their pages. Raises MirrorError."""
     for folder, options in pages.values():
-        if sink_of(options) is MlflowSink:
+        if class_of(options) == MLFLOW:
             try:
                 publish(folder.home, options["uri"])
             except Exception as error:  # any error of the tracker's client
@@ -365,8 +431,7 @@ def _follow(lines: Lines, pause: float) -> None:
                 trial.catch_up(last)
             except BusyError:
                 pass
-            # any error of the tracker's client: tried again, and raised the last time
-            except Exception as error:
+            except ERRORS as error:  # tried again, and raised the last time
                 if last:
                     raise refusal(trial.folder, trial.options, error) from error
         for trial in trials:
@@ -403,7 +468,9 @@ class _FollowedTrial:
         if not (self.folder.path / CONFIG).exists() or (is_waiting and not last):
             return
         if self._run is None:
-            self._run = TrackerRun(self.folder, self.options, self.folder.configuration())
+            values = self.folder.configuration()
+            # the permissions that this process's parent got on its command line
+            self._run = TrackerRun(self.folder, self.options, values, tuple(allowed_modules()))
         self._run.add_curves()
         if state != "running":
             self._run.end()

@@ -1,18 +1,17 @@
 """MLflow: the tracker's address, its client, and a trial as an MLflow run.
 
 A metric's time is computed from the trial's files, not from the clock. MLflow drops exact
-repetitions, so a metric that is sent twice is stored once. The trial's folder keeps the run's id,
-so that no trial gets two runs.
+repetitions, so a metric that is sent twice is stored once. A tag of the run has the token that the
+trial's folder keeps, so that no trial gets two runs.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import time
-import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +19,10 @@ import psutil
 from filelock import FileLock
 
 from gsbench.errors import InputError
-from gsbench.files import atomic, require_no_links, write_json
-from gsbench.runs import layout
+from gsbench.files import atomic, require_no_links
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.sinks import MirrorState, Scalar, Summary, TrackedTrial
+from gsbench.tracking.sinks import NOTE, Run, Status
+from gsbench.tracking.trial import Picture, Scalar, TrackedTrial
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -149,114 +148,94 @@ def _create_sqlite(uri: str) -> None:
 
 # ---- a trial
 
-STATE = "mlflow.json"  # in the trial's folder: which run mirrors it, and how far
-OWN_DATABASE = "runs/mlflow.db"  # stands in the state for the database of the runs folder
 TOKEN_TAG = "gsbench.token"
-PARAMS_TAG = "gsbench"  # set once all settings are logged
 ERROR_TAG = "error"
-NOTE = "mlflow.note.content"  # the description, in Markdown
+DESCRIPTION = "mlflow.note.content"
 MAX_TAG = 5000  # characters of a tag (MLflow's limit)
 # characters of a parameter: MLflow's limit, and the limits of older servers
 MAX_VALUES = (6000, 500, 250)
 
 
-class MlflowSink:
-    """The MLflow run of one trial."""
+@dataclass
+class MLflow:
+    """The MLflow run of a trial in the tracker ``uri`` (`tracker_uri`)."""
 
-    name, state_file = "MLflow", STATE
+    uri: str | None = None
 
-    def __init__(self, options: dict[str, Any], trial: TrackedTrial) -> None:
-        self._trial = trial
-        self.client = connect(options["uri"], trial.folder.runs)
-        self.run_id = ""
-        self._started = 0  # ms since 1970
+    def open(self, trial: TrackedTrial, run: Run) -> str:
+        """Open the run as `gsbench.tracking.sinks.Sink` says; a deleted one is replaced."""
+        runs = trial.folder.runs
+        self._client, self._run = connect(self.uri, runs), run
+        experiment = ensure_experiment(self._client, trial.values["name"], runs)
+        if run.replaces and (old := self._found(experiment, run.replaces)):
+            self._client.delete_run(old.info.run_id)
+        found = self._found(experiment, run.token)
+        if found is None:
+            tags = {TOKEN_TAG: run.token, "mlflow.user": psutil.Process().username()}
+            found = self._client.create_run(experiment, tags=tags, run_name=trial.label)
+        self._id = str(found.info.run_id)
+        require_own_artifacts(self._client, str(found.info.artifact_uri), runs)
+        if not (run.complete and self._id == run.id):
+            self._client.update_run(self._id, status="RUNNING")
+            if ERROR_TAG in found.data.tags:  # an earlier attempt failed
+                self._client.delete_tag(self._id, ERROR_TAG)
+        return self._id
 
-    def open(self, state: MirrorState, results: str | None) -> MirrorState:
-        """Open the run (see `gsbench.tracking.sinks.Sink`).
-
-        A deleted run, or one in another tracker, is replaced.
-        """
-        runs, uri = self._trial.folder.runs, str(self.client.tracking_uri)
-        if uri == default_uri(runs):
-            uri = OWN_DATABASE  # a runs folder may be moved
-        experiment_id = ensure_experiment(self.client, self._trial.values["name"], runs)
-        run = None
-        if state.uri == uri and state.token:
-            same = f"tags.`{TOKEN_TAG}` = '{state.token}'"
-            run = next(iter(self.client.search_runs([experiment_id], same, max_results=1)), None)
-        if run is not None and state.complete not in (None, results):
-            # it shows results that are no longer the trial's
-            self.client.delete_run(run.info.run_id)
-            run = None
-        if run is None:
-            token = uuid.uuid4().hex
-            state = MirrorState(uri=uri, token=token, started=int(time.time() * 1000))
-            # Written before the run is created, so that its token finds it even if the server's
-            # answer is lost.
-            write_json(self._trial.folder.path / STATE, state.to_json())
-            user = psutil.Process().username()
-            tags = self._trial.tags() | {TOKEN_TAG: token, "mlflow.user": user}
-            run = self.client.create_run(experiment_id, tags=tags, run_name=self._trial.label)
-        self.run_id, self._started = run.info.run_id, state.started
-        if PARAMS_TAG not in run.data.tags:
-            self._log_params()
-        require_own_artifacts(self.client, str(run.info.artifact_uri), runs)
-        if state.complete is None:
-            self.client.update_run(self.run_id, status="RUNNING")
-        return state
-
-    def log(self, scalars: Sequence[Scalar]) -> None:
-        """Log numbers, which MLflow sends in batches."""
-        from mlflow.entities import Metric
-
-        metrics = [
-            Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step)
-            for scalar in scalars
-        ]
-        self.client.log_batch(self.run_id, metrics=metrics)
-
-    def complete(self, summary: Summary) -> None:
-        """Log the final metrics, pictures and files, and close the run."""
-        from mlflow.entities import RunTag
-
-        if ERROR_TAG in self.client.get_run(self.run_id).data.tags:  # an earlier attempt failed
-            self.client.delete_tag(self.run_id, ERROR_TAG)
-        self.log(summary.scalars)
-        tags = summary.tags | {NOTE: summary.note[:MAX_TAG]}
-        self.client.log_batch(self.run_id, tags=[RunTag(key, value) for key, value in tags.items()])
-        for folder, path in summary.files:
-            self.client.log_artifact(self.run_id, str(path), folder or None)
-        at = self._time_of(summary.seconds)
-        for key, picture in summary.pictures.items():
-            self.client.log_image(
-                self.run_id, picture, key=key, step=summary.step, timestamp=at, synchronous=True
-            )
-        self.client.set_terminated(self.run_id, "FINISHED")
-
-    def stop(self, status: str, reason: str | None) -> None:
-        """Close the run. The ``reason`` of a failure becomes a tag, and its files are uploaded."""
-        if reason is not None:
-            self.client.set_tag(self.run_id, ERROR_TAG, reason[:MAX_TAG])
-            for name in (layout.CONFIG, layout.FAILED, layout.LOG):
-                if (self._trial.folder.path / name).exists():
-                    self.client.log_artifact(self.run_id, str(self._trial.folder.path / name))
-        self.client.set_terminated(self.run_id, status)
-
-    def _log_params(self) -> None:
+    def params(self, values: Mapping[str, str]) -> None:
+        """Log the settings, cut for servers that take only short ones."""
         from mlflow.entities import Param
         from mlflow.exceptions import MlflowException
 
-        values = self._trial.params()
         for limit in MAX_VALUES:
             params = [Param(key, value[:limit]) for key, value in values.items()]
             try:
-                self.client.log_batch(self.run_id, params=params)
+                self._client.log_batch(self._id, params=params)
                 break
             except MlflowException:  # perhaps a value is too long for this server
                 if limit == MAX_VALUES[-1] or max(map(len, values.values())) <= MAX_VALUES[-1]:
                     raise
-        self.client.set_tag(self.run_id, PARAMS_TAG, "1")
+
+    def tags(self, values: Mapping[str, str]) -> None:
+        """Set tags; the note becomes the run's description."""
+        from mlflow.entities import RunTag
+
+        named = {DESCRIPTION if key == NOTE else key: text for key, text in values.items()}
+        tags = [RunTag(key, text[:MAX_TAG]) for key, text in named.items()]
+        self._client.log_batch(self._id, tags=tags)
+
+    def metrics(self, scalars: Sequence[Scalar]) -> None:
+        """Log numbers, which MLflow sends in batches."""
+        from mlflow.entities import Metric
+
+        metrics = [
+            Metric(one.key, one.value, self._time_of(one.seconds), one.step) for one in scalars
+        ]
+        self._client.log_batch(self._id, metrics=metrics)
+
+    def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
+        """Upload files, and show the pictures in MLflow's grid."""
+        for name, path in files.items():
+            self._client.log_artifact(self._id, str(path), name.rpartition("/")[0] or None)
+        for one in pictures:
+            self._client.log_image(
+                self._id,
+                one.pixels,
+                key=one.key,
+                step=one.step,
+                timestamp=self._time_of(one.seconds),
+                synchronous=True,
+            )
+
+    def close(self, status: Status, reason: str | None) -> None:
+        """End the run; the reason of a failure becomes a tag."""
+        if reason is not None:
+            self._client.set_tag(self._id, ERROR_TAG, reason[:MAX_TAG])
+        self._client.set_terminated(self._id, status)
+
+    def _found(self, experiment: str, token: str | None) -> Any:
+        same = f"tags.`{TOKEN_TAG}` = '{token}'"
+        return next(iter(self._client.search_runs([experiment], same, max_results=1)), None)
 
     def _time_of(self, seconds: float) -> int:
         """The time, in ms since 1970, ``seconds`` of training after the run's start."""
-        return int(self._started + 1000 * seconds)
+        return int(self._run.started + 1000 * seconds)

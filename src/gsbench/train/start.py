@@ -62,8 +62,7 @@ def check_start(
     if scene.extent == 0:
         raise InputError(
             f"scene {scene.name}: all training cameras stand at one place, so no depth can be "
-            "learnt: take photographs "
-            "from several places"
+            "learnt: take photographs from several places"
         )
     warnings = far_cameras(scene) + odd_lenses(scene)
     _warn(scene, warnings)  # before the errors below, because they may explain an error
@@ -76,9 +75,8 @@ def check_start(
     if not distances[farthest] <= MAX_DISTANCE:
         raise InputError(
             f"initial point {farthest} of {len(points):,} is {distances[farthest]:.3g} times as "
-            "far from the cameras "
-            f"as they are from each other, at {_place(points[farthest], normalization)}: remove "
-            "it from the cloud"
+            "far from the cameras as they are from each other, at "
+            f"{_place(points[farthest], normalization)}: remove it from the cloud"
         )
     identical = _identical_share(points)
     if identical == 1.0:
@@ -89,8 +87,7 @@ def check_start(
     if not seen_by.any():
         raise InputError(
             "no training view has one of the initial points in view: the cloud lies in other "
-            "coordinates than the "
-            "cameras; bring it into theirs"
+            "coordinates than the cameras; bring it into theirs"
         )
     facts = InitialCloud(
         seen=float((seen_by >= 2).mean()),
@@ -157,8 +154,8 @@ def far_cameras(scene: Scene) -> list[str]:
     typical = float(np.median(distances))
     return [
         f"the camera of {view.name} is {distance / typical:,.0f} times as far from the others as "
-        "they usually are, and "
-        f"sets the scene extent to {scene.extent:.4g}: check its pose, or leave the image out"
+        f"they usually are, and sets the scene extent to {scene.extent:.4g}: check its pose, or "
+        "leave the image out"
         for view, distance in zip(scene.train, distances, strict=True)
         if distance > FAR_CAMERA * typical > 0
     ]

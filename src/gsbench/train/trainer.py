@@ -334,9 +334,8 @@ class Trainer:
         except torch.OutOfMemoryError as error:
             raise TrainingError(
                 f"iteration {self.step}: {self.device} has no memory left at "
-                f"{len(self.gaussians):,} Gaussians; "
-                f"{_last_state(folder)}; lower densify.max_gaussians, scene.max_size or the "
-                "number of trials at once "
+                f"{len(self.gaussians):,} Gaussians; {_last_state(folder)}; lower "
+                "densify.max_gaussians, scene.max_size or the number of trials at once "
                 "(launch.parallel), or end other programs on that device"
             ) from error
 

@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 from gsbench.errors import InputError
 from gsbench.verbs import VERBS
-from gsbench.words import did_you_mean, is_path
+from gsbench.words import did_you_mean, is_path, split_outside_brackets
 
 MAX_PORT = 65535
 
@@ -105,8 +105,8 @@ def _condition(text: str) -> tuple[str, str]:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Different names, separated by commas; an argument's ``type``."""
-    words = tuple(word.strip() for word in text.split(","))
+    """Different names, such as ``adc,momentum[decay=0.9, lr=1]``; an argument's ``type``."""
+    words = tuple(word.strip() for word in split_outside_brackets(text, ","))
     if not all(words) or len(set(words)) < len(words):
         raise argparse.ArgumentTypeError(f"must be different names, comma between, got {text!r}")
     return words

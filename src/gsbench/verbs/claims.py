@@ -11,6 +11,7 @@ from typing import Any
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.designs import Components, Design, designs_needed, estimate_components
+from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair
 from gsbench.analysis.planning import COMMANDS, UNSURE, Purpose, deviation_range
 from gsbench.analysis.quantities import Quantity, quantity
@@ -18,10 +19,11 @@ from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
-from gsbench.claims.check import Check, make_page, prepare, recheck, to_html, to_text
+from gsbench.claims.check import Check, prepare, recheck
+from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, RETRIES
-from gsbench.claims.stopping import KeyAndSeed, run_looks
+from gsbench.claims.stopping import KeyAndSeed
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
 from gsbench.config.trust import PERMISSIONS
@@ -30,7 +32,7 @@ from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.record import declare_questions
-from gsbench.runs.experiments import ERROR_RATE, Question, read_declarations
+from gsbench.runs.experiments import ERROR_RATE, Question
 from gsbench.runs.layout import SEED
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
 from gsbench.words import counted
@@ -97,7 +99,7 @@ def _recheck(file: ClaimsFile, archive: Path, out: Path | None) -> None:
     if out is not None and out.suffix != ".html":
         raise InputError(f"--out {out}: a page ends in .html")
     with tempfile.TemporaryDirectory() as folder:
-        page = make_page(file, *recheck(file, archive, Path(folder)))
+        page = make_page(recheck(file, archive, Path(folder)))
         print(to_text(page), end="")
         if out is None:
             print("The whole page says what each verdict rests on: --out PAGE.html")
@@ -160,11 +162,12 @@ def _run(check: Check) -> None:
         if unfinished:
             run_batch(unfinished)
 
-    verdicts = check.verdicts(run_looks(check.declaration, check.judged, run))
-    page = make_page(check.file, verdicts, check.declaration, read_declarations(check.home))
-    write_text(check.home / HTML, to_html(page))
-    for verdict in verdicts:
-        print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.reason}")
+    checked = check.checked(check.asked.answer(run))
+    write_text(check.home / HTML, to_html(make_page(checked)))
+    for one in checked.verdicts:
+        print(f"{one.word:<19}  {one.claim.id}: {one.sentence}")
+    for note in texts(checked.unused):
+        print(note)
     print(check.home / HTML)
 
 
@@ -214,11 +217,11 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    print("\n".join([*comparison.sentences, *comparison.unused, *experiment.warnings]))
+    print("\n".join([*comparison.sentences, *texts(comparison.unused), *experiment.warnings]))
     for baseline, arm in comparison.pairs:
         paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
-            reason = next(iter(paired.left_out), "they share no scene and seed")
+            reason = next(map(str, paired.left_out), "they share no scene and seed")
             fault = f"no trials of {baseline} and {arm} can be paired in {metric.name}: {reason}"
             if len(comparison.pairs) == 1:
                 raise InputError(fault)
@@ -248,8 +251,8 @@ def _lines(
         between = f", between scenes by {components.between:{digits}}"
     lines = [
         f"  differences in {metric.name} vary between seeds by "
-        f"{components.within:{digits}}{between} "
-        f"(from {counted(components.trials, 'pair')} on {counted(components.scenes, 'scene')})"
+        f"{components.within:{digits}}{between} (from {counted(components.trials, 'pair')} on "
+        f"{counted(components.scenes, 'scene')})"
     ]
     groups = {"these scenes": False, f"scenes like these (from {MIN_SCENES} scenes on)": True}
     for group, like_these in groups.items():

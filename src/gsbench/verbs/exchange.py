@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsbench.analysis.addresses import TRIAL
 from gsbench.analysis.pairing import BASELINE
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import TrialResult, load_all_trials
@@ -18,7 +19,6 @@ from gsbench.runs.keys import INIT
 from gsbench.runs.layout import STORE
 from gsbench.settings import is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
-from gsbench.view import ADDRESS
 from gsbench.words import readable_bytes
 
 DONE, LEFT_OUT = 0, 1
@@ -117,7 +117,7 @@ def _export_parser() -> ArgumentParser:
         "trial",
         nargs="*",
         metavar="TRIAL",
-        help=f"{ADDRESS}; after the word init: its initial model",
+        help=f"{TRIAL}; after the word init: its initial model",
     )
     parser.add_argument(
         "--out",
@@ -174,8 +174,8 @@ def check_form(out: Path) -> None:
     if not out.name.lower().endswith(".ply") or out.name.lower().endswith(".compressed.ply"):
         raise InputError(
             f"--out {out}: name a file that ends in .ply, the 3DGS form, which every viewer and "
-            "trainer reads, or in "
-            ".html, a page for browsers (docs/other_models.md says what makes other forms)"
+            "trainer reads, or in .html, a page for browsers (docs/other_models.md says what makes "
+            "other forms)"
         )
 
 

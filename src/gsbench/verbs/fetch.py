@@ -144,8 +144,8 @@ def _parser(names: Sequence[str]) -> ArgumentParser:
     parser = ArgumentParser(
         "fetch",
         f"They come into the data folder (${DATA_VARIABLE}, else ./data), where scene=NAME finds "
-        "them: only the wanted "
-        "scenes and image folders out of the archives. Stopped, the same command goes on.",
+        "them: only the wanted scenes and image folders out of the archives. Stopped, the same "
+        "command goes on.",
     )
     parser.add_argument("dataset", nargs="?", metavar="DATASET", help=", ".join(names))
     parser.add_argument(

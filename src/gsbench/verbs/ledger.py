@@ -10,13 +10,14 @@ from typing import Any
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.ledger_table import describe_ledger, difference_text, ledger_tables, why
 from gsbench.analysis.looks import FIRST_LOOK
+from gsbench.analysis.notes import texts
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
 from gsbench.claims.ledger import IDEAS, RATE
-from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
+from gsbench.claims.stopping import KeyAndSeed, finished_trials
 from gsbench.config.command_words import key_of, typed_permissions
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
@@ -210,10 +211,8 @@ def _run(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
         else:
             fails = "its trials fail" if code else ""
 
-    def judged() -> list[Any]:
-        return [rules.judge_idea(finished_trials(home, trials.values()), declaration)]
-
-    (verdict,) = run_looks(declaration, judged, run)
+    asked = rules.ask_idea(declaration, lambda: finished_trials(home, trials.values()))
+    (verdict,) = asked.answer(run)
     ended = rules.end_of(idea, verdict, stamp_now())
     if fails and not verdict.final:
         own = set(book.keys_of(idea).values())
@@ -303,7 +302,9 @@ def show(options: argparse.Namespace, home: Path) -> int:
         values = {"opened": book.opened.to_json(), "ideas": ideas, "confirmations": confirmations}
         print(json.dumps(values | _left(book), indent=1))
         return 0
-    print("\n".join([*describe_ledger(book), "", *map(to_markdown, ledger_tables(book))]))
+    left_out = texts(rules.unused(book, trials))
+    tables = map(to_markdown, ledger_tables(book))
+    print("\n".join([*describe_ledger(book), "", *tables, *left_out]))
     return 0
 
 
@@ -406,7 +407,7 @@ def _print_idea(book: Ledger, idea: str, as_json: bool) -> None:
         return
     ended = book.ended[idea]
     difference = difference_text(book.opened, ended.difference)
-    facts = [f"{book.opened.metric} {difference}"] * bool(difference)
+    facts = [f"{book.opened.metric} {difference}"] if difference else []
     if ended.seconds is not None:
         facts.append(f"{ended.seconds:.2f} times the training time")
     print("; ".join([f"{idea}: {ended.result}: {why(ended)}", *facts]))

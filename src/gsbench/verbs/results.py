@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsbench.analysis.addresses import CELL, trials_of_arm
 from gsbench.analysis.cells import (
     check_averageable,
     make_cell,
@@ -29,7 +30,6 @@ from gsbench.analysis.results import (
     Arm,
     Experiment,
     TrialResult,
-    group_by,
     load_experiment,
 )
 from gsbench.analysis.table_formats import FORMATS
@@ -44,12 +44,8 @@ from gsbench.files import own_output, writable_output, write_text
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.package_code import edited
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
-from gsbench.words import some_of
+from gsbench.words import some_of, split_outside_brackets
 
-ADDRESS = (
-    "EXPERIMENT:SCENE:METRIC:ARM, such as table1:garden:lpips:volumetric or "
-    "demo:courtyard:psnr:sfm-adc"
-)
 TRIALS, JSON = "trials", "json"
 FAIRNESS = "fairness"
 PAPER_NOTES = "paper"  # `gsbench tables paper` shows the paper's own inconsistencies
@@ -269,16 +265,16 @@ def file_at(out: Path, experiment: str) -> Path:
 def explain(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     parser = ArgumentParser("explain")
-    parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {ADDRESS}")
+    parser.add_argument("cell", metavar="CELL", help=f"a number of a table: {CELL}")
     print(explain_cell(parser.parse_args(argv).cell, runs))
     return 0
 
 
 def explain_cell(address: str, runs: Path) -> str:
     """Plain text about the cell at ``address``; raises ``InputError`` if there is no such cell."""
-    parts = address.split(":")
+    parts = split_outside_brackets(address, ":")
     if len(parts) != 4 or not all(parts):
-        raise InputError(f"{address!r} is not {ADDRESS}")
+        raise InputError(f"{address!r} is not {CELL}")
     name, scene, metric, arm = parts
     experiment = load_experiment(runs, name)
     trials = _trials_at(experiment, scene, arm)
@@ -305,17 +301,12 @@ def explain_cell(address: str, runs: Path) -> str:
 
 
 def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
-    """The trials of a scene and of the one arm that ``word`` names (`Arm.answers_to`)."""
-    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
+    """The trials of a scene and of the one arm that ``word`` names."""
+    of_scene = [one for one in with_variants(experiment.trials) if one.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
         raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")
-    by_arm = group_by(of_scene, lambda trial: trial.arm)
-    chosen = [arm for arm in by_arm if arm.answers_to(word)]
-    if len(chosen) != 1:
-        names = ", ".join(str(arm) for arm in sorted(chosen or by_arm))
-        raise InputError(f"{word!r} names {len(chosen)} arms of {scene}; choose one of {names}")
-    return by_arm[chosen[0]]
+    return trials_of_arm(of_scene, word, f" of {scene}")
 
 
 def _trials_lines(trials: Sequence[TrialResult], shown: Quantity) -> list[str]:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import requests
 
+from gsbench.analysis.addresses import TRIAL
 from gsbench.errors import InputError
 from gsbench.runs.experiments import experiment_home, list_experiments
 from gsbench.runs.layout import DATABASE
@@ -24,7 +25,6 @@ from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking.comparison import addresses, publish
 from gsbench.tracking.mlflow_sink import SETTINGS, absolute_address, default_uri, tracker_uri
 from gsbench.verbs.arguments import ArgumentParser, port
-from gsbench.view import ADDRESS
 
 VIEWER_PORT, DASHBOARD_PORT = 8080, 5000
 SECONDS_TO_ANSWER, SECONDS_TO_START = 5.0, 60
@@ -35,7 +35,7 @@ LEAN = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
 def view(argv: Sequence[str], runs: Path) -> int:
     """Run the verb: serves the viewer until Ctrl-C."""
     parser = ArgumentParser("view")
-    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=ADDRESS)
+    parser.add_argument("trial", nargs="+", metavar="TRIAL", help=TRIAL)
     parser.add_argument(
         "--port", type=port, default=VIEWER_PORT, help=f"on this machine; 0: any ({VIEWER_PORT})"
     )

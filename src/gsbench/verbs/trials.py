@@ -258,17 +258,28 @@ def sync(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser("sync")
     parser.add_argument("experiment", nargs="?", help="its name; without one, all")
     parser.add_argument(
+        "permissions",
+        nargs="*",
+        metavar="allow_targets=[mine]",
+        help="for trials that a tracker of your own shows",
+    )
+    parser.add_argument(
         "--uri",
         help="such as http://127.0.0.1:5000; default: $MLFLOW_TRACKING_URI, or the runs folder's",
     )
     options = parser.parse_args(argv)
-    names = [options.experiment] if options.experiment else list_experiments(runs)
+    words = [options.experiment or "", *options.permissions]
+    experiment = "" if "=" in words[0] else words.pop(0)
+    if unread := [word for word in words if key_of(word) != PERMISSIONS]:
+        raise InputError(f"sync reads only {PERMISSIONS}, not {unread[0]}")
+    allow_modules(allowed := typed_permissions(words))
+    names = [experiment] if experiment else list_experiments(runs)
     homes = [experiment_home(runs, name) for name in names]
     try:
         folders: list[TrialFolder] = []
         for home in homes:
             folders += [TrialFolder(Path(place)) for place in sorted(trial_folders(home))]
-        for line in send_missing(folders, options.uri):
+        for line in send_missing(folders, options.uri, allowed):
             print(line, flush=True)
     except (MirrorError, OSError) as error:
         raise GsbenchError(f"{error}; the files are complete: try again") from error

@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsbench.analysis.cells import select_trials
+from gsbench.analysis.comparison import unused_trials
+from gsbench.analysis.notes import texts
 from gsbench.analysis.results import TrialResult, group_by, read_experiment
+from gsbench.analysis.verdict_words import reason, with_notes
 from gsbench.app.command import one_trial_per_scene, run_trials
 from gsbench.claims import gate as gates
 from gsbench.claims.archive import unpack_archive
-from gsbench.claims.stopping import KeyAndSeed, finished_trials, run_looks
+from gsbench.claims.stopping import KeyAndSeed, finished_trials
 from gsbench.config.compose import Trial, with_seed
 from gsbench.errors import GsbenchError, InputError, TrainingError
 from gsbench.external.program import run_program
@@ -39,10 +42,9 @@ def gate(argv: Sequence[str], runs: Path) -> int:
     """
     parser = ArgumentParser(
         "gate",
-        "It trains this version on scenes and seeds of an archive (gsbench export --results), "
-        "seed by seed until it "
-        "is decided. Exit code 0: not worse by --least; 1: worse, or a trial failed; 3: undecided; "
-        "2: bad input (docs/gate.md).",
+        "It trains this version on scenes and seeds of an archive (gsbench export --results), seed "
+        "by seed until it is decided. Exit code 0: not worse by --least; 1: worse, or a trial "
+        "failed; 3: undecided; 2: bad input (docs/gate.md).",
     )
     parser.add_argument("archive", type=path, help="the results of the version that you trust")
     add_question(parser)
@@ -70,11 +72,11 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         }
         make_runs_folder(checked_runs_folder(str(home.parent)))
         old = [trial for of_scene in baseline.values() for trial in of_scene if trial.seed in seeds]
-        gate = gates.Gate(
-            declare_questions(home, declaration),
-            lambda: old,
-            lambda: finished_trials(home, trials.values()),
-        )
+
+        def new() -> list[TrialResult]:
+            return finished_trials(home, trials.values())
+
+        asked = gates.ask_gate(declare_questions(home, declaration), lambda: old, new)
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
             if code := run_trials([trials[key] for key in planned if key in trials]):
@@ -82,11 +84,12 @@ def gate(argv: Sequence[str], runs: Path) -> int:
                     "the new version's trials fail: nothing is compared"
                 )
 
-        (verdict,) = run_looks(gate.declaration, gate.judged, run)
+        (verdict,) = asked.answer(run)
         if verdict.answer is None and not verdict.equal:
-            reasons = filter(None, (verdict.untestable, *verdict.notes, "trials are missing"))
-            raise InputError(f"the versions cannot be compared: {next(reasons)}")
-        print("\n".join([gates.describe(verdict), *gates.deviations(old, list(gate.new()))]))
+            why = with_notes(reason(verdict), verdict)
+            raise InputError(f"the versions cannot be compared: {why}")
+        left_out = texts(unused_trials([*asked.read()], [verdict]))
+        print("\n".join([gates.describe(verdict), *left_out, *gates.deviations(old, new())]))
     return EXIT_CODES[gates.result_of(verdict)]
 
 
@@ -132,11 +135,9 @@ def bisect(argv: Sequence[str], runs: Path) -> int:
     parser = ArgumentParser(
         "bisect",
         "It searches the git repository of this folder: one with a densifier of your own, or "
-        "gsbench's checkout. Each "
-        "step trains one commit in a work tree of its own and compares it with GOOD and BAD; all "
-        "steps share an error rate of 5 %. The same command goes on after a kill. Exit code 0: "
-        "found, 3: not found "
-        "(docs/gate.md).",
+        "gsbench's checkout. Each step trains one commit in a work tree of its own and compares it "
+        "with GOOD and BAD; all steps share an error rate of 5 %. The same command goes on after a "
+        "kill. Exit code 0: found, 3: not found (docs/gate.md).",
     )
     parser.add_argument("good", help="a commit, tag or branch whose results are good")
     parser.add_argument("bad", help="a later one whose results are worse")
@@ -182,10 +183,10 @@ class CommitSearch:
             for version, k in places.items()
         }
         good, bad, new = (lambda home=home: _trials(home) for home in homes.values())
-        asked: gates.Gate | gates.Step = (
-            gates.Gate(self.declaration, good, new)
+        asked = (
+            gates.ask_gate(self.declaration, good, new)
             if number == last
-            else gates.Step(self.declaration, self.share, good, bad, new)
+            else gates.ask_step(self.declaration, self.share, good, bad, new)
         )
 
         def run(planned: Sequence[KeyAndSeed]) -> None:
@@ -194,7 +195,7 @@ class CommitSearch:
                 self._train(place, homes[version], seeds)
 
         try:
-            verdicts = run_looks(asked.declaration, asked.judged, run)
+            verdicts = asked.answer(run)
         except TrainingError as error:
             if number == last or not good():
                 raise

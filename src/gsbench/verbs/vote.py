@@ -6,10 +6,11 @@ import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsbench.analysis.addresses import trials_of_arm
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.pairing import BASELINE
-from gsbench.analysis.results import Arm, Experiment, load_experiment
+from gsbench.analysis.results import Arm, Experiment, TrialResult, load_experiment
 from gsbench.analysis.statistics import ALPHA, sign_test_needs
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.vote_words import describe_round, load_rounds, people_words, vote_table
@@ -22,7 +23,7 @@ from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.layout import VOTE_KEY, VOTES
 from gsbench.runs.votes import Ballot, RoundKey, StoredBallot, check_ballot, read_key, store_ballots
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
-from gsbench.words import counted, some_of
+from gsbench.words import counted
 
 PAIRS, PEOPLE = 40, 9  # nine: the sign test then lets one person disagree
 MOST = 1000  # pairs, and people
@@ -88,7 +89,7 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     from gsbench.claims.vote_page import PAGE, make_round  # here, for a quick answer to --help
 
     trials = with_variants(experiment.trials)
-    arms = choose_arms(sorted({trial.arm for trial in trials}), options.arms)
+    arms = choose_arms(trials, options.arms)
     out: Path = options.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(
@@ -177,19 +178,13 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
             print("\n".join([*describe_round(verdict), *tables]))
 
 
-def choose_arms(arms: Sequence[Arm], wanted: Sequence[str]) -> list[Arm]:
-    """The wanted arms, by whole name or densifier, the baseline first; all arms by default.
+def choose_arms(trials: Sequence[TrialResult], wanted: Sequence[str]) -> list[Arm]:
+    """The wanted arms of ``trials``, the baseline first; all arms by default.
 
     Raises InputError unless each word names one arm, and there are two.
     """
-    chosen: list[Arm] = []
-    for word in wanted:
-        own = [arm for arm in arms if arm.answers_to(word)]
-        if len(own) != 1:
-            raise InputError(
-                f"--arms: {word!r} names {len(own)} arms; there are {some_of([*map(str, arms)])}"
-            )
-        chosen += own
+    arms = sorted({trial.arm for trial in trials})
+    chosen = [trials_of_arm(trials, word)[0].arm for word in wanted]
     # Two words may name the same arm.
     unique = list(dict.fromkeys(chosen)) or sorted(arms, key=lambda arm: arm.densify != BASELINE)
     if len(unique) < 2:

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from gsbench.analysis.addresses import TRIAL, fitting
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.results import TrialResult, load_experiment
 from gsbench.densify.volumetric import log_volume
@@ -35,7 +36,7 @@ from gsbench.runs.store import Store
 from gsbench.scene.colmap import model_points, pinhole_camera, read_model
 from gsbench.scene.images import png_name, read_image
 from gsbench.scene.types import PINHOLE_NAMES, Camera, View
-from gsbench.view import ADDRESS
+from gsbench.words import split_outside_brackets
 
 # raised by numpy for a file that is missing or damaged
 DAMAGE = (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
@@ -65,25 +66,21 @@ class ViewedTrial:
 
 
 def find_trial(address: str, runs: Path) -> TrialResult:
-    """The trial at ``address`` (see ``ADDRESS``); if several seeds match, the first.
+    """The trial at ``address`` (`TRIAL`); if several seeds match, the first.
 
     Raises InputError if there is no such trial, or if several arms match.
     """
     folder = Path(address).expanduser()
     if folder.is_dir():
         return _trial_in(folder.resolve())
-    parts = address.split(":")
+    parts = split_outside_brackets(address, ":")
     if len(parts) not in (3, 4) or not all(parts):
-        raise InputError(f"{address!r} is neither a folder nor EXPERIMENT:SCENE:DENSIFY[:SEED]")
-    name, scene, densify, *seed = parts
+        raise InputError(f"{address!r} is neither a folder nor EXPERIMENT:SCENE:ARM[:SEED]")
+    name, scene, arm, *seed = parts
     trials = with_variants(load_experiment(runs, name).trials)
-    matches = [
-        trial
-        for trial in trials
-        if trial.scene == scene
-        and trial.arm.answers_to(densify)
-        and (not seed or str(trial.seed) == seed[0])
-    ]
+    wanted = [t for t in trials if t.scene == scene and str(t.seed) in (seed or [str(t.seed)])]
+    matches = [trial for own in fitting(wanted, [arm]).values() for trial in own]
+    matches.sort(key=lambda trial: trial.seed)
     if not matches:
         arms = {f"{name}:{trial.scene}:{trial.arm}:{trial.seed}" for trial in trials}
         raise InputError(f"no complete trial {address}; there are {', '.join(sorted(arms))}")
@@ -99,12 +96,12 @@ def find_trial(address: str, runs: Path) -> TrialResult:
 def _trial_in(folder: Path) -> TrialResult:
     # RUNS/EXPERIMENT/SCENE/ARM/TRIAL
     if len(folder.parents) < 4 or not (folder / RESULTS).is_file():
-        raise InputError(f"{folder} is not a trial's folder; give {ADDRESS}")
+        raise InputError(f"{folder} is not a trial's folder; give {TRIAL}")
     experiment = load_experiment(folder.parents[3], folder.parents[2].name)
     for trial in (*experiment.trials, *experiment.older):
         if trial.path == folder:
             return trial
-    raise InputError(f"{folder} is not a complete trial; give {ADDRESS}")
+    raise InputError(f"{folder} is not a complete trial; give {TRIAL}")
 
 
 def model_file(trial: TrialResult) -> Path:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.analysis import verdicts
+from gsbench.analysis import verdict_words
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.differences import between_scenes_notes
@@ -22,6 +22,7 @@ from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
+from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair_trials
 from gsbench.analysis.paper import layout_of, load_paper, paper_tables
 from gsbench.analysis.quantities import COSTS, choose_quantities, relative_change
@@ -30,7 +31,7 @@ from gsbench.analysis.report.charts import ForestRow, forest_plot, line_chart, r
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry, fill
 from gsbench.analysis.tables import build_table, with_agreement
-from gsbench.analysis.verdicts import PairVerdicts
+from gsbench.analysis.verdicts import PairVerdicts, seeds_to_resolve
 from gsbench.analysis.vote_words import describe_round, disagreements, load_rounds, vote_table
 from gsbench.analysis.votes import RoundVerdict
 from gsbench.errors import InputError
@@ -93,16 +94,15 @@ def build_report(
         versus=[compare_arms(trials, own) for own in judged],
         ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
-        declared=[*comparison.declaration_lines, *verdicts.families(judged)],
-        unused=[*[CHOSEN.format(chosen)] * bool(where), *comparison.unused],
+        declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
+        unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.unused)],
         tables=[_without_verdicts(one) for one in with_agreement(tables)],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
-        say=verdicts,
-        signed=lambda value, decimals: (
-            "unknown" if value is None else signed(value, f".{decimals}f")
-        ),
+        say=verdict_words,
+        seeds_to_resolve=seeds_to_resolve,
+        signed=lambda value, decimals: "–" if value is None else signed(value, f".{decimals}f"),
         training=training_charts(trials, arms),
         event_table=event_table(trials, arms),
         events=event_charts(trials, arms),
@@ -119,7 +119,7 @@ CHOSEN = "Tables, curves and pictures show only trials with {}; verdicts rest on
 
 def _without_verdicts(table: Table) -> Table:
     """The table without the notes on verdicts, which the top of the page has."""
-    notes = [note for note in table.notes if not note.startswith(VERDICT)]
+    notes = [note for note in table.notes if not str(note).startswith(VERDICT)]
     return replace(table, notes=tuple(notes))
 
 
@@ -148,12 +148,12 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "judged": judged,
         "title": f"{second} against {first}",
         "has_like_these": any(one.like_these is not None for one in judged.verdicts),
-        "caveats": caveats(trials, first, second),
+        "caveats": " ".join(texts(caveats(trials, first, second))),
         "fairness": fairness_table(trials, first, second),
         "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
         "forests": [_forest(verdict) for verdict in judged.verdicts],
         "views": views,
-        "notes": dict.fromkeys([*judged.notes, *faults]),
+        "notes": texts([*judged.notes, *faults]),
     }
 
 

@@ -243,8 +243,8 @@ def triangulate(
     if model.num_points3D() == 0:
         raise InputError(
             "no point could be triangulated under the reference cameras: the matches contradict "
-            "them (are they the "
-            "cameras of these photos?), or the photos have too little texture or overlap"
+            "them (are they the cameras of these photos?), or the photos have too little texture "
+            "or overlap"
         )
     # On some processors the solver changes the fixed poses by a rounding error.
     for image in model.images.values():

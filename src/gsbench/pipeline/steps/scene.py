@@ -38,12 +38,14 @@ from gsbench.scene.images import (
 )
 from gsbench.scene.load import load_scene
 from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
+from gsbench.scene.own_reader import PosedImages, SceneReader, read_posed_images
 from gsbench.scene.readers import (
     SPARSE_FOLDERS,
     existing_folder,
     fingerprint,
     read_colmap,
     read_photos,
+    read_posed,
     read_transforms,
     require_subfolder,
 )
@@ -58,17 +60,25 @@ from gsbench.system.resources import available_threads
 class CaptureSource:
     """The source of the photographs of a scene: the user's folder, or a step that makes them."""
 
-    def __init__(self, options: SceneConfig) -> None:
+    def __init__(
+        self,
+        options: SceneConfig,
+        reader: SceneReader | None = None,
+        user: UserCode = NO_USER_CODE,
+    ) -> None:
         self.options, self.name = options, str(options.name)
+        self._reader, self._user = reader, user
 
     @cached_property
     def step(self) -> Step | None:
-        """The step that makes the photographs, or a COLMAP model from ``transforms.json``.
+        """The step that makes the photographs, or a COLMAP model of cameras from other files.
 
         None for a scene whose folder can be read directly.
         """
         if self.options.kind == "transforms":
             return _transforms_step(self._transforms)
+        if self._reader is not None:
+            return _reader_step(self._posed, options_of("scene", self._reader, self._user))
         return _courtyard_step(self.options) if self.options.kind == "courtyard" else None
 
     def read(self, made: Path | None) -> Capture:
@@ -84,6 +94,11 @@ class CaptureSource:
             capture = read_transforms(
                 self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection
             )
+        elif options.kind == "reader":
+            assert made is not None
+            capture = read_posed(
+                self.name, self._folder, self._posed, made / SPARSE_FOLDERS[0], **selection
+            )
         elif options.kind == "photos":
             capture = read_photos(self.name, path, images=options.images, **selection)
         else:
@@ -95,9 +110,18 @@ class CaptureSource:
             check_final_size(image_size(file), options.downscale, options.max_size, str(file))
         return capture
 
+    @property
+    def _folder(self) -> Path:
+        return existing_folder(self.name, str(self.options.path))
+
+    @cached_property
+    def _posed(self) -> PosedImages:
+        assert self._reader is not None
+        return read_posed_images(self._reader, self._folder)
+
     @cached_property
     def _transforms(self) -> Transforms:
-        folder = existing_folder(self.name, str(self.options.path))
+        folder = self._folder
         images = self.options.images
         if images is not None:
             require_subfolder(folder, images, "scene.images")
@@ -128,6 +152,21 @@ def _transforms_step(transforms: Transforms) -> Step:
             grey = np.full(points.shape, GREY, dtype=np.uint8)
             cloud = transforms.applied_to_points.undo(points), grey if colors is None else colors
         write_frames(target / SPARSE_FOLDERS[0], transforms.images, cloud=cloud)
+
+    return step_of(CAPTURE, inputs, build)
+
+
+def _reader_step(posed: PosedImages, reader: dict[str, Any]) -> Step:
+    """The step that writes what a user's ``reader`` (class, code, options) read as a model."""
+    cameras = {
+        name: [asdict(camera), rotation.tolist(), translation.tolist()]
+        for name, (camera, rotation, translation) in posed.images.items()
+    }
+    points = None if posed.points is None else [values.tolist() for values in posed.points]
+    inputs = {"reader": reader, "cameras": sha256_of(cameras), "points": sha256_of(points)}
+
+    def build(target: Path) -> None:
+        write_frames(target / SPARSE_FOLDERS[0], posed.images, cloud=posed.points)
 
     return step_of(CAPTURE, inputs, build)
 

@@ -1,0 +1,189 @@
+"""Notes: what tables, reports, verdicts and verbs say beside their numbers.
+
+A note is a record of facts, so that code and tests compare facts. Its sentence is made here alone.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Self
+
+from gsbench.events import FEW_ROUNDS
+from gsbench.words import FORM
+
+
+@dataclass(frozen=True)
+class Note:
+    """A note of a kind in `SENTENCES`, with its facts; ``about`` is the metric that it is about.
+
+    Its text (``str``) is the kind's sentence.
+    """
+
+    kind: str
+    facts: tuple[tuple[str, Any], ...] = ()
+    about: str = ""
+
+    @classmethod
+    def of(cls, kind: str, **facts: Any) -> Self:
+        """Make a note; lists become tuples, so that equal notes count once in a set."""
+        known = {key: tuple(f) if isinstance(f, list) else f for key, f in facts.items()}
+        return cls(kind, tuple(known.items()))
+
+    def __getitem__(self, fact: str) -> Any:
+        return dict(self.facts)[fact]
+
+    @property
+    def sentence(self) -> str:
+        """The sentence without the metric."""
+        return FORM.format(SENTENCES[self.kind], **dict(self.facts))
+
+    def __str__(self) -> str:
+        return f"{self.about}: {self.sentence}" if self.about else self.sentence
+
+
+SENTENCES: dict[str, str] = {
+    # ---- pairs of trials that cannot be compared
+    "unlike": "{text}",  # the whole text of an error
+    "conditions": "{scene}: the arms differ in {conditions:list}, so they are not compared",
+    "unpaired": "{scene}: seed {seed} has no partner",
+    "valueless": "{places:few}: {reason}",
+    "uneven": (
+        "{least:n seed} of each scene can count: there are no more of {scenes:few} (others have up "
+        "to {most})"
+    ),
+    "no pairs": "no trials of {baseline} and {arm} can be paired",
+    "no value": "{reason}",
+    # ---- questions that cannot be tested
+    "equal": (
+        "both arms of {pairs:n pair} of trials are equal to the last bit: the settings that differ "
+        "had no effect at this size"
+    ),
+    "as given": "{text}",  # a reason from a file of claims
+    "seen": (
+        "{trials:n trial} had been measured before this was declared. So the metric shares the "
+        "error rate with all metrics that could have been chosen"
+    ),
+    # ---- arms and trials in no verdict
+    "no partner": "{arm} is not compared: there is no {partner}.",
+    "lone baseline": (
+        "{arm} is not compared: it has the baseline's densifier, and no other arm has its "
+        "initialiser."
+    ),
+    "far baseline": (
+        "{arm} is not compared: other arms have a baseline with settings nearer to theirs."
+    ),
+    "unused": "In no verdict: {trials:few} ({reasons:few}).",
+    "not planned": "seeds after an undeclared or missing one do not count",
+    "decided before": "the question was decided with {seeds:n seed}",
+    "not asked": "no declared question is about them",
+    # ---- arms that are unlike in more than was asked
+    "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
+    "unequal counts": (
+        "{arm} has {more} Gaussians than {baseline}, so this does not compare at equal counts. To "
+        "do so: {advice}."
+    ),
+    "no ingredient": "{arm} and {baseline} differ in no recorded setting.",
+    "ingredients": "{arm} differs from {baseline} by {ingredients:all}{alone}.",
+    "compared": "Compared: {pairs:n pair} of trials of one scene and seed.",
+    # ---- the tuning of arms
+    "no tuning": (
+        "No tuning is recorded: each arm ran with one choice of settings. What was tried elsewhere "
+        "is not known."
+    ),
+    "unlike tuning": "They were not tuned alike: {arms:all}.",
+    "vain search": "{arm}: the search {experiment} found nothing.",
+    "search": (
+        "{arm}: {chosen:all} is the best of {points:n point} by {metric} of validation views "
+        "({scenes:all}; seed {seeds:list}; the search {experiment}), {when}. Tried: "
+        "{tried:list}{more:if: and % more}.{others}"
+    ),
+    "varied": (
+        "{arm}: {choices:n choice} of its settings ran here. They differ in {settings:all}, "
+        "and all were measured on the test views that the verdict uses."
+    ),
+    # ---- verdicts, and what was declared
+    "verdict": "Verdict, {sentence}",
+    "declared beforehand": "{metric} was declared beforehand (eval.primary, {when}).",
+    "declared": "{metric} was declared (eval.primary, {when}).",
+    "doubted": (
+        "An arm whose metric or trials were declared after its first result is judged in all "
+        "metrics, adjusted for their number. To test {metric} alone, run other seeds under another "
+        "name, all by one command."
+    ),
+    "replaced": "Declared before it: {metric} ({when}).",
+    "looks to come": (
+        "Seeds come in planned looks (launch.stop_when_decided); {missing} of the "
+        "{declared:n declared trial} are not there."
+    ),
+    "early look": (
+        "{missing} of the {declared:n declared trial} are still missing, so this is an early look. "
+        "Do not stop here because the result pleases: that finds effects that do not exist."
+    ),
+    # ---- how to read a table
+    "one trial": "One trial per cell, so there is no deviation.",
+    "mean": "Mean over {trials} trials; ± is the deviation (n − 1) over {spread}.",
+    "bold": "Bold: best mean of a scene after rounding; this is not a test.",
+    "few values": "(k/{trials}): only k of {trials} trials have a value; —: none.",
+    "protocol": "Protocol {protocols:list}.",
+    "not available": "n/a, {reason}.",
+    "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",
+    "no best": "{place}: not compared, no best marked: {conditions:list} differ.",
+    "unusable": "Left out ({count}): {folders:few}.",
+    "agreement": (
+        "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
+        "3DGS models was {metrics:list} in one study (arXiv 2511.06830, table 3). gsbench vote "
+        "asks people."
+    ),
+    # ---- trials: who made them, on what, and doubts
+    "worthless": "{mark} {trial} is {what}.",
+    "passed over": "{text}.",
+    "filters": (
+        "Pictures of scene.images and of scene.downscale were made by different filters: results "
+        "on them differ by about 0.3 to 0.45 dB."
+    ),
+    "near twins": (
+        "{scene}: {near} of {tested} test views have a near twin in training, so they measure "
+        "memory too."
+    ),
+    "copies": "{scene}: {copies:n photograph} left out, since another one has its name or content.",
+    "few rounds": FEW_ROUNDS,
+    "cloud": "Before training, {scene} {init}: {doubt}.",
+    "program's model": (
+        "Trained here by another program, its model rendered by gsbench (its time is that of the "
+        "whole program, and it sets its own budget): {arms:list}."
+    ),
+    "program's renders": (
+        "Trained here by another program, its own renders measured as they are (its time is that "
+        "of the whole program, and it sets its own budget): {arms:list}."
+    ),
+    "foreign model": (
+        "A model that another program trained, rendered here (its conditions are not known): "
+        "{arms:list}."
+    ),
+    "foreign renders": (
+        "Renders of another program, measured as they are (its conditions are not known): "
+        "{arms:list}."
+    ),
+    "edited": (
+        "{module} was edited since: {trials:n trial} of {arms:few} came from the old code. Give "
+        "the command again to run the new one."
+    ),
+    "machines": (
+        "The trials ran on {kinds} kinds of machine: {trials:parts}. There equal settings give "
+        "other last digits and, after thousands of iterations, other results."
+    ),
+    "clouds": (
+        "{scene}: trials of init {init} started from {clouds} different clouds ({trials:parts})."
+    ),
+    "held out": "Held out{question:if: (%)}{scenes:if:, %}: {rule}; {views}.",
+    "points of all": (
+        "Initial points of {init}: from all views, test views included (init.points_from=all)."
+    ),
+    "points of some": (
+        "Initial points of {init}: from training views alone (init.points_from={choice})."
+    ),
+}
+
+
+def texts(notes: Iterable[object]) -> list[str]:
+    """The sentences of notes, each once."""
+    return list(dict.fromkeys(map(str, notes)))

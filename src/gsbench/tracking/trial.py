@@ -1,0 +1,268 @@
+"""A trial in a tracker's terms: names, curves, results and pictures, read from its files."""
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsbench.eval.facts import find_metric
+from gsbench.parsing import Record, read_if_sound
+from gsbench.runs import layout
+from gsbench.runs.keys import TRAIN
+from gsbench.runs.nested import flatten, sha256_of
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import TrialRecord, read_rows
+
+# characters that MLflow refuses in a picture's name
+NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")
+Array = NDArray[np.uint8]
+FILES = (layout.CONFIG, layout.RESULTS, layout.INIT_REPORT, layout.PER_VIEW, layout.EVENTS)
+# Trackers sort names and show a chart for each, so only what people look at is sent, results first.
+EVAL = "eval"
+CURVES: dict[str, dict[str, str]] = {  # by file: key in it -> name in the tracker
+    layout.CURVES: {
+        "loss": "train/loss",
+        "l1": "train/l1",
+        "ssim": "train/ssim",
+        "num_gaussians": "train/gaussians",
+    },
+    layout.EVENTS: {
+        key: f"train/densify/{key}"
+        for key in (
+            "cloned",
+            "split_gradient",
+            "split_volume",
+            "pruned_opacity",
+            "pruned_size",
+            "blocked_by_cap",
+        )
+    },
+}
+
+
+PICTURE_KINDS = ("1 render", "2 photograph", "3 error")  # of a test view, numbered for their order
+
+
+def picture_key(view: str, kind: str) -> str:
+    """The name of a picture of a test view, with characters that every tracker takes."""
+    return f"{NOT_IN_A_KEY.sub('_', view)}/{kind}"
+
+
+def arm_name(densify: str, init: str) -> str:
+    """The name of an arm.
+
+    The densifier is compared most often. It comes first, since trackers cut long names at the end.
+    """
+    return f"{densify} · {init}"
+
+
+def eval_name(key: str) -> str:
+    """The name of a metric of the test views, with its unit: ``eval/psnr_dB``."""
+    facts = find_metric(key)
+    unit = facts.unit.replace("/", "_per_") if facts else ""
+    return f"{EVAL}/{key}_{unit}" if unit else f"{EVAL}/{key}"
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """One number of a trial: its name, value, iteration, and the seconds of training until then."""
+
+    key: str
+    value: float
+    step: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a test view: ``pixels`` [H, W, 3] uint8, shown at an iteration and a time."""
+
+    key: str
+    pixels: Array
+    step: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The parts of a finished trial that a tracker shows; the tag ``note`` is in Markdown."""
+
+    scalars: Sequence[Scalar]
+    tags: dict[str, str]
+    files: dict[str, Path]  # by their paths in the tracker
+    pictures: Sequence[Picture]
+
+
+@dataclass(frozen=True)
+class TrackedTrial:
+    """A trial in ``folder`` with the configuration ``values``, in the terms of a tracker."""
+
+    folder: TrialFolder
+    values: dict[str, Any]
+
+    @property
+    def arm(self) -> str:
+        """The name of the trial's arm."""
+        return arm_name(self.values["densify"]["name"], self.values["init"]["name"])
+
+    @property
+    def label(self) -> str:
+        """The run's name: densifier, scene and seed."""
+        return (
+            f"{self.values['densify']['name']} · {self.values['scene']['name']} · "
+            f"s{self.values['seed']}"
+        )
+
+    @property
+    def path(self) -> str:
+        """The trial's folder, relative to the runs folder."""
+        return self.folder.path.relative_to(self.folder.runs).as_posix()
+
+    def tags(self) -> dict[str, str]:
+        """The tags by which the trial is found."""
+        names = {group: self.values[group]["name"] for group in ("scene", "init", "densify")}
+        return {"kind": "trial", **names, "seed": str(self.values["seed"]), "folder": self.path}
+
+    def params(self) -> dict[str, str]:
+        """The settings that have a value, by their dotted keys. The arm comes first, for charts."""
+        return {"arm": self.arm} | {
+            key: str(value) for key, value in flatten(self.values).items() if str(value)
+        }
+
+    def results_hash(self) -> str | None:
+        """The hash of the results, by which a mirror knows whether it shows them, or None."""
+        results = self.folder.sound_record()
+        return None if results is None else sha256_of(results.to_json())
+
+    def curves(
+        self, logged: Mapping[str, int], live: bool
+    ) -> Iterator[tuple[str, int, list[Scalar]]]:
+        """Yield name, newest iteration and new scalars of each file of curves with new records.
+
+        Records after the iteration ``logged[name]`` are new. ``live`` says that the trial runs.
+        """
+        # A training in progress writes to its own folder in the store. The trial's folder has the
+        # curves of the last training that ended, perhaps of an earlier command.
+        building = self.folder.building()
+        places = [Path(building.folder)] if building.stage == TRAIN.name else []
+        places += [] if live else [self.folder.path]
+        for name, names in CURVES.items():
+            source = next((file for place in places if (file := place / name).exists()), None)
+            rows = [] if source is None else read_rows(source)
+            if records := [row for row in rows if row["step"] > logged.get(name, 0)]:
+                yield (
+                    name,
+                    int(records[-1]["step"]),
+                    [
+                        Scalar(names[key], float(value), int(record["step"]), _seconds(record))
+                        for record in records
+                        for key, value in record.items()
+                        if key in names
+                    ],
+                )
+
+    def summary(self, results: TrialRecord, images: int, with_model: bool) -> Summary:
+        """The finished trial with at most ``images`` test views, and its model ``with_model``."""
+        step, seconds = results.iterations, results.seconds.get("train", results.iterations / 1000)
+        numbers = {eval_name(key): value for key, value in results.metrics.items()}
+        counts = {
+            "gaussians": results.num_gaussians,
+            "init_points": results.num_init_points,
+            "peak_memory_MB": results.peak_memory_mb,
+        }
+        # None: unknown, for renders of another program
+        numbers |= {f"{EVAL}/{key}": value for key, value in counts.items() if value is not None}
+        if "train" in results.seconds:
+            numbers[f"{EVAL}/minutes"] = results.seconds["train"] / 60
+        scalars = []
+        for at, measured in results.metrics_at.items():
+            then = seconds * int(at) / max(1, step)
+            for key, value in measured.metrics.items():
+                scalars.append(Scalar(eval_name(key), float(value), int(at), then))
+        scalars += [Scalar(key, float(value), step, seconds) for key, value in numbers.items()]
+        tags = {
+            "protocol": results.protocol,
+            "raster": results.raster,
+            "commit": results.code.commit or "unknown",
+            "note": self._note(results),
+        }
+        tags |= {f"hash_{key}": value for key, value in results.hashes.items()}
+        names = (*FILES, layout.POINT_CLOUD) if with_model else FILES
+        files = self.files(names)
+        for path in self.folder.pictures(layout.FIGURES)[:images]:
+            files[f"{layout.FIGURES}/{path.name}"] = path
+        pictures = [
+            Picture(key, pixels, step, seconds) for key, pixels in self._pictures(images).items()
+        ]
+        return Summary(scalars, tags, files, pictures)
+
+    def files(self, names: Sequence[str]) -> dict[str, Path]:
+        """Those of the files ``names`` that the trial's folder has."""
+        paths = {name: self.folder.path / name for name in names}
+        return {name: path for name, path in paths.items() if path.exists()}
+
+    def _note(self, results: TrialRecord) -> str:
+        """The results in one line, the folder, and the command that repeats it, in Markdown."""
+        shown = [(find_metric(key), key, value) for key, value in results.metrics.items()]
+        texts = [f"{facts.name if facts else key} {value:.4g}" for facts, key, value in shown]
+        if results.num_gaussians is not None:
+            texts.append(f"{results.num_gaussians:,} Gaussians")
+        lines = [
+            f"{', '.join(texts)} after {results.iterations:,} iterations.",
+            f"Folder: `{self.path}`",
+        ]
+        plan = read_if_sound(self.folder.home / layout.PLAN, _Plan)
+        place = self.folder.path.relative_to(self.folder.home).as_posix()
+        if plan and (planned := plan.trials.get(place)):
+            lines.append(f"Again: `{shlex.join(['gsbench', *planned.overrides])}`")
+        return "\n\n".join(lines)
+
+    def _pictures(self, count: int) -> dict[str, Array]:
+        """Render, photograph and absolute error of ``count`` test views, by `picture_key`."""
+        rendered, photographed, wrong = PICTURE_KINDS
+        pictures: dict[str, Array] = {}
+        for path in self.folder.pictures(layout.RENDERS)[:count]:
+            render = _read_picture(path)
+            pictures[picture_key(path.stem, rendered)] = render
+            photograph = self.folder.path / layout.GROUND_TRUTH / path.name
+            if not photograph.exists():
+                continue
+            truth = _read_picture(photograph)
+            pictures[picture_key(path.stem, photographed)] = truth
+            if truth.shape == render.shape:
+                error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
+                pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
+        return pictures
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Planned(Record):
+    """The part of a planned trial that is shown: the words of its command."""
+
+    overrides: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan(Record):
+    """The part of an experiment's plan that is shown: its trials by their folders."""
+
+    trials: dict[str, _Planned]
+
+
+def _read_picture(path: Path) -> Array:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def _seconds(record: Mapping[str, float]) -> float:
+    """The training time of a record.
+
+    For a record without a time it is computed from the iteration, so that each reading agrees.
+    """
+    return float(record.get("seconds", record["step"] / 1000))

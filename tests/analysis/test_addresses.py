@@ -1,0 +1,93 @@
+"""The address of a cell or a trial: as it is printed, so it is accepted, by every verb."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsbench.analysis.addresses import ArmName, trials_of_arm
+from gsbench.analysis.cells import with_variants
+from gsbench.analysis.results import load_experiment
+from gsbench.errors import InputError
+from gsbench.renders.measure import ReferenceImages, find_destination
+from gsbench.runs.experiments import Arm
+from gsbench.verbs.results import explain_cell
+from gsbench.verbs.vote import choose_arms
+from gsbench.view.trials import find_trial
+from tests.analysis.synthetic import write_arms
+
+NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
+VALUES = st.one_of(
+    st.floats(allow_nan=False),
+    st.integers(),
+    st.booleans(),
+    st.none(),
+    NAMES,
+    st.lists(st.integers()),
+    st.just("mine.a:b"),
+)
+
+
+@given(NAMES, NAMES, st.dictionaries(NAMES, VALUES, max_size=3), st.booleans())
+def test_a_printed_arm_is_read_back(init, densify, values, short):
+    arm = Arm(init, densify, tuple((f"densify.{key}", str(one)) for key, one in values.items()))
+    read = ArmName.read(arm.short if short else str(arm))
+    assert read.name == (densify if short else f"{init}-{densify}")
+    assert dict(read.settings) == {key: str(one) for key, one in values.items()}
+
+
+MADE = [(0.9, "a:b"), (0.99, "a:b"), (0.9, [1, 2])]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """An experiment with three momentum arms, which differ in a number, a list and a text."""
+    folder = tmp_path_factory.mktemp("runs")
+    arms = [("adc", {}), *(("momentum", {"decay": decay, "kind": kind}) for decay, kind in MADE)]
+    for name, options in arms:
+        write_arms(folder, {name: options}, (0, 1), ("garden",))
+    return folder
+
+
+ARMS = {
+    "momentum[decay=0.9, kind=a:b]": 1,
+    "sfm-momentum[decay=0.9, kind=a:b]": 1,
+    "momentum[decay=0.99]": 1,
+    "momentum[decay=9.9e-1]": 1,
+    "momentum[densify.decay=0.99]": 1,
+    "sfm-momentum[kind=[1, 2]]": 1,
+    "momentum[decay=0.9]": 2,
+    "momentum": 3,
+    "momentum[decay=0.5]": 0,
+    "momentum[cay=0.9]": 0,
+}
+
+
+@pytest.mark.parametrize("word, count", ARMS.items())
+def test_all_verbs_read_an_arm_alike(runs, word, count):
+    trials = with_variants(load_experiment(runs, "exp").trials)
+    readers = {
+        "explain": lambda: explain_cell(f"exp:garden:psnr:{word}", runs),
+        "view": lambda: find_trial(f"exp:garden:{word}:1", runs),
+        "vote": lambda: choose_arms(trials, (word, "adc")),
+    }
+    for reader in readers.values():
+        if count == 1:
+            reader()
+        else:
+            with pytest.raises(InputError, match=r"momentum\[decay=0.9, kind=\[1, 2\]\]"):
+                reader()
+
+
+@pytest.mark.parametrize("word", ["momentum[decay=0.9", "[decay=1]", "momentum[0.9]", "a[b=1]c"])
+def test_another_form_is_refused_in_a_line(runs, word):
+    with pytest.raises(InputError, match=re.escape(f"{word!r} is no arm such as")):
+        trials_of_arm(load_experiment(runs, "exp").trials, word)
+
+
+def test_renders_are_entered_under_an_arm_with_settings(runs):
+    truth = ReferenceImages({}, "pictures", "0" * 64, (96, 72), {}, "garden", "sfm")
+    entered = find_destination("exp:mine[decay=0.9, train.lr=1]", None, 0, truth, runs)
+    assert (entered.init, entered.densify) == ("sfm", "mine")
+    assert entered.settings == (("densify.decay", 0.9), ("train.lr", 1))

@@ -1,0 +1,163 @@
+"""A user's own reader of captures: what it may return, and where its results are stored."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.config.compose import compose_one
+from gsbench.errors import InputError
+from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.steps.scene import CaptureSource
+from gsbench.runs.user_code import UserCode
+from gsbench.scene.colmap import read_model
+from gsbench.scene.options import SceneConfig
+from gsbench.scene.own_reader import PosedImages, read_posed_images
+from gsbench.scene.types import CameraModel
+
+CAMERA = CameraModel("PINHOLE", 32, 24, (30.0, 31.0, 16.0, 12.0))
+POINTS = (np.arange(6.0).reshape(2, 3), np.zeros((2, 3), np.uint8))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for number in range(4):
+        pixels = np.full((24, 32, 3), 50 * number, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{number}.png")
+    return tmp_path
+
+
+def posed(count=4):
+    """Cameras on a line."""
+    return PosedImages(
+        {f"{n}.png": (CAMERA, np.eye(3), np.array([0.1 * n, 0, 0])) for n in range(count)}, POINTS
+    )
+
+
+@dataclass
+class Reader:
+    result: Any = None
+    scale: float = 1.0
+
+    def read(self, folder):
+        if isinstance(self.result, BaseException):
+            raise self.result
+        return posed() if self.result is None else self.result
+
+
+def one(**changes):
+    """One image whose camera, rotation or translation is changed."""
+    values = {"camera": CAMERA, "rotation": np.eye(3), "translation": np.zeros(3)} | changes
+    return PosedImages({"0.png": tuple(values.values())})
+
+
+def camera(*params, name="PINHOLE"):
+    return one(camera=CameraModel(name, 32, 24, params))
+
+
+FAULTS = {
+    "nothing": ({}, "read() must return gsbench.scene.own_reader.PosedImages, got dict"),
+    "an error": (KeyError("w"), "Reader cannot read {folder} (KeyError: 'w')"),
+    "an end": (SystemExit(3), "Reader cannot read {folder} (SystemExit: 3)"),
+    "a missing file": (PosedImages({"9.png": posed().images["0.png"]}), "9.png: no such file in"),
+    "a file above": (PosedImages({"../0.png": posed().images["0.png"]}), "../0.png: no such file"),
+    "an absolute path": (PosedImages({"/etc/passwd": posed().images["0.png"]}), "no such file in"),
+    "no camera": (PosedImages({"0.png": None}), "0.png: "),
+    "no model": (camera(30, 31, 16, 12, name="pinhole"), "'pinhole' is no camera model of"),
+    "no camera model": (one(camera="PINHOLE"), "0.png: "),
+    "too few parameters": (camera(30, 16, 12), "is not a camera of COLMAP: it has fx, fy, cx, cy"),
+    "no focal length": (camera(0, 31, 16, 12), "is not a camera of COLMAP"),
+    "a parameter": (camera(np.nan, 31, 16, 12), "parameters must be finite"),
+    "a mirror": (one(rotation=np.diag([1.0, 1, -1])), "the rotation must only rotate and move"),
+    "a scale": (one(rotation=2 * np.eye(3)), "the rotation must only rotate and move"),
+    "a matrix": (one(rotation=np.eye(4)), "a rotation [3, 3] and a translation [3]"),
+    "a place": (one(translation=[np.inf, 0, 0]), "the pose must be finite"),
+    "points": (replace(posed(), points=([[1, 2]], POINTS[1])), "points must be finite numbers"),
+    "colours": (replace(posed(), points=(POINTS[0], POINTS[0])), "must be uint8 [P, 3]"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_the_reader_is_named(fault, folder):
+    result, said = FAULTS[fault]
+    with pytest.raises(InputError) as error:
+        read_posed_images(Reader(result), folder)
+    assert said.format(folder=folder) in str(error.value)
+    assert "test_own_reader.Reader" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def source(folder, reader, code="a", **settings):
+    options = SceneConfig("own", "reader", _target_="mine.Reader", path=str(folder), **settings)
+    return CaptureSource(options, reader, UserCode({"mine": code}, {"scene": "mine.Reader"}))
+
+
+def test_cameras_points_and_the_readers_own_split_reach_the_capture(folder, tmp_path):
+    own = replace(posed(), split=(["0.png", "2.png", "3.png"], ["1.png"]), files=[folder / "0.png"])
+    made = source(folder, Reader(own), split="list")
+    step = made.step
+    assert step is not None
+    (tmp_path / "made").mkdir()
+    step.build(tmp_path / "made")
+    model = read_model(tmp_path / "made" / "sparse" / "0")
+    positions = {i.name: i.cam_from_world().translation[0] for i in model.images.values()}
+    assert positions == pytest.approx({f"{n}.png": 0.1 * n for n in range(4)})
+    assert sorted(point.xyz.tolist() for point in model.points3D.values()) == POINTS[0].tolist()
+    capture = made.read(tmp_path / "made")
+    assert capture.test_names == ("1.png",)
+    assert capture.read_from == (folder / "0.png",)
+
+
+def test_results_are_stored_under_the_readers_code_its_settings_and_what_it_reads(folder):
+    def key(reader, code="a"):
+        step = source(folder, reader, code).step
+        assert step is not None
+        return step.key
+
+    first = key(Reader())
+    assert key(Reader()) == first
+    moved = replace(posed(), images=dict(posed().images) | posed(1).images)
+    assert key(Reader(scale=2.0)) != first
+    assert key(Reader(), code="b") != first
+    assert key(Reader(replace(moved, points=None))) != first
+    shifted = {"0.png": (CAMERA, np.eye(3), np.array([0.5, 0, 0]))}
+    assert key(Reader(PosedImages(dict(posed().images) | shifted, POINTS))) != first
+
+
+@pytest.mark.parametrize(
+    "settings, said",
+    [
+        ({"kind": "reader"}, "a reader of your own is scene=reader scene._target_=mine.MyReader"),
+        ({"kind": "colmap", "_target_": "mine.Reader"}, "a reader of your own is scene=reader"),
+        ({"kind": "reader", "_target_": "mine.Reader", "sparse": "0"}, "only by colmap"),
+        (
+            {"kind": "reader", "_target_": "mine.Reader", "images": "x"},
+            "scene.images=x is not read",
+        ),
+    ],
+)
+def test_a_reader_goes_with_its_kind_of_scene(settings, said):
+    with pytest.raises(InputError, match=said):
+        SceneConfig("own", path="/a", **settings)
+
+
+def test_options_of_the_reader_stand_among_the_settings_of_the_scene(monkeypatch, folder):
+    module = SimpleNamespace(Reader=Reader, __spec__=None)
+    monkeypatch.setitem(sys.modules, "mine", module)
+    words = ["scene=reader", f"scene.path={folder}", "allow_targets=[mine,tests]"]
+    words += ["scene._target_=mine.Reader", "+scene.scale=3"]
+    parts = Parts(compose_one(words).values)
+    assert parts.reader == Reader(scale=3.0)
+    assert parts.scene.path == str(folder)
+    for word, said in (("+scene.scael=3", "did you mean scale"), ("+scene.scale=x", "scene.scale")):
+        with pytest.raises(InputError, match=said):
+            _ = Parts(compose_one([*words[:-1], word]).values).reader
+    assert "_target_" not in compose_one([]).values["scene"]  # earlier results keep their keys
+    with pytest.raises(InputError, match=r"scene.scale is not a setting"):
+        compose_one(["+scene.scale=3"])

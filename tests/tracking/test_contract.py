@@ -1,0 +1,353 @@
+"""One contract, four trackers: what each shows of the same files, and after each interruption."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.system.locks import BusyError
+from gsbench.tracking import connect
+from gsbench.tracking.mirror import TrackerRun, make_sink
+from tests.conftest import ROOT
+from tests.tracking.helpers import (
+    RECORDS,
+    begin_trial,
+    found_runs,
+    mirror_trial,
+    options,
+    trial_values,
+    write_trial,
+)
+
+AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
+METHODS = ("open", "params", "tags", "metrics", "artifacts", "close")
+# the class of the document
+(OWN,) = re.findall(r"^# kept.py\n.*?^```$", (ROOT / "docs/hydra.md").read_text(), re.S | re.M)
+
+
+class FakeRun:
+    """Stands in for a run of W&B's client."""
+
+    def __init__(self, name):
+        self.name, self.notes, self.code = name, "", None
+        self.config, self.summary = dict[str, Any](), dict[str, Any]()
+        self.rows, self.files = list[dict[str, Any]](), set[str]()
+        self.config = SimpleNamespace(
+            values={}, update=lambda new, **how: self.config.values.update(new)
+        )
+
+    def define_metric(self, name, step_metric):
+        assert (name, step_metric) == ("*", "iteration")
+
+    def log(self, row):
+        self.rows.append(row)
+
+    def save(self, path, base_path, policy):
+        self.files.add(Path(path).relative_to(base_path).as_posix())
+
+    def finish(self, code):
+        self.code = code
+
+
+class Shown:
+    """What a tracker shows of its runs, in one form."""
+
+    def __init__(self, kind, runs, monkeypatch):
+        self.kind, self.runs = kind, runs
+        self.settings = options() | {"_target_": f"gsbench.tracking.{kind}"}
+        if kind == "WandB":
+            self.fakes = {}
+            wandb = ModuleType("wandb")
+            wandb.__spec__ = SimpleNamespace()
+            wandb.Settings, wandb.Image = dict, lambda pixels: pixels
+            wandb.init = lambda **how: self.fakes.setdefault(how["id"], FakeRun(how["name"]))
+            monkeypatch.setitem(sys.modules, "wandb", wandb)
+        if kind == "own":
+            module = ModuleType("kept")
+            monkeypatch.setitem(sys.modules, "kept", module)
+            exec(OWN.removesuffix("```"), vars(module))
+            self.settings |= {"_target_": "kept.Kept", "folder": str(runs / "kept")}
+
+    def mirror(self, folder, values):
+        return mirror_trial(self.settings, folder, values, ["kept"])
+
+    def __call__(self):
+        return getattr(self, f"_{self.kind.lower()}")()
+
+    def one(self):
+        """The newest run; only W&B keeps those with earlier results."""
+        shown = self()
+        assert len(shown) == 1 or self.kind == "WandB"
+        return shown[-1]
+
+    def _own(self):
+        shown = [json.loads(file.read_text()) for file in (self.runs / "kept").glob("*.json")]
+        return [
+            {
+                "params": one["params"],
+                "tags": one["tags"],
+                "metrics": {
+                    (key.split()[0], int(key.split()[1])): value
+                    for key, value in one.get("metrics", {}).items()
+                },
+                "files": set(one.get("files", ())),
+                "pictures": set(one.get("pictures", ())),
+                "status": tuple(one.get("end", {"status": "RUNNING", "reason": None}).values()),
+            }
+            for one in shown
+        ]
+
+    def _mlflow(self):
+        client = connect(None, self.runs)
+        return [
+            {
+                "params": run.data.params,
+                "tags": run.data.tags | {"note": run.data.tags.get("mlflow.note.content")},
+                "metrics": {
+                    (key, one.step): one.value
+                    for key in run.data.metrics
+                    for one in _once(client.get_metric_history(run.info.run_id, key))
+                },
+                "files": {item.path for item in client.list_artifacts(run.info.run_id)},
+                "pictures": {
+                    Path(item.path).name.partition("+")[0].replace("~", "/")
+                    for item in client.list_artifacts(run.info.run_id, "images")
+                },
+                "status": (run.info.status, run.data.tags.get("error")),
+            }
+            for run in found_runs(client, "tracked")
+        ]
+
+    def _wandb(self):
+        status = {None: "RUNNING", 0: "FINISHED", 1: "FAILED"}
+        return [
+            {
+                "params": run.config.values,
+                "tags": run.config.values | {"note": run.notes},
+                "metrics": {
+                    (key, row["iteration"]): value
+                    for row in run.rows
+                    for key, value in row.items()
+                    if key != "iteration" and not isinstance(value, np.ndarray)
+                },
+                "files": run.files,
+                "pictures": {
+                    key
+                    for row in run.rows
+                    for key, value in row.items()
+                    if isinstance(value, np.ndarray)
+                },
+                "status": (status[run.code], run.summary.get("error") if run.code else None),
+            }
+            for run in self.fakes.values()
+        ]
+
+    def _tensorboard(self):
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+        from tensorboard.util import tensor_util
+
+        folder = next((self.runs / "tensorboard").glob("tracked/*/*/*"))
+        assert len(list(folder.iterdir())) == 1
+        sizes = {"scalars": 0, "images": 0, "tensors": 0}
+        events = EventAccumulator(str(folder), size_guidance=sizes).Reload()
+        names = events.Tags()
+
+        def texts(name):
+            key = f"{name}/text_summary"
+            found = events.Tensors(key) if key in names["tensors"] else []
+            return [tensor_util.make_ndarray(one.tensor_proto)[0].decode() for one in found]
+
+        def table(name):
+            rows = [
+                line.strip("| ").split(" | ") for text in texts(name) for line in text.split("\n")
+            ]
+            return {row[0]: row[1] for row in rows if len(row) == 2}
+
+        status, _, reason = (texts("status") or ["RUNNING"])[-1].partition(": ")
+        metrics = {
+            (key, one.step): pytest.approx(one.value)
+            for key in names["scalars"]
+            for one in _once(events.Scalars(key))
+        }
+        return [
+            {
+                "params": table("settings"),
+                "tags": table("trial"),
+                "metrics": metrics,
+                "files": None,  # TensorBoard keeps none
+                "pictures": set(names["images"]),
+                "status": (status, reason or None),
+            }
+        ]
+
+
+def _once(history):
+    """The history of a number, which no step may have twice."""
+    steps = [one.step for one in history]
+    assert len(steps) == len(set(steps))
+    return history
+
+
+@pytest.fixture(params=["MLflow", "TensorBoard", "WandB", "own"])
+def shown(request, runs, tmp_path, monkeypatch):
+    """A tracker for a new runs folder; MLflow's database is copied, since making it takes long."""
+    if request.param == "TensorBoard":
+        pytest.importorskip("tensorboard", reason="needs tensorboard")
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    if request.param == "MLflow":
+        shutil.copy(runs / "mlflow.db", folder)
+        connect(None, folder).rename_experiment("1", "elsewhere")
+    return Shown(request.param, folder, monkeypatch)
+
+
+def finished(runs, psnr=20.0):
+    """A finished trial with a picture, which was also measured at iteration 50."""
+    values = trial_values(runs, 1)
+    folder = begin_trial(values)
+    write_trial(folder, values, psnr=psnr)
+    results = json.loads((folder / "results.json").read_text()) | {"metrics_at": AT}
+    (folder / "results.json").write_text(json.dumps(results))
+    for kind, value in (("renders", 200), ("ground_truth", 50)):
+        (folder / kind).mkdir(exist_ok=True)
+        Image.fromarray(np.full((4, 6, 3), value, np.uint8)).save(folder / kind / "view 1#.png")
+    return folder, values
+
+
+def check_whole(run, psnr=20.0):
+    """The run shows the trial of `finished`, all of it."""
+    losses = {("train/loss", i): 1 / i for i in range(1, RECORDS + 1)}
+    cloned = {("train/densify/cloned", i): i for i in (50, 100)}
+    ends = {("eval/psnr_dB", 50): 15.0, ("eval/psnr_dB", RECORDS): psnr}
+    ends |= {("eval/gaussians", RECORDS): 11, ("eval/init_points", RECORDS): 5}
+    for key, value in (losses | cloned | ends).items():
+        assert run["metrics"][key] == value, key
+    assert run["params"]["densify.name"] == "a_densify"
+    assert next(iter(run["params"])) == "arm" or run["params"]["arm"] == "a_densify · a_init"
+    tags = {"seed": "1", "protocol": "paper-1", "hash_config": "abc"}
+    assert tags.items() <= run["tags"].items()
+    assert run["tags"]["note"].startswith(f"PSNR (dB) {psnr:g}, 11 Gaussians after 150 iterations.")
+    assert run["files"] is None or {"config.yaml", "results.json", "events.jsonl"} <= run["files"]
+    kinds = ("1 render", "2 photograph", "3 error")
+    assert run["pictures"] == {f"view 1_/{kind}" for kind in kinds}
+    assert run["status"] == ("FINISHED", None)
+
+
+def test_a_whole_trial_is_shown_once(shown):
+    folder, values = finished(shown.runs)
+    assert shown.mirror(folder, values)
+    check_whole(shown.one())
+    before = shown.one()
+    assert not shown.mirror(folder, values)
+    assert shown.one() == before
+
+
+def test_what_was_sent_before_a_crash_is_not_shown_twice(shown):
+    folder, values = finished(shown.runs)
+    assert shown.mirror(folder, values)
+    (state,) = [path for path in folder.glob("*.json") if "token" in path.read_text()]
+    kept = json.loads(state.read_text())
+    del kept["complete"]
+    state.write_text(json.dumps(kept | {"logged": {"metrics.jsonl": 70}}))
+    assert shown.mirror(folder, values)
+    check_whole(shown.one())
+    assert len(shown()) == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_after_an_error_anywhere_the_next_time_completes_the_run(shown, method, monkeypatch):
+    folder, values = finished(shown.runs)
+    cls = type(make_sink(shown.settings, ["kept"]))
+    with monkeypatch.context() as patch:
+        for done in (False, True):  # before the tracker did it, and after: its answer is lost
+            whole = getattr(cls, method)
+            patch.setattr(cls, method, _failing(whole, done))
+            with pytest.raises(ConnectionError):
+                shown.mirror(folder, values)
+            patch.setattr(cls, method, whole)
+    assert shown.mirror(folder, values)
+    check_whole(shown.one())
+    assert len(shown()) == 1
+
+
+def _failing(whole, done):
+    def method(*given):
+        if done:
+            whole(*given)
+        raise ConnectionError
+
+    return method
+
+
+def test_changed_results_replace_those_that_were_shown(shown):
+    folder, values = finished(shown.runs)
+    assert shown.mirror(folder, values)
+    finished(shown.runs, psnr=33.0)
+    assert shown.mirror(folder, values)
+    check_whole(shown.one(), psnr=33.0)
+    assert len(shown()) == (2 if shown.kind == "WandB" else 1)
+    assert not shown.mirror(folder, values)
+
+
+def test_a_failure_is_shown_with_its_reason_until_the_trial_succeeds(shown):
+    values = trial_values(shown.runs, 1)
+    folder = begin_trial(values)
+    (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan\nagain"}))
+    assert shown.mirror(folder, values)
+    run = shown.one()
+    assert run["status"] == ("FAILED", "the loss became nan")
+    assert run["files"] is None or run["files"] >= {"config.yaml", "failed.json"}
+    (folder / "failed.json").unlink()
+    finished(shown.runs)
+    assert shown.mirror(folder, values)
+    check_whole(shown.one())
+    assert len(shown()) == 1
+
+
+def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
+    folder, values = finished(shown.runs)  # an earlier command left results and curves
+    files = TrialFolder(folder)
+    (folder / "results.json").unlink()
+    run = TrackerRun(files, shown.settings, values, ["kept"])
+    with pytest.raises(BusyError):  # one process at a time
+        TrackerRun(files, shown.settings, values, ["kept"])
+    run.add_curves()
+    assert ("train/loss", 1) not in shown.one()["metrics"]
+    training = {"stage": "train", "folder": str(tmp_path / "building")}
+    (tmp_path / "building").mkdir()
+    (folder / "building.json").write_text(json.dumps(training))
+    seen = []
+    for text in ('{"step": 10, "loss": 0.5}\n{"step": 20, "lo', 'ss": 0.25}\n', ""):
+        with (tmp_path / "building" / "metrics.jsonl").open("a") as stream:
+            stream.write(text)
+        run.add_curves()
+        curve = {s: v for (key, s), v in shown.one()["metrics"].items() if key == "train/loss"}
+        seen.append(curve)
+    assert seen == [{10: 0.5}, {10: 0.5, 20: 0.25}, {10: 0.5, 20: 0.25}]
+    run.end()
+    assert shown.one()["status"][0] == ("FAILED" if shown.kind == "WandB" else "KILLED")
+
+
+@pytest.mark.parametrize("shown", ["MLflow", "TensorBoard", "own"], indirect=True)
+def test_a_run_that_was_deleted_there_is_made_again(shown):
+    folder, values = finished(shown.runs)
+    assert shown.mirror(folder, values)
+    if shown.kind == "MLflow":
+        client = connect(None, shown.runs)
+        client.delete_run(found_runs(client, "tracked")[0].info.run_id)
+    elif shown.kind == "TensorBoard":
+        shutil.rmtree(shown.runs / "tensorboard")
+    else:
+        shutil.rmtree(shown.runs / "kept")
+    assert shown.mirror(folder, values)
+    check_whole(shown.one())
