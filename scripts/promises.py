@@ -214,9 +214,9 @@ def largest_size(level: float) -> Measure:
 
     def found(share: float) -> tuple[float, float]:
         shapes = product(range(2, 31), range(2, 9))  # the test of one scene is Student's
-        first = {one: sizes(*one, round(2000 + 4000 * share), 11) for one in shapes}
-        again = sorted(first, key=lambda one: first[one])[-5:]
-        return max(sizes(*one, round(4000 + 60_000 * share), 12) for one in again)
+        first = {one: sizes(*one, round(2000 + 2000 * share), 11) for one in shapes}
+        again = sorted(first, key=lambda one: first[one])[-3:]
+        return max(sizes(*one, round(4000 + 28_000 * share), 12) for one in again)
 
     return found
 
@@ -563,10 +563,10 @@ def promises() -> Iterator[Promise]:
     for finish, how in ((True, "finishes, far worse"), (False, "fails")):
         name = f"better, although a training in ten of one arm {how}, 3 × 3"
         yield Promise(name, judged, ONE_ARM_LIMIT, 4000, failing(finish))
-    for level, most in ((0.05, 1.04), (0.025, 1.04), (0.0125, 1.07), (0.005, 1.1)):
+    for level, most in ((0.05, 1.04), (0.025, 1.04), (0.0125, 1.07), (0.005, 1.2)):
         name = f"false signs at {100 * level:g} %, in parts of it, at all shapes and kinds of noise"
-        yield Promise(name, "`Region`", most, 64_000, found=largest_size(level))
-    for scenes, looks in ((1, (2, 3, 4, 5, 6)), (3, (2, 3, 4)), (8, (2, 3, 4, 5, 6))):
+        yield Promise(name, "`Region`", most, 32_000, found=largest_size(level))
+    for scenes, looks in ((1, (2, 3, 4, 5, 6)), (3, (2, 3, 4))):
         for level in (0.05, 0.0125, 0.0025):
             name = f"false signs at {100 * level:g} %, in parts of it, over all looks, "
             name += f"{scenes} × {looks[-1]}"

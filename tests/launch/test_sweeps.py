@@ -95,6 +95,7 @@ PROGRAM = [
 WITH_CODE = [*PROGRAM, "densify.options.code=/code"]
 NEEDED = {  # what a YAML leaves to its user
     ("train", "none"): ["densify=none"],
+    ("scene", "reader"): ["scene._target_=mine.Reader", "allow_targets=[mine]"],
     **{("init", name): ["init.path=/somewhere"] for name in ("ply", "points")},
     ("densify", "external/program"): [
         *PROGRAM,
@@ -111,7 +112,10 @@ NEEDED = {  # what a YAML leaves to its user
 # Choices whose name is not that of their file: a user's captures are called after their folder.
 NAMES = {
     ("densify", "external/program"): "external",
-    **{("scene", name): "somewhere" for name in ("blender", "colmap", "photos", "transforms")},
+    **{
+        ("scene", name): "somewhere"
+        for name in ("blender", "colmap", "photos", "reader", "transforms")
+    },
 }
 
 

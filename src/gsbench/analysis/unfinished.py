@@ -63,7 +63,7 @@ class Unfinished:
 def one_sided(
     question: Question, trials: Iterable[TrialResult], unfinished: Iterable[Unfinished]
 ) -> tuple[Sequence[Unfinished], Sequence[Unfinished]]:
-    """For each side of a question, the trials that lack a result where the other side has one.
+    """The trials of each side of a question that lack a result where the other side has one.
 
     ``trials`` are both sides' finished trials. A side lacks nothing where another trial of it has
     finished, as after a repair of its code.

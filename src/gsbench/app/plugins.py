@@ -1,4 +1,4 @@
-"""Where Hydra's plug-ins attach: other sweepers and launchers, callbacks, and Hydra's own files.
+"""The places where Hydra's plug-ins attach: sweepers, launchers, callbacks, and Hydra's own files.
 
 `hydra.main` calls a `TrialTask` for a single trial, and for each job of another launcher, perhaps
 in another process. Another sweeper proposes the jobs, and gets a value for each. Without plug-ins,

@@ -8,6 +8,7 @@ and operations say how often they are paid.
 
 from __future__ import annotations
 
+import ctypes
 import statistics
 import time
 from collections.abc import Iterator
@@ -98,6 +99,9 @@ class NullDevice:
     def _launch(self, kernel: Any, *programs: Any) -> Any:
         def count(**arguments: Any) -> None:
             self.launches += 1
+            if kernel is loss_triton.add_up:  # the loss must be a number
+                values = arguments["values"]
+                ctypes.memset(values.data_ptr(), 0, values.nbytes)  # no operation of torch
 
         return count
 

@@ -47,7 +47,7 @@ class SceneReader(Protocol):
 
 
 def read_posed_images(reader: SceneReader, folder: Path) -> PosedImages:
-    """What the user's ``reader`` reads in ``folder``; raises InputError that names its fault."""
+    """The capture that the user's ``reader`` reads; raises InputError that names its fault."""
     name = f"scene: {type(reader).__module__}.{type(reader).__qualname__}"
     try:
         posed = reader.read(folder)

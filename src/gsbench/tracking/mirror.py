@@ -24,7 +24,14 @@ import time
 import traceback
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, chdir, closing, suppress
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    chdir,
+    closing,
+    nullcontext,
+    suppress,
+)
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Queue
@@ -35,6 +42,7 @@ from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import read_if_sound
 from gsbench.runs.layout import CONFIG, FAILED, LOG, RESULTS
+from gsbench.runs.nested import GSBENCH
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import foreign_address
 from gsbench.system.isolate import describe_exit, error_lines, python_command
@@ -63,6 +71,15 @@ NOT_OPTIONS = ("name", "enabled", "flush_seconds", "patience_seconds", "images",
 def class_of(options: Mapping[str, Any]) -> str:
     """The import path of the tracker's class that the settings ``tracking`` name."""
     return str(options.get("_target_") or MLFLOW)
+
+
+def place_for(options: Mapping[str, Any]) -> AbstractContextManager[str | Path]:
+    """The folder to call a tracker in: an empty one, but a user's own tracker stays here.
+
+    Trackers' clients read settings in the current folder: W&B would take its server's address from
+    a stranger's ``wandb/settings``.
+    """
+    return own_folder() if class_of(options).startswith(GSBENCH) else nullcontext(Path.cwd())
 
 
 def tracker_name(options: Mapping[str, Any]) -> str:
@@ -142,10 +159,8 @@ class Mirror:
 
         Raises OSError where it cannot start.
         """
-        # Trackers' clients read settings in the current folder: W&B would take its server's address
-        # from a stranger's ``wandb/settings``.
         self._held = ExitStack()  # as long as the process runs
-        folder = self._held.enter_context(own_folder())
+        folder = self._held.enter_context(place_for(self._options))
         self._errors = self._held.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
         words = (str(self._options["flush_seconds"]), str(self._options["patience_seconds"]))
         return subprocess.Popen(
@@ -331,8 +346,7 @@ def sync(
             yield f"left out: {folder.label}: {error}"
             continue
         try:
-            # for the same reason as in `Mirror`
-            with own_folder() as place, chdir(place):
+            with place_for(options) as place, chdir(place):
                 is_new = mirror_ended(folder, options, values, allowed)
             pages[folder.home, options["uri"]] = folder, options
         except BusyError:

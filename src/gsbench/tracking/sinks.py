@@ -39,6 +39,30 @@ class Sink(Protocol):
     The methods are called in a process of their own, in the order below; each may raise any error,
     which ends the mirroring and harms no trial. The process may be killed at any moment, and ends
     without clean-up. So each method must send at once what it gets, and may get it again.
+
+    Examples:
+        Only the last value of each metric is kept:
+
+        >>> from types import SimpleNamespace
+        >>> class Latest:
+        ...     def open(self, trial, run):
+        ...         self.shown = {}
+        ...         return run.token
+        ...
+        ...     def metrics(self, scalars):
+        ...         self.shown |= {one.key: one.value for one in scalars}
+        ...
+        ...     def params(self, values): ...
+        ...     def tags(self, values): ...
+        ...     def artifacts(self, files, pictures): ...
+        ...     def close(self, status, reason): ...
+
+        >>> latest = Latest()
+        >>> latest.open(None, SimpleNamespace(token="a"))
+        'a'
+        >>> latest.metrics([SimpleNamespace(key="loss", value=0.2, step=100)])
+        >>> latest.shown
+        {'loss': 0.2}
     """
 
     def open(self, trial: TrackedTrial, run: Run) -> str:

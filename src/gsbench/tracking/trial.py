@@ -203,7 +203,7 @@ class TrackedTrial:
         return Summary(scalars, tags, files, pictures)
 
     def files(self, names: Sequence[str]) -> dict[str, Path]:
-        """Those of the files ``names`` that the trial's folder has."""
+        """The files among ``names`` that the trial's folder has."""
         paths = {name: self.folder.path / name for name in names}
         return {name: path for name, path in paths.items() if path.exists()}
 
