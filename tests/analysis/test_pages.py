@@ -11,7 +11,7 @@ from markupsafe import Markup
 from gsbench.analysis import table_formats
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.claims.check import to_html
+from gsbench.claims.check_page import to_html
 from gsbench.claims.export import write_archive
 from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
