@@ -28,8 +28,8 @@ def test_the_power_of_a_check_is_that_of_its_verdicts():
     assert planned < Purpose().power(design, 0.2, 0.1)
 
 
-def test_giving_up_and_a_single_capture_cost_power():
-    plain, ledger = Purpose(0.005, looks=True), Purpose(0.005, looks=True, give_up=0.05, alone=3.0)
+def test_giving_up_costs_power():
+    plain, ledger = Purpose(0.005, looks=True), Purpose(0.005, looks=True, give_up=0.05)
     for design in (Design(1, 8), Design(3, 5)):
         assert ledger.power(design, 0.15, 0.1) < plain.power(design, 0.15, 0.1)
     assert plain.power(Design(1, 2), 0.1, 0.0) == 1.0

@@ -77,6 +77,9 @@ PROGRAMS = {
 PLACES = {option: ["init.path=/data/model.ply"] for option in ("ply", "points")}
 
 
+READER = ["scene._target_=mine.Reader", "allow_targets=[mine]"]
+
+
 def needs(option):
     return [*PROGRAMS[option], "densify.version='1'"] if option in PROGRAMS else []
 
@@ -86,13 +89,13 @@ def needs(option):
 )
 def test_every_option_composes(group, option):
     extra = ["scene.path=/data/capture"] if group == "scene" and option != "courtyard" else []
-    extra += PLACES.get(option, [])
+    extra += PLACES.get(option, []) + (READER if option == "reader" else [])
     extra += ["densify=none"] if (group, option) == ("train", "none") else []
     extra += ["train=paper", *needs(option)] if group == "densify" else []
     values = composed(f"{group}={option}", *extra)
     own = {
         "external/program": "external",
-        **dict.fromkeys(("photos", "colmap", "transforms", "blender"), "capture"),
+        **dict.fromkeys(("photos", "colmap", "transforms", "blender", "reader"), "capture"),
     }
     assert values[group]["name"] == own.get(option, option.rpartition("/")[2])
 

@@ -101,7 +101,7 @@ def made(monkeypatch):
     state.told = told
 
     class Source:
-        def __init__(self, options):
+        def __init__(self, options, reader, user):
             self.step = state.capture_step
 
         def read(self, folder):
@@ -136,7 +136,7 @@ def made(monkeypatch):
     initializer = SimpleNamespace(needs_reference=lambda capture: state.needs)
     state.parts = SimpleNamespace(
         **{"scene": SimpleNamespace(transparent="white"), "initializer": initializer},
-        **{"threads": 3, "program": None, "user_code": "code"},
+        **{"threads": 3, "program": None, "user_code": "code", "reader": None},
     )
     return state
 

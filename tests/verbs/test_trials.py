@@ -266,7 +266,7 @@ def test_sync_sends_the_begun_trials_of_one_or_all_experiments(folders, runs, mo
     begin(composed(["name=y", "densify=adc"])[0])
     sent = []
 
-    def send(given, uri):
+    def send(given, uri, allowed):
         sent.extend((one.path.parents[2].name, uri) for one in given)
         return [f"sent {len(given)}"]
 
