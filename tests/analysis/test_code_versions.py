@@ -39,7 +39,7 @@ def test_the_newest_code_counts_and_older_trials_are_named(tmp_path):
         finished_at(one_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW)), 2000)
     words = (
-        "exp/garden/sfm-adc seeds 0, 1: left out, made by an earlier mine (11111111; the "
+        "exp/garden/sfm-adc seeds 0, 1: made by an earlier mine (11111111; the "
         "trials that count have 22222222)"
     )
     experiment = load_experiment(tmp_path, "exp")

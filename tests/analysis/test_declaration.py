@@ -328,7 +328,8 @@ def test_a_metric_whose_trials_were_added_after_results_is_adjusted_with_all_oth
     declare_trials(tmp_path, (EARLY, trials), *([(LATE, WHOLE)] if recorded else []))
     (one,) = judged(experiment)
     assert {(one.role(verdict), verdict.family) for verdict in one.verdicts} == {("", 4)}
-    words = f"{added} trial{'s' * (added > 1)} added after the arm's first result"
+    were = "trials were" if added > 1 else "trial was"
+    words = f"{added} {were} added after the arm's first result"
     assert any(words in note for note in build_table(experiment).notes)
 
 
@@ -336,7 +337,7 @@ def test_the_report_says_that_trials_were_added(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR, views=3)
     declare_trials(tmp_path, (EARLY, planned([0, 1])))
     page = build_report(experiment)
-    assert "3 trials added after the arm&#39;s first result" in page
+    assert "3 trials were added after the arm&#39;s first result" in page
     assert "declared beforehand." not in page
     assert "all metrics of a pair of arms are one family, 4 tests adjusted by Holm." in page
 

@@ -91,6 +91,11 @@ DEMO, MINE = (
             "densify.max_gaussians=12300 name=exp_equal` && `gsbench -m densify=adc "
             "densify._target_=mine.A 'allow_targets=[mine]' seed=0,1 scene=garden",
         ),
+        (
+            ["densify=adc", "launch.stop_when_decided=True"],
+            MINE,  # looks need two arms in one command
+            "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor",
+        ),
         # a stranger's plan: nothing of it reaches the shell
         (["densify=$(rm x)"], ["densify=y"], "`gsbench -m 'densify=$(rm x),y' seed=0,1"),
     ],

@@ -121,7 +121,7 @@ def test_all_seeds_of_planned_looks_are_declared_beforehand(sweep, runs, psnr):
     # the sweep's last look and every other surface have the verdict of one function
     assert answer.primary[0].outcome == verdicts_of(runs)[0].outcome
     assert answer.primary[0].interval == verdicts_of(runs)[0].interval
-    assert ("4 of the 8 declared trials are not there" in str(comparison.notes()[-1])) == (
+    assert ("Not there yet: 4 of the 8 declared trials" in str(comparison.notes()[-1])) == (
         psnr is clear
     )
 

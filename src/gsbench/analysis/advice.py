@@ -10,8 +10,10 @@ from gsbench.parsing import DamagedError, read_json
 from gsbench.runs.layout import PLAN
 
 DIGITS = 3  # significant digits of a number of Gaussians
-# words that the advice gives itself
-REPLACED = ("name", "densify.cap", "densify.max_gaussians")
+# Looks need both arms in one command, but the advice may give each arm its own.
+LOOKS = "launch.stop_when_decided"
+# words that the advice gives itself or leaves out
+REPLACED = ("name", "densify.cap", "densify.max_gaussians", LOOKS)
 
 EXPERIMENT = "+experiment"
 

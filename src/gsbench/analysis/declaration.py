@@ -48,7 +48,8 @@ class Standing:
             of_arm = f"{len(self.seen)} of the arm's {counted(self.trials, 'trial')}"
             return f"declared after {of_arm} had been measured"
         if self.added:
-            return f"{counted(len(self.added), 'trial')} added after the arm's first result"
+            were = "was" if len(self.added) == 1 else "were"
+            return f"{counted(len(self.added), 'trial')} {were} added after the arm's first result"
         return ""
 
 

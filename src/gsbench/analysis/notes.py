@@ -111,8 +111,8 @@ SENTENCES: dict[str, str] = {
     ),
     "replaced": "Declared before it: {metric} ({when}).",
     "looks to come": (
-        "Seeds come in planned looks (launch.stop_when_decided); {missing} of the "
-        "{declared:n declared trial} are not there."
+        "Seeds come in planned looks (launch.stop_when_decided). Not there yet: {missing} of the "
+        "{declared:n declared trial}."
     ),
     "early look": (
         "{missing} of the {declared:n declared trial} are still missing, so this is an early look. "

@@ -352,12 +352,12 @@ def newest_code(experiment: Experiment) -> Experiment:
 
 
 def _left_out_line(made: Sequence[TrialResult], newest: TrialResult) -> str:
-    """``sw/garden/sfm-mine seeds 0, 1: left out, made by an earlier mine (3fa9c1d2, now …)``"""
+    """``sw/garden/sfm-mine seeds 0, 1: made by an earlier mine (3fa9c1d2, now …)``"""
     parts = dict.fromkeys([*newest.code, *made[0].code], "none")
     change = next(code_changes(parts | made[0].code, (parts | newest.code).get))
     cell = f"{made[0].experiment}/{made[0].scene}/{made[0].init}-{made[0].densify}"
     return (
-        f"{cell} {seeds_text(made)}: left out, made by an earlier {change.name} "
+        f"{cell} {seeds_text(made)}: made by an earlier {change.name} "
         f"({change.made:.{SHOWN}}; the trials that count have {change.now:.{SHOWN}})"
     )
 
