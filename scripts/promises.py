@@ -591,14 +591,14 @@ def promises() -> Iterator[Promise]:
     yield Promise("pooled interval of three studies misses", "`pool`", 0.05, 8000, pooled)
     yield Promise(
         "gate: worse although nothing changed, 2 × 6",
-        "`Gate`",
+        "`ask_gate`",
         0.025,
         1500,
         gate(2, 6, 0.0, gates.WORSE),
     )
     yield Promise(
         "gate: passed although the loss is the least that matters, 2 × 6",
-        "`Gate`",
+        "`ask_gate`",
         0.025,
         1500,
         gate(2, 6, LEAST, gates.PASSED),
@@ -607,10 +607,10 @@ def promises() -> Iterator[Promise]:
         count, scenes, seeds, loss, deviation = case
         name = f"bisect of {count} commits: wrong name, {scenes} × {seeds}, "
         name += f"loss {loss:g}, deviation {deviation:g}"
-        yield Promise(name, "`first_worse`, `Step`", 0.05, 500, bisect(*case))
+        yield Promise(name, "`first_worse`, `ask_step`", 0.05, 500, bisect(*case))
     yield Promise(
         f"bisect: wrong name, the worst of {len(GRID)} cells",
-        "`first_worse`, `Step`",
+        "`first_worse`, `ask_step`",
         0.05,
         200,
         found=worst_bisect,
