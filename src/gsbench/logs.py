@@ -117,7 +117,7 @@ def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bo
             if not isinstance(old, _CurrentStderrHandler | _RootHandler)
         ]
         logger.handlers = [*handlers, *kept]
-    LOGGER.setLevel(logging.DEBUG)
+        logger.setLevel(logging.DEBUG)  # `shown` decides
     LOGGER.propagate = False
 
 

@@ -151,7 +151,7 @@ def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):
     found = run_blocks(ROOT / "docs" / "library.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
     scene = ["scene=colmap", "scene.path=library/courtyard", "scene.name=courtyard"]
-    assert run([*scene, *found["quick"], "tracking=none", "name=colmap"]) == 0
+    assert run([*scene, *found["quick"].split(), "name=colmap"]) == 0
     (own,), (colmap,) = (
         list(Path("runs", name).rglob("results.json")) for name in ("llff", "colmap")
     )

@@ -71,7 +71,7 @@ def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_pat
     # in the same runs folder, with trials of another version
     write_class(tmp_path, 1, worse=True)
     worse = do("gate", "good.zip", *WORDS, code=1)
-    assert "worse in PSNR (dB): −" in worse.stdout
+    assert "worse in PSNR (dB) on this scene: −" in worse.stdout
     (tmp_path / "mine.py").write_text("raise RuntimeError('broken')\n")
     broken = do("gate", "good.zip", *WORDS, code=None)
     assert broken.returncode in (1, 2)

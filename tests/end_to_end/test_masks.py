@@ -161,8 +161,8 @@ def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, c
     assert f"{mask}: the mask is 20x20 px" in said("init=random")
     mask.unlink()
     assert f"add {mask.name}" in said("init=random")
-    assert "no such folder; set scene.masks to one of: images, masks, sparse" in said(
-        "init=random scene.masks=msk"
+    assert "no such folder; set scene.masks to one of: images, masks" in said(
+        "init=random", "scene.masks=msk"
     )
 
 

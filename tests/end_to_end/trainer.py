@@ -7,6 +7,7 @@ The option ``--mode`` says how it fails.
 
 import argparse
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -18,8 +19,6 @@ import numpy as np
 import pycolmap
 from PIL import Image
 from scipy.spatial import cKDTree
-
-from tests.helpers import read_json, write
 
 SH_DC = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
 COLUMNS = [
@@ -80,12 +79,15 @@ def write_model(path, points, colors, mode):
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property float {name}" for name in COLUMNS] + ["end_header", ""]
     body = table.tobytes()
-    write(path, "\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(
+        "\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body)
+    )
 
 
 def paint(cameras, output, points, colors, mode):
     """Draw the points, far ones first, as squares of 3 px."""
-    for frame in read_json(cameras / "transforms.json")["frames"]:
+    for frame in json.loads((cameras / "transforms.json").read_text())["frames"]:
         # world to OpenCV camera
         pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
         local = points @ pose[:3, :3].T + pose[:3, 3]
