@@ -445,7 +445,7 @@ def test_the_footprint_of_a_direct_step_is_that_of_its_own_view():
     model, cameras = steps.trainer.gaussians, [view.camera for view in steps.trainer.scene.train]
     target = torch.zeros(17, 20, 3, dtype=torch.uint8)
     for camera in cameras:
-        render = steps.direct.step(model, camera, target, 1, False, False).render
+        render = steps.direct.step(model, camera, target, 1, False, None).render
         found = render.require_footprint()
         expected = TritonRasterizer().render(model.values, camera, 1, BLACK).require_footprint()
         for own, theirs in zip(vars(found).values(), vars(expected).values(), strict=True):
@@ -457,7 +457,7 @@ def test_memory_of_direct_steps_is_kept_for_few_sizes():
     for width in range(4, 4 + MOST_SIZES + 2):
         camera = orbit_camera(0.0, width=width, height=4)
         target = torch.zeros(4, width, 3, dtype=torch.uint8)
-        image = steps.direct.step(steps.trainer.gaussians, camera, target, 0, False, False)[0].image
+        image = steps.direct.step(steps.trainer.gaussians, camera, target, 0, False, None)[0].image
         expected = TritonRasterizer().render(steps.trainer.gaussians.values, camera, 0, BLACK).image
         assert torch.equal(image, expected)
     assert [size[0] for size in steps.direct._memory] == [6, 7, 8, 9]
