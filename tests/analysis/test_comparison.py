@@ -186,11 +186,15 @@ def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
         ([(5, "mine")], {"adc": 2, "mine": 6}, ""),
         # a further arm after the result of another
         ([(1, "adc mine"), (5, "more")], {"adc": 2, "mine": 2, "more": 6}, ""),
-        ([(5, "adc mine")], {"adc": 2, "mine": 2}, "declared after 3 of the arm's 3 trials"),
+        ([(5, "adc mine")], {"adc": 2, "mine": 2}, "only after 3 trials of the arm"),
         # further seeds, of the arm or of both
         ([(1, "adc mine"), (5, "adc+ mine+")], {"adc+": 6, "mine": 2, "mine+": 6}, "2 trials"),
         # further seeds of the baseline, which the arm had from the start
-        ([(1, "adc mine mine+"), (5, "adc+")], {"adc": 2, "adc+": 6, "mine+": 2}, "1 trial added"),
+        (
+            [(1, "adc mine mine+"), (5, "adc+")],
+            {"adc": 2, "adc+": 6, "mine+": 2},
+            "1 trial was added",
+        ),
         # a further seed of the baseline alone makes no pair
         ([(1, "adc mine"), (5, "adc+")], {"adc+": 6, "mine": 2}, ""),
     ],

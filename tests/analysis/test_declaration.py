@@ -217,8 +217,7 @@ def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
     page = build_report(experiment)
     assert "on these scenes: better in LPIPS VGG raw (−" in page
     assert (
-        "LPIPS VGG raw was declared, but declared after 6 of the arm&#39;s 6 trials had been "
-        "measured" in page
+        "LPIPS VGG raw was declared, but only after 6 trials of the arm had been measured" in page
     )
     assert "declared beforehand." not in page
 

@@ -28,13 +28,12 @@ class Standing:
     ``declaration`` is the one that first named the arm, with its trials up to the arm's first
     result; questions of one such declaration share an error rate. ``seen`` are the arm's trials
     that were measured before the metric was declared, ``added`` the trials of its pairs that were
-    not declared before its first result. ``trials`` is the number of its trials.
+    not declared before its first result.
     """
 
     declaration: Declaration
     seen: tuple[TrialResult, ...]
     added: tuple[TrialResult, ...]
-    trials: int
 
     @property
     def beforehand(self) -> bool:
@@ -45,8 +44,9 @@ class Standing:
     def doubt(self) -> str:
         """The reason why the question does not count as declared; "" if it does."""
         if self.seen:
-            of_arm = f"{len(self.seen)} of the arm's {counted(self.trials, 'trial')}"
-            return f"declared after {of_arm} had been measured"
+            # trials of earlier code were seen, too, so these may be more than the arm has now
+            of_arm = f"{counted(len(self.seen), 'trial')} of the arm"
+            return f"only after {of_arm} had been measured"
         if self.added:
             were = "was" if len(self.added) == 1 else "were"
             return f"{counted(len(self.added), 'trial')} {were} added after the arm's first result"
@@ -104,7 +104,7 @@ class ActiveDeclaration:
             next_record = min(named, default=math.inf)
             added = [one for one in paired if one.measured >= next_record]
         declaration = in_looks[-1] if in_looks else naming[0]
-        return Standing(declaration, tuple(seen), tuple(added), len(arm))
+        return Standing(declaration, tuple(seen), tuple(added))
 
     def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
         """A note on the declared trials that are missing; none if all are there."""
