@@ -26,10 +26,10 @@ import matplotlib.pyplot as plt
 from IPython.display import HTML, Markdown
 
 from gsbench.analysis import load_experiment, to_frame
+from gsbench.analysis.designs import seeds_needed
 from gsbench.analysis.images import choose_views
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.pairing import pair_trials
-from gsbench.analysis.statistics import seeds_needed
 from gsbench.analysis.table_formats import to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.cli import run
