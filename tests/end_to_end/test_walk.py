@@ -25,7 +25,7 @@ from tests.end_to_end.conftest import SMALL
 pytestmark = pytest.mark.slow
 
 PACKAGE = Path(gsbench.__file__).parent
-MAX_CROSSINGS = 10
+MAX_CROSSINGS = 11
 KEY = "densify.volume_threshold"
 TRIAL = [
     *SMALL,
