@@ -380,7 +380,7 @@ def test_an_address_counts_if_it_is_typed_or_in_the_environment(place, monkeypat
         ({"uri": None}, [], ""),
         ({"uri": "http://a"}, [], "http://a"),
         ({"uri": "databricks"}, [], "databricks"),
-        ({"uri": "http://a", "enabled": False}, [], ""),
+        ({"uri": "http://a", "enabled": False}, [], "http://a"),  # it counts for `sync`
         ({"uri": "http://a"}, ["http://a"], ""),
         ({"uri": "http://a"}, ["http://a/"], "http://a"),
         ({"host": "http://a"}, [], "http://a"),  # an option of a user's own tracker

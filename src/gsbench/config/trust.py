@@ -215,7 +215,8 @@ def check_permissions(values: Mapping[str, Any]) -> None:
     if is_external(values["densify"]):
         check_program(values["densify"], allowed)
     _check_launch(values["launch"], allowed)
-    if address := foreign_address(values["tracking"], allowed):
+    tracking = values["tracking"]
+    if tracking.get("enabled", True) and (address := foreign_address(tracking, allowed)):
         raise InputError(
             f"results would go to {address}, which only a file names; if you trust it, "
             f"{permission_advice([address], allowed)}; tracking=none sends nothing"

@@ -313,7 +313,7 @@ def sync(
 ) -> Iterator[str]:
     """Mirror ended trials that the tracker lacks; yields a line for each, and a summary.
 
-    ``allowed`` are the modules whose code may run.
+    ``allowed`` are the modules whose code may run, and the addresses that may get results.
 
     Raises MirrorError if the tracker refuses a trial.
     """
@@ -333,7 +333,7 @@ def sync(
         options = values["tracking"] | ({"uri": uri} if uri else {})
         # The runs folder may be a stranger's. It must not make gsbench send files or passwords to
         # the stranger's address.
-        if address := foreign_address(options, [uri] if uri else []):
+        if address := foreign_address(options, [*allowed, *([uri] if uri else [])]):
             yield (
                 f"left out: {folder.label}: its configuration names the tracker {address}, and "
                 f"--uri {address} was not typed"
