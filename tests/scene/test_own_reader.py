@@ -161,3 +161,9 @@ def test_options_of_the_reader_stand_among_the_settings_of_the_scene(monkeypatch
     assert "_target_" not in compose_one([]).values["scene"]  # earlier results keep their keys
     with pytest.raises(InputError, match=r"scene.scale is not a setting"):
         compose_one(["+scene.scale=3"])
+
+
+def test_photographs_are_in_the_order_of_their_names(folder):
+    """Test views are chosen by it, and a folder's order differs from file system to file system."""
+    shuffled = replace(posed(), images=dict(reversed(posed().images.items())))
+    assert list(read_posed_images(Reader(shuffled), folder).images) == [*posed().images]

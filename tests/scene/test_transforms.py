@@ -444,6 +444,10 @@ def test_a_focal_length_that_contradicts_the_field_of_view_is_used_with_one_line
     folder = write(tmp_path, camera_angle_x=2 * math.atan(20 / 50 * 1.02))
     read_transforms(folder)
     assert not caplog.text
+    own = {"w": 20, "h": 15, "fl_x": 25, "fl_y": 25, "cx": 10, "cy": 7}
+    own["camera_angle_x"] = 2 * math.atan(10 / 25)  # of the frame's own width
+    read_transforms(write(tmp_path, lambda document: document["frames"][2].update(own)))
+    assert not caplog.text
     images = read_transforms(write(tmp_path, camera_angle_x=0.3)).images
     assert images["images/3.png"][0].params[0] == 50
     assert caplog.text.count("its focal length is 50 px, but its field of view means 132.") == 1

@@ -190,11 +190,6 @@ def rescaled_camera(
     return copy
 
 
-def is_model(name: str) -> bool:
-    """Return whether COLMAP has a camera model of this name."""
-    return name in pycolmap.CameraModelId.__members__
-
-
 def new_camera(
     camera_id: int,
     model: pycolmap.CameraModelId | str,

@@ -59,6 +59,7 @@ _MODELS = {
     16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
 }
+PARAMETERS = dict(_MODELS.values())  # the number of them, by the name of the model
 
 
 def model_files(folder: Path) -> list[Path]:
@@ -66,16 +67,17 @@ def model_files(folder: Path) -> list[Path]:
 
     Raises `InputError` if neither set is complete.
     """
-    for suffix in (".bin", ".txt"):
-        files = [folder / f"{stem}{suffix}" for stem in REQUIRED]
-        if all(file.is_file() for file in files):
-            return files + [
-                file for stem in OPTIONAL if (file := folder / f"{stem}{suffix}").is_file()
-            ]
-    for suffix in (".bin", ".txt"):
-        lacking = [
+    lacking_by_suffix = {
+        suffix: [
             f"{stem}{suffix}" for stem in REQUIRED if not (folder / f"{stem}{suffix}").is_file()
         ]
+        for suffix in (".bin", ".txt")
+    }
+    for suffix, lacking in lacking_by_suffix.items():
+        if not lacking:
+            files = [folder / f"{stem}{suffix}" for stem in (*REQUIRED, *OPTIONAL)]
+            return [file for file in files if file.is_file()]
+    for lacking in lacking_by_suffix.values():
         if len(lacking) < len(REQUIRED):
             hint = "; points3D.txt may be empty" if lacking == ["points3D.txt"] else ""
             raise InputError(
@@ -241,7 +243,7 @@ def _numbers(words: Sequence[str]) -> list[float]:
 
 def _text_camera(line: str, _: Lines, checks: ModelChecks) -> None:
     words = line.split()
-    if dict(_MODELS.values()).get(words[1]) != len(words) - 4:
+    if PARAMETERS.get(words[1]) != len(words) - 4:
         raise InputError(f"camera {words[0]} is of an unknown model or lacks parameters")
     checks.camera(int(words[0]), words[1], int(words[2]), int(words[3]), _numbers(words[4:]))
 

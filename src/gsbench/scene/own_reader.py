@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from gsbench.errors import InputError
+from gsbench.scene.colmap_files import PARAMETERS
 from gsbench.scene.transforms import PosedCamera, nearest_rotation
 from gsbench.scene.types import CameraModel
 
@@ -76,19 +77,20 @@ def read_posed_images(reader: SceneReader, folder: Path) -> PosedImages:
         if colors.shape != positions.shape or colors.dtype != np.uint8:
             raise InputError(f"{name}: colours of points must be uint8 [P, 3], as the points")
         points = positions, colors
-    return replace(posed, images=images, points=points)
+    # in the order of the names, by which test views are chosen
+    return replace(posed, images=dict(sorted(images.items())), points=points)
 
 
 def _checked(
     folder: Path, image: str, camera: CameraModel, rotation: object, translation: object
 ) -> PosedCamera:
     """A photograph's camera and pose; raises InputError or ValueError for unusable ones."""
-    from gsbench.scene.colmap import is_model, new_camera  # loads pycolmap
+    from gsbench.scene.colmap import new_camera  # loads pycolmap
 
     place = PurePath(image)
     if place.is_absolute() or ".." in place.parts or not (folder / place).is_file():
         raise InputError(f"no such file in {folder}")
-    if not is_model(camera.name):
+    if camera.name not in PARAMETERS:
         raise InputError(f"{camera.name!r} is no camera model of COLMAP, such as PINHOLE")
     params = tuple(map(float, camera.params))
     if not np.isfinite(params).all():

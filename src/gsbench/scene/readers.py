@@ -152,9 +152,9 @@ def read_posed(
     root: Path,
     posed: PosedImages,
     model: Path,
-    max_images: int = MAX_IMAGES,
-    split: SplitRule = EVERY_NTH,
-    masks: str | None = None,
+    max_images: int,
+    split: SplitRule,
+    masks: str | None,
 ) -> Capture:
     """Read the photographs ``posed`` below ``root``, whose cameras the COLMAP ``model`` has."""
     from gsbench.scene.colmap import read_model, reference_cameras

@@ -391,9 +391,7 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
         _check_center(where, (width, height), (value("cx"), value("cy")))
     if width != int(width) or height != int(height) or min(width, height) < 1:
         raise InputError(f"{where}: w and h must be whole numbers of px, got {width} and {height}")
-    # A frame with a focal length of its own, in whatever form, uses none of the file's.
-    own_focal = any(getattr(frame, name) is not None for name in FOCAL_KEYS)
-    source: Intrinsics = frame if own_focal else record
+    source = _source(record, frame, FOCAL_KEYS)
     focal_x = _focal_length(width, source.fl_x, source.camera_angle_x, source.x_fov)
     focal_y = _focal_length(height, source.fl_y, source.camera_angle_y, source.y_fov)
     # Pixels are square if only one of both is given, as in instant-ngp and nerfstudio.
@@ -410,6 +408,11 @@ def _camera(image: Path, path: Path, record: TransformsRecord, frame: FrameRecor
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     model, distortion = _distortion(where, record, frame)
     return CameraModel(model, int(width), int(height), (focal_x, focal_y, *center, *distortion))
+
+
+def _source(record: TransformsRecord, frame: FrameRecord, keys: Collection[str]) -> Intrinsics:
+    """The frame, if it has a value of its own for one of ``keys``, else the file; never a mix."""
+    return frame if any(getattr(frame, key) is not None for key in keys) else record
 
 
 def _check_own_size(where: str, record: TransformsRecord, frame: FrameRecord) -> None:
@@ -449,9 +452,7 @@ def _distortion(
 ) -> tuple[str, tuple[float, ...]]:
     """COLMAP's name of the camera model, and its parameters after the principal point."""
     names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    # A frame with a coefficient of its own uses none of the file's.
-    own = any(getattr(frame, name) is not None for name in names)
-    source: Intrinsics = frame if own else record
+    source = _source(record, frame, names)
     k1, k2, k3, k4, k5, k6, p1, p2 = (getattr(source, name) or 0.0 for name in names)
     fisheye = record.is_fisheye if frame.is_fisheye is None else frame.is_fisheye
     model = frame.camera_model or record.camera_model or (FISHEYE if fisheye else "OPENCV")
@@ -499,10 +500,12 @@ def _focal_length(
 def _report_contradictions(path: Path, record: TransformsRecord, camera: CameraModel) -> None:
     """Log one line if a record's focal length and its field of view differ; the first is used."""
     for source in (record, *record.frames):
+        width = camera.width if source.w is None else source.w
+        height = camera.height if source.h is None else source.h
         given = (source.fl_x, source.fl_y)
         seen = (
-            _focal_length(camera.width, None, source.camera_angle_x, source.x_fov),
-            _focal_length(camera.height, None, source.camera_angle_y, source.y_fov),
+            _focal_length(width, None, source.camera_angle_x, source.x_fov),
+            _focal_length(height, None, source.camera_angle_y, source.y_fov),
         )
         for length, other in zip(given, seen, strict=True):
             if length and other and not 1 / SAME_FOCAL < length / other < SAME_FOCAL:
