@@ -17,6 +17,7 @@ from gsbench.logs import (
     LOGGER,
     PrintableStream,
     _QuietHandler,
+    begin_command,
     log_to,
     printable_output,
     set_up_logging,
@@ -220,7 +221,7 @@ def test_what_an_encoding_lacks_is_escaped(encoding, shown):
 def test_a_note_about_a_scene_is_shown_once_in_a_command_and_is_in_every_log(tmp_path, capsys):
     for _ in range(2):
         with printable_output():
-            set_up_logging()
+            begin_command()
             for seed in range(3):
                 set_up_logging()
                 with log_to(tmp_path / f"{seed}.txt"):

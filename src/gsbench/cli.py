@@ -17,7 +17,7 @@ try:
     from gsbench import __version__
     from gsbench.errors import GsbenchError, InputError
     from gsbench.files import checked_runs_folder, storage_errors
-    from gsbench.logs import printable_output, set_up_logging
+    from gsbench.logs import begin_command, printable_output
     from gsbench.system.programs import protect_environment
     from gsbench.verbs import VERBS, load_verb
     from gsbench.words import did_you_mean
@@ -40,7 +40,7 @@ def run(argv: list[str]) -> int:
     """Run the command line ``argv``; returns the exit code and prints errors as one line."""
     with suppress(FileNotFoundError):  # the current folder was deleted, with all that is in it
         protect_environment()
-    set_up_logging()
+    begin_command()
     try:
         if argv and argv[0] == "help":
             return _help([])

@@ -55,7 +55,6 @@ class PrintableStream:
 @contextmanager
 def printable_output() -> Iterator[None]:
     """Make everything that the block and its libraries print `printable`."""
-    _shown_of_scenes.clear()
     out, err = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = PrintableStream(out), PrintableStream(err)
     try:
@@ -77,6 +76,12 @@ class _RootHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         logging.getLogger().handle(record)
+
+
+def begin_command() -> None:
+    """Set up logging for a command, which shows each warning about a scene once."""
+    _shown_of_scenes.clear()
+    set_up_logging()
 
 
 def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bool = False) -> None:
