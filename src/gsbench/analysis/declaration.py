@@ -14,8 +14,7 @@ from pathlib import Path
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult
-from gsbench.analysis.trial_settings import load_flat_config, settings_text
-from gsbench.parsing import DamagedError
+from gsbench.analysis.trial_settings import config_if_readable, settings_text
 from gsbench.runs.experiments import Declaration, merge_planned, read_declarations
 from gsbench.runs.layout import SEED
 from gsbench.words import counted
@@ -130,9 +129,8 @@ class ActiveDeclaration:
         That is so if the planned trial failed and its code was repaired.
         """
         for seed in seeds:
-            try:
-                config = load_flat_config(self.folder / f"{key}{SEED}{seed}")
-            except (FileNotFoundError, DamagedError):
+            config = config_if_readable(self.folder / f"{key}{SEED}{seed}")
+            if not config:
                 continue
             place = key.rpartition("/")[0]
             same_arm = [one for one in trials if one.key.rpartition("/")[0] == place]

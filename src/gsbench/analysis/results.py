@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from gsbench.analysis.trial_settings import (
     Configurations,
     canonical,
-    load_flat_config,
+    config_if_readable,
     settings_text,
 )
 from gsbench.errors import InputError
@@ -115,10 +115,7 @@ class TrialResult:
     @cached_property
     def whole_config(self) -> Mapping[str, Any]:
         """Every setting with dotted keys, also those that change no result; empty if unreadable."""
-        try:
-            return load_flat_config(self.path)
-        except (FileNotFoundError, DamagedError):
-            return {}
+        return config_if_readable(self.path)
 
     @cached_property
     def folder(self) -> TrialFolder:

@@ -67,6 +67,14 @@ def load_flat_config(folder: Path) -> dict[str, Any]:
     return flatten(values)
 
 
+def config_if_readable(folder: Path) -> Mapping[str, Any]:
+    """The same as `load_flat_config`, but {} if the configuration is missing or damaged."""
+    try:
+        return load_flat_config(folder)
+    except (FileNotFoundError, DamagedError):
+        return {}
+
+
 def canonical(value: object) -> str:
     """JSON text that is equal for equal values."""
     if type(value) is int or (type(value) is float and math.isfinite(value)):

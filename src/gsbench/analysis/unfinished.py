@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.results import TrialResult
-from gsbench.analysis.trial_settings import load_flat_config
-from gsbench.parsing import DamagedError
+from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.runs.experiments import Question, trial_key
 from gsbench.runs.layout import SEED
 from gsbench.words import counted, some_of
@@ -45,10 +44,7 @@ class Unfinished:
     @cached_property
     def config(self) -> Mapping[str, Any]:
         """The settings with dotted keys; empty if unreadable."""
-        try:
-            return load_flat_config(self.path)
-        except (FileNotFoundError, DamagedError):
-            return {}
+        return config_if_readable(self.path)
 
     def is_of(self, question: Question, side: int) -> bool:
         """Return whether the trial belongs to a side of the question."""

@@ -20,8 +20,8 @@ from PIL import Image
 from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import TrialResult, read_experiment, read_views
-from gsbench.analysis.trial_settings import load_flat_config
-from gsbench.config.command_words import typed_permissions
+from gsbench.analysis.trial_settings import config_if_readable
+from gsbench.config.command_words import parse_word, typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.config.trust import PERMISSIONS
@@ -32,7 +32,6 @@ from gsbench.eval.options import EvalConfig
 from gsbench.eval.pictures import Matching, PicturePair, match_by_order, match_pictures, measure
 from gsbench.files import atomic, file_sha256, storage_errors, write_text
 from gsbench.logs import progress
-from gsbench.parsing import DamagedError
 from gsbench.pipeline.parts import Parts, build_metrics, make_evaluator
 from gsbench.pipeline.steps.evaluate import summary_of, write_per_view
 from gsbench.pipeline.trial import TrialSteps, versions
@@ -359,10 +358,11 @@ def find_destination(
                 f"--as {experiment}:{inits[0]}-{arm}"
             )
         init = inits[0] if inits else init or "renders"
-    settings = tuple(
-        (key if "." in key else f"densify.{key}", yaml.safe_load(value))
+    named = (
+        (key if "." in key else f"densify.{key}", value)
         for key, value in typed_arm.settings.items()
     )
+    settings = tuple((key, parse_word(f"{key}={value}").value()) for key, value in named)
     return Destination(experiment, scene_name, init, name, seed, settings)
 
 
@@ -485,11 +485,8 @@ def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dic
 
 def _has(folder: Path, settings: Mapping[str, Any]) -> bool:
     """Return whether a trial has these settings, or none that tell its arm apart."""
-    try:
-        own = load_flat_config(folder)
-    except (FileNotFoundError, DamagedError):
-        return True
-    return all(own.get(key) == value for key, value in settings.items())
+    own = config_if_readable(folder)
+    return not own or all(own.get(key) == value for key, value in settings.items())
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:
