@@ -67,10 +67,13 @@ def folders_in(folder: str | Path) -> list[str]:
     except OSError as error:
         log.warning("left out: %s cannot be read (%s)", folder, error.strerror)
         return []
+    paths = []
     for entry in found:
-        if not is_one_line(entry.name):  # its line breaks would be lines about other folders
+        if is_one_line(entry.name):
+            paths.append(entry.path)
+        else:  # its line breaks would be lines about other folders
             log.warning("left out: %r: gsbench gives no folder such a name", entry.path)
-    return [entry.path for entry in found if is_one_line(entry.name)]
+    return paths
 
 
 # ---- the search for the settings of an arm

@@ -42,7 +42,6 @@ from gsbench.runs.trial_record import (
     MadeOf,
     ResultsFile,
     Row,
-    Stamp,
     TrialRecord,
     UnfinishedError,
     read_rows,
@@ -66,16 +65,14 @@ class TrialFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # sha256 of files by name, from the results that were read last
-        self._digests: Mapping[str, str] | None = None
-        self._stamps: Mapping[str, Stamp] = {}
+        self._origin: MadeOf | None = None  # of the results that were read last, if recorded
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> TrialFolder:
         """The folder of the trial with the resolved configuration ``values``."""
         runs = Path(values["runs"]).expanduser().resolve()
         arm = f"{values['init']['name']}-{values['densify']['name']}"
-        leaf = f"{config_hash(dict(values))[:8]}{layout.SEED}{values['seed']}"
+        leaf = f"{config_hash(values)[:8]}{layout.SEED}{values['seed']}"
         return cls(runs / values["name"] / values["scene"]["name"] / arm / leaf)
 
     @property
@@ -190,15 +187,21 @@ class TrialFolder:
                     f"was changed after it was written: `gsbench retry {self.home.name}` repairs it"
                 )
                 raise DamagedError(path, reason)
-        self._digests = {} if made_of is None else made_of.digests
-        self._stamps = {} if made_of is None else made_of.published
+        self._origin = made_of
         return record
 
     def change(self, thorough: bool = False) -> Change | None:
         """A change among the judged files since the results were written (`change_of_files`)."""
-        if self._digests is None:
+        origin = self._known_origin()
+        if origin is None:
+            return None
+        return change_of_files(self.path, origin.digests, origin.published, thorough)
+
+    def _known_origin(self) -> MadeOf | None:
+        """What made the results, read if they were not yet; None if unrecorded or unsound."""
+        if self._origin is None:
             self.sound_record()
-        return change_of_files(self.path, self._digests or {}, self._stamps, thorough)
+        return self._origin
 
     def sound_record(self) -> TrialRecord | None:
         """The same as `record`, but None if the trial has no sound results."""
@@ -266,12 +269,12 @@ class TrialFolder:
         not known whether the metric can be computed, so the trial must be checked.
         """
         try:
-            record, origin = self.record(), self.made_of()
+            record = self.record()
         except (FileNotFoundError, UnfinishedError):
             return Change("unfinished", layout.RESULTS)
         except DamagedError as error:
             return Change("damaged", error.path.name, now=error.reason)
-        if origin is None:
+        if (origin := self._origin) is None:
             return Change("unrecorded", layout.RESULTS)
         if change := next(changes(self.path, values, record, origin), None):
             return change
@@ -318,9 +321,8 @@ class TrialFolder:
         later.
         """
         content = read_bytes(self.path / name)
-        if self._digests is None:
-            self.sound_record()
-        recorded = (self._digests or {}).get(name)
+        origin = self._known_origin()
+        recorded = None if origin is None else origin.digests.get(name)
         if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
             raise DamagedError(
                 self.path / name,

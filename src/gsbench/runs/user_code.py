@@ -1,7 +1,8 @@
 """The user's code behind a trial: its modules, each with a digest of what it computes.
 
-These are the modules of configured classes and those in ``allow_targets``: no others can be
-imported. A module counts whole, Python by its syntax, other code by its bytes.
+These are the modules of configured classes and those in ``allow_targets``, except those of
+trackers: no others can be imported. A module counts whole, Python by its syntax, other code by its
+bytes.
 """
 
 import hashlib
