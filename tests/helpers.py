@@ -1,4 +1,4 @@
-"""What tests of all rooms need: an expected refusal, and files that are written and read."""
+"""What tests of all packages need: an expected refusal, and files that are written and read."""
 
 import json
 from contextlib import contextmanager

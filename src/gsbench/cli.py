@@ -117,11 +117,11 @@ gsbench tests whether an idea helps 3D Gaussian Splatting.
 
 
 def _trials(argv: list[str]) -> int:
-    from gsbench.verbs.queries import QUERIES, ask_hydra
-
     if not argv or argv in (["-m"], ["--multirun"]):
         print(USAGE + "\nEverything: gsbench --help")
         return DONE
+    from gsbench.verbs.queries import QUERIES, ask_hydra
+
     if any(word.split("=")[0] in QUERIES for word in argv):
         return ask_hydra(argv)
     from gsbench.app.command import launch

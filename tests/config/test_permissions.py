@@ -1,6 +1,7 @@
 """Runs folders and trainers of strangers run only what the user allows in each command."""
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from gsbench.launch.record import add_to_plan
 from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.settings import ADDRESS_VARIABLES, foreign_address
+from gsbench.system.install import conf_dir
 from tests.strange import experiment, no_trial
 from tests.strange import place as place
 
@@ -100,6 +102,20 @@ def strange_runs(settings):
 
 def _words(settings):
     return [f"{key}={value_text(value)}" for key, value in settings.items()]
+
+
+@pytest.mark.parametrize(
+    "settings, said",
+    [
+        ({"runs": "theirs"}, "runs=theirs, a place to write"),
+        ({"hydra": {"sweeper": {"params": {"runs": "theirs"}}}}, "runs"),
+        ({"hydra": {"job": {"env_set": {"PATH": "."}}}}, "set variables in the shell"),
+    ],
+)
+def test_a_choice_that_leaves_its_groups_folder_is_a_strangers_file(settings, said, refused):
+    experiment(settings)
+    outside = os.path.relpath("conf/experiment/strange", Path(conf_dir(), "experiment"))
+    assert said in refused(f"+experiment={outside}")
 
 
 def _claims(settings):

@@ -124,7 +124,7 @@ def test_options_of_a_users_class_are_in_the_key_whatever_their_names(home):
 
 def test_the_cache_of_prepared_photographs_depends_on_the_code(monkeypatch):
     monkeypatch.setattr(
-        "gsbench.pipeline.steps.scene.edited", lambda rooms: dict.fromkeys(rooms, "edited")
+        "gsbench.pipeline.steps.scene.edited", lambda packages: dict.fromkeys(packages, "edited")
     )
     view_versions.cache_clear()
     found = view_versions()

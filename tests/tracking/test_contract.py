@@ -1,7 +1,5 @@
 """One contract, four trackers: what each shows of the same files, and after each interruption."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -40,7 +38,7 @@ class FakeRun:
 
     def __init__(self, name):
         self.name, self.notes, self.code = name, "", None
-        self.config, self.summary = dict[str, Any](), dict[str, Any]()
+        self.summary = dict[str, Any]()
         self.rows, self.files = list[dict[str, Any]](), set[str]()
         self.config = SimpleNamespace(
             values={}, update=lambda new, **how: self.config.values.update(new)

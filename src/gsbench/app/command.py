@@ -12,10 +12,10 @@ from collections.abc import Sequence
 
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
+from gsbench.app.hydra_main import run_main
 from gsbench.app.plugins import (
     TrialTask,
     other_sweep,
-    run_main,
     words_for_plugins,
     words_without_sweeper,
 )
@@ -96,11 +96,11 @@ def own_sweep(sweep: Sweep) -> Ended:
         log.info(
             "hydra.job.chdir: paths still start in %s, where the command was given", os.getcwd()
         )
-    ended = Ended()
     if (words := words_for_plugins(sweep)) is not None:
-        task = TrialTask(run_batch, sweep.composer.allowed, sweep=sweep, ended=ended)
+        task = TrialTask(run_batch, sweep.composer.allowed, sweep=sweep)
         run_main(task, words, sweep.config)
-        return ended
+        return task.ended
+    ended = Ended()
 
     def run(trials: Sequence[Trial]) -> None:
         ended.add(trials, run_batch(trials))

@@ -11,21 +11,14 @@ import logging
 import os
 import shlex
 import statistics
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import (
-    AbstractContextManager,
-    contextmanager,
-    nullcontext,
-    redirect_stderr,
     suppress,
 )
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import hydra
-import hydra.utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
@@ -35,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.analysis.results import group_by
 from gsbench.app.grids import GRIDS, run_sweep
+from gsbench.app.hydra_main import run_main
 from gsbench.app.sweep import (
     DEFAULT_METRIC,
     HYDRA_ERRORS,
@@ -43,24 +37,25 @@ from gsbench.app.sweep import (
     Sweep,
     better_direction,
 )
-from gsbench.config.command_words import bare_key, grid_points, is_sweep, key_of, parse_word
+from gsbench.config.command_words import (
+    bare_key,
+    grid_points,
+    is_sweep,
+    key_of,
+    own_words,
+    parse_word,
+)
 from gsbench.config.compose import (
-    CONFIG_NAME,
-    VERSION_BASE,
     Trial,
     check_permitted,
     installed_nodes,
     trial_of_job,
 )
-from gsbench.config.schema import register_schemas
-from gsbench.config.trust import HYDRAS_CALLBACKS, load_callbacks
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.jobs import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import metric_and_question
-from gsbench.runs.nested import targets_in
-from gsbench.system.install import conf_dir
 from gsbench.system.own_modules import allow_modules
 from gsbench.words import counted
 
@@ -68,12 +63,6 @@ GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no value
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
 MODE = "hydra.mode"
 HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
-HYDRAS_LINE = "Error executing job with overrides"
-# Within this context, Hydra 1.4 and later instantiates only the named classes (``mine.*``: all of a
-# module).
-WHITELIST: Callable[[Sequence[str]], AbstractContextManager[Any]] = getattr(
-    hydra.utils, "execution_whitelist", lambda names: nullcontext()
-)
 
 log = logging.getLogger(__name__)
 
@@ -204,10 +193,7 @@ class TrialTask:
     def _launch(self, trials: Sequence[Trial], launcher: Launcher, name: str) -> None:
         """Run trials by another launcher than gsbench's; all are checked before the first."""
         begin_for_another_launcher(trials)
-        jobs = [
-            [word for word in trial.overrides if not parse_word(word).is_hydra_override()]
-            for trial in trials
-        ]
+        jobs = [own_words(trial.overrides) for trial in trials]
         try:
             returned = launcher.launch(jobs, initial_job_idx=len(self.ended.trials))
         except GsbenchError:
@@ -363,11 +349,7 @@ def best_line(trials: Sequence[Trial], objective: Objective) -> str:
 
 def _job_words(trial: Trial, without: str) -> tuple[str, ...]:
     """The words of a trial's job without Hydra's own and without one key."""
-    return tuple(
-        word
-        for word in trial.overrides
-        if key_of(word) != without and not parse_word(word).is_hydra_override()
-    )
+    return tuple(word for word in own_words(trial.overrides) if key_of(word) != without)
 
 
 def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:
@@ -404,12 +386,12 @@ def prepare_other_sweeper(sweep: Sweep) -> tuple[list[str], Objective]:
         for key, word in lists.items()
         if "." not in key and key != "seed"
     ]
+    own = own_words(single)
     for number, point in enumerate(itertools.product(*choices)):
         if number == MAX_CHOICES:
             raise InputError(
                 f"hydra/sweeper={name}: more than {MAX_CHOICES} combinations of choices"
             )
-        own = [word for word in single if not parse_word(word).is_hydra_override()]
         sweep.composer.settings([*own, *(word for (word,) in point)])
     if name == GRID_SWEEPER:
         return words, Objective(-1)
@@ -441,58 +423,3 @@ def _maximizes(sweeper: DictConfig) -> bool:
         for key in ("optim.maximize", "ax_config.experiment.minimize")
     )
     return name == "maximize" or nevergrad is True or ax is False
-
-
-# ---- hydra.main
-
-
-def run_main(
-    task: Callable[[Any], Any], argv: Sequence[str], config: DictConfig | None = None
-) -> None:
-    """Run ``task`` as an app of ``hydra.main`` with the words ``argv``; raises what it raises.
-
-    Hydra may instantiate its own callbacks, the plug-ins that the checked ``config`` chooses, and
-    the classes that it allows.
-    """
-    names: list[str] = []
-    if config is not None:
-        load_callbacks(config.hydra.callbacks, config.allow_targets)
-        plugins = [config.hydra.launcher, config.hydra.sweeper]
-        nodes = [OmegaConf.to_container(node, resolve=False) for node in plugins]
-        names = [*config.allow_targets, *(target for _, target in targets_in(nodes))]
-    names = [name for name in names if all(part.isidentifier() for part in name.split("."))]
-    register_schemas()
-    with (
-        WHITELIST([*HYDRAS_CALLBACKS, *names, *(f"{name}.*" for name in names)]),
-        redirect_stderr(_WithoutHydrasLine(sys.stderr)),
-        _as_program(["gsbench", *argv]),
-    ):
-        hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=CONFIG_NAME)(task)()
-
-
-@contextmanager
-def _as_program(argv: list[str]) -> Iterator[None]:
-    """Let Hydra read ``argv``, and raise errors instead of printing them and ending the process."""
-    saved = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv, os.environ["HYDRA_FULL_ERROR"] = argv, "1"
-    try:
-        yield
-    finally:
-        sys.argv = saved[0]
-        os.environ.pop("HYDRA_FULL_ERROR")
-        if saved[1] is not None:
-            os.environ["HYDRA_FULL_ERROR"] = saved[1]
-        HydraConfig.instance().cfg = None
-
-
-class _WithoutHydrasLine:
-    """Standard error without Hydra's line about a job's error, which gsbench prints itself."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        return len(text) if text.startswith(HYDRAS_LINE) else int(self._stream.write(text))

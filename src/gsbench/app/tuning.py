@@ -180,9 +180,9 @@ def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) 
         missing: list[Trial] = []
         for (search, _, _), own in zip(points, trials, strict=True):
             missing += [trial for trial in own if search.value_of(trial) is None]
-        if missing and run is None:
-            return False
-        if missing and run is not None:
+        if missing:
+            if run is None:
+                return False
             _write(searches)  # before training, so that the ranges were on record before any result
             run(missing)
         for (search, proposal, _), own in zip(points, trials, strict=True):

@@ -112,7 +112,7 @@ class NullDevice:
             mock.patch.multiple(executor, launch=self._launch, launch_grid=self._launch),
             mock.patch.multiple(lists, launch=self._launch, launch_grid=self._launch),
             mock.patch.object(loss_triton, "launch_grid", self._launch),
-            mock.patch.object(adam_triton, "launch_grid", self._launch),
+            mock.patch.object(adam_triton, "launch", self._launch),
             mock.patch.object(executor, "Readback", _Sizes),
             mock.patch.object(direct, "Readback", _Sizes),
         ):

@@ -9,6 +9,7 @@ import logging
 import sys
 from typing import Any
 
+from gsbench.config.groups import REMOVABLE
 from gsbench.config.trust import (
     check_program,
     check_target,
@@ -89,10 +90,10 @@ def _check_names(cls: Any, target: str, options: dict[str, Any], group: str) -> 
     key = f"{group}.{unknown}"
     if target.startswith(GSBENCH):
         raise InputError(unknown_setting(key, unknown, parameters))
+    remove = f"remove it by ~{key}, or " if group in REMOVABLE else ""
     raise InputError(
         f"{key} is not a setting{did_you_mean(unknown, parameters)} ({target} has: "
-        f"{', '.join(parameters) or 'none'}); remove it by ~{key}, or start from another choice, "
-        f"{group}=NAME"
+        f"{', '.join(parameters) or 'none'}); {remove}start from another choice, {group}=NAME"
     )
 
 

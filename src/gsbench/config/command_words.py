@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import accumulate, islice, product
 from pathlib import Path
@@ -12,8 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from gsbench.config.groups import GROUPS, options
-from gsbench.config.schema import COMPONENTS
+from gsbench.config.groups import GROUPS, REMOVABLE, options
 from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
@@ -160,13 +159,18 @@ def check_text(word: str) -> None:
             break
 
 
+def own_words(words: Iterable[str]) -> list[str]:
+    """The words without those for Hydra."""
+    return [word for word in words if not parse_word(word).is_hydra_override()]
+
+
 def check_removal(override: Override) -> None:
     """Raise InputError unless the removed setting is an option of a component.
 
     A user's class may lack options that the chosen file sets.
     """
     group, dot, _ = bare_key(override.get_key_element()).partition(".")
-    if not dot or group not in (*COMPONENTS, "raster"):
+    if not dot or group not in REMOVABLE:
         raise InputError(
             f"{override.input_line!r}: a setting cannot be removed: give it another value"
         )

@@ -88,9 +88,10 @@ class Trial:
 class Composer:
     """Composes the configurations and the trials of one command.
 
-    ``config`` is the whole configuration of the words that list no values, with Hydra's node.
-    Only the words ``typed`` by the user (default: all ``words``) give permissions. From here on
-    Python finds the modules that are allowed in the folder ``modules`` (default: the current one).
+    ``config`` is the whole configuration of the words that list no values, with Hydra's node and
+    without settings of groups whose choices are listed. Only the words ``typed`` by the user
+    (default: all ``words``) give permissions. From here on Python finds the modules that are
+    allowed in the folder ``modules`` (default: the current one).
     Raises InputError with one line.
     """
 
@@ -108,10 +109,10 @@ class Composer:
         allow_modules(self.allowed, os.getcwd() if modules is None else modules)
         check_places(command_words.searched_folders(words), packages)
         single = [word for word in words if not command_words.is_sweep(word)]
-        self.hydra_words = tuple(word for word in single if parse_word(word).is_hydra_override())
+        own = command_words.own_words(single)
+        self.hydra_words = tuple(word for word in single if word not in own)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
-        own = [word for word in single if word not in self.hydra_words]
         self._own_choices = _choices(own)
         # The settings of a group whose choices are listed are checked with each choice.
         listed = set(map(key_of, words)) - set(map(key_of, single))
@@ -156,13 +157,14 @@ class Composer:
                 any_seed[others] = self._trial(words, others, seed)
             trial = any_seed[others]
             if trial is None:
-                trial = self._trial(words, words) or self._trial_of_hydra(words, number)
+                again = None if seed is None else self._trial(words, words)
+                trial = again or self._trial_of_hydra(words, number)
             trials.append(trial if seed is None else with_seed(trial, seed))
         return trials
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
-        words = [word for word in overrides if not parse_word(word).is_hydra_override()]
+        words = command_words.own_words(overrides)
         trial = self._trial(words, words) or self._trial_of_hydra(words)
         return replace(trial, overrides=tuple(overrides))
 
@@ -233,8 +235,9 @@ class Composer:
             config = hydra.compose(
                 CONFIG_NAME, [*self.hydra_words, *choices], return_hydra_config=True
             )
-        if self.hydra_words:  # without them, all files are gsbench's own
-            # for the check, which tells what is typed from what a file sets
+        # Without words for Hydra all files are gsbench's own, unless a choice leaves its folder.
+        if self.hydra_words or any(".." in choice for choice in choices):
+            # for the check, which tells what is in a word from what a file sets
             config.hydra.overrides.task = list(map(key_of, words))
             check_permitted(config, self.allowed)
         return config

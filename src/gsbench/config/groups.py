@@ -6,6 +6,7 @@ from pathlib import Path
 from gsbench.system.install import conf_dir
 
 GROUPS = ("scene", "init", "densify", "raster", "train", "eval", "tracking", "launch", "experiment")
+REMOVABLE = ("init", "densify", "raster")  # groups whose options ~KEY can remove
 EXTERNAL_FOLDER = "external"  # subfolder of a group for other programs; glob(*) does not list it
 
 

@@ -156,7 +156,8 @@ class TuneSettings:
 class Config:
     """The root of the configuration.
 
-    ``init`` and ``densify`` take any keys, because a user's own class has its own options.
+    ``init`` and ``densify`` take any keys, because a user's own class has its own options; so do
+    other groups that name a user's class.
     """
 
     name: ExperimentName = "default"
@@ -226,7 +227,7 @@ def _names_and_defaults(schema: type) -> type:
 def checked_values(config: DictConfig) -> dict[str, Any]:
     """Resolve, convert (``1e3``) and check a configuration; returns its values.
 
-    Hydra's node is left out. The classes that ``init`` and ``densify`` name check their options
+    Hydra's node is left out. Classes that a group names check their options
     themselves, when they are made. Raises InputError naming the key.
     """
     return check(plain(config))

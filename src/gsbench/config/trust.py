@@ -1,8 +1,8 @@
 """Permissions: a configuration may run gsbench's own classes, and what the command line allows.
 
-Only ``allow_targets`` on the command line gives permission; no file can. It names modules
-(``mine``), programs (``bash``) and environment variables (``PATH``). `docs/security.md` says what
-this protects from.
+Only the command line gives permission; no file can. ``allow_targets`` names modules (``mine``),
+programs (``bash``), environment variables (``PATH``) and addresses; a typed address or place to
+write is allowed, too. `docs/security.md` says what this protects from.
 
 `check_composed` checks a composed configuration, Hydra's own settings included, before Hydra makes
 any object of it. `check_permissions` checks the resolved values of each trial before its parts are

@@ -62,12 +62,18 @@ class KnownGradients:
     sh_degree: int
 
     def updates(self, states: Sequence[AdamState | None]) -> list[Update]:
-        """The updates of the parameters with a state; None leaves one out."""
-        # Harmonics, the last parameter, have gradients up to the degree.
+        """The updates of the parameters with a state and a gradient; a state None leaves one out.
+
+        Harmonics, the last parameter, have gradients up to the degree: at degree 0, none.
+        """
         rest = 3 * ((self.sh_degree + 1) ** 2 - 1)
-        active = [None] * (len(self.parameters) - 1) + [rest]
+        active: list[int | None] = [*[None] * (len(self.parameters) - 1), rest]
         found = zip(self.parameters, self.gradients, states, active, strict=True)
-        return [Update(*one[:2], state, one[3]) for one in found if (state := one[2]) is not None]
+        return [
+            Update(parameter, gradient, state, columns)
+            for parameter, gradient, state, columns in found
+            if state is not None and columns != 0
+        ]
 
 
 class TrainableGaussians:
@@ -88,7 +94,7 @@ class TrainableGaussians:
         spatial_scale: float,
         step_all: StepAll | None = None,
     ) -> None:
-        """``step_all`` applies Adam to a whole parameter (None: torch's fused kernel)."""
+        """``step_all`` applies Adam to whole parameters (None: torch's fused kernel)."""
         self.rates = rates
         self.spatial_scale = spatial_scale
         self.step_all = step_all or torch_adam
@@ -155,8 +161,7 @@ class TrainableGaussians:
     def advance(self, known: KnownGradients) -> list[AdamState | None]:
         """Count a step with ``known`` gradients; return the state of each parameter to update.
 
-        It is None for a parameter that was replaced since, and for ``sh_rest`` at degree 0, where
-        all its gradients are 0.
+        It is None for a parameter that was replaced since.
         """
         states: list[AdamState | None] = []
         for (name, parameter), own in zip(
@@ -165,8 +170,7 @@ class TrainableGaussians:
             current = parameter is own
             if current:
                 self.adam[name].step += 1
-            idle = name == "sh_rest" and known.sh_degree == 0
-            states.append(self.adam[name] if current and not idle else None)
+            states.append(self.adam[name] if current else None)
         return states
 
     @torch.no_grad()

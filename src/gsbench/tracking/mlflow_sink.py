@@ -21,8 +21,8 @@ from filelock import FileLock
 from gsbench.errors import InputError
 from gsbench.files import atomic, require_no_links
 from gsbench.runs.layout import ARTIFACTS, DATABASE
-from gsbench.tracking.sinks import NOTE, Run, Status
-from gsbench.tracking.trial import Picture, Scalar, TrackedTrial
+from gsbench.tracking.sinks import Run, Status
+from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -14,10 +14,9 @@ from gsbench.files import require_no_links
 from gsbench.parsing import Count, Record
 from gsbench.runs import layout
 from gsbench.system.install import install_command
-from gsbench.tracking.trial import Picture, Scalar, TrackedTrial
+from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
-NOTE = "note"  # the tag that describes a finished trial, in Markdown
 
 
 @dataclass(frozen=True, kw_only=True)

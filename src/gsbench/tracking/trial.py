@@ -19,6 +19,7 @@ from gsbench.runs.nested import flatten, sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
+NOTE = "note"  # the tag that describes a finished trial, in Markdown
 # characters that MLflow refuses in a picture's name
 NOT_IN_A_KEY = re.compile(r"[^a-zA-Z0-9_\-. ]")
 Array = NDArray[np.uint8]
@@ -190,7 +191,7 @@ class TrackedTrial:
             "protocol": results.protocol,
             "raster": results.raster,
             "commit": results.code.commit or "unknown",
-            "note": self._note(results),
+            NOTE: self._note(results),
         }
         tags |= {f"hash_{key}": value for key, value in results.hashes.items()}
         names = (*FILES, layout.POINT_CLOUD) if with_model else FILES

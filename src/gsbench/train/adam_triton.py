@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsbench.gaussians.trainable import ADAM_BETAS, ADAM_EPSILON, Update
 from gsbench.raster.staged import upload
-from gsbench.raster.triton.launch import launch_grid
+from gsbench.raster.triton.launch import launch
 
 NUMBERS = 1024  # of a parameter per program
 BETA1, BETA2 = (tl.constexpr(beta) for beta in ADAM_BETAS)
@@ -78,24 +78,20 @@ class TritonAdam:
 
     def launch(self, updates: Sequence[Update], factors: Tensor, seen: Tensor | None) -> None:
         """Apply Adam with ``factors`` [updates, 2] in the memory of the device."""
-        for (parameter, gradient, state, active), own in zip(
-            updates, factors.unbind(), strict=True
-        ):
-            count = len(parameter)
-            if not count:
-                continue
-            width = parameter.numel() // count
-            with torch.cuda.device_of(parameter):
-                launch_grid(adam_step, triton.cdiv(parameter.numel(), NUMBERS))(
+        with torch.cuda.device_of(factors):
+            for (parameter, gradient, state, active), own in zip(
+                updates, factors.unbind(), strict=True
+            ):
+                width = parameter.shape[1:].numel()
+                launch(adam_step, parameter.numel(), NUMBERS)(
                     values=parameter.detach(),
                     gradients=gradient,
                     first=state.first,
                     second=state.second,
                     factors=own,
                     seen=gradient if seen is None else seen,
-                    count=count,
+                    count=len(parameter),
                     WIDTH=width,
                     ACTIVE=width if active is None else active,
                     HAS_SEEN=seen is not None,
-                    GROUP=NUMBERS,
                 )

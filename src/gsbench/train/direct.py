@@ -1,6 +1,6 @@
 """Training steps on a GPU without autograd, recorded as CUDA graphs.
 
-Most of a step's time on the host is Python: autograd, some sixty operations of torch, eleven
+Most of a step's time on the host is Python: autograd, over a hundred operations of torch, seventeen
 launches of Triton. Between two refinements every step launches the same kernels on the same memory,
 so `DirectStep` records them once and replays them. Whatever changes from step to step is in the
 memory of the device: camera, photograph, learning rates.
@@ -22,8 +22,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsbench.gaussians.trainable import AdamState, KnownGradients, TrainableGaussians
-from gsbench.raster.base import RenderOutput
+from gsbench.gaussians.trainable import KnownGradients, TrainableGaussians
+from gsbench.raster.base import CameraNumbers, RenderOutput
 from gsbench.raster.staged import (
     Lifetime,
     Readback,
@@ -126,7 +126,7 @@ class DirectStep:
         states = gaussians.advance(plan.known)
         # After a refinement, a graph would write to the parameters that were replaced.
         if plan.suits(gaussians, plan.shape) and plan.adam_graph is not None:
-            plan.replay_adam(states)
+            plan.replay_adam()
         else:
             gaussians.apply(plan.known, states)
 
@@ -191,7 +191,7 @@ class _Plan:
         self.adam = list(gaussians.adam.values())
         count, allocate = len(self.values), memory.allocate
         size = camera.height, camera.width
-        self.view = allocate("view", (24,), torch.float32)
+        self.view = allocate("view", (len(CameraNumbers._fields),), torch.float32)
         self.target = allocate(f"target_{shape.target}", (*size, 3), shape.target)
         self.one = allocate("one", (), torch.float32).fill_(1.0)
         self.losses = allocate("losses", (3,), torch.float32)
@@ -264,12 +264,11 @@ class _Plan:
         )
         return Differentiated(render, self.losses, self.known)
 
-    def replay_adam(self, states: list[AdamState | None]) -> None:
-        """Apply the recorded Adam with the rates and step counts of ``states``."""
+    def replay_adam(self) -> None:
+        """Apply the recorded Adam with the present rates and step counts."""
         assert self.adam_graph is not None
         host = self.factors_on_host[self.adam[0].step % FACTORS_KEPT]
-        rows = [(0.0, 0.0) if x is None else adam_factors(x.rate, x.step) for x in states]
-        host.numpy()[:] = rows
+        host.numpy()[:] = [adam_factors(one.rate, one.step) for one in self.adam]
         self.factors.copy_(host, non_blocking=True)
         self.adam_graph()
 
@@ -316,9 +315,7 @@ class _Plan:
         self.known = KnownGradients(self.parameters, self.gradients, seen, self.shape.degree)
 
     def _third(self) -> None:
-        # At degree 0, the harmonics, the last parameter, have no gradient.
-        states = [*self.adam[:-1], self.adam[-1] if self.shape.degree else None]
-        updates = self.known.updates(states)
+        updates = self.known.updates(self.adam)
         TritonAdam().launch(updates, self.factors[: len(updates)], self.known.seen)
 
     def _measure_room(self) -> None:

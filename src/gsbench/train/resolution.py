@@ -122,7 +122,8 @@ MAX_GROWTH = 0.2  # share of the count that one round may add
 class Resolution:
     """The size of the pictures at each iteration, and the limit on the count for this size.
 
-    As a `gsbench.densify.base.CountSchedule`, it also limits the count.
+    The limit is that of a `gsbench.densify.base.CountSchedule`.
+
     Sizes depend only on the pictures and on the densification window of ``options``; they change
     only after rounds of densification.
     """

@@ -109,7 +109,8 @@ class Trainer:
     checkpoints into a folder and resumes from the newest checkpoint there. On the CPU, a resumed
     run gives the same bits as an uninterrupted one. A signal to stop (see
     `gsbench.system.stopping`) ends the run after the current iteration, with a checkpoint. At the
-    iterations ``snapshot_at``, the model is also written to `snapshot_file`.
+    iterations ``snapshot_at``, the model is also written to `snapshot_file`. Making a trainer
+    raises InputError if the rasterizer lacks an output that the densifier needs.
     """
 
     def __init__(

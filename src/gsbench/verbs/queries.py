@@ -5,7 +5,7 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from gsbench.app.plugins import run_main
+from gsbench.app.hydra_main import run_main
 from gsbench.config.command_words import (
     check_search_path,
     check_single,

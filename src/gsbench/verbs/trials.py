@@ -23,7 +23,7 @@ from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
-from gsbench.launch.record import PlannedTrial, forget, read_plan, remove
+from gsbench.launch.record import PlannedTrial, forget, remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
 from gsbench.runs.trial_folder import TrialFolder
@@ -78,8 +78,10 @@ def status(argv: Sequence[str], runs: Path) -> int:
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
-        # `default` is for the folder, a Path
-        print(json.dumps([asdict(trial) for trial in trials], indent=1, default=str))
+        shown = [asdict(replace(trial, planned=None)) for trial in trials]
+        for one in shown:
+            del one["planned"]  # the plan's own entry, for `retry`
+        print(json.dumps(shown, indent=1, default=str))  # `default` is for the folder, a Path
     else:
         print("\n".join(lines_of(trials, options.all)))
     return int(any(trial.state in RETRIED for trial in trials))
@@ -193,26 +195,27 @@ def retry(argv: Sequence[str], runs: Path) -> int:
             f"{refused[0]} would make other trials than those of the plan: give the sweep's own "
             "command"
         )
-    unfinished = [trial.folder for trial in states_of_experiment(home) if trial.state in RETRIED]
+    unfinished = [trial for trial in states_of_experiment(home) if trial.state in RETRIED]
     if not unfinished:
         print(f"nothing to retry: all trials of {options.experiment} are done, running or queued")
         return 0
-    planned = read_plan(home)
     modules = os.getcwd()  # noted now, since `recompose` changes the current folder
     trials = [
-        recompose(folder, planned.get(folder), runs, options.changes, modules)
-        for folder in unfinished
+        recompose(one.folder, one.planned, runs, options.changes, modules) for one in unfinished
     ]
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
-    replaced = [old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old]
+    replaced = [
+        old for old, trial in zip(unfinished, trials, strict=True) if trial.folder != old.folder
+    ]
     for old in replaced:
         log.info(
-            "%s: its configuration has changed since; the new one is run", TrialFolder(old).label
+            "%s: its configuration has changed since; the new one is run",
+            TrialFolder(old.folder).label,
         )
     code = run_trials(trials)
-    forget(home, [old for old in replaced if old in planned])
+    forget(home, [old.folder for old in replaced if old.planned is not None])
     return code
 
 
