@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from gsbench.analysis import statistics
 from gsbench.analysis.judgement import FEW, OUTLYING
 from gsbench.analysis.looks import SPENDING_POWER
+from gsbench.analysis.looks import look_levels as levels_of_judge
 from gsbench.analysis.thresholds import Region, evenness
 
 Array = NDArray[np.float64]
@@ -173,7 +173,7 @@ def calibration(scenes: int, seeds: int) -> list[Draws]:
 def look_levels(rule: Rule, scenes: int, looks: tuple[int, ...], rate: float) -> tuple[float, ...]:
     """The levels of the looks; for the judge's rule, its own."""
     if rule.tabulated:
-        return statistics.look_levels(scenes, looks, rate)
+        return levels_of_judge(scenes, looks, rate)
     simulated = calibration(scenes, looks[-1])[: 1 if rule.equal_noise else 3]
     free, levels = np.ones((len(simulated), CALIBRATION), dtype=bool), list[float]()
     for seeds in looks:

@@ -34,11 +34,12 @@ from gsbench.analysis.planning import Purpose, deviation_range
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED
 from gsbench.analysis.thresholds import Region
+from gsbench.analysis.unfinished import Unfinished
 from gsbench.analysis.votes import judge_votes
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
 from gsbench.claims.pooling import Study, pool
-from gsbench.claims.stopping import KeyAndSeed, run_looks
+from gsbench.claims.stopping import Asked, KeyAndSeed
 from gsbench.runs import ledger as records
 from gsbench.runs.experiments import Declaration, Question, trial_key
 from gsbench.runs.trial_record import TrialRecord
@@ -189,7 +190,7 @@ def failing(finish: bool) -> Draw:
         lost = [one for one, failed in zip(arm, bad.flat, strict=True) if failed and not finish]
         done = [*baseline, *(one for one in arm if one not in lost)]
         declared = Declaration(time=TIME, questions=(asked,))
-        (verdict,) = judge(done, declared, [one.path for one in lost])
+        (verdict,) = judge(done, declared, [Unfinished(one.path) for one in lost])
         return float(verdict.outcome == SUPPORTED)
 
     return draw
@@ -247,7 +248,7 @@ def in_looks(declaration: Declaration, made: Sequence[TrialResult]) -> list[Verd
     def run(planned: Iterable[KeyAndSeed]) -> None:
         done.update({key: by_key[key] for key in planned})
 
-    return run_looks(declaration, lambda: judge(list(done.values()), declaration), run)
+    return Asked(declaration, done.values).answer(run)
 
 
 def check(scenes: int, seeds: int, ratio: float, effect: float, claims: int) -> Draw:
@@ -343,7 +344,7 @@ def gate(scenes: int, seeds: int, loss: float, counted: str) -> Draw:
             lambda: [one for one in old if one.seed < most],
             lambda: [one for one in new if one.seed < most],
         )
-        (verdict,) = run_looks(asked, found.judged, run)
+        (verdict,) = found.answer(run)
         return float(gates.result_of(verdict) == counted)
 
     return draw
@@ -383,10 +384,10 @@ def bisect(count: int, scenes: int, seeds: int, loss: float, deviation: float) -
 
             good, last, new = (lambda place=place: read(place) for place in places.values())
             if number == count:
-                (verdict,) = run_looks(asked, gates.ask_gate(asked, good, new).judged, run)
+                (verdict,) = gates.ask_gate(asked, good, new).answer(run)
                 return gates.result_of(verdict)
             step = gates.ask_step(asked, share, good, last, new)
-            return gates.step_result(run_looks(step.declaration, step.judged, run))
+            return gates.step_result(step.answer(run))
 
         found = gates.first_worse(count, result)
         named = found is not None and found[1] - found[0] == 1

@@ -25,7 +25,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import sentence
 from gsbench.claims.export import write_archive
 from gsbench.claims.site import write_site
-from gsbench.runs.experiments import Declaration, open_question, record_text
+from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
 from gsbench.tracking.comparison import description
 from gsbench.verbs.claims import plan
 from gsbench.verbs.results import explain_cell, tables
@@ -115,6 +115,44 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     rows = [row.labels[3] for row in build_table(after.experiment).rows]
     assert rows == ["–", "–", "0.9", "0.99"]  # adc and absgs have no such setting
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
+
+
+def declare_looks(runs, *pairs):
+    """Declare a sweep in looks before all trials, with (baseline, arm) as lists of trials."""
+    questions = [
+        Question(
+            metric="psnr",
+            sign=1,
+            least=0.1,
+            baseline=Arm("sfm", first[0].densify),
+            arm=Arm("sfm", second[0].densify),
+            scenes={"a": (first[0].key, second[0].key)},
+            seeds=(0, 1, 2),
+        )
+        for first, second in pairs
+    ]
+    sweep = Declaration(time=DECLARED_AT, questions=tuple(questions), looks=(2, 3))
+    (runs / "exp" / "declared.jsonl").write_text(record_text([sweep]))
+
+
+def test_the_baseline_that_a_sweep_in_looks_declared_stays_it_if_another_arm_ended_first(tmp_path):
+    first, second = grid("absgs", day=3), grid("mine", day=2)
+    write(tmp_path, [*first, *second])
+    declare_looks(tmp_path, (first, second))
+    found = answer(tmp_path)
+    assert against(found) == [("sfm-mine", "sfm-absgs")]
+    assert "of at most 3 seeds. The metric was declared beforehand." in found.sentences[0]
+
+
+def test_a_sweep_in_looks_gets_no_verdict_that_it_did_not_declare(tmp_path):
+    """It stopped by the verdicts on its own pairs, so no other pair of its arms can be tested."""
+    low, high, mine = grid("adc", cap=1), grid("adc", cap=2), grid("mine", lr=3)
+    write(tmp_path, [*low, *high, *mine])
+    declare_looks(tmp_path, (low, mine), (high, mine))
+    pairs = [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]")]
+    assert against(answer(tmp_path)) == pairs
+    declare_looks(tmp_path, (low, high), (low, mine), (high, mine))
+    assert against(answer(tmp_path)) == [*pairs, BOTH_CAPS]
 
 
 BOTH_CAPS = ("sfm-adc[cap=2]", "sfm-adc[cap=1]")

@@ -13,6 +13,7 @@ from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import Pairs, choose_pairs, pair
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.statistics import answer_family
+from gsbench.analysis.unfinished import unfinished
 from gsbench.analysis.verdict_words import outlying_words
 from gsbench.analysis.verdicts import judge_pairs, seeds_to_resolve
 from gsbench.runs.experiments import Arm, Declaration, Question
@@ -239,7 +240,7 @@ def test_no_verdict_favours_an_arm_whose_trials_failed_alone(
     asked = replace(PSNR, metric=metric, sign=direction, least=1.0)
     experiment = read_experiment(tmp_path / made.name)
     declared = Declaration(time=EARLY, questions=(asked,))
-    (verdict,) = judge(experiment.trials, declared, experiment.lacking)
+    (verdict,) = judge(experiment.trials, declared, unfinished(experiment))
     outcome = {3.0: "supported", -3.0: "refuted", 0.0: "too small to matter"}[effect]
     undecided = lost in {3.0: ["volumetric"], -3.0: ["adc"], 0.0: ["volumetric", "adc"]}[effect]
     assert verdict.outcome == ("undecided" if undecided else outcome)

@@ -330,7 +330,7 @@ def _mirror(folder):
     trial = TrackedTrial(TrialFolder(folder), TrialFolder(folder).configuration())
     assert trial.params()
     assert trial.tags()
-    list(trial.curves({}))
+    list(trial.curves({}, live=False))
     results = trial.folder.sound_record()
     if results is not None:
         trial.summary(results, 2, False)

@@ -84,7 +84,6 @@ READS_ITSELF = {
     "claims/archive.py",  # archives, which anybody may have made
     "claims/export.py",  # text of this very process
     "parsing.py",
-    "renders/measure.py",  # words that the user typed
     "tracking/mirror.py",  # lines of the process that started it
 }
 LOADERS = {

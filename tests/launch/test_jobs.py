@@ -325,9 +325,9 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     values = trial_values(tmp_path, name="cluster")
     folder = job_folder(values)
     assert folder == tmp_path / ".jobs" / "cluster"
-    script = folder / "2_submission.sh"
+    script = new_job_folder(values) / "2_submission.sh"
     script.write_text("#!/bin/bash\n")
-    left = folder / ".submission_file_aaa46bf3.sh"
+    left = script.with_name(".submission_file_aaa46bf3.sh")
     left.symlink_to(script)
     assert job_folder(values) == folder
     assert not left.is_symlink()

@@ -91,7 +91,7 @@ def test_a_good_idea_is_kept_and_a_bad_one_is_dropped(home, capsys):
     assert attempt(f"{SPLIT}=0.04") == 1
     assert "adc-2: dropped: a gain of 0.5 is unlikely" in capsys.readouterr().out
     first, second = entries(home, Started)
-    # LOND: one was kept before; a third of it on one capture
+    # LOND: one was kept before; a third of it
     assert (first.level, second.level) == pytest.approx((0.1 / 40 / 3, 2 * 0.1 / 40 / 3))
     good, bad = entries(home, Ended)
     assert (good.result, bad.result) == ("kept", "dropped")

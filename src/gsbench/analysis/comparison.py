@@ -4,9 +4,12 @@ A `Comparison` has the trials that count, what was declared, the verdicts on eac
 arms, and a line for each arm and trial that no verdict uses.
 """
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.cells import with_variants
@@ -22,9 +25,10 @@ from gsbench.analysis.pairing import (
     uncompared,
 )
 from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
+from gsbench.analysis.unfinished import unfinished
 from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
-from gsbench.runs.experiments import Question
+from gsbench.runs.experiments import Question, read_declarations
 from gsbench.runs.layout import LEDGER, TUNING
 
 VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
@@ -43,21 +47,43 @@ class Pairing:
 
 
 def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
-    """Choose the pairs of arms to compare; every arm is in one, or in a line with its reason."""
+    """Choose the pairs of arms to compare; every arm is in one, or in a note with its reason."""
     trials = tuple(with_variants(experiment.trials))
     if (experiment.folder / TUNING).exists():
         return Pairing(trials, (), ())
     by_arm = group_by(trials, lambda trial: trial.arm)
     arms, settings = sorted(by_arm), {arm: own[0].config for arm, own in by_arm.items()}
     ages = {arm: min(trial.measured for trial in own) for arm, own in by_arm.items()}
+    # A sweep in looks declared its pairs before any trial began: its baseline stays the baseline,
+    # and other pairs of its arms are none, since it stopped by the results of its own.
+    planned = _pairs_in_looks(experiment.folder)
+    keys = {arm: {trial.key for trial in own} for arm, own in by_arm.items()}
+    ages |= {arm: -math.inf for arm in arms if keys[arm] & {first for first, _ in planned}}
+    in_looks = {arm for arm in arms if keys[arm] & set(itertools.chain(*planned))}
     pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
     pairs += [
-        pair
-        for pair in baseline_settings(arms, ages, baseline)
+        (first, second)
+        for first, second in baseline_settings(arms, ages, baseline)
+        if (first, second) not in pairs
         # settings under which no two trials can be paired, such as budgets, give no verdict
-        if pair not in pairs and pair_trials(trials, *pair)
+        and pair_trials(trials, first, second)
+        and (
+            not {first, second} <= in_looks
+            or any(one in keys[first] and other in keys[second] for one, other in planned)
+        )
     ]
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
+
+
+def _pairs_in_looks(home: Path) -> set[tuple[str, str]]:
+    """The pairs of trials, without seeds, that sweeps in looks declared: (baseline, arm)."""
+    return {
+        keys
+        for declaration in read_declarations(home)
+        if declaration.looks
+        for question in declaration.questions
+        for keys in question.scenes.values()
+    }
 
 
 @dataclass(frozen=True)
@@ -175,7 +201,7 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment.folder, arms.trials, experiment.older)
-    answers = judge_pairs(arms.trials, arms.pairs, declared, experiment.lacking)
+    answers = judge_pairs(arms.trials, arms.pairs, declared, unfinished(experiment))
     if (experiment.folder / LEDGER).exists():
         answers = [
             replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers

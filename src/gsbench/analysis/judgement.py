@@ -7,7 +7,6 @@ its pairs of trials from `gsbench.analysis.pairing.pair`.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -166,12 +165,12 @@ class Verdict:
 
 
 def judge(
-    trials: Sequence[TrialResult], declaration: Declaration, lacking: Sequence[Path] = ()
+    trials: Sequence[TrialResult], declaration: Declaration, lacking: Sequence[Unfinished] = ()
 ) -> list[Verdict]:
     """The verdicts on the questions of ``declaration``, in their order.
 
-    ``lacking`` are the folders of trials without a usable result; a look waits for its trials, so
-    they matter only without looks. Questions share the error rate. If seeds come in looks, each
+    ``lacking`` are the trials without a usable result (`unfinished`); a look waits for its trials,
+    so they matter only without looks. Questions share the error rate. If seeds come in looks, each
     question gets an equal share and is answered at the first look that decides it; otherwise
     Holm's method adjusts them as one family. Secondary questions have an error rate of their own.
     """
@@ -187,7 +186,6 @@ def judge(
             return [trial for key in keys for trial in by_folder.get(key, [])]
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
-    unfinished = [Unfinished(path) for path in lacking]
     unjudged = [
         _with_pairs(trials_of(question), question, declaration)
         for question in declaration.questions
@@ -209,8 +207,8 @@ def judge(
             answers = answer_family(differences, declaration.error_rate / candidates)
             for k, answer in zip(family, answers, strict=True):
                 decided = _decide(replace(unjudged[k], family=len(family)), answer)
-                if unfinished:
-                    decided = _without_lacking(decided, trials_of(decided.question), unfinished)
+                if lacking:
+                    decided = _without_lacking(decided, trials_of(decided.question), lacking)
                 judged[k] = decided
     return _with_scenes(judged, declaration.error_rate)
 

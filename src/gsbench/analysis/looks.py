@@ -43,7 +43,7 @@ def plan_looks(maximum: int) -> tuple[int, ...]:
 
 @cache
 def look_levels(
-    scenes: int, looks: tuple[int, ...], alpha: float, draws: int = DRAWS, seed: int = 0
+    scenes: int, looks: tuple[int, ...], alpha: float, draws: int = DRAWS
 ) -> tuple[float, ...]:
     """The error rate of the interval at each look; all looks together have the rate ``alpha``.
 
@@ -51,9 +51,9 @@ def look_levels(
     """
     # Equally noisy scenes alone would not do: the test is cautious there, so each look would get
     # all that may be spent.
-    simulated = [simulate_looks(1, looks, draws, seed=seed)]
+    simulated = [simulate_looks(1, looks, draws)]
     if scenes > 1:
-        simulated += [simulate_looks(scenes, looks, draws, noise, seed) for noise in NOISY]
+        simulated += [simulate_looks(scenes, looks, draws, noise) for noise in NOISY]
     # The test itself keeps the level of the first look.
     levels = [alpha * (looks[0] / looks[-1]) ** SPENDING_POWER]
     free = [np.ones(draws, dtype=bool) for _ in simulated]

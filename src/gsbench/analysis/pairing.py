@@ -130,14 +130,6 @@ class Pairs:
         return replace(self, rows=tuple(row for row in rows if row.seeds))
 
 
-class _UnlikeError(InputError):
-    """Trials of two arms cannot be compared; ``note`` says why."""
-
-    def __init__(self, note: Note) -> None:
-        super().__init__(str(note))
-        self.note = note
-
-
 def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
     """Pair the trials of a question by scene and seed.
 
@@ -151,9 +143,6 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
     for scene, sides in _sides(trials, question).items():
         try:
             row, faults = _pair_scene(scene, *sides, question)
-        except _UnlikeError as error:
-            left_out.append(error.note)
-            continue
         except InputError as error:
             left_out.append(Note.of("unlike", text=str(error)))
             continue
@@ -219,7 +208,7 @@ def _match_seeds(
         if question.scenes:
             differing.pop("budget", None)
         if differing:
-            raise _UnlikeError(Note.of("conditions", scene=scene, conditions=list(differing)))
+            raise InputError(str(Note.of("conditions", scene=scene, conditions=list(differing))))
     unpaired = () if question.seeds else tuple(seed for seed in wanted if seed not in pairs)
     return pairs, [Note.of("unpaired", scene=scene, seed=seed) for seed in unpaired]
 

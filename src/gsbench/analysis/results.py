@@ -133,7 +133,7 @@ class TrialResult:
         shown = [part for part in self.code if part.kind != "package"]
         return [f"{part} {self.code[part]:.{SHOWN}}" for part in shown]
 
-    @property
+    @cached_property
     def edits(self) -> list[Change]:
         """The user's modules that were edited since, as far as they are found from here."""
         modules = {part: made for part, made in self.code.items() if part.kind == "module"}

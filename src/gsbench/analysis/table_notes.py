@@ -117,9 +117,10 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[Note]:
 def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
     """A note for each of the user's modules that was edited after it made some of the trials."""
     of_module: dict[str, list[TrialResult]] = {}
-    for trial in trials:
-        for edit in trial.edits:
-            of_module.setdefault(edit.name, []).append(trial)
+    # Trials of one version of the code have the same edits, and finding them reads the modules.
+    for own in group_by(trials, lambda trial: frozenset(trial.code.items())).values():
+        for edit in own[0].edits:
+            of_module.setdefault(edit.name, []).extend(own)
     return [
         Note.of(
             "edited",

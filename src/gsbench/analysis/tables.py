@@ -1,7 +1,4 @@
-"""Tables of an experiment: mean and deviation over trials, the best in bold, missing values marked.
-
-The notes below a table say who trained, what was declared, and how else the compared arms differ.
-"""
+"""Tables of an experiment: mean and deviation over trials, best in bold, missing values marked."""
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.runs.experiments import Question, trial_key
 from gsbench.runs.layout import SEED
@@ -56,8 +56,13 @@ class Unfinished:
         return arm is not None and arm.has(self.path.parts[-2], self.config)
 
 
+def unfinished(experiment: Experiment) -> list[Unfinished]:
+    """The trials of an experiment without a usable result."""
+    return [Unfinished(path) for path in experiment.lacking]
+
+
 def one_sided(
-    question: Question, trials: Iterable[TrialResult], unfinished: Iterable[Unfinished]
+    question: Question, trials: Iterable[TrialResult], lacking: Iterable[Unfinished]
 ) -> tuple[Sequence[Unfinished], Sequence[Unfinished]]:
     """The trials of each side of a question that lack a result where the other side has one.
 
@@ -69,12 +74,12 @@ def one_sided(
     for trial in trials:
         is_arm = trial.key in of_arm if question.scenes else trial.arm == question.arm
         done[ARM if is_arm else BASELINE].add((trial.scene, trial.seed))
-    lacking: tuple[list[Unfinished], list[Unfinished]] = ([], [])
-    for one in unfinished:
+    found: tuple[list[Unfinished], list[Unfinished]] = ([], [])
+    for one in lacking:
         for side in (BASELINE, ARM):
             if (one.scene, one.seed) in done[1 - side] - done[side] and one.is_of(question, side):
-                lacking[side].append(one)
-    return lacking
+                found[side].append(one)
+    return found
 
 
 def lacking_words(lacking: Sequence[Unfinished]) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.notes import Note
 from gsbench.analysis.results import group_by
 from gsbench.analysis.statistics import (
     ALPHA,
@@ -234,10 +235,8 @@ def _too_few(judged: PairVerdicts, verdict: Verdict) -> str:
 
 def no_pairs(judged: PairVerdicts) -> str:
     """The reason why no trials of two arms could be compared."""
-    return next(
-        (note.sentence for note in judged.notes),
-        f"no trials of {judged.first} and {judged.second} can be paired",
-    )
+    nothing = Note.of("no pairs", baseline=judged.first, arm=judged.second)
+    return next(iter(judged.notes), nothing).sentence
 
 
 def _why_exploratory(judged: PairVerdicts) -> str:

@@ -13,7 +13,6 @@ Holm (1979). So a further arm never changes the verdict on another one.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration, Standing
@@ -27,6 +26,7 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
+from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
@@ -78,11 +78,11 @@ def judge_pairs(
     trials: Sequence[TrialResult],
     pairs: Sequence[ArmPair],
     declared: ActiveDeclaration | None = None,
-    lacking: Sequence[Path] = (),
+    lacking: Sequence[Unfinished] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
-    ``declared`` defines the families of tests; ``lacking`` are folders of trials without a result.
+    ``declared`` defines the families of tests; ``lacking`` are trials without a result.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primary = None if declared is None else asked_quantity(declared.metric, trials)
@@ -133,7 +133,7 @@ def _judge_families(
     trials: Sequence[TrialResult],
     asked: Sequence[tuple[ArmPair, Question]],
     standings: Mapping[ArmPair, Standing],
-    lacking: Sequence[Path],
+    lacking: Sequence[Unfinished],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair."""
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsbench.analysis.comparison import unused_trials
-from gsbench.analysis.judgement import Verdict
+from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
@@ -227,7 +227,7 @@ def recheck(file: ClaimsFile, archive: Path, folder: Path) -> Checked:
         )
     declaration = latest_declaration(declarations)
     _check_same_claims(file, declaration)
-    judged = Asked(declaration, lambda: experiment.trials).judged()
+    judged = judge(experiment.trials, declaration)
     verdicts = claim_verdicts(file, declaration, judged)
     unused = unused_trials(experiment.trials, judged)
     return Checked(file, verdicts, declaration, declarations, unused)

@@ -128,9 +128,8 @@ def result_of(verdict: Verdict) -> Result:
 
 
 def _hopeless(verdict: Verdict) -> str:
-    """The reason why an undecided idea is given up (`GIVE_UP`); "" if it is not."""
-    given_up = verdict.outcome not in (SUPPORTED, REFUTED, TOO_SMALL)
-    if not given_up or not verdict.gain_excluded(GIVE_UP):
+    """The reason why an undecided idea is given up (`GIVE_UP`); "" if a gain is still possible."""
+    if not verdict.gain_excluded(GIVE_UP):
         return ""
     return f"a gain of {least_words(verdict)} is unlikely"
 

@@ -218,9 +218,10 @@ def job_folder(values: dict[str, Any]) -> Path:
     require_no_links(runs, folder)
     # submitit leaves a link to each job script. It is not read again, and `require_no_links` below
     # would refuse it.
-    for link in folder.glob(".submission_file_*.sh"):
-        if link.is_symlink():
-            link.unlink(missing_ok=True)
+    for jobs in (folder, *folder.glob("*")):
+        for link in [] if jobs.is_symlink() else jobs.glob(".submission_file_*.sh"):
+            if link.is_symlink():
+                link.unlink(missing_ok=True)
     require_no_links(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
     return folder

@@ -13,6 +13,7 @@ from gsbench.analysis.looks import FIRST_LOOK
 from gsbench.analysis.notes import texts
 from gsbench.analysis.results import read_experiment
 from gsbench.analysis.table_formats import to_markdown
+from gsbench.analysis.unfinished import unfinished
 from gsbench.app.command import compose_trials, require_waiting, run_trials
 from gsbench.claims import ledger as rules
 from gsbench.claims.gate import asked_difference
@@ -279,8 +280,8 @@ def _run_confirmation(
     trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
-    done, lacking = finished_trials(home, trials.values()), read_experiment(home).lacking
-    verdicts = judge(done, declaration, lacking)
+    done = finished_trials(home, trials.values())
+    verdicts = judge(done, declaration, unfinished(read_experiment(home)))
 
     def make(now: Ledger) -> records.Confirmed | None:
         if now.confirmations[number][1] is not None:  # by a process that ran the same command

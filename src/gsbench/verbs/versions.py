@@ -88,8 +88,10 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         if verdict.answer is None and not verdict.equal:
             why = with_notes(reason(verdict), verdict)
             raise InputError(f"the versions cannot be compared: {why}")
-        left_out = texts(unused_trials([*asked.read()], [verdict]))
-        print("\n".join([gates.describe(verdict), *left_out, *gates.deviations(old, new())]))
+        made = [*asked.read()]
+        left_out = texts(unused_trials(made, [verdict]))
+        new_trials = [trial for trial in made if trial.config_hash == gates.NEW]
+        print("\n".join([gates.describe(verdict), *left_out, *gates.deviations(old, new_trials)]))
     return EXIT_CODES[gates.result_of(verdict)]
 
 

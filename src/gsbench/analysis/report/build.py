@@ -119,7 +119,7 @@ CHOSEN = "Tables, curves and pictures show only trials with {}; verdicts rest on
 
 def _without_verdicts(table: Table) -> Table:
     """The table without the notes on verdicts, which the top of the page has."""
-    notes = [note for note in table.notes if not str(note).startswith(VERDICT)]
+    notes = [note for note in table.notes if not note.startswith(VERDICT)]
     return replace(table, notes=tuple(notes))
 
 
