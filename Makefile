@@ -57,7 +57,7 @@ test-hydra-plugins: hydra-plugins ## run the tests of Hydra's sweepers and launc
 test-next-hydra: next-hydra ## run the tests of configurations and sweeps on the next version of Hydra
 	PYTHONPATH=$(abspath $(VENV)/next-hydra) $(PYTEST) $(NEXT_HYDRA_TESTS)
 
-promises: $(VENV)/.stamp-dev ## simulate every promised error rate and power, into docs/promises.md
+promises: $(VENV)/.stamp-dev ## simulate every promised error rate and power, into findings/simulations.md
 	$(BIN)/python scripts/promises.py
 
 lint: $(VENV)/.stamp-dev ## check style and types

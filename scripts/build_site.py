@@ -22,6 +22,7 @@ PAGES = {
     "CODE_OF_CONDUCT.md": "conduct.md",
     "SECURITY.md": "report_a_weakness.md",
     "findings/README.md": "findings/README.md",
+    "findings/simulations.md": "findings/simulations.md",
 }  # file of the repository: page of the site
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)

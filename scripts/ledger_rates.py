@@ -1,26 +1,25 @@
 """Simulated nights of ideas: how many kept ideas are no better, and how many good ones are kept.
 
-    python scripts/ledger_rates.py                 write the table of docs/night.md (two minutes)
-    python scripts/ledger_rates.py --nights 100    print it from fewer nights
+    python scripts/ledger_rates.py                 write findings/simulations.md (three minutes)
+    python scripts/ledger_rates.py --nights 100    print the tables from fewer nights
 
 A night tries forty ideas on three scenes with up to six seeds. All are compared with the same
 trainings of one baseline. Differences are in standard deviations of a pair of trainings. In an
-adaptive night, every second idea (by chance) is another try of what looked best so far, with the
-same effect and new trainings.
+adaptive night, every second idea (by chance) is another try of what has the largest mean so far, as
+the ledger shows it, with the same effect and new trainings.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from pathlib import Path
 
 import numpy as np
+import simulations
 from numpy.typing import NDArray
 
 from gsbench.analysis.looks import look_levels, plan_looks
@@ -30,9 +29,8 @@ from gsbench.claims.ledger import GIVE_UP, RETRIES
 IDEAS, RATE = 40, 0.1
 SCENES, SEEDS = 3, 6
 LOOKS = plan_looks(SEEDS)
-NIGHTS = 2000
+NIGHTS, MANY_NIGHTS = 2000, 8000
 NAIVE_SEEDS = 3
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "night.md"
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -101,7 +99,8 @@ class Night:
 
     A share ``real`` of the ideas gains ``effect`` times ``least``. A share ``retried`` of them are
     another try of what looked best so far, with the same effect; their noise correlates with that
-    of the first try. ``noise`` has the deviations of the captures.
+    of the first try. The best has the largest mean, or (``by_size``) the largest mean in standard
+    errors. ``noise`` has the deviations of the captures.
     """
 
     least: float
@@ -110,6 +109,7 @@ class Night:
     retried: float = 0.0
     correlation: float = 0.0
     noise: tuple[float, ...] = (1.0,) * SCENES
+    by_size: bool = False
 
 
 def simulate(rule: Rule, night: Night, nights: int) -> Rates:
@@ -130,9 +130,9 @@ def simulate(rule: Rule, night: Night, nights: int) -> Rates:
         noise = np.where(retry[:, None, None], alike, noise)
         differences = own[:, None, None] + scale * noise - baseline
         keep, seeds = rule(differences, kept, night.least)
-        mean = differences[:, :, : LOOKS[0]].mean(axis=(1, 2))
-        ahead = (mean > best) & ~keep
-        best, best_effect = np.where(ahead, mean, best), np.where(ahead, own, best_effect)
+        looks = _sizes(differences, seeds) if night.by_size else _means(differences, seeds)
+        ahead = (looks > best) & ~keep
+        best, best_effect = np.where(ahead, looks, best), np.where(ahead, own, best_effect)
         best_noise = np.where(ahead[:, None, None], noise, best_noise)
         kept += keep
         false += keep & (own == 0)
@@ -146,8 +146,37 @@ def simulate(rule: Rule, night: Night, nights: int) -> Rates:
     )
 
 
+def _means(differences: Array, seeds: NDArray[np.int64]) -> Array:
+    """The means [N] over the seeds that were trained."""
+    trained = np.arange(differences.shape[2]) < seeds[:, None, None]
+    return np.asarray((differences * trained).sum(axis=(1, 2)) / seeds / differences.shape[1])
+
+
+def _sizes(differences: Array, seeds: NDArray[np.int64]) -> Array:
+    """The same in standard errors."""
+    trained = np.arange(differences.shape[2]) < seeds[:, None, None]
+    each = (differences * trained).sum(axis=2, keepdims=True) / seeds[:, None, None]
+    squares = (((differences - each) ** 2) * trained).sum(axis=(1, 2))
+    error = np.sqrt(squares / (seeds - 1) / seeds) / differences.shape[1]
+    return _means(differences, seeds) / error
+
+
+def choices(nights: int) -> str:
+    """The table on what is tried again: the share of false discoveries, no idea being good."""
+    heads = ["retries correlate by", "captures", "retried: largest mean", "most standard errors"]
+    lines = [f"| {' | '.join(heads)} |", f"|{' --- |' * len(heads)}"]
+    for captures, correlation in product((1, 3), (0.0, 0.39, 0.7, 0.8, 0.95)):
+        noise = (1.0,) * captures
+        cells = [f"{correlation:g}", str(captures)]
+        for by_size in (False, True):
+            night = Night(0.5, 0.0, 0.0, 0.7, correlation, noise, by_size)
+            cells.append(f"{100 * simulate(RULES['the ledger'], night, nights).false:.1f} %")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def table(nights: int) -> str:
-    """The table in Markdown."""
+    """The table of rates in Markdown."""
     heads = ["least", "good ideas", "gain", "next idea", *RULES]
     lines = [f"| {' | '.join(heads)} |", f"|{' --- |' * len(heads)}"]
     cases = [(0.0, 0.0), *((real, effect) for real in (0.05, 0.2) for effect in (0.5, 1.0, 2.0))]
@@ -159,7 +188,7 @@ def table(nights: int) -> str:
             found = f" · {100 * rates.found:.0f}" if real else ""
             cells.append(f"{100 * rates.false:.1f}{found} · {rates.seeds:.1f}")
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -168,15 +197,12 @@ def main() -> None:
     )
     parser.add_argument("--nights", type=int)
     nights = parser.parse_args().nights
-    text = table(nights or NIGHTS)
-    if nights:
-        print(text)
-        return
-    page = PAGE.read_text(encoding="utf-8")
-    marked = re.compile(r"(<!-- rates -->\n).*?(<!-- end of rates -->)", re.DOTALL)
-    PAGE.write_text(
-        marked.sub(lambda match: f"{match[1]}{text}\n{match[2]}", page), encoding="utf-8"
-    )
+    for name, make, most in (("rates", table, NIGHTS), ("retries", choices, MANY_NIGHTS)):
+        text = make(nights or most)
+        if nights:
+            print(text)
+        else:
+            simulations.write_table(name, text)
 
 
 if __name__ == "__main__":

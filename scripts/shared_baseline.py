@@ -1,4 +1,4 @@
-"""Simulate arms that are declared after their baseline was measured, for docs/verdict.md.
+"""Simulate arms that are declared after their baseline was measured, for findings/simulations.md.
 
     python scripts/shared_baseline.py                 write the table into the page (seconds)
     python scripts/shared_baseline.py --draws 2000    print it from fewer draws
@@ -10,18 +10,16 @@ normal and independent. The rows say who saw what of the baseline before an arm 
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
+import simulations
 from numpy.typing import NDArray
 
 from gsbench.analysis.statistics import ALPHA
 from gsbench.analysis.thresholds import Region, evenness
 
 SCENES = (1, 3)
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict.md"
 HEAD = (
     "| the baseline | the arms | one scene: an arm's verdict is false | any of them | three "
     "scenes: an arm's | any of them |"
@@ -76,8 +74,8 @@ ROWS: dict[tuple[str, str], tuple[Baseline, int, bool]] = {
 }
 
 
-def table(draws: int) -> list[str]:
-    """The lines of the table."""
+def table(draws: int) -> str:
+    """The table in Markdown."""
     lines = [HEAD, "|---|---|---|---|---|---|"]
     for (baseline, arms), (draw, number, together) in ROWS.items():
         shares = [
@@ -85,7 +83,7 @@ def table(draws: int) -> list[str]:
         ]
         cells = " | ".join(f"{100 * share:.1f} %" for share in shares)
         lines.append(f"| {baseline} | {arms} | {cells} |")
-    return lines
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -93,12 +91,9 @@ def main() -> None:
     parser.add_argument("--draws", type=int, help="print the table from so many draws")
     options = parser.parse_args()
     if options.draws:
-        print("\n".join(table(options.draws)))
+        print(table(options.draws), end="")
         return
-    lines = "\n".join(["<!-- shared baseline -->", *table(100_000), "<!-- end -->"])
-    text = PAGE.read_text(encoding="utf-8")
-    pattern = re.compile(r"<!-- shared baseline -->.*?<!-- end -->", re.DOTALL)
-    PAGE.write_text(pattern.sub(lines, text), encoding="utf-8")
+    simulations.write_table("shared baseline", table(100_000))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Simulate checks of claims whose truth is known, for the table of docs/verdict.md.
+"""Simulate checks of claims whose truth is known, for findings/simulations.md.
 
     python scripts/untruths.py                 write the table into the page (two minutes)
     python scripts/untruths.py --checks 200    print it from fewer checks
@@ -13,7 +13,6 @@ compare them).
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import simulations
 from decision_rules import CHOSEN, Draws, decide
 from numpy.typing import NDArray
 
@@ -209,8 +209,6 @@ def scene_pairs(place: int, noise: Array, effect: float) -> ScenePairs:
 
 
 QUANTITY = asked_quantity("psnr")
-PAGE = Path(__file__).parents[1] / "docs" / "verdict.md"
-SECTION = re.compile(r"(<!-- untruths -->\n).*?(<!-- end -->)", re.DOTALL)
 EFFECTS = (0.0, 0.5, 1.0, 2.0)
 
 
@@ -244,9 +242,6 @@ if __name__ == "__main__":
     wanted = parser.parse_args().checks
     made = table(wanted or 3000)
     if wanted is None:
-        PAGE.write_text(
-            SECTION.sub(lambda m: m[1] + made + m[2], PAGE.read_text(encoding="utf-8")),
-            encoding="utf-8",
-        )
+        simulations.write_table("untruths", made)
     else:
         print(made, end="")

@@ -1,4 +1,4 @@
-"""Simulate rounds of votes whose truth is known, for the tables of docs/verdict.md.
+"""Simulate rounds of votes whose truth is known, for findings/simulations.md.
 
     python scripts/vote_untruths.py                  write the tables into the page (three minutes)
     python scripts/vote_untruths.py --rounds 200     print it from fewer rounds
@@ -12,11 +12,10 @@ person has on them. A statement about scenes is about these people, in the same 
 from __future__ import annotations
 
 import argparse
-import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import simulations
 from numpy.typing import NDArray
 from scipy.special import bdtr
 
@@ -122,10 +121,6 @@ def ranking_misses(people: int, scenes: int, rounds: int) -> float:
     return missed / rounds / 3
 
 
-PAGE = Path(__file__).parents[1] / "docs" / "verdict.md"
-SECTION = re.compile(r"(<!-- votes -->\n).*?(<!-- end -->)", re.DOTALL)
-
-
 def table(rounds: int) -> str:
     """The table: how often each statement decides, and how often wrongly, by kind and effect."""
     lines = [
@@ -156,9 +151,6 @@ if __name__ == "__main__":
     wanted = parser.parse_args().rounds
     made = table(wanted or 3000)
     if wanted is None:
-        PAGE.write_text(
-            SECTION.sub(lambda m: m[1] + made + m[2], PAGE.read_text(encoding="utf-8")),
-            encoding="utf-8",
-        )
+        simulations.write_table("votes", made)
     else:
         print(made, end="")

@@ -1,4 +1,4 @@
-"""A sample of the simulations behind docs/promises.md; ``make promises`` repeats all of them."""
+"""A sample of the simulations behind findings/simulations.md; ``make promises`` repeats all of them."""
 
 import re
 
@@ -20,8 +20,8 @@ def test_a_promise_holds_in_a_sample(promise):
 
 
 def test_each_promise_of_the_page_has_a_figure():
-    page = promises.PAGE.read_text(encoding="utf-8")
-    rows = re.findall(r"^\| (.+?) \| .+ \| ([\d.]+) ± ([\d.]+) % \| \d+ \| (\S+) \|$", page, re.M)
+    table = promises.simulations.table("promises")
+    rows = re.findall(r"^\| (.+?) \| .+ \| ([\d.]+) ± ([\d.]+) % \| \d+ \| (\S+) \|$", table, re.M)
     assert [name for name, *_ in rows] == [one.name for one in ALL]
     assert {holds for *_, holds in rows} == {"yes"}
 

@@ -16,12 +16,13 @@ from gsbench.runs import ledger as records
 from gsbench.runs.layout import LEDGER
 from gsbench.runs.ledger import Ended, Started, read_ledger
 from gsbench.verbs import ledger as verb
-from scripts import ledger_rates
 from tests.composed import composed
+from tests.conftest import script
 from tests.finished import write_results
 
 SETTINGS = split("scene=courtyard init=random densify=adc tracking=none eval.lpips=[]")
 NEW = [*split("new night --metric psnr --least 0.5"), *SETTINGS, "seed=0,1,2,3"]
+ledger_rates = script("ledger_rates")
 SPLIT = "densify.split_size"  # its value chooses a made-up effect
 
 
@@ -403,7 +404,7 @@ def test_nothing_is_confirmed_if_trials_fail(home, monkeypatch, code, kind, caps
 
 
 def test_the_simulated_rule_decides_as_the_ledger_does(trainings, monkeypatch, tmp_path):
-    """The rates in docs/night.md hold for the program: equal draws give equal decisions."""
+    """The rates in findings/simulations.md hold for the program: equal draws give equal decisions."""
     monkeypatch.setattr(ledger_rates, "SCENES", 1)
     run(["ledger", *NEW[:-1], "seed=0,1,2,3,4,5"])
     draws = np.random.default_rng(1).normal(0.6, 1, (6, 6))

@@ -6,7 +6,7 @@ with ``ideas`` planned tests and a false discovery rate ``rate``, the next test 
 discovery rate for p values with positive dependence (Zrnic, Ramdas and Jordan 2021, theorem 4),
 such as those of ideas that share the trainings of one baseline. Tests that run side by side count
 the ideas that were kept before they began, as the same paper does. `scripts/ledger_rates.py`
-simulates it (docs/night.md).
+simulates it (findings/simulations.md).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
