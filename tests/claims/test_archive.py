@@ -1,5 +1,6 @@
 """Archives of results: what they keep, what they never hold, and one line for every damage."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ from shlex import split
 import pytest
 import yaml
 
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.images import textured_error
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.claims.archive import unpack_archive
@@ -144,13 +146,25 @@ def drop(name):
 
 def resigned(name, old, new):
     """An edit by somebody who also updates the checksum."""
-    import hashlib
 
     def change(content):
         assert old in content[name]
         content[name] = content[name].replace(old, new)
         manifest = json.loads(content["archive.json"])
         manifest["sha256"][name] = hashlib.sha256(content[name]).hexdigest()
+        content["archive.json"] = json.dumps(manifest).encode()
+
+    return lambda file: rewrite(file, change)
+
+
+def with_unfinished(folder):
+    """An archive by somebody who names this trial as failed."""
+    line = json.dumps({"folder": folder, "configuration": {}}).encode()
+
+    def change(content):
+        content["unfinished.jsonl"] = line
+        manifest = json.loads(content["archive.json"])
+        manifest["sha256"]["unfinished.jsonl"] = hashlib.sha256(line).hexdigest()
         content["archive.json"] = json.dumps(manifest).encode()
 
     return lambda file: rewrite(file, change)
@@ -200,6 +214,9 @@ def flip_a_bit(file):
         ),
         (resigned("per_view.csv", b"-seed1,", b"-seed9,"), "per_view.csv"),
         (edit("archive.json", b"{", b"[" * 200_000), "not JSON"),
+        (with_unfinished("../../up"), "cannot be the folder of a trial"),
+        (with_unfinished("yard/sfm-adc/strange"), "strange: unfinished"),
+        (with_unfinished("x"), "cannot be the folder of a trial"),
         (
             edit("archive.json", b'"experiment": "exp"', b'"experiment": "../up"'),
             "cannot be the name of an experiment",
@@ -247,6 +264,26 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
         [],
     ):
         refused("export", *words)
+
+
+@pytest.mark.parametrize("config", ["kept", "unreadable"])
+def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, config):
+    runs = tmp_path / "runs"
+    *_, failed = write_runs(runs, Plan(effect={"psnr": 3.0}))
+    (runs / "exp" / "declared.jsonl").write_text(
+        '{"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-01-01T00:00:00Z"}\n'
+    )
+    (failed / "results.json").unlink()
+    (failed / "failed.json").write_text('{"reason": "out of memory in /home/me/x"}')
+    if config == "unreadable":
+        (failed / "config.yaml").write_text("[1")
+    there = load_experiment(runs, "exp")
+    write_archive(there, tmp_path / "exp.zip")
+    back = unpack_archive(tmp_path / "exp.zip", tmp_path / "other")
+    assert compare(back).sentences == compare(there).sentences
+    assert "1 trial of one arm alone failed or stopped" in compare(back).sentences[0]
+    assert "unfinished" in back.warnings[0]
+    assert b"/home/me" not in b"".join(members(tmp_path / "exp.zip").values())
 
 
 def test_what_a_question_asks_of_pictures_comes_with_the_results(tmp_path, monkeypatch):

@@ -6,6 +6,8 @@ An archive is a zip file that is also an RO-Crate 1.2 (`gsbench.claims.export` w
 - ``configurations.jsonl``: every configuration without the seed, with its trials' folders and
   seeds;
 - ``per_view.csv``: the metrics of every test view;
+- ``unfinished.jsonl``: folder and configuration of each trial without a usable result, since such
+  trials forbid verdicts (`gsbench.analysis.unfinished`);
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
 - ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
@@ -55,6 +57,7 @@ FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
+UNFINISHED = "unfinished.jsonl"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any
 # experiment needs.
@@ -81,6 +84,7 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             (_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])
         ]
         _unpack(home, trials, contents)
+        unfinished = _unpack_unfinished(home, contents)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
@@ -88,8 +92,10 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             f"{file}: its content is not that of an archive ({error!r}): export it again"
         ) from None
     experiment = read_experiment(home)
-    if not experiment.trials or experiment.warnings:
-        reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
+    of_unfinished = tuple(f"{path.relative_to(runs)}: " for path in unfinished)
+    faults = [one for one in experiment.warnings if not one.startswith(of_unfinished)]
+    if not experiment.trials or faults or set(experiment.lacking) != unfinished:
+        reason = next(iter(faults or experiment.warnings), "it has no trial")
         raise InputError(f"{file}: {reason}")
     for trial in experiment.trials:
         try:
@@ -226,6 +232,20 @@ def _unpack(
     for name in RECORDS:
         if name in contents:
             (home / name).write_bytes(contents[name])
+
+
+def _unpack_unfinished(home: Path, contents: Mapping[str, bytes]) -> set[Path]:
+    """Make the folders of trials without a usable result, and return them."""
+    folders = set()
+    for line in _lines(contents.get(UNFINISHED, b"")):
+        folder = home / _checked_folder(line["folder"])
+        if folder.exists():
+            raise InputError(f"the trial {line['folder']} is in it twice")
+        folder.mkdir(parents=True)
+        settings = yaml.safe_dump(line["configuration"], sort_keys=False)
+        (folder / CONFIG).write_text(settings, encoding="utf-8")
+        folders.add(folder)
+    return folders
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:

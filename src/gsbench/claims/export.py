@@ -36,6 +36,7 @@ from gsbench.claims.archive import (
     PIXELS,
     SEED_KEY,
     TRIALS,
+    UNFINISHED,
     VERSION,
     check_size,
 )
@@ -68,6 +69,7 @@ FILES = {  # media types and descriptions
     CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
+    UNFINISHED: ("application/jsonl", "Trials that failed, were stopped or are damaged"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
     LEDGER: ("application/jsonl", "The ideas in the order of their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
@@ -80,15 +82,17 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
+    unusable = list(experiment.lacking)
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
     for trial in experiment.trials:
         try:
-            views, configuration = read_views(trial), _configuration(trial)
+            views, configuration = read_views(trial), json.dumps(_configuration(trial.path))
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
+            unusable.append(trial.path)
             continue
-        place = _folder(trial)
+        place = _folder(trial.path)
         rows += [{"trial": place, "view": view} | views[view] for view in sorted(views)]
         configurations.setdefault(configuration, []).append((place, trial.seed))
         kept.append(trial)
@@ -96,18 +100,19 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     contents = {
         TRIALS: _json_lines(
-            {"folder": _folder(trial), "results": _results(trial)} for trial in kept
+            {"folder": _folder(trial.path), "results": _results(trial)} for trial in kept
         ),
         CONFIGURATIONS: _json_lines(
             {"configuration": json.loads(text), "trials": trials}
             for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
+        **({UNFINISHED: _json_lines(map(_unfinished, sorted(unusable)))} if unusable else {}),
         **_declared(experiment.folder, kept),
     }
     for trial in kept if pictures else ():
         for kind in PICTURES:
-            place = f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}"
+            place = f"{PICTURES_FOLDER}/{_folder(trial.path)}/{kind}"
             for path in trial.folder.pictures(kind):
                 contents[f"{place}/{path.name}"] = read_bytes(path)
     check_size(sum(map(len, contents.values())))
@@ -145,7 +150,7 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
         for trial in trials:
             with suppress(InputError):  # a trial whose pictures cannot be read
                 measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
-                measured.append({"folder": _folder(trial), "measures": measures})
+                measured.append({"folder": _folder(trial.path), "measures": measures})
         contents[PIXELS] = _json_lines(measured)
     return contents
 
@@ -174,24 +179,33 @@ def _page(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
-def _folder(trial: TrialResult) -> str:
+def _folder(path: Path) -> str:
     """A trial's folder within its experiment."""
-    return "/".join(trial.path.parts[-3:])
+    return "/".join(path.parts[-3:])
 
 
-def _configuration(trial: TrialResult) -> str:
-    """The trial's ``config.yaml`` as JSON, without paths of this machine.
+def _unfinished(path: Path) -> dict[str, Any]:
+    """What an archive says of a trial without a usable result."""
+    configuration: dict[str, Any] = {}
+    with suppress(InputError):  # settings that cannot be read
+        configuration = _configuration(path)
+    return {"folder": _folder(path), "configuration": configuration}
+
+
+def _configuration(path: Path) -> dict[str, Any]:
+    """The ``config.yaml`` of a trial without its seed and without paths of this machine.
 
     Raises InputError if it is damaged.
     """
     try:
-        values = read_yaml(trial.path / CONFIG)
+        values = read_yaml(path / CONFIG)
     except FileNotFoundError:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
     kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
-    return json.dumps(without_paths(kept))
+    shared: dict[str, Any] = without_paths(kept)
+    return shared
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:
