@@ -1,4 +1,4 @@
-"""Simulate rules for the test of the mean over scenes (findings/simulations.md, "Rules that were tried").
+"""Simulate rules for the test of the mean over scenes, for findings/simulations.md.
 
     python scripts/decision_rules.py                   print the table (about ten minutes)
     python scripts/decision_rules.py --draws 4000      print it from fewer draws
