@@ -1,6 +1,6 @@
 """Simulate every error rate and power that the documents promise (findings/simulations.md).
 
-    python scripts/promises.py                write all rows of the page (under an hour)
+    python scripts/promises.py                write all rows of the page (15 minutes)
     python scripts/promises.py --only bisect  write the rows whose names have this word
     python scripts/promises.py --share 0.05   print them from a twentieth of the draws
 
