@@ -117,8 +117,12 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
 
-def declare_looks(runs, *pairs):
-    """Declare a sweep in looks before all trials, with (baseline, arm) as lists of trials."""
+def in_looks(*pairs, scenes="a"):
+    """A sweep in looks, declared before all trials, with (baseline, arm) as lists of trials."""
+
+    def keys(trials, scene):
+        return replace(trials[0], scene=scene).key
+
     questions = [
         Question(
             metric="psnr",
@@ -126,13 +130,16 @@ def declare_looks(runs, *pairs):
             least=0.1,
             baseline=Arm("sfm", first[0].densify),
             arm=Arm("sfm", second[0].densify),
-            scenes={"a": (first[0].key, second[0].key)},
+            scenes={scene: (keys(first, scene), keys(second, scene)) for scene in scenes},
             seeds=(0, 1, 2),
         )
         for first, second in pairs
     ]
-    sweep = Declaration(time=DECLARED_AT, questions=tuple(questions), looks=(2, 3))
-    (runs / "exp" / "declared.jsonl").write_text(record_text([sweep]))
+    return Declaration(time=DECLARED_AT, questions=tuple(questions), looks=(2, 3))
+
+
+def declare_looks(runs, *pairs, **scenes):
+    (runs / "exp" / "declared.jsonl").write_text(record_text([in_looks(*pairs, **scenes)]))
 
 
 def test_the_baseline_that_a_sweep_in_looks_declared_stays_it_if_another_arm_ended_first(tmp_path):
@@ -156,6 +163,137 @@ def test_a_sweep_in_looks_gets_no_verdict_that_it_did_not_declare(tmp_path):
 
 
 BOTH_CAPS = ("sfm-adc[cap=2]", "sfm-adc[cap=1]")
+
+
+def test_a_sweep_in_looks_keeps_its_verdict_when_a_baseline_is_added(tmp_path):
+    first, second = grid("absgs"), grid("mine")
+    write(tmp_path, [*first, *second])
+    declare_looks(tmp_path, (first, second))
+    (before,) = answer(tmp_path).sentences
+    write(tmp_path, grid("adc", day=5))
+    assert before in answer(tmp_path).sentences
+
+
+@pytest.mark.parametrize("missing", [["adc", "mine"], ["mine"]], ids=["not begun", "failed"])
+def test_a_look_waits_for_every_scene(tmp_path, missing):
+    """The scenes that have finished are not judged by themselves, as if there were no looks."""
+    first, second = grid("adc"), grid("mine")
+    there = [replace(one, scene="b") for one in [*first, *second] if one.densify not in missing]
+    write(tmp_path, [*first, *second, *there])
+    declare_looks(tmp_path, (first, second), scenes="ab")
+    found = answer(tmp_path)
+    words = "sfm-mine against sfm-adc: no verdict yet, not all of the first 2 seeds are there"
+    assert found.sentences[0].startswith(words)
+    assert "(a look waits for all of its trials)" in texts(found.unused)[0]
+    assert found.answers[0].verdicts[0].question.seeds == (0, 1, 2)
+
+
+def test_a_look_whose_first_seed_failed_says_that_it_waits(tmp_path):
+    first, second = grid("adc"), grid("mine")
+    write(tmp_path, [*first, *second[1:]])
+    declare_looks(tmp_path, (first, second))
+    assert "no verdict yet, not all of the first 2 seeds" in answer(tmp_path).sentences[0]
+
+
+def test_another_metric_declared_for_a_later_arm_keeps_the_verdict_on_an_earlier_one(tmp_path):
+    early, late = [*grid("adc"), *grid("mine")], grid("more", day=6)
+    write(tmp_path, early)
+    first, second = (
+        [Declaration(time=time, questions=(open_question(metric),), trials=named)]
+        for time, metric, named in (
+            (DECLARED_AT, "psnr", {one.key: (0, 1, 2) for one in early}),
+            ("2026-01-05T00:00:00Z", "ssim", {one.key: (0, 1, 2) for one in [*early, *late]}),
+        )
+    )
+    file = tmp_path / "exp" / "declared.jsonl"
+    file.write_text(record_text(first))
+    (before,) = answer(tmp_path).sentences
+    write(tmp_path, late)
+    file.write_text(record_text(first + second))
+    found = answer(tmp_path)
+    kept, other = found.sentences
+    assert kept == before
+    assert "undecided in SSIM" in other
+    assert other.endswith("The metric was declared beforehand.")
+    said = texts(found.declared_notes)
+    assert [line.partition(" (eval")[0] for line in said] == [
+        "PSNR (dB) was declared beforehand",
+        "SSIM was declared beforehand",
+    ]
+
+
+@pytest.mark.parametrize("looks", [False, True])
+def test_a_baseline_that_is_chosen_later_declares_no_other_pairs(tmp_path, looks):
+    arms = first, second, third = [grid(name) for name in ("adc", "mine", "more")]
+    trials = [one for arm in arms for one in arm]
+    write(tmp_path, trials)
+    declare(tmp_path, (1, trials))
+    if looks:
+        declare_looks(tmp_path, (first, second), (first, third))
+    found = compare(load_experiment(tmp_path, "exp"), "mine")
+    stated = {(str(one.second), str(one.first)): one for one in found.answers}
+    assert not stated["sfm-more", "sfm-mine"].beforehand
+    assert "but not for this pair of arms" in sentence(stated["sfm-more", "sfm-mine"])
+    turned = stated[("sfm-mine", "sfm-adc") if looks else ("sfm-adc", "sfm-mine")]
+    assert turned.beforehand
+
+
+def drop_value(runs, made, metric="psnr", reason="it is not a number"):
+    file = runs / "exp" / f"{made.key}-seed{made.seed}" / "results.json"
+    data = json.loads(file.read_text())
+    del data["metrics"][metric]
+    data["unavailable"][metric] = reason
+    moment = file.stat().st_mtime
+    file.write_text(json.dumps(data))
+    os.utime(file, (moment, moment))
+
+
+@pytest.mark.parametrize("declared", [False, True])
+def test_an_arm_gains_nothing_by_a_trial_without_a_value(tmp_path, declared):
+    """It counts as a failed one, and every surface names it."""
+    adc, mine = grid("adc", seeds=4), grid("mine", seeds=4)
+    write(tmp_path, [*adc, *mine])
+    for one in mine:  # a clear gain
+        file = tmp_path / "exp" / f"{one.key}-seed{one.seed}" / "results.json"
+        data = json.loads(file.read_text())
+        data["metrics"]["psnr"] += 5
+        file.write_text(json.dumps(data))
+    if declared:
+        declare(tmp_path, (1, [*adc, *mine]))
+    assert "better in PSNR" in answer(tmp_path).sentences[0]
+    drop_value(tmp_path, mine[1])
+    found = answer(tmp_path)
+    (verdict,) = [one for one in found.answers[0].verdicts if one.question.metric == "psnr"]
+    assert verdict.favours_lacking
+    assert "1 trial of one arm alone failed, stopped or gave no value" in found.sentences[0]
+    line = "PSNR (dB): a seed 1 not compared: it is not a number"
+    experiment = found.experiment
+    for told in (
+        texts(found.remarks),
+        found.to_json()["left_out"],
+        build_table(experiment).notes,
+    ):
+        assert line in told
+    assert line in build_report(experiment)
+    for one in (mine[0], mine[2], mine[3]):
+        drop_value(tmp_path, one)
+    assert "PSNR (dB): sfm-mine not compared: it is not a number" in texts(answer(tmp_path).remarks)
+
+
+def test_a_metric_without_a_direction_is_named(tmp_path):
+    trials = [*grid("adc"), *grid("mine")]
+    write(tmp_path, trials)
+    for one in trials:
+        file = tmp_path / "exp" / f"{one.key}-seed{one.seed}" / "results.json"
+        data = json.loads(file.read_text())
+        data["metrics"]["fancy"] = 1.0
+        file.write_text(json.dumps(data))
+    line = "fancy: in no verdict, unknown whether higher is better: set `direction` in the metric's"
+    assert line in texts(answer(tmp_path).remarks)[0]
+    declare(tmp_path, (1, trials), metric="fancy")
+    assert (
+        "the declared metric fancy has no direction (unknown" in (answer(tmp_path).sentences[0])
+    )
 
 
 def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):

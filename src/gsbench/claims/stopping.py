@@ -205,7 +205,7 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
             for pair in comparison.pairs
         ]
         unequal = [note for note in counts if note is not None]
-        for line in [*texts(unequal), *comparison.sentences, *texts(comparison.unused)]:
+        for line in [*texts(unequal), *comparison.sentences, *texts(comparison.remarks)]:
             log.info("%s", line)
 
 

@@ -217,7 +217,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    print("\n".join([*comparison.sentences, *texts(comparison.unused), *experiment.warnings]))
+    print("\n".join([*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]))
     for baseline, arm in comparison.pairs:
         paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
         if not paired.rows:
