@@ -291,9 +291,7 @@ def test_a_metric_without_a_direction_is_named(tmp_path):
     line = "fancy: in no verdict, unknown whether higher is better: set `direction` in the metric's"
     assert line in texts(answer(tmp_path).remarks)[0]
     declare(tmp_path, (1, trials), metric="fancy")
-    assert (
-        "the declared metric fancy has no direction (unknown" in (answer(tmp_path).sentences[0])
-    )
+    assert "the declared metric fancy has no direction (unknown" in (answer(tmp_path).sentences[0])
 
 
 def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
@@ -429,9 +427,37 @@ ARMS = [
 ]
 
 
+@dataclass(frozen=True)
+class Experiment:
+    """A made-up experiment.
+
+    ``without`` are trials without a PSNR, ``declared`` those declared with PSNR before all results,
+    and ``looks`` the pairs of arms that a sweep in looks declared.
+    """
+
+    trials: list[Made]
+    without: frozenset[Made]
+    declared: list[Made]
+    looks: list[tuple[list[Made], list[Made]]]
+
+    @property
+    def baseline(self):
+        first = self.trials[0]
+        return [one for one in self.trials if (one.densify, one.hash) == (first.densify, first.hash)]
+
+    def write(self, runs, order=None):
+        write(runs, order or self.trials)
+        for one in self.without:
+            drop_value(runs, one)
+        if self.looks:
+            declare_looks(runs, *self.looks, scenes=sorted({one.scene for one in self.trials}))
+        elif self.declared:
+            declare(runs, (1, self.declared))
+
+
 @st.composite
 def experiments(draw):
-    """Trials of a baseline and of arms on scenes and seeds, some missing; those declared."""
+    """Arms on scenes and seeds against a baseline, with and without declarations, looks and faults."""
     places = draw(
         st.lists(
             st.tuples(st.sampled_from("abc"), st.integers(0, 3)),
@@ -441,34 +467,49 @@ def experiments(draw):
         )
     )
     arms = draw(st.lists(st.sampled_from(ARMS), min_size=1, max_size=4, unique=True))
-    trials = []
-    for densify, options in [("adc", ()), *arms]:
-        own = [Made(densify, options, scene=scene, seed=seed) for scene, seed in places]
+    in_looks = draw(st.booleans())
+    # without a baseline, arms are compared with the first one: only looks say which that is
+    first = draw(st.sampled_from(["adc", "plain"] if in_looks else ["adc"]))
+    swept = [(("cap", 5),), (("cap", 9),)]
+    first_settings = draw(st.sampled_from([[()], swept] if first == "adc" else [[()]]))
+    trials, groups = [], []
+    for densify, options in [*((first, one) for one in first_settings), *arms]:
+        code = draw(st.sampled_from(["", NEW]))
+        own = [Made(densify, options, scene=scene, seed=seed, code=code) for scene, seed in places]
         missing = draw(st.sets(st.sampled_from(own), max_size=1 if len(own) > 1 else 0))
         day = draw(st.integers(2, 9))
-        trials += [replace(one, day=day) for one in own if one not in missing]
-    return trials, trials[: draw(st.sampled_from([0, len(trials), len(trials) - 1]))]
-
-
-def one_of(trials, densify):
-    return [one for one in trials if one.densify == densify]
+        groups.append([replace(one, day=day) for one in own if one not in missing])
+        trials += groups[-1]
+        if code and draw(st.booleans()):
+            trials.append(replace(groups[-1][0], code=OLD, day=1))
+    without = draw(st.sets(st.sampled_from(trials), max_size=1))
+    declared = trials[: draw(st.sampled_from([0, len(trials), len(trials) - 1]))]
+    pairs = [(groups[0], one) for one in groups[len(first_settings) :]] if in_looks else []
+    return Experiment(trials, frozenset(without), declared, pairs)
 
 
 ADDED = {
-    "an arm": lambda trials: [replace(one, densify="zzz", options=(), day=2) for one in trials[:2]],
-    "an arm that is sorted first": lambda trials: [
-        replace(one, densify="aaa", options=()) for one in one_of(trials, "adc")
+    "an arm": lambda made: [
+        replace(one, densify="zzz", options=(), day=2) for one in made.trials[:2]
     ],
-    "an arm of another initialiser": lambda trials: [
-        replace(one, init="random", densify="mine", options=(), day=2) for one in trials[:2]
+    "an arm that is sorted first": lambda made: [
+        replace(one, densify="aaa", options=()) for one in made.baseline
     ],
-    "a scene that only one arm has": lambda trials: [replace(trials[-1], scene="z")],
-    "a setting of another arm": lambda trials: [
+    "a baseline": lambda made: [
+        replace(one, densify="adc", options=(), code="", day=9)
+        for one in made.baseline
+        if made.baseline[0].densify != "adc"
+    ],
+    "an arm of another initialiser": lambda made: [
+        replace(one, init="random", densify="mine", options=(), day=2) for one in made.trials[:2]
+    ],
+    "a scene that only one arm has": lambda made: [replace(made.trials[-1], scene="z")],
+    "a setting of another arm": lambda made: [
         replace(one, densify="zzz", options=(("decay", decay), ("lr", 1)))
-        for one in one_of(trials, "adc")
+        for one in made.baseline
         for decay in (1, 2)
     ],
-    "old versions of an arm": lambda trials: [replace(trials[-1], code=OLD, day=1)],
+    "old versions of an arm": lambda made: [replace(made.trials[-1], code=OLD, day=1)],
 }
 
 
@@ -487,17 +528,20 @@ def test_what_is_added_never_changes_another_verdict(what):
     examples = 500 if os.environ.get("GSBENCH_EXAMPLES") else 12
 
     @settings(max_examples=examples, deadline=None)
-    @given(experiments())
-    def check(made):
-        trials, declared = made
+    @given(experiments(), st.booleans())
+    def check(made, other_metric):
         runs = Path(tempfile.mkdtemp())
         try:
-            write(runs, trials)
-            if declared:
-                declare(runs, (1, declared))
+            made.write(runs)
             before = answer(runs)
-            added = set(ADDED[what](trials)) - set(trials)
+            added = set(ADDED[what](made)) - set(made.trials)
             write(runs, sorted(added, key=repr))
+            file = runs / "exp" / "declared.jsonl"
+            if other_metric and file.exists():
+                named = {one.key: (one.seed,) for one in added}
+                asked = (open_question("ssim"),)
+                later = Declaration(time="2026-02-01T00:00:00Z", questions=asked, trials=named)
+                file.write_text(file.read_text() + record_text([later]))
             (runs / "exp" / "d" / "sfm-mine" / "deadbeef-seed0").mkdir(parents=True)  # it failed
             after = answer(runs)
             assert before.pairs
@@ -531,12 +575,9 @@ def check_all_is_named(comparison):
 @settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
 @given(experiments())
 def test_all_surfaces_state_the_same(made):
-    trials, declared = made
     runs = Path(tempfile.mkdtemp())
     try:
-        write(runs, trials)
-        if declared:
-            declare(runs, (1, declared))
+        made.write(runs)
         comparison = answer(runs)
         notes = "\n".join(build_table(comparison.experiment).notes)
         page = html.unescape(build_report(comparison.experiment))
@@ -547,7 +588,7 @@ def test_all_surfaces_state_the_same(made):
             assert f"Verdict, {sentence}" in notes
             assert f"<strong>{sentence}" in page
             assert sentence in told or len(told) > 4000  # cut to what a tag may hold
-        for line in texts(comparison.unused):
+        for line in texts(comparison.remarks):
             assert line in notes
             assert line in page
     finally:
@@ -557,14 +598,11 @@ def test_all_surfaces_state_the_same(made):
 @settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 12, deadline=None)
 @given(experiments(), st.randoms(use_true_random=False))
 def test_the_order_of_commands_does_not_matter(made, shuffler):
-    trials, declared = made
     found = []
-    for order in (trials, shuffler.sample(trials, len(trials))):
+    for order in (made.trials, shuffler.sample(made.trials, len(made.trials))):
         runs = Path(tempfile.mkdtemp())
         try:
-            write(runs, order)
-            if declared:
-                declare(runs, (1, sorted(declared, key=order.index)))
+            made.write(runs, order)
             found.append(outcomes(answer(runs)))
         finally:
             shutil.rmtree(runs)

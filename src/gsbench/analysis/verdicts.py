@@ -96,7 +96,8 @@ def judge_pairs(
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
         ]
         if declared is not None:
-            standing = declared.standing(*(by_arm.get(arm, []) for arm in pair), pair in others)
+            first, second = (by_arm.get(arm, []) for arm in pair)
+            standing = declared.standing(first, second, other_pair=pair in others)
             primary = asked_quantity(standing.active.metric, trials)
             standings[pair], primaries[pair] = standing, primary
             metrics = [primary, *(metric for metric in metrics if metric.key != primary.key)]

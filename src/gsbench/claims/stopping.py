@@ -19,7 +19,7 @@ from gsbench.analysis.fairness import counts_note
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
-from gsbench.analysis.pairing import choose_pairs
+from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.results import Arm, TrialResult, group_by, newest_code, read_experiment
 from gsbench.analysis.trial_settings import GROUPS
 from gsbench.config.compose import Trial
@@ -151,7 +151,7 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     expected = with_variants([_planned(trial) for trial in trials])
     seeds = _seeds(expected)
     settings = {trial.arm: trial.config for trial in expected}
-    chosen = choose_pairs(sorted(settings), settings=settings)
+    chosen = choose_pairs(sorted(settings), controls=controls_of(expected), settings=settings)
     if not chosen:
         raise InputError(
             "launch.stop_when_decided compares arms, and this sweep has one: give two densifiers"
