@@ -443,7 +443,9 @@ class Experiment:
     @property
     def baseline(self):
         first = self.trials[0]
-        return [one for one in self.trials if (one.densify, one.hash) == (first.densify, first.hash)]
+        return [
+            one for one in self.trials if (one.densify, one.hash) == (first.densify, first.hash)
+        ]
 
     def write(self, runs, order=None):
         write(runs, order or self.trials)

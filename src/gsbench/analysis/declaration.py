@@ -180,7 +180,7 @@ class ActiveDeclaration:
         return False
 
     def notes(self, name: str, doubted: bool) -> list[Note]:
-        """Notes that say when the metric called ``name`` was declared, and if that is ``doubted``."""
+        """Notes on when the metric called ``name`` was declared, and if this is ``doubted``."""
         name += f" at {self.question}" if self.question else ""
         when = self.records[0].when
         notes = [Note.of("declared" if doubted else "declared beforehand", metric=name, when=when)]
