@@ -19,10 +19,11 @@ from hypothesis import strategies as st
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
+from gsbench.analysis.results import load_all_trials, load_experiment
 from gsbench.analysis.statistics import t_test
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import sentence
+from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.claims.site import write_site
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
@@ -238,6 +239,18 @@ def test_a_baseline_that_is_chosen_later_declares_no_other_pairs(tmp_path, looks
     assert turned.beforehand
 
 
+def gain(runs, trials, by=5.0):
+    """Raise the PSNR of trials of one view."""
+    for one in trials:
+        file = runs / "exp" / f"{one.key}-seed{one.seed}" / "results.json"
+        data = json.loads(file.read_text())
+        old = data["metrics"]["psnr"]
+        data["metrics"]["psnr"] = old + by
+        file.write_text(json.dumps(data))
+        views = file.with_name("per_view.csv")
+        views.write_text(views.read_text().replace(repr(old), repr(old + by)))
+
+
 def drop_value(runs, made, metric="psnr", reason="it is not a number"):
     file = runs / "exp" / f"{made.key}-seed{made.seed}" / "results.json"
     data = json.loads(file.read_text())
@@ -253,11 +266,7 @@ def test_an_arm_gains_nothing_by_a_trial_without_a_value(tmp_path, declared):
     """It counts as a failed one, and every surface names it."""
     adc, mine = grid("adc", seeds=4), grid("mine", seeds=4)
     write(tmp_path, [*adc, *mine])
-    for one in mine:  # a clear gain
-        file = tmp_path / "exp" / f"{one.key}-seed{one.seed}" / "results.json"
-        data = json.loads(file.read_text())
-        data["metrics"]["psnr"] += 5
-        file.write_text(json.dumps(data))
+    gain(tmp_path, mine)
     if declared:
         declare(tmp_path, (1, [*adc, *mine]))
     assert "better in PSNR" in answer(tmp_path).sentences[0]
@@ -414,6 +423,33 @@ def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
     write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
     declare(tmp_path, (5, [*grid("adc"), *grid("mine", code=NEW)]))
     assert not answer(tmp_path).answers[0].beforehand
+
+
+def fail(runs, made):
+    """Make the folder of a trial that failed."""
+    folder = runs / "exp" / f"{made.key}-seed{made.seed}"
+    folder.mkdir()
+    config = {"densify": {"name": made.densify} | dict(made.options)}
+    (folder / "config.yaml").write_text(json.dumps(config))
+
+
+def test_an_archive_gives_the_same_answers(tmp_path):
+    """Trials that failed and trials of earlier code matter for them."""
+    adc, idea, lost = grid("adc", 4), grid("idea", day=6), grid("lost", 4, day=6)
+    old, new = grid("mine", code=OLD), grid("mine", code=NEW, day=6)
+    trials = [*adc, *idea, *lost[:3], *old, *new]
+    write(tmp_path, trials)
+    gain(tmp_path, lost[:3])
+    fail(tmp_path, lost[3])
+    declare(tmp_path, (5, [*adc, *idea, *lost, *new]))
+    here = answer(tmp_path)
+    assert [one.second.densify for one in here.answers if not one.beforehand] == ["mine"]
+    assert "1 trial of one arm alone failed" in here.sentences[1]
+    write_archive(load_all_trials(tmp_path, "exp"), tmp_path / "exp.zip")
+    there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
+    assert there.sentences == here.sentences
+    assert texts(there.remarks) == texts(here.remarks)
+    assert "made by an earlier mine" in there.to_json()["left_out"][-1]
 
 
 # ---- random experiments

@@ -2,7 +2,10 @@
 
 An archive is a zip file that is also an RO-Crate 1.2 (`gsbench.claims.export` writes it). It holds:
 
-- ``results.jsonl``: the ``results.json`` of every trial, one per line, with the trial's folder;
+- ``results.jsonl``: the ``results.json`` of every trial, one per line, with the trial's folder, and
+  ``older`` where later code repeated it;
+- ``unfinished.jsonl``: folders and configurations of trials without a usable result, if any: no
+  verdict favours an arm that lacks them;
 - ``configurations.jsonl``: every configuration without the seed, with its trials' folders and
   seeds;
 - ``per_view.csv``: the metrics of every test view;
@@ -21,6 +24,7 @@ import csv
 import hashlib
 import io
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -55,6 +59,7 @@ FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
+UNFINISHED, OLDER = "unfinished.jsonl", "older"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any
 # experiment needs.
@@ -81,6 +86,12 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             (_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])
         ]
         _unpack(home, trials, contents)
+        for line in _lines(contents[TRIALS]):
+            if line.get(OLDER):  # what was finished last counts
+                os.utime(home / line["folder"] / RESULTS, (0, 0))
+        unfinished = {
+            _unpack_unfinished(home, line) for line in _lines(contents.get(UNFINISHED, b""))
+        }
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
@@ -88,7 +99,8 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             f"{file}: its content is not that of an archive ({error!r}): export it again"
         ) from None
     experiment = read_experiment(home)
-    if not experiment.trials or experiment.warnings:
+    others = set(experiment.lacking) != unfinished or len(experiment.warnings) > len(unfinished)
+    if not experiment.trials or others:
         reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
         raise InputError(f"{file}: {reason}")
     for trial in experiment.trials:
@@ -226,6 +238,16 @@ def _unpack(
     for name in RECORDS:
         if name in contents:
             (home / name).write_bytes(contents[name])
+
+
+def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:
+    """Make the folder of a trial without a usable result, and return it."""
+    folder = home / _checked_folder(line["folder"])
+    if folder.exists():
+        raise InputError(f"the trial {line['folder']} is in it twice")
+    folder.mkdir(parents=True)
+    (folder / CONFIG).write_text(yaml.safe_dump(line["configuration"]), encoding="utf-8")
+    return folder
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:

@@ -23,6 +23,7 @@ from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import (
     Experiment,
     TrialResult,
+    newest_code,
     read_views,
 )
 from gsbench.claims.archive import (
@@ -31,11 +32,13 @@ from gsbench.claims.archive import (
     FORMAT,
     MANIFEST,
     NO_CONFIGURATION,
+    OLDER,
     PICTURES,
     PICTURES_FOLDER,
     PIXELS,
     SEED_KEY,
     TRIALS,
+    UNFINISHED,
     VERSION,
     check_size,
 )
@@ -65,6 +68,7 @@ FILES = {  # media types and descriptions
         "application/jsonl",
         "Results of every trial, one JSON object a line: metrics, counts, hashes, code",
     ),
+    UNFINISHED: ("application/jsonl", "Trials that failed or were stopped, with configurations"),
     CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
@@ -80,15 +84,18 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
+    unfinished, experiment = [*experiment.lacking], newest_code(experiment)
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
-    for trial in experiment.trials:
+    # what earlier code showed was seen, so a declaration after it is late
+    for trial in (*experiment.trials, *experiment.older):
         try:
-            views, configuration = read_views(trial), _configuration(trial)
+            views, configuration = read_views(trial), _configuration(trial.path)
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
+            unfinished.append(trial.path)
             continue
-        place = _folder(trial)
+        place = _folder(trial.path)
         rows += [{"trial": place, "view": view} | views[view] for view in sorted(views)]
         configurations.setdefault(configuration, []).append((place, trial.seed))
         kept.append(trial)
@@ -96,7 +103,9 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     contents = {
         TRIALS: _json_lines(
-            {"folder": _folder(trial), "results": _results(trial)} for trial in kept
+            {"folder": _folder(trial.path), "results": _results(trial)}
+            | ({OLDER: True} if trial in experiment.older else {})
+            for trial in kept
         ),
         CONFIGURATIONS: _json_lines(
             {"configuration": json.loads(text), "trials": trials}
@@ -105,9 +114,11 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         PER_VIEW: _table(rows),
         **_declared(experiment.folder, kept),
     }
+    if unfinished:
+        contents[UNFINISHED] = _json_lines(map(_unfinished, unfinished))
     for trial in kept if pictures else ():
         for kind in PICTURES:
-            place = f"{PICTURES_FOLDER}/{_folder(trial)}/{kind}"
+            place = f"{PICTURES_FOLDER}/{_folder(trial.path)}/{kind}"
             for path in trial.folder.pictures(kind):
                 contents[f"{place}/{path.name}"] = read_bytes(path)
     check_size(sum(map(len, contents.values())))
@@ -145,7 +156,7 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
         for trial in trials:
             with suppress(InputError):  # a trial whose pictures cannot be read
                 measures = PixelMeasures(error_textured=textured_error(trial)).to_json()
-                measured.append({"folder": _folder(trial), "measures": measures})
+                measured.append({"folder": _folder(trial.path), "measures": measures})
         contents[PIXELS] = _json_lines(measured)
     return contents
 
@@ -174,18 +185,26 @@ def _page(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
-def _folder(trial: TrialResult) -> str:
+def _folder(path: Path) -> str:
     """A trial's folder within its experiment."""
-    return "/".join(trial.path.parts[-3:])
+    return "/".join(path.parts[-3:])
 
 
-def _configuration(trial: TrialResult) -> str:
+def _unfinished(path: Path) -> dict[str, Any]:
+    """The line of a trial without a usable result; its configuration may be unreadable, too."""
+    configuration = "{}"
+    with suppress(InputError, OSError):
+        configuration = _configuration(path)
+    return {"folder": _folder(path), "configuration": json.loads(configuration)}
+
+
+def _configuration(path: Path) -> str:
     """The trial's ``config.yaml`` as JSON, without paths of this machine.
 
     Raises InputError if it is damaged.
     """
     try:
-        values = read_yaml(trial.path / CONFIG)
+        values = read_yaml(path / CONFIG)
     except FileNotFoundError:
         raise InputError(NO_CONFIGURATION) from None
     if not isinstance(values, dict):
