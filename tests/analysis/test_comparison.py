@@ -9,6 +9,7 @@ import tempfile
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from gsbench.analysis.verdict_words import sentence
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.claims.site import write_site
+from gsbench.claims.stopping import log_verdicts
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
 from gsbench.tracking.comparison import description
 from gsbench.verbs.claims import plan
@@ -251,6 +253,21 @@ def gain(runs, trials, by=5.0):
         views.write_text(views.read_text().replace(repr(old), repr(old + by)))
 
 
+def test_seeds_added_to_one_arm_leave_the_others_their_family(tmp_path):
+    arms = [grid(name) for name in ("adc", "mine", "more")]
+    trials = [one for arm in arms for one in arm]
+    write(tmp_path, trials)
+    declare(tmp_path, (1, trials))
+    before = answer(tmp_path).sentences
+    assert "adjusted for 2 tests" in before[1]
+    more = [replace(one, seed=3, day=6) for one in (arms[0][0], arms[1][0])]
+    write(tmp_path, more)
+    declare(tmp_path, (1, trials), (5, more))
+    after = answer(tmp_path).sentences
+    assert "2 trials were added" in after[0]
+    assert after[1] == before[1]
+
+
 def drop_value(runs, made, metric="psnr", reason="it is not a number"):
     file = runs / "exp" / f"{made.key}-seed{made.seed}" / "results.json"
     data = json.loads(file.read_text())
@@ -419,6 +436,13 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
     assert "missing" not in "\n".join(texts(answer(tmp_path).declared_notes))
 
 
+def test_the_end_of_a_sweep_names_trials_of_earlier_code(tmp_path, caplog):
+    write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
+    caplog.set_level("INFO", "gsbench")
+    log_verdicts([SimpleNamespace(files=SimpleNamespace(home=tmp_path / "exp"))])
+    assert "exp/a/sfm-mine seeds 0, 1, 2: made by an earlier mine" in caplog.messages[-1]
+
+
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
     write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
     declare(tmp_path, (5, [*grid("adc"), *grid("mine", code=NEW)]))
@@ -483,6 +507,10 @@ class Experiment:
             one for one in self.trials if (one.densify, one.hash) == (first.densify, first.hash)
         ]
 
+    @property
+    def last(self):
+        return next(one for one in reversed(self.trials) if one.code != OLD)
+
     def write(self, runs, order=None):
         write(runs, order or self.trials)
         for one in self.without:
@@ -526,6 +554,7 @@ def experiments(draw):
     return Experiment(trials, frozenset(without), declared, pairs)
 
 
+SEED_OF_ONE = "a seed of one arm"
 ADDED = {
     "an arm": lambda made: [
         replace(one, densify="zzz", options=(), day=2) for one in made.trials[:2]
@@ -546,6 +575,9 @@ ADDED = {
         replace(one, densify="zzz", options=(("decay", decay), ("lr", 1)))
         for one in made.baseline
         for decay in (1, 2)
+    ],
+    SEED_OF_ONE: lambda made: [
+        replace(one, scene=made.last.scene, seed=9, day=9) for one in (made.baseline[0], made.last)
     ],
     "old versions of an arm": lambda made: [replace(made.trials[-1], code=OLD, day=1)],
 }
@@ -585,7 +617,8 @@ def test_what_is_added_never_changes_another_verdict(what):
             assert before.pairs
             changed = outcomes(after)
             for pair, found in outcomes(before).items():
-                assert changed[pair] == found
+                own = what == SEED_OF_ONE and f"sfm-{made.last.densify}" in pair[0]
+                assert own or changed[pair] == found
             check_all_is_named(after)
         finally:
             shutil.rmtree(runs)

@@ -228,7 +228,8 @@ def _with_pairs(
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
     if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
-        return replace(verdict, pairs=pairs.first(0))
+        none = pairs.first(0) if declaration.looks else replace(pairs, rows=())
+        return replace(verdict, pairs=none)
     if (
         pairs.rows
         and question.scenes

@@ -91,6 +91,8 @@ def judge_pairs(
     standings: dict[ArmPair, Standing] = {}
     undirected: dict[ArmPair, list[Note]] = {}
     asked: list[tuple[ArmPair, Quantity, Question]] = []
+    before: list[tuple[ArmPair, Question, Standing]] = []
+    late: dict[ArmPair, list[TrialResult]] = {}
     for pair in pairs:
         metrics = [
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
@@ -110,8 +112,17 @@ def judge_pairs(
             if metric.direction:
                 question = _question(by_arm, pair, metric, standings.get(pair))
                 asked.append((pair, metric, question))
-    questions = [(pair, own) for pair, _, own in asked]
-    verdicts = _judge_families(trials, questions, standings, lacking)
+        if (known := standings.get(pair)) is not None and known.added:
+            # The question stays in its family as it was before, so that others keep their verdict.
+            # Looks have fixed shares.
+            whole = replace(known, added=())
+            counts = whole.beforehand and whole.question is None
+            directed = [metric for metric in metrics if metric.direction and counts]
+            before += [(pair, _question(by_arm, pair, one, whole), whole) for one in directed]
+            places = {(trial.scene, trial.seed) for trial in known.added}
+            late[pair] = [t for t in by_arm.get(pair[1], []) if (t.scene, t.seed) in places]
+    questions = [(pair, own, standings.get(pair)) for pair, _, own in asked]
+    verdicts = _judge_families(trials, questions, lacking, before, late)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0][0])
     judged = []
     for pair in pairs:
@@ -148,15 +159,18 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
 
 def _judge_families(
     trials: Sequence[TrialResult],
-    asked: Sequence[tuple[ArmPair, Question]],
-    standings: Mapping[ArmPair, Standing],
+    asked: Sequence[tuple[ArmPair, Question, Standing | None]],
     lacking: Sequence[Unfinished],
+    before: Sequence[tuple[ArmPair, Question, Standing | None]],
+    late: Mapping[ArmPair, Sequence[TrialResult]],
 ) -> list[Verdict]:
-    """Judge each family of questions: those of one declaration, or of one exploratory pair."""
+    """Judge each family of questions: those of one declaration, or of one exploratory pair.
 
-    def family(entry: tuple[int, tuple[ArmPair, Question]]) -> tuple[object, ...]:
-        pair, question = entry[1]
-        standing = standings.get(pair)
+    Families also count the questions as they were ``before`` trials came that are too ``late``.
+    """
+
+    def family(entry: tuple[int, tuple[ArmPair, Question, Standing | None]]) -> tuple[object, ...]:
+        pair, question, standing = entry[1]
         if standing is None or not standing.beforehand:
             return pair
         # The baseline's own settings are a family of their own: questions about ideas pay nothing
@@ -166,8 +180,10 @@ def _judge_families(
         return named.time, named.hash, bool(question.seeds), is_setting
 
     verdicts: dict[int, Verdict] = {}
-    for own in group_by(enumerate(asked), family).values():
-        standing, questions = standings.get(own[0][1][0]), tuple(one for _, (_, one) in own)
+    for own in group_by(enumerate([*asked, *before]), family).values():
+        standing, questions = own[0][1][2], tuple(question for _, (_, question, _) in own)
+        added = {t.path for at, (pair, _, _) in own if at >= len(asked) for t in late[pair]}
+        counting = [trial for trial in trials if trial.path not in added] if added else trials
         # Without a time no trial is late, so Holm's method alone adjusts for the number of metrics.
         declaration = Declaration(time=NO_TIME, questions=questions)
         if standing is not None and standing.beforehand:
@@ -183,7 +199,7 @@ def _judge_families(
                 looks=looks,
             )
         places = [place for place, _ in own]
-        verdicts |= dict(zip(places, judge(trials, declaration, lacking), strict=False))
+        verdicts |= dict(zip(places, judge(counting, declaration, lacking), strict=False))
     return [verdicts[place] for place in range(len(asked))]
 
 

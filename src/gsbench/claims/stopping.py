@@ -196,16 +196,20 @@ def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
 def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what one must know beside them.
 
-    These are unequal counts of Gaussians, said first, and trials in no verdict.
+    These are unequal counts of Gaussians, said first, trials in no verdict, and earlier code.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
-        comparison = compare(newest_code(read_experiment(home)))
+        experiment = read_experiment(home)
+        newest = newest_code(experiment)
+        superseded = newest.warnings[len(experiment.warnings) :]
+        comparison = compare(newest)
         counts = [
             counts_note(comparison.trials, *pair, equal_counts_settings)
             for pair in comparison.pairs
         ]
         unequal = [note for note in counts if note is not None]
-        for line in [*texts(unequal), *comparison.sentences, *texts(comparison.remarks)]:
+        said = [*texts(unequal), *comparison.sentences, *texts(comparison.remarks), *superseded]
+        for line in said:
             log.info("%s", line)
 
 
