@@ -26,6 +26,7 @@ from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import sentence
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
+from gsbench.claims.pooling import PooledQuestion, read_studies
 from gsbench.claims.site import write_site
 from gsbench.claims.stopping import log_verdicts
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
@@ -474,6 +475,9 @@ def test_an_archive_gives_the_same_answers(tmp_path):
     assert there.sentences == here.sentences
     assert texts(there.remarks) == texts(here.remarks)
     assert "made by an earlier mine" in there.to_json()["left_out"][-1]
+    question = PooledQuestion(("lost",), ("adc",), "psnr")
+    _, notes, _ = read_studies(tmp_path / "exp.zip", question, "ours")
+    assert f"ours: left out, exp/{lost[3].key}-seed3: unfinished" in "\n".join(notes)
 
 
 # ---- random experiments
