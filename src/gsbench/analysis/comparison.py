@@ -249,8 +249,9 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment.folder, arms.trials, experiment.older)
-    chosen_before = {frozenset(pair) for pair in pair_arms(experiment).pairs}
-    others = [pair for pair in arms.pairs if frozenset(pair) not in chosen_before]
+    usual = arms if baseline == BASELINE else pair_arms(experiment)
+    known = {frozenset(pair) for pair in usual.pairs}
+    others = [pair for pair in arms.pairs if frozenset(pair) not in known]
     answers = judge_pairs(arms.trials, arms.pairs, declared, unfinished(experiment), others)
     if (experiment.folder / LEDGER).exists():
         answers = [

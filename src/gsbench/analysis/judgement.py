@@ -299,9 +299,9 @@ def _without_lacking(
     verdict: Verdict, trials: Sequence[TrialResult], unfinished: Sequence[Unfinished]
 ) -> Verdict:
     """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
-    valued = [trial for trial in trials if verdict.quantity.read(trial) is not None]
-    valueless = [Unfinished(trial.path) for trial in trials if trial not in valued]
-    lacking = one_sided(verdict.question, valued, [*unfinished, *valueless])
+    by_value = group_by(trials, lambda trial: verdict.quantity.read(trial) is not None)
+    valueless = [Unfinished(trial.path) for trial in by_value.get(False, [])]
+    lacking = one_sided(verdict.question, by_value.get(True, []), [*unfinished, *valueless])
 
     def favours_lacking(outcome: Outcome) -> bool:
         sides = favoured(outcome, verdict.question.sign, verdict.quantity.direction)
