@@ -4,7 +4,9 @@ import os
 
 import pytest
 
+from gsbench.analysis.comparison import compare
 from gsbench.analysis.differences import find_superseded
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment, read_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs import freshness
@@ -93,10 +95,17 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path
     (tmp_path / "patient.py").write_text("x = 2\n")
     table = table_of(tmp_path)
     assert table.rows[0].entries[0].text == "28.00"
-    assert (
+    line = (
         "patient was edited since: 1 trial of sfm-adc came from the old code. Give the command again "
-        "to run the new one." in table.notes
+        "to run the new one."
     )
+    assert line in table.notes
+    experiment = load_experiment(tmp_path, "exp")
+    comparison = compare(experiment)
+    # the sweep's end, plan and site have the remarks
+    assert [*map(str, comparison.remarks)] == [line]
+    assert comparison.to_json()["left_out"][0] == line
+    assert line in build_report(experiment)
 
 
 @pytest.mark.parametrize(

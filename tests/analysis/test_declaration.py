@@ -233,12 +233,18 @@ def test_a_repeated_declaration_counts_from_its_first_time():
     assert latest_declaration([psnr, flip, later]) is later
 
 
-def test_a_replaced_declaration_is_reported(tmp_path):
-    experiment = declared_experiment(tmp_path, ("psnr", EARLY), ("flip", LATE))
-    found = compare(experiment).declared
-    assert found is not None
-    assert found.metric == "flip"
-    assert "Declared before it: psnr (2020-01-01 00:00 UTC)." in lines(experiment)
+@pytest.mark.parametrize(
+    "records, metric, other",
+    [
+        ([("psnr", EARLY), ("flip", LATE)], "PSNR (dB)", "flip (2037-01-01 00:00 UTC)"),
+        ([("flip", EARLY), ("psnr", EARLY)], "PSNR (dB)", "flip (2020-01-01 00:00 UTC)"),
+    ],
+    ids=["after the results", "replaced before them"],
+)
+def test_another_declared_metric_is_reported(tmp_path, records, metric, other):
+    said = lines(declared_experiment(tmp_path, *records))
+    assert f"{metric} was declared beforehand" in said
+    assert f"Also declared, but in force for no arm: {other}." in said
 
 
 OLDER = (0, 1, 3)  # two trials of the baseline, which do no harm, and one of the arm
@@ -345,7 +351,9 @@ def test_declared_trials_that_are_missing_are_counted(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
     assert standing(experiment).beforehand
-    assert "4 of the 16 declared trials are still missing" in lines(experiment)
+    (line,) = texts(compare(experiment).remarks)
+    assert "4 of the 16 declared trials are still missing" in line
+    assert line in build_report(experiment)
 
 
 def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(tmp_path):

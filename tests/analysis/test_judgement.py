@@ -112,7 +112,7 @@ def test_no_ratio_is_taken_of_a_value_of_zero(make_experiment, densify):
     assert pair(trials, replace(PSNR, metric="ssim", relative=True)).seeds == 3  # all below one
     found = pair(trials, replace(PSNR, relative=True))
     assert found.rows[0].seeds == (0, 2)
-    assert "garden seed 1: PSNR (dB) is 0, and a ratio needs numbers above 0" in texts(
+    assert "garden seed 1 not compared: PSNR (dB) is 0, and a ratio needs numbers above 0" in texts(
         found.left_out
     )
 

@@ -85,6 +85,11 @@ def test_each_pair_of_arms_is_a_question_about_the_primary_metric():
         "stops when decided, by psnr and a least difference of 0.1: 2 pairs of arms, looks at 2, 3 "
         "seeds, 6 trials until the first, 9 at most"
     )
+    control = plan_sweep(
+        composed([*WORDS, "densify=adc,mcmc,volumetric", "+eval.controls={volumetric: mcmc}"])
+    )
+    asked = [(str(one.arm), str(one.baseline)) for one in control.declaration.questions]
+    assert asked[2:] == [("sfm-volumetric", "sfm-mcmc")]
     (own,) = plan_sweep(composed([*WORDS, "launch.least_difference=0.25"])).declaration.questions
     assert own.least == 0.25
 

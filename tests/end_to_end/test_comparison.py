@@ -52,8 +52,7 @@ def test_differences_of_arms_are_named_and_arms_added_later_are_reported(
     assert run(["-m", *TINY, *OWN, "densify.interval=40", "allow_targets=[patient_arm]"]) == 0
     notes = tables()
     assert verdict in notes.splitlines()
-    # The new arm's command declared nothing.
-    assert "An arm whose metric or trials were declared after its first result" in notes
+    # Its command named no metric, so the declared one stays for its trials, with its own time.
     assert "Verdict, random-patient against random-adc" in notes
     assert (
         "random-patient differs from random-adc by rule patient_arm.Patient and schedule" in notes

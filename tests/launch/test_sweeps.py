@@ -450,6 +450,15 @@ def test_failed_trial_does_not_stop_the_others(fake_trial, capsys):
     assert order == [1]
 
 
+def test_progress_names_the_arms_of_a_sweep_by_their_settings(fake_trial, capsys):
+    set_up_logging()
+    words = ["name=x", "densify=adc", "densify.prune_opacity=0.01,0.02"]
+    assert run_trials(composed(words)) == 0
+    said = capsys.readouterr().err
+    for number, value in enumerate(("0.01", "0.02"), 1):
+        assert f"{number} of 2: courtyard/sfm-adc[prune_opacity={value}] seed 0 (" in said
+
+
 def test_busy_trial_comes_last(fake_trial):
     behaviour, order = fake_trial
     behaviour[0] = BusyError("another process is at it")

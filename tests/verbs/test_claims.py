@@ -1,13 +1,15 @@
 """``gsbench plan`` and ``ablate``, with made-up results."""
 
+import json
 import re
 from shlex import split
 
+import numpy as np
 import pytest
 
 from gsbench.verbs import claims
 from gsbench.verbs.claims import plan
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.synthetic import Plan, write_runs, write_trial
 from tests.finished import write_results
 from tests.helpers import refusal
 
@@ -39,6 +41,25 @@ def test_plan_answers_for_the_command_given(pilots, capsys):
         trials[words[0]] = int(re.search(r"on these scenes.*?\((\d+) trials", out)[1])
         assert re.search(r"only within 0\.\d+ to 1\.\d+ times \(80 % of pilots\)", out)
     assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
+
+
+def test_arms_that_cannot_be_planned_for_are_named_beside_the_others(pilots, capsys):
+    """One is equal to the baseline, another has one seed."""
+    (pilots / "one").rename(pilots / "some")
+    for path in (pilots / "some").glob("*/*/*/results.json"):
+        data = json.loads(path.read_text()) | {"experiment": "some"}
+        path.write_text(json.dumps(data))
+        for arm in ("same", "short"):
+            changed = {"densify": arm}
+            if arm == "same" and data["densify"] == "adc":
+                write_trial(pilots, data | changed, {"psnr": np.full(2, data["metrics"]["psnr"])})
+            if arm == "short" and data["densify"] != "adc" and data["seed"] == 0:
+                write_trial(pilots, data | changed, {"psnr": np.full(2, data["metrics"]["psnr"])})
+    assert plan(["some"], pilots) == 0
+    out = capsys.readouterr().out
+    assert "sfm-adc and sfm-same: differences in PSNR (dB) do not vary between seeds" in out
+    assert "sfm-adc and sfm-short: planning needs pilot trials with at least two seeds" in out
+    assert "sfm-volumetric against sfm-adc\n  differences in PSNR (dB) vary" in out
 
 
 def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, capsys):

@@ -60,17 +60,22 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     keys = {arm: {trial.key for trial in own} for arm, own in by_arm.items()}
     ages |= {arm: -math.inf for arm in arms if keys[arm] & {first for first, _ in planned}}
     in_looks = {arm for arm in arms if keys[arm] & set(itertools.chain(*planned))}
+    declared = {
+        (first, second)
+        for first, second in itertools.permutations(arms, 2)
+        if any(one in keys[first] and other in keys[second] for one, other in planned)
+    }
     pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
+    # with another baseline, a declared pair is not also asked the other way round
+    pairs = [(one, two) for one, two in pairs if (two, one) not in declared]
+    pairs += sorted(declared.difference(pairs))
     pairs += [
         (first, second)
         for first, second in baseline_settings(arms, ages, baseline)
         if (first, second) not in pairs
         # settings under which no two trials can be paired, such as budgets, give no verdict
         and pair_trials(trials, first, second)
-        and (
-            not {first, second} <= in_looks
-            or any(one in keys[first] and other in keys[second] for one, other in planned)
-        )
+        and not {first, second} <= in_looks
     ]
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
 
@@ -118,28 +123,69 @@ class Comparison:
         return [*self.arms.uncompared, *unused_trials(trials, verdicts)]
 
     @cached_property
+    def remarks(self) -> list[Note]:
+        """What must be known beside the sentences, wherever they stand.
+
+        That is what no verdict uses, old code, and declared trials that are missing.
+        """
+        lacking = [
+            note
+            for one in self.answers
+            for note in one.notes
+            if note.kind in ("no direction", "valueless")
+        ]
+        early = [note for note in self._progress if note.kind == "early look"]
+        return [*self.unused, *dict.fromkeys(lacking), *edited_notes(self.trials), *early]
+
+    @cached_property
+    def _progress(self) -> list[Note]:
+        return self.declared.progress(self.trials) if self.declared and self.answers else []
+
+    @cached_property
     def declared_notes(self) -> list[Note]:
-        """Notes on what was declared, and how much of it is still to come."""
+        """Notes on what was declared, and on looks to come."""
         if self.declared is None or not self.answers:
             return []
-        metric = self.answers[0].declared
-        name = self.declared.metric if metric is None else metric.name
-        standings = [one.standing for one in self.answers if one.standing is not None]
-        progress = self.declared.progress(self.trials)
-        return [*self.declared.notes(name, standings), *progress]
+        notes, in_force = [], group_by(self.answers, lambda one: one.declared)
+        for metric, own in in_force.items():
+            if metric is not None and own[0].standing is not None:
+                doubted = any(not one.beforehand for one in own)
+                notes += own[0].standing.active.notes(metric.name, doubted)
+        known = [one.standing.active.records for one in self.answers if one.standing]
+        unused = [one for one in self.declared.declared if one not in itertools.chain(*known)]
+        notes += [Note.of("replaced", metric=one.primary, when=one.when) for one in unused]
+        return [*notes, *(note for note in self._progress if note.kind == "looks to come")]
 
     def notes(self) -> list[Note]:
-        """The notes below a table: verdicts, what no verdict uses, and what was declared."""
+        """The notes below a table: verdicts, remarks, and what was declared."""
         return [
             *(Note.of("verdict", sentence=one) for one in self.sentences),
-            *self.unused,
+            *self.remarks,
             *self.declared_notes,
         ]
 
     def to_json(self) -> dict[str, Any]:
         """The verdicts on each compared pair of arms and what is left out, for other programs."""
-        left_out = texts([*self.unused, *self.experiment.warnings])
+        left_out = texts([*self.remarks, *self.experiment.warnings])
         return {"pairs": [_as_json(one) for one in self.answers], "left_out": left_out}
+
+
+def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
+    """A note for each of the user's modules that was edited after it made some of the trials."""
+    of_module: dict[str, list[TrialResult]] = {}
+    # Trials of one version of the code have the same edits, and finding them reads the modules.
+    for own in group_by(trials, lambda trial: frozenset(trial.code.items())).values():
+        for edit in own[0].edits:
+            of_module.setdefault(edit.name, []).extend(own)
+    return [
+        Note.of(
+            "edited",
+            module=module,
+            trials=len(own),
+            arms=sorted({f"{one.init}-{one.densify}" for one in own}),
+        )
+        for module, own in of_module.items()
+    ]
 
 
 def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) -> list[Note]:
@@ -169,6 +215,8 @@ def _reasons(verdict: Verdict) -> list[str]:
     reasons = [note.sentence for note in (verdict.untestable, *verdict.notes) if note]
     if verdict.question.seeds and verdict.answer is not None and verdict.final:
         reasons.append(Note.of("decided before", seeds=verdict.pairs.seeds).sentence)
+    if not reasons and verdict.question.seeds and verdict.answer is None:
+        reasons.append(Note.of("waits").sentence)
     return reasons
 
 
@@ -201,7 +249,10 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment.folder, arms.trials, experiment.older)
-    answers = judge_pairs(arms.trials, arms.pairs, declared, unfinished(experiment))
+    usual = arms if baseline == BASELINE else pair_arms(experiment)
+    known = {frozenset(pair) for pair in usual.pairs}
+    others = [pair for pair in arms.pairs if frozenset(pair) not in known]
+    answers = judge_pairs(arms.trials, arms.pairs, declared, unfinished(experiment), others)
     if (experiment.folder / LEDGER).exists():
         answers = [
             replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers

@@ -8,14 +8,14 @@ harm, since adding until an effect appears finds effects that do not exist.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import reduce
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 from pathlib import Path
 
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
-from gsbench.runs.experiments import Declaration, merge_planned, read_declarations
+from gsbench.runs.experiments import Declaration, Question, merge_planned, read_declarations
 from gsbench.runs.layout import SEED
 from gsbench.words import counted
 
@@ -25,19 +25,23 @@ class Standing:
     """The standing of a declaration to the question about one arm.
 
     ``declaration`` is the one that first named the arm, with its trials up to the arm's first
-    result; questions of one such declaration share an error rate. ``seen`` are the arm's trials
-    that were measured before the metric was declared, ``added`` the trials of its pairs that were
-    not declared before its first result.
+    result; questions of one such declaration share an error rate. ``question`` is that about these
+    arms if a sweep in looks names its questions. ``seen`` are the arm's trials that were measured
+    before the metric was declared, ``added`` the trials of its pairs that were not declared before
+    its first result. ``other_pair``: these arms are no pair of the declaration.
     """
 
+    active: "ActiveDeclaration"
     declaration: Declaration
+    question: Question | None
     seen: tuple[TrialResult, ...]
     added: tuple[TrialResult, ...]
+    other_pair: bool
 
     @property
     def beforehand(self) -> bool:
         """Return whether the question was fixed before any result of its arm."""
-        return not self.seen and not self.added
+        return not self.doubt
 
     @property
     def doubt(self) -> str:
@@ -49,21 +53,35 @@ class Standing:
         if self.added:
             were = "was" if len(self.added) == 1 else "were"
             return f"{counted(len(self.added), 'trial')} {were} added after the arm's first result"
-        return ""
+        return "not for this pair of arms" if self.other_pair else ""
 
 
 @dataclass(frozen=True)
 class ActiveDeclaration:
     """The declarations in force in an experiment: all of the latest metric, the oldest first.
 
-    ``folder`` is the experiment's, ``older`` are trials of earlier code, which do not count but
-    were seen. ``earlier`` are the declarations of other metrics that this one replaced.
+    ``declared`` are those of all metrics, ``folder`` is the experiment's. ``older`` are trials of
+    earlier code, which do not count but were seen.
     """
 
-    records: tuple[Declaration, ...]
-    earlier: tuple[Declaration, ...]
+    declared: tuple[Declaration, ...]
     folder: Path
     older: tuple[TrialResult, ...] = ()
+
+    @cached_property
+    def records(self) -> tuple[Declaration, ...]:
+        latest, others = self.declared[-1], self.replaced
+        return tuple(
+            one
+            for one in self.declared
+            if one.primary == latest.primary
+            and (not others or one.moment > others[-1].moment or one is latest)
+        )
+
+    @property
+    def replaced(self) -> tuple[Declaration, ...]:
+        """The declarations of other metrics."""
+        return tuple(one for one in self.declared if one.primary != self.declared[-1].primary)
 
     @property
     def metric(self) -> str:
@@ -74,18 +92,39 @@ class ActiveDeclaration:
         """The question of the verdict, interpolation or extrapolation; "" if it is about both."""
         return self.records[0].questions[0].about
 
-    def standing(self, baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> Standing:
-        """The standing to the question about ``arm``, given both arms' trials."""
+    def standing(
+        self, baseline: Sequence[TrialResult], arm: Sequence[TrialResult], other_pair: bool = False
+    ) -> Standing:
+        """The standing to the question about ``arm``, given both arms' trials.
+
+        A metric that is declared after the arm's first result is in force for later arms alone.
+        ``other_pair`` says that the arms would not be compared without a choice made later.
+        """
+        old = [
+            one
+            for one in self.older
+            if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)
+        ]
+        first = min((trial.measured for trial in (*arm, *old)), default=math.inf)
+        if known := [one for one in self.declared if one.moment <= first]:
+            metric = known[-1].primary
+            kept = tuple(o for o in self.declared if o.moment <= first or o.primary == metric)
+            if kept != self.declared:
+                return replace(self, declared=kept).standing(baseline, arm, other_pair)
         first = min((trial.measured for trial in arm), default=math.inf)
         # times are whole seconds: a declaration of the arm's first second may be later
         before = [one for one in self.records if one is self.records[0] or one.moment < first]
         keys = {trial.key for trial in arm}
         naming = [one for one in before if keys & one.planned.keys()] or before[:1]
         in_looks = [one for one in naming if one.looks]
-        old = [
-            one
-            for one in self.older
-            if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)
+        of_baseline = {trial.key for trial in baseline}
+        asked = [
+            (one, question)
+            for one in in_looks
+            for question in one.questions
+            # some scenes may have no result yet
+            if any(a in of_baseline for a, _ in question.scenes.values())
+            and any(b in keys for _, b in question.scenes.values())
         ]
         seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
@@ -102,12 +141,14 @@ class ActiveDeclaration:
             named = (one.moment for one in self.records if one.names_trials)
             next_record = min(named, default=math.inf)
             added = [one for one in paired if one.measured >= next_record]
-        declaration = in_looks[-1] if in_looks else naming[0]
-        return Standing(declaration, tuple(seen), tuple(added))
+        declaration, question = asked[-1] if asked else ((*in_looks, naming[0])[0], None)
+        # a sweep in looks stopped by its own questions
+        other_pair = not asked if in_looks else other_pair
+        return Standing(self, declaration, question, tuple(seen), tuple(added), other_pair)
 
     def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
         """A note on the declared trials that are missing; none if all are there."""
-        planned = reduce(merge_planned, (one.planned for one in self.records))
+        planned = reduce(merge_planned, (one.planned for one in self.declared))
         done = {(trial.key, trial.seed) for trial in trials}
         replaced = {trial.key for trial in self.older}
         wanted = [
@@ -120,7 +161,7 @@ class ActiveDeclaration:
         missing = sum(one not in done for one in wanted)
         if not missing:
             return []
-        kind = "looks to come" if any(one.looks for one in self.records) else "early look"
+        kind = "looks to come" if any(one.looks for one in self.declared) else "early look"
         return [Note.of(kind, missing=missing, declared=len(wanted))]
 
     def _is_replaced(self, key: str, seeds: Iterable[int], trials: Sequence[TrialResult]) -> bool:
@@ -138,16 +179,12 @@ class ActiveDeclaration:
             return any(one.key != key and settings_text(one.config) == text for one in same_arm)
         return False
 
-    def notes(self, name: str, standings: Iterable[Standing]) -> list[Note]:
-        """Notes that say when the metric called ``name`` was declared, and for which trials."""
+    def notes(self, name: str, doubted: bool) -> list[Note]:
+        """Notes on when the metric called ``name`` was declared, and if this is ``doubted``."""
         name += f" at {self.question}" if self.question else ""
         when = self.records[0].when
-        doubted = any(one.doubt for one in standings)
         notes = [Note.of("declared" if doubted else "declared beforehand", metric=name, when=when)]
-        notes += [Note.of("doubted", metric=name)] if doubted else []
-        return notes + [
-            Note.of("replaced", metric=one.primary, when=one.when) for one in self.earlier
-        ]
+        return notes + ([Note.of("doubted", metric=name)] if doubted else [])
 
 
 def _places(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:
@@ -166,11 +203,4 @@ def active_declaration(
     declared = [one for one in recorded if one.kind == "sweep"]
     if not declared:
         return None
-    others = [one for one in declared if one.primary != declared[-1].primary]
-    current = [
-        one
-        for one in declared
-        if one.primary == declared[-1].primary
-        and (not others or one.moment > others[-1].moment or one is declared[-1])
-    ]
-    return ActiveDeclaration(tuple(current), tuple(others), folder, tuple(older))
+    return ActiveDeclaration(tuple(declared), folder, tuple(older))

@@ -207,9 +207,7 @@ def judge(
             answers = answer_family(differences, declaration.error_rate / candidates)
             for k, answer in zip(family, answers, strict=True):
                 decided = _decide(replace(unjudged[k], family=len(family)), answer)
-                if lacking:
-                    decided = _without_lacking(decided, trials_of(decided.question), lacking)
-                judged[k] = decided
+                judged[k] = _without_lacking(decided, trials_of(decided.question), lacking)
     return _with_scenes(judged, declaration.error_rate)
 
 
@@ -230,7 +228,8 @@ def _with_pairs(
     if not pairs.rows and pairs.left_out and question.scenes:
         return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
     if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
-        return replace(verdict, pairs=replace(pairs, rows=()))
+        none = pairs.first(0) if declaration.looks else replace(pairs, rows=())
+        return replace(verdict, pairs=none)
     if (
         pairs.rows
         and question.scenes
@@ -300,7 +299,9 @@ def _without_lacking(
     verdict: Verdict, trials: Sequence[TrialResult], unfinished: Sequence[Unfinished]
 ) -> Verdict:
     """The verdict, undecided if it favours an arm that lacks results which the other arm has."""
-    lacking = one_sided(verdict.question, trials, unfinished)
+    by_value = group_by(trials, lambda trial: verdict.quantity.read(trial) is not None)
+    valueless = [Unfinished(trial.path) for trial in by_value.get(False, [])]
+    lacking = one_sided(verdict.question, by_value.get(True, []), [*unfinished, *valueless])
 
     def favours_lacking(outcome: Outcome) -> bool:
         sides = favoured(outcome, verdict.question.sign, verdict.quantity.direction)

@@ -45,7 +45,8 @@ SENTENCES: dict[str, str] = {
     "unlike": "{text}",  # the whole text of an error
     "conditions": "{scene}: the arms differ in {conditions:list}, so they are not compared",
     "unpaired": "{scene}: seed {seed} has no partner",
-    "valueless": "{places:few}: {reason}",
+    "valueless": "{places:few} not compared: {reason}",
+    "no direction": "in no verdict, {reason}",
     "uneven": (
         "{least:n seed} of each scene can count: there are no more of {scenes:few} (others have up "
         "to {most})"
@@ -73,6 +74,7 @@ SENTENCES: dict[str, str] = {
     ),
     "unused": "In no verdict: {trials:few} ({reasons:few}).",
     "not planned": "seeds after an undeclared or missing one do not count",
+    "waits": "a look waits for all of its trials",
     "decided before": "the question was decided with {seeds:n seed}",
     "not asked": "no declared question is about them",
     # ---- arms that are unlike in more than was asked
@@ -109,7 +111,7 @@ SENTENCES: dict[str, str] = {
         "metrics, adjusted for their number. To test {metric} alone, run other seeds under another "
         "name, all by one command."
     ),
-    "replaced": "Declared before it: {metric} ({when}).",
+    "replaced": "Also declared, but in force for no arm: {metric} ({when}).",
     "looks to come": (
         "Seeds come in planned looks (launch.stop_when_decided). Not there yet: {missing} of the "
         "{declared:n declared trial}."

@@ -22,6 +22,7 @@ from gsbench.analysis.differences import differing_conditions
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import asked_quantity, value_of
 from gsbench.analysis.results import TrialPair, TrialResult, group_by
+from gsbench.analysis.trial_settings import Configured
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Question
 
@@ -330,9 +331,10 @@ def uncompared(arms: Sequence[Arm], pairs: Sequence[tuple[Arm, Arm]], baseline: 
     return notes
 
 
-def controls_of(trials: Sequence[TrialResult]) -> dict[str, str]:
+def controls_of(trials: Sequence[Configured]) -> dict[str, str]:
     """The control of each densifier: another densifier that the trials' ``eval.controls`` name."""
-    firsts = [group[0] for group in group_by(trials, lambda trial: trial.arm).values()]
+    arms = group_by(trials, lambda trial: (trial.init, trial.densify))
+    firsts = [group[0] for group in arms.values()]
     return {
         key.removeprefix(CONTROLS): str(value)
         for trial in firsts

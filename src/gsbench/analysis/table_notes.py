@@ -28,7 +28,6 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
     return [
         *doubt_notes(trials),
         *origin_notes(trials),
-        *edited_notes(trials),
         *comparison_notes(experiment),
         *held_out_notes(trials),
         *points_notes(trials),
@@ -38,7 +37,7 @@ def trials_notes(experiment: Experiment, trials: Sequence[TrialResult]) -> list[
 
 
 def comparison_notes(experiment: Experiment) -> list[Note]:
-    """Notes on the compared arms: the verdicts, what no verdict uses, and caveats.
+    """Notes on the compared arms: verdicts, remarks and caveats.
 
     They are about the whole experiment, so choosing the trials that a table shows cannot change a
     verdict.
@@ -112,24 +111,6 @@ def origin_notes(trials: Sequence[TrialResult]) -> list[Note]:
         arms = [f"{arm} (version {made})" if trained_here else arm for arm, made in sorted(own)]
         notes += [Note.of(kind, arms=arms)] if own else []
     return notes
-
-
-def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
-    """A note for each of the user's modules that was edited after it made some of the trials."""
-    of_module: dict[str, list[TrialResult]] = {}
-    # Trials of one version of the code have the same edits, and finding them reads the modules.
-    for own in group_by(trials, lambda trial: frozenset(trial.code.items())).values():
-        for edit in own[0].edits:
-            of_module.setdefault(edit.name, []).extend(own)
-    return [
-        Note.of(
-            "edited",
-            module=module,
-            trials=len(own),
-            arms=sorted({f"{one.init}-{one.densify}" for one in own}),
-        )
-        for module, own in of_module.items()
-    ]
 
 
 def machine_notes(trials: Sequence[TrialResult]) -> list[Note]:

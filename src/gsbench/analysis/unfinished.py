@@ -21,7 +21,7 @@ BASELINE, ARM = 0, 1  # the sides of a question
 
 @dataclass(frozen=True)
 class Unfinished:
-    """The folder of a trial that failed, was stopped or is damaged."""
+    """The folder of a trial that failed, was stopped, is damaged, or lacks the metric."""
 
     path: Path
 
@@ -85,6 +85,6 @@ def one_sided(
 def lacking_words(lacking: Sequence[Unfinished]) -> str:
     """The reason why a verdict that would favour an arm with such trials is undecided."""
     return (
-        f"{counted(len(lacking), 'trial')} of one arm alone failed or stopped, and those may be "
-        f"its bad ones: {some_of([one.label for one in lacking])}"
+        f"{counted(len(lacking), 'trial')} of one arm alone failed, stopped or gave no value, and "
+        f"those may be its bad ones: {some_of([one.label for one in lacking])}"
     )

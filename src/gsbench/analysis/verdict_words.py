@@ -69,7 +69,7 @@ def reason(verdict: Verdict, early: str = "") -> str:
     if verdict.outcome != UNDECIDED:
         return f"{outcome_words(verdict)}{_known_sign(verdict)}"
     if verdict.favours_lacking:
-        return "undecided, since trials of one arm alone failed"
+        return "undecided, since trials of one arm alone have no result"
     if verdict.rests_on_outlying:
         return "undecided, since it depends on trials far outside the others"
     return early or f"undecided{' by all seeds' if verdict.final else ' so far'}"
@@ -187,11 +187,13 @@ def sentence(judged: PairVerdicts) -> str:
     If the question was declared in time, the sentence has only the declared metric's verdict.
     """
     verdicts, against = judged.verdicts, f"{judged.second} against {judged.first}"
-    if judged.missing is not None and judged.beforehand:
-        return (
-            f"{against}: no verdict, since the declared metric {judged.missing.about} has no "
-            f"value ({judged.missing.sentence})."
-        )
+    if (missing := judged.missing) is not None and judged.beforehand:
+        if missing.kind == "no pairs" and (waits := _before_looks(judged)):
+            return f"{against}: no verdict yet, {waits}."
+        what = f"the declared metric {missing.about} has no"
+        if missing.kind == "no direction":
+            return f"{against}: no verdict, since {what} direction ({missing['reason']})."
+        return f"{against}: no verdict, since {what} value ({missing.sentence})."
     if not verdicts:
         return f"{against}: no verdict, since {no_pairs(judged)}."
     where = _scope(verdicts[0])
@@ -204,7 +206,8 @@ def sentence(judged: PairVerdicts) -> str:
     first = verdicts[0]
     if judged.role(first) == DECLARED:
         if first.interval is None:
-            return f"{against}: no verdict yet, {first.untestable or _too_few(judged, first)}."
+            why = first.untestable or _before_looks(judged) or TOO_FEW.format(where)
+            return f"{against}: no verdict yet, {why}."
         waits = "" if first.final else "not decided yet, "
         details = [line for line in (like_these_words(first), outlying_words(first)) if line]
         words = "; ".join([in_words(first), *details])
@@ -226,11 +229,11 @@ BEFORE_LOOKS = (
 )
 
 
-def _too_few(judged: PairVerdicts, verdict: Verdict) -> str:
+def _before_looks(judged: PairVerdicts) -> str:
     standing = judged.standing
-    if verdict.question.seeds and standing is not None and standing.declaration.looks:
-        return BEFORE_LOOKS.format(standing.declaration.looks[0])
-    return TOO_FEW.format(_scope(verdict))
+    if standing is None or standing.question is None:
+        return ""
+    return BEFORE_LOOKS.format(standing.declaration.looks[0])
 
 
 def no_pairs(judged: PairVerdicts) -> str:

@@ -79,28 +79,50 @@ def judge_pairs(
     pairs: Sequence[ArmPair],
     declared: ActiveDeclaration | None = None,
     lacking: Sequence[Unfinished] = (),
+    others: Sequence[ArmPair] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
-    ``declared`` defines the families of tests; ``lacking`` are trials without a result.
+    ``declared`` defines the families of tests; ``lacking`` are trials without a result. The pairs
+    ``others`` are no questions of it.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
-    primary = None if declared is None else asked_quantity(declared.metric, trials)
+    primaries: dict[ArmPair, Quantity] = {}
     standings: dict[ArmPair, Standing] = {}
+    undirected: dict[ArmPair, list[Note]] = {}
     asked: list[tuple[ArmPair, Quantity, Question]] = []
+    before: list[tuple[ArmPair, Question, Standing]] = []
+    late: dict[ArmPair, list[TrialResult]] = {}
     for pair in pairs:
         metrics = [
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
         ]
-        if declared is not None and primary is not None:
-            standings[pair] = declared.standing(*(by_arm.get(arm, []) for arm in pair))
+        if declared is not None:
+            first, second = (by_arm.get(arm, []) for arm in pair)
+            standing = declared.standing(first, second, other_pair=pair in others)
+            primary = asked_quantity(standing.active.metric, trials)
+            standings[pair], primaries[pair] = standing, primary
             metrics = [primary, *(metric for metric in metrics if metric.key != primary.key)]
+        undirected[pair] = [
+            replace(Note.of("no direction", reason=NO_DIRECTION), about=metric.name)
+            for metric in metrics
+            if not metric.direction
+        ]
         for metric in metrics:
             if metric.direction:
-                question = _question(by_arm, pair, metric, declared, standings.get(pair))
+                question = _question(by_arm, pair, metric, standings.get(pair))
                 asked.append((pair, metric, question))
-    questions = [(pair, own) for pair, _, own in asked]
-    verdicts = _judge_families(trials, questions, standings, lacking)
+        if (known := standings.get(pair)) is not None and known.added:
+            # The question stays in its family as it was before, so that others keep their verdict.
+            # Looks have fixed shares.
+            whole = replace(known, added=())
+            counts = whole.beforehand and whole.question is None
+            directed = [metric for metric in metrics if metric.direction and counts]
+            before += [(pair, _question(by_arm, pair, one, whole), whole) for one in directed]
+            places = {(trial.scene, trial.seed) for trial in known.added}
+            late[pair] = [t for t in by_arm.get(pair[1], []) if (t.scene, t.seed) in places]
+    questions = [(pair, own, standings.get(pair)) for pair, _, own in asked]
+    verdicts = _judge_families(trials, questions, lacking, before, late)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0][0])
     judged = []
     for pair in pairs:
@@ -112,34 +134,43 @@ def judge_pairs(
             else:
                 found = (_why_missing(_trials_of(by_arm, pair), metric, verdict),)
             notes += [replace(note, about=metric.name) for note in found]
-        if primary is not None and not primary.direction:
-            notes.append(replace(Note.of("no value", reason=NO_DIRECTION), about=primary.name))
-        standing = standings.get(pair)
-        judged.append(PairVerdicts(*pair, tuple(own), tuple(notes), primary, standing))
+        said = (*notes, *undirected[pair])
+        judged.append(
+            PairVerdicts(*pair, tuple(own), said, primaries.get(pair), standings.get(pair))
+        )
     return judged
 
 
 def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdict) -> Note:
     """The first reason why a metric has no pair of trials with values."""
-    reasons = [trial.unavailable.get(metric.key) for trial in trials]
-    if found := [short_reason(reason) for reason in reasons if reason is not None]:
-        return Note.of("no value", reason=found[0])
     question = verdict.question
     nothing = Note.of("no pairs", baseline=question.baseline, arm=question.arm)
-    return (*verdict.notes, nothing)[0]
+    why = (*verdict.notes, nothing)[0]
+    lacking = [trial for trial in trials if metric.read(trial) is None]
+    if not lacking:
+        return why
+    reasons = [trial.unavailable.get(metric.key) for trial in lacking]
+    reason = next((short_reason(one) for one in reasons if one is not None), why.sentence)
+    if len(lacking) == len(trials):
+        return Note.of("no value", reason=reason)
+    arms = [str(arm) for arm in dict.fromkeys(trial.arm for trial in lacking)]
+    return Note.of("valueless", places=arms, reason=reason)
 
 
 def _judge_families(
     trials: Sequence[TrialResult],
-    asked: Sequence[tuple[ArmPair, Question]],
-    standings: Mapping[ArmPair, Standing],
+    asked: Sequence[tuple[ArmPair, Question, Standing | None]],
     lacking: Sequence[Unfinished],
+    before: Sequence[tuple[ArmPair, Question, Standing | None]],
+    late: Mapping[ArmPair, Sequence[TrialResult]],
 ) -> list[Verdict]:
-    """Judge each family of questions: those of one declaration, or of one exploratory pair."""
+    """Judge each family of questions: those of one declaration, or of one exploratory pair.
 
-    def family(entry: tuple[int, tuple[ArmPair, Question]]) -> tuple[object, ...]:
-        pair, question = entry[1]
-        standing = standings.get(pair)
+    Families also count the questions as they were ``before`` trials came that are too ``late``.
+    """
+
+    def family(entry: tuple[int, tuple[ArmPair, Question, Standing | None]]) -> tuple[object, ...]:
+        pair, question, standing = entry[1]
         if standing is None or not standing.beforehand:
             return pair
         # The baseline's own settings are a family of their own: questions about ideas pay nothing
@@ -149,8 +180,10 @@ def _judge_families(
         return named.time, named.hash, bool(question.seeds), is_setting
 
     verdicts: dict[int, Verdict] = {}
-    for own in group_by(enumerate(asked), family).values():
-        standing, questions = standings.get(own[0][1][0]), tuple(one for _, (_, one) in own)
+    for own in group_by(enumerate([*asked, *before]), family).values():
+        standing, questions = own[0][1][2], tuple(question for _, (_, question, _) in own)
+        added = {t.path for at, (pair, _, _) in own if at >= len(asked) for t in late[pair]}
+        counting = [trial for trial in trials if trial.path not in added] if added else trials
         # Without a time no trial is late, so Holm's method alone adjusts for the number of metrics.
         declaration = Declaration(time=NO_TIME, questions=questions)
         if standing is not None and standing.beforehand:
@@ -166,7 +199,7 @@ def _judge_families(
                 looks=looks,
             )
         places = [place for place, _ in own]
-        verdicts |= dict(zip(places, judge(trials, declaration, lacking), strict=False))
+        verdicts |= dict(zip(places, judge(counting, declaration, lacking), strict=False))
     return [verdicts[place] for place in range(len(asked))]
 
 
@@ -178,7 +211,6 @@ def _question(
     by_arm: Mapping[Arm, Sequence[TrialResult]],
     pair: ArmPair,
     metric: Quantity,
-    declared: ActiveDeclaration | None,
     standing: Standing | None,
 ) -> Question:
     """The question about two arms in one metric; in a sweep in looks, about the planned trials."""
@@ -190,17 +222,14 @@ def _question(
         baseline=baseline,
         arm=arm,
     )
-    if declared is None or standing is None or not standing.beforehand:
+    if standing is None or not standing.beforehand:
         return question
+    active, planned = standing.active, standing.question
     split_question = next((trial.question for trial in by_arm.get(baseline, [])), "")
-    is_primary = declared.question in ("", split_question) and metric.key == declared.metric
-    for planned in standing.declaration.questions:
-        keys = [{trial.key for trial in by_arm.get(side, [])} for side in pair]
-        if planned.scenes and all(
-            a in keys[0] and b in keys[1] for a, b in planned.scenes.values()
-        ):
-            question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
-            question = replace(question, least=planned.least) if is_primary else question
+    is_primary = active.question in ("", split_question) and metric.key == active.metric
+    if planned is not None:
+        question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
+        question = replace(question, least=planned.least) if is_primary else question
     return replace(question, secondary=not is_primary)
 
 

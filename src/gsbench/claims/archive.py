@@ -2,12 +2,13 @@
 
 An archive is a zip file that is also an RO-Crate 1.2 (`gsbench.claims.export` writes it). It holds:
 
-- ``results.jsonl``: the ``results.json`` of every trial, one per line, with the trial's folder;
+- ``results.jsonl``: the ``results.json`` of every trial, one per line, with the trial's folder, and
+  ``older`` where later code repeated it;
+- ``unfinished.jsonl``: folders and configurations of trials without a usable result, if any: no
+  verdict favours an arm that lacks them;
 - ``configurations.jsonl``: every configuration without the seed, with its trials' folders and
   seeds;
 - ``per_view.csv``: the metrics of every test view;
-- ``unfinished.jsonl``: folder and configuration of each trial without a usable result, since such
-  trials forbid verdicts (`gsbench.analysis.unfinished`);
 - ``declared.jsonl``: the declarations of the experiment, if there are any;
 - ``ledger.jsonl``: the ideas of a ledger (`gsbench ledger`), if it is one;
 - ``from_pixels.jsonl``: measures of the trials' pictures, if declared claims use them;
@@ -23,6 +24,7 @@ import csv
 import hashlib
 import io
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -57,7 +59,7 @@ FORMAT, VERSION = "gsbench results", 1
 PIXELS = "from_pixels.jsonl"
 MANIFEST, CRATE = "archive.json", "ro-crate-metadata.json"
 TRIALS, CONFIGURATIONS = "results.jsonl", "configurations.jsonl"
-UNFINISHED = "unfinished.jsonl"
+UNFINISHED, OLDER = "unfinished.jsonl", "older"
 PICTURES_FOLDER, PICTURES = "pictures", (RENDERS, GROUND_TRUTH)
 # Archives may come from strangers: these limits stop a zip bomb. They are larger than any
 # experiment needs.
@@ -84,7 +86,12 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             (_checked_folder(line["folder"]), line["results"]) for line in _lines(contents[TRIALS])
         ]
         _unpack(home, trials, contents)
-        unfinished = _unpack_unfinished(home, contents)
+        for line in _lines(contents[TRIALS]):
+            if line.get(OLDER):  # what was finished last counts
+                os.utime(home / line["folder"] / RESULTS, (0, 0))
+        unfinished = {
+            _unpack_unfinished(home, line) for line in _lines(contents.get(UNFINISHED, b""))
+        }
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, csv.Error) as error:
@@ -92,10 +99,9 @@ def unpack_archive(file: Path, runs: Path) -> Experiment:
             f"{file}: its content is not that of an archive ({error!r}): export it again"
         ) from None
     experiment = read_experiment(home)
-    of_unfinished = tuple(f"{path.relative_to(runs)}: " for path in unfinished)
-    faults = [one for one in experiment.warnings if not one.startswith(of_unfinished)]
-    if not experiment.trials or faults or set(experiment.lacking) != unfinished:
-        reason = next(iter(faults or experiment.warnings), "it has no trial")
+    others = set(experiment.lacking) != unfinished or len(experiment.warnings) > len(unfinished)
+    if not experiment.trials or others:
+        reason = experiment.warnings[0] if experiment.warnings else "it has no trial"
         raise InputError(f"{file}: {reason}")
     for trial in experiment.trials:
         try:
@@ -234,18 +240,14 @@ def _unpack(
             (home / name).write_bytes(contents[name])
 
 
-def _unpack_unfinished(home: Path, contents: Mapping[str, bytes]) -> set[Path]:
-    """Make the folders of trials without a usable result, and return them."""
-    folders = set()
-    for line in _lines(contents.get(UNFINISHED, b"")):
-        folder = home / _checked_folder(line["folder"])
-        if folder.exists():
-            raise InputError(f"the trial {line['folder']} is in it twice")
-        folder.mkdir(parents=True)
-        settings = yaml.safe_dump(line["configuration"], sort_keys=False)
-        (folder / CONFIG).write_text(settings, encoding="utf-8")
-        folders.add(folder)
-    return folders
+def _unpack_unfinished(home: Path, line: Mapping[str, Any]) -> Path:
+    """Make the folder of a trial without a usable result, and return it."""
+    folder = home / _checked_folder(line["folder"])
+    if folder.exists():
+        raise InputError(f"the trial {line['folder']} is in it twice")
+    folder.mkdir(parents=True)
+    (folder / CONFIG).write_text(yaml.safe_dump(line["configuration"]), encoding="utf-8")
+    return folder
 
 
 def _unpack_picture(home: Path, name: str, content: bytes) -> None:

@@ -23,6 +23,7 @@ from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import (
     Experiment,
     TrialResult,
+    newest_code,
     read_views,
 )
 from gsbench.claims.archive import (
@@ -31,6 +32,7 @@ from gsbench.claims.archive import (
     FORMAT,
     MANIFEST,
     NO_CONFIGURATION,
+    OLDER,
     PICTURES,
     PICTURES_FOLDER,
     PIXELS,
@@ -66,10 +68,10 @@ FILES = {  # media types and descriptions
         "application/jsonl",
         "Results of every trial, one JSON object a line: metrics, counts, hashes, code",
     ),
+    UNFINISHED: ("application/jsonl", "Trials that failed or were stopped, with configurations"),
     CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
-    UNFINISHED: ("application/jsonl", "Trials that failed, were stopped or are damaged"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
     LEDGER: ("application/jsonl", "The ideas in the order of their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
@@ -82,15 +84,16 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
-    unusable = list(experiment.lacking)
+    unfinished, experiment = [*experiment.lacking], newest_code(experiment)
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
-    for trial in experiment.trials:
+    # what earlier code showed was seen, so a declaration after it is late
+    for trial in (*experiment.trials, *experiment.older):
         try:
-            views, configuration = read_views(trial), json.dumps(_configuration(trial.path))
+            views, configuration = read_views(trial), _configuration(trial.path)
         except InputError as error:
             left_out.append(f"{trial.label}: {error}")
-            unusable.append(trial.path)
+            unfinished.append(trial.path)
             continue
         place = _folder(trial.path)
         rows += [{"trial": place, "view": view} | views[view] for view in sorted(views)]
@@ -100,16 +103,19 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
     contents = {
         TRIALS: _json_lines(
-            {"folder": _folder(trial.path), "results": _results(trial)} for trial in kept
+            {"folder": _folder(trial.path), "results": _results(trial)}
+            | ({OLDER: True} if trial in experiment.older else {})
+            for trial in kept
         ),
         CONFIGURATIONS: _json_lines(
             {"configuration": json.loads(text), "trials": trials}
             for text, trials in configurations.items()
         ),
         PER_VIEW: _table(rows),
-        **({UNFINISHED: _json_lines(map(_unfinished, sorted(unusable)))} if unusable else {}),
         **_declared(experiment.folder, kept),
     }
+    if unfinished:
+        contents[UNFINISHED] = _json_lines(map(_unfinished, unfinished))
     for trial in kept if pictures else ():
         for kind in PICTURES:
             place = f"{PICTURES_FOLDER}/{_folder(trial.path)}/{kind}"
@@ -185,15 +191,15 @@ def _folder(path: Path) -> str:
 
 
 def _unfinished(path: Path) -> dict[str, Any]:
-    """What an archive says of a trial without a usable result."""
-    configuration: dict[str, Any] = {}
-    with suppress(InputError):  # settings that cannot be read
+    """The line of a trial without a usable result; its configuration may be unreadable, too."""
+    configuration = "{}"
+    with suppress(InputError, OSError):
         configuration = _configuration(path)
-    return {"folder": _folder(path), "configuration": configuration}
+    return {"folder": _folder(path), "configuration": json.loads(configuration)}
 
 
-def _configuration(path: Path) -> dict[str, Any]:
-    """The ``config.yaml`` of a trial without its seed and without paths of this machine.
+def _configuration(path: Path) -> str:
+    """The trial's ``config.yaml`` as JSON, without paths of this machine.
 
     Raises InputError if it is damaged.
     """
@@ -204,8 +210,7 @@ def _configuration(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise InputError(f"its {CONFIG} is not a mapping")
     kept = {key: value for key, value in values.items() if key not in (*PRIVATE, SEED_KEY)}
-    shared: dict[str, Any] = without_paths(kept)
-    return shared
+    return json.dumps(without_paths(kept))
 
 
 def _results(trial: TrialResult) -> dict[str, Any]:

@@ -187,8 +187,9 @@ def read_studies(
     """
     studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
-        archived = unpack_archive(path, Path(folder)).trials
-        trials = with_variants(select_trials(archived, question.where))
+        archived = unpack_archive(path, Path(folder))
+        notes += [f"{name}: left out, {line}" for line in archived.warnings]
+        trials = with_variants(select_trials(archived.trials, question.where))
         by_protocol = sorted(group_by(trials, lambda trial: trial.record.protocol).items())
         for protocol, own in by_protocol:
             groups = _group_into_studies(own, _arm_pairs(own, question, path))

@@ -101,7 +101,7 @@ def _section(experiment: Experiment, key: str) -> dict[str, Any]:
         "claims": claims,
         "lines": comparison.sentences,
         "tables": tables,
-        "notes": [*notes, *comparison.unused, *experiment.warnings],
+        "notes": [*notes, *comparison.remarks, *experiment.warnings],
     }
     ranks = ranks if comparison.pairs else []
     return {"name": experiment.name, "key": key, "ranks": ranks} | shown

@@ -19,7 +19,7 @@ from gsbench.analysis.fairness import counts_note
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
-from gsbench.analysis.pairing import choose_pairs
+from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.results import Arm, TrialResult, group_by, newest_code, read_experiment
 from gsbench.analysis.trial_settings import GROUPS
 from gsbench.config.compose import Trial
@@ -151,7 +151,7 @@ def plan_sweep(trials: Sequence[Trial]) -> SweepInLooks:
     expected = with_variants([_planned(trial) for trial in trials])
     seeds = _seeds(expected)
     settings = {trial.arm: trial.config for trial in expected}
-    chosen = choose_pairs(sorted(settings), settings=settings)
+    chosen = choose_pairs(sorted(settings), controls=controls_of(expected), settings=settings)
     if not chosen:
         raise InputError(
             "launch.stop_when_decided compares arms, and this sweep has one: give two densifiers"
@@ -196,16 +196,20 @@ def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
 def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what one must know beside them.
 
-    These are unequal counts of Gaussians, said first, and trials in no verdict.
+    These are unequal counts of Gaussians, said first, trials in no verdict, and earlier code.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
-        comparison = compare(newest_code(read_experiment(home)))
+        experiment = read_experiment(home)
+        newest = newest_code(experiment)
+        superseded = newest.warnings[len(experiment.warnings) :]
+        comparison = compare(newest)
         counts = [
             counts_note(comparison.trials, *pair, equal_counts_settings)
             for pair in comparison.pairs
         ]
         unequal = [note for note in counts if note is not None]
-        for line in [*texts(unequal), *comparison.sentences, *texts(comparison.unused)]:
+        said = [*texts(unequal), *comparison.sentences, *texts(comparison.remarks), *superseded]
+        for line in said:
             log.info("%s", line)
 
 

@@ -22,9 +22,11 @@ from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError, require_no_links
 from gsbench.launch.states import (
+    arm_names,
     ask_queue,
     current_user,
     forget_submission,
+    label_of,
     read_queue,
     read_submission,
     record_submission,
@@ -79,7 +81,14 @@ class Outcome:
 def _say_last(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> None:
     """Log the outcome of the trial that ended last, and how many have ended."""
     last = outcomes[-1]
-    log.info("%s: %s  (%d of %d)", last.label, last.message, len(outcomes), len(trials))
+    label = _labels(trials)[last.folder]
+    log.info("%s: %s  (%d of %d)", label, last.message, len(outcomes), len(trials))
+
+
+def _labels(trials: Sequence[Trial]) -> dict[Path, str]:
+    """The names of trials in messages, with the settings that distinguish their arms."""
+    names = arm_names({trial.folder: trial.overrides for trial in trials})
+    return {folder: label_of(folder, names) for folder in names}
 
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
@@ -103,9 +112,10 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
+    labels = _labels(trials)
     for number, trial in enumerate(trials, 1):
         if len(trials) > 1:
-            log.info("%d of %d: %s", number, len(trials), trial.files.label)
+            log.info("%d of %d: %s", number, len(trials), labels[trial.folder])
         try:
             outcomes.append(run_one(trial, mirror, wait=len(trials) == 1))
         except BusyError as error:

@@ -179,15 +179,14 @@ def declare(trials: Sequence[Trial]) -> None:
             write_text(home / DECLARED, record_text([*declarations, added]))
         if same_metric:
             log.warning(
-                "%s: trials are added to those declared with %s; if there are results already, it "
-                "no longer decides the verdict alone",
+                "%s: trials are added to those declared with %s; it no longer decides alone on an "
+                "arm that has results already and gets more of them",
                 home.name,
                 metric,
             )
         elif latest is not None:
             log.warning(
-                "%s: the verdict is from now on about %s, and the report will say that %s was "
-                "declared before",
+                "%s: %s decides on arms that have no results yet; on the others, %s does",
                 home.name,
                 metric,
                 latest.primary,

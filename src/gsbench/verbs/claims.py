@@ -15,7 +15,7 @@ from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair
 from gsbench.analysis.planning import COMMANDS, UNSURE, Purpose, deviation_range
 from gsbench.analysis.quantities import Quantity, quantity
-from gsbench.analysis.results import load_experiment, read_experiment
+from gsbench.analysis.results import TrialResult, load_experiment, read_experiment
 from gsbench.analysis.statistics import MIN_SCENES
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
@@ -217,21 +217,39 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    print("\n".join([*comparison.sentences, *texts(comparison.unused), *experiment.warnings]))
+    print("\n".join([*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]))
+    purpose = _purpose(options.command, options.questions)
     for baseline, arm in comparison.pairs:
-        paired = pair(trials, Question(metric=metric.key, baseline=baseline, arm=arm))
-        if not paired.rows:
-            reason = next(map(str, paired.left_out), "they share no scene and seed")
-            fault = f"no trials of {baseline} and {arm} can be paired in {metric.name}: {reason}"
+        question = Question(metric=metric.key, baseline=baseline, arm=arm)
+        try:
+            components = _components(trials, question, metric)
+        except InputError as error:
             if len(comparison.pairs) == 1:
-                raise InputError(fault)
-            print(fault)
+                raise
+            print(error)
             continue
-        components = estimate_components([row.arm - row.baseline for row in paired.rows])
-        purpose = _purpose(options.command, options.questions)
         lines = _lines(components, metric, difference, purpose)
         print("\n".join([f"{arm} against {baseline}", *lines]))
     return 0
+
+
+def _components(trials: Sequence[TrialResult], question: Question, metric: Quantity) -> Components:
+    """How a question's differences vary; raises InputError if its trials cannot tell."""
+    paired = pair(trials, question)
+    arms = f"{question.baseline} and {question.arm}"
+    if not paired.rows:
+        reason = next(map(str, paired.left_out), "they share no scene and seed")
+        raise InputError(f"no trials of {arms} can be paired in {metric.name}: {reason}")
+    try:
+        components = estimate_components([row.arm - row.baseline for row in paired.rows])
+    except InputError as error:
+        raise InputError(f"{arms}: {error}") from None
+    if not components.within:
+        raise InputError(
+            f"{arms}: differences in {metric.name} do not vary between seeds, so nothing tells how "
+            "many would show one"
+        )
+    return components
 
 
 def _purpose(command: str, questions: int | None) -> Purpose:

@@ -95,7 +95,7 @@ def build_report(
         ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
-        unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.unused)],
+        unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.remarks)],
         tables=[_without_verdicts(one) for one in with_agreement(tables)],
         ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
         contradictions=[] if paper_table is None else load_paper().contradictions,
