@@ -117,7 +117,7 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
     one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="other", **second)
     table = table_of(tmp_path)
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
-    said = "garden: not compared, no best marked: code of mine differ."
+    said = "garden: not compared, no best marked: the arms differ in code of mine."
     assert (said in table.notes) == (not best)
 
 

@@ -117,6 +117,16 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
 
+def test_arms_that_one_command_added_share_the_adjustment_and_are_named(tmp_path):
+    day_1, day_2 = grid("momentum", decay=0.9), [*grid("absgs", day=5), *grid("mine", day=5)]
+    write(tmp_path, [*grid("adc"), *day_1, *day_2])
+    declare(tmp_path, (1, [*grid("adc"), *day_1]), (4, day_2))
+    found = {str(one.second): sentence(one) for one in answer(tmp_path).answers}
+    for arm in ("sfm-absgs", "sfm-mine"):
+        assert "adjusted for 2 tests, of sfm-absgs, sfm-mine)" in found[arm]
+    assert "adjusted" not in found["sfm-momentum"]
+
+
 def declare_looks(runs, *pairs):
     """Declare a sweep in looks before all trials, with (baseline, arm) as lists of trials."""
     questions = [

@@ -345,7 +345,7 @@ def test_declared_trials_that_are_missing_are_counted(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
     assert standing(experiment).beforehand
-    assert "4 of the 16 declared trials are still missing" in lines(experiment)
+    assert "Still missing: 4 of the 16 declared trials" in lines(experiment)
 
 
 def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(tmp_path):

@@ -179,7 +179,7 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
     one_trial(tmp_path, 0, psnr=28.0, _densify="volumetric", _iterations=7000)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [row[3] for row in texts(table)] == ["27.00", "28.00"]
-    assert "garden: not compared, no best marked: iterations differ." in table.notes
+    assert "garden: not compared, no best marked: the arms differ in iterations." in table.notes
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
     one_trial(tmp_path, 0, psnr=28.0, _densify="none", _budget=second_budget, _events=second)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [row[3] for row in texts(table)] == ["27.00", "*28.00*" if compared else "28.00"]
-    assert ("garden: not compared, no best marked: budget differ." in table.notes) is not compared
+    assert ("garden: not compared, no best marked: the arms differ in budget." in table.notes) is not compared
 
 
 def test_the_mean_of_scenes_gives_each_the_same_weight(tmp_path):
@@ -265,7 +265,7 @@ def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path):
     assert notes[:4] == (
         "Mean over 3 trials; ± is the deviation (n − 1) over trials.",
         "Bold: best mean of a scene after rounding; this is not a test.",
-        "(k/3): only k of 3 trials have a value; —: none.",
+        "(k/3): k of 3 trials with a value; —: none.",
         "Protocol paper-1.",
     )
     assert any(note.endswith("n/a, weights file alexnet.pth not found.") for note in notes)

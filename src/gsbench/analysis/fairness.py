@@ -6,7 +6,7 @@ recorded.
 
 import itertools
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from gsbench.analysis.advice import Advice, equal_counts_command
@@ -24,10 +24,11 @@ from gsbench.analysis.quantities import COSTS, Reader, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
+from gsbench.gaussians.paper_values import PAPER_CAP
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
-from gsbench.words import counted
+from gsbench.words import counted, listed
 
 LONGEST = 60  # the most characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
@@ -69,6 +70,58 @@ def counts_note(
     more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
     how = advise(baseline, other)
     return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
+
+
+def limit_notes(
+    trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]
+) -> list[Note]:
+    """A note for each limit on the count that compared arms share and that some did not reach.
+
+    The limit held an arm if a trial on each scene came near it, or was refused growth by a cap
+    that may end lower. The paper's own cap is no limit for equal counts: all arms have it.
+    """
+    notes, arms = [], set(itertools.chain(*pairs))
+    limited = [trial for trial in trials if trial.arm in arms and _limit(trial)]
+    for limit, sharing in group_by(limited, _limit).items():
+        by_arm = group_by(sharing, lambda trial: trial.arm)
+        free: dict[str, list[TrialResult]] = {}
+        for arm, own in by_arm.items():
+            for of_scene in group_by(own, lambda trial: trial.scene).values():
+                if not any(map(_is_held, of_scene)):
+                    free.setdefault(str(arm), []).extend(of_scene)
+        if not free or len(by_arm) < 2:
+            continue
+        unheld = [trial for own in free.values() for trial in own]
+        scenes = {trial.scene for trial in unheld}
+        places = sorted(scenes) if scenes != {trial.scene for trial in sharing} else []
+        notes.append(
+            Note.of(
+                "limit not reached",
+                arms=list(free),
+                limit=limit,
+                largest=max(trial.record.num_gaussians or 0 for trial in unheld),
+                scenes=listed(places),
+            )
+        )
+    return notes
+
+
+def _limit(trial: TrialResult) -> int:
+    """The limit on the count that the trial's experiment asked for; 0 without one."""
+    budget = trial.record.budget
+    if budget is None or trial.record.num_gaussians is None or trial.made_elsewhere:
+        return 0
+    limit = budget.max_gaussians or 0
+    return 0 if (limit, budget.cap) == (PAPER_CAP, "soft") else limit
+
+
+def _is_held(trial: TrialResult) -> bool:
+    """Return whether the trial's limit held its count."""
+    budget, count = trial.record.budget, trial.record.num_gaussians or 0
+    # a governor and a curve hold growth back early, also if the limit is never reached
+    refuses = budget is not None and budget.cap not in ("governor", "curve")
+    refused = refuses and bool(trial.record.events.get("blocked_by_cap"))
+    return refused or count >= (1 - EQUAL_COUNTS) * _limit(trial)
 
 
 def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:

@@ -15,7 +15,7 @@ import yaml
 from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.fairness import counts_note
+from gsbench.analysis.fairness import counts_note, limit_notes
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
@@ -196,7 +196,7 @@ def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
 def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what one must know beside them.
 
-    These are unequal counts of Gaussians, said first, and trials in no verdict.
+    These are unequal counts and limits without effect, said first, and trials in no verdict.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
         comparison = compare(newest_code(read_experiment(home)))
@@ -204,8 +204,8 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
             counts_note(comparison.trials, *pair, equal_counts_settings)
             for pair in comparison.pairs
         ]
-        unequal = [note for note in counts if note is not None]
-        for line in [*texts(unequal), *comparison.sentences, *texts(comparison.unused)]:
+        before = [*filter(None, counts), *limit_notes(comparison.trials, comparison.pairs)]
+        for line in [*texts(before), *comparison.sentences, *texts(comparison.unused)]:
             log.info("%s", line)
 
 
