@@ -277,7 +277,7 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
     found = answer(tmp_path)
     assert found.answers[0].beforehand
     assert "missing" not in "\n".join(texts(found.declared_notes))
-    assert "made by an earlier mine" in found.experiment.warnings[0]
+    assert "made by earlier versions of mine" in found.experiment.warnings[0]
     # the old code failed before any result: its folder has settings, but no results
     folder = tmp_path / "exp" / old[0].key
     (folder.parent / f"{folder.name}-seed0" / "results.json").unlink()

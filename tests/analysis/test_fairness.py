@@ -161,10 +161,10 @@ def test_settings_that_vary_among_the_arms_are_listed_as_tuning(tmp_path):
     two = tmp_path / "two"
     write_arms(two, {"adc": densifier("adc"), **dict([*arms.items()][:2])})
     assert any(
-        "sfm-volumetric-0.01: 2 choices of its settings" in note
+        "sfm-volumetric-0.01: 2 choices of settings" in note
         for note in sheet(two, "volumetric-0.01").notes
     )
-    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of its settings" in note]
+    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of settings" in note]
     assert (
         "They differ in densify.volume_threshold, and all were measured on the test views" in line
     )

@@ -19,6 +19,7 @@ from gsbench.analysis.quantities import (
     quantity,
     relative_change,
 )
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import escape_latex, to_csv, to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table, with_agreement
@@ -385,6 +386,35 @@ def test_latex_has_as_many_cells_as_columns(make_experiment):
     } == {width}
 
 
+@pytest.mark.parametrize(
+    "counts, heading, cells",
+    [
+        ((512, 640), "Gaussians ↓", ["512", "640"]),
+        ((999, 28_012), "Gaussians ↓", ["999", "28,012"]),
+        ((1000, 28_012), "Gaussians (k) ↓", ["1.0", "28.0"]),
+        ((4000, 3_410_000), "Gaussians (k) ↓", ["4.0", "3,410.0"]),
+        ((100_000, 3_410_000), "Gaussians (M) ↓", ["0.10", "3.41"]),
+    ],
+)
+def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, heading, cells):
+    write_runs(
+        tmp_path,
+        Plan(
+            scenes=("garden",),
+            seeds=(0,),
+            gaussians=dict(zip(("adc", "volumetric"), counts, strict=True)),
+        ),
+    )
+    experiment = load_experiment(tmp_path, "exp")
+    table = build_table(experiment, metrics=["gaussians"])
+    assert [heading, *cells] == [
+        table.columns[0].heading, *(row.entries[0].text for row in table.rows)
+    ]
+    report = build_report(experiment)
+    for page in (to_markdown(table), to_latex(table).replace("$\\downarrow$", "↓"), report):
+        assert all(text in page for text in (heading, *cells))
+
+
 def test_results_files_are_plain_json(make_experiment):
     trial = make_experiment().trials[0]
     assert read_json(trial.path / "results.json")["metrics"] == trial.metrics
@@ -395,10 +425,10 @@ def test_results_files_are_plain_json(make_experiment):
     [
         (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
         (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
-        (900, 2.0, ["Gaussians (k)", "train (s)", "initial points (k)", "total (s)"]),
+        (900, 2.0, ["Gaussians", "train (s)", "initial points (k)", "total (s)"]),
     ],
 )
-def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
+def test_counts_from_a_thousand_and_times_from_ten_minutes_have_the_larger_unit(
     tmp_path, gaussians, seconds, headings
 ):
     write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
@@ -412,13 +442,14 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     assert [one.name.partition(" ↓")[0] for one in found] == headings
     values = [one.read(trials[0]) for one in found]
     scales = [
-        {"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}[name.split()[-1]] for name in headings
+        {"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}.get(name.split()[-1], 1)
+        for name in headings
     ]
     own = [gaussians, seconds, 3000, seconds + 7]
     assert values == pytest.approx(
         [value / scale for value, scale in zip(own, scales, strict=True)]
     )
-    decimals = [{"(s)": 1, "(min)": 1, "(k)": 1, "(M)": 2}[name.split()[-1]] for name in headings]
+    decimals = [{"Gaussians": 0, "(M)": 2}.get(name.split()[-1], 1) for name in headings]
     assert [one.format(1.23456) for one in found] == [
         f"{1.23456:.{places}f}" for places in decimals
     ]

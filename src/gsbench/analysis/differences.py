@@ -299,8 +299,13 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """The settings in which two configurations differ, without those in `WITHOUT_EFFECT`."""
-    keys = [key for key in {**one, **other} if not _is_among(key, WITHOUT_EFFECT)]
-    return [key for key in keys if one.get(key) != other.get(key)]
+    keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
+    return [key for key in keys if is_ingredient(key)]
+
+
+def is_ingredient(key: str) -> bool:
+    """Return whether a setting may change the trained model."""
+    return not _is_among(key, WITHOUT_EFFECT)
 
 
 def _is_among(key: str, settings: Sequence[str]) -> bool:

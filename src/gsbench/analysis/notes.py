@@ -101,7 +101,7 @@ SENTENCES: dict[str, str] = {
         "{tried:list}{more:if: and % more}.{others}"
     ),
     "varied": (
-        "{arm}: {choices:n choice} of its settings ran here. They differ in {settings:all}, "
+        "{arm}: {choices:n choice} of settings and code ran here. They differ in {settings:all}, "
         "and all were measured on the test views that the verdict uses."
     ),
     # ---- verdicts, and what was declared
