@@ -134,7 +134,12 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         (("governor", 90_000), {"garden": (3000, 3800)}, {"blocked_by_cap": 9}, "3,800 at most"),
         (("governor", 4000), {"garden": (3950, 3800)}, {}, "trials of sfm-volumetric ended with"),
         (("governor", 4000), {"garden": (3950, 4010)}, {}, ""),
-        (("governor", 4000), {"garden": (3950, 3990), "room": (40, 50)}, {}, "bind on room: trials"),
+        (
+            ("governor", 4000),
+            {"garden": (3950, 3990), "room": (40, 50)},
+            {},
+            "bind on room: trials",
+        ),
         (("soft", 4000), {"garden": (3000, 3000)}, {"blocked_by_cap": 9}, ""),
         (("soft", 4000), {"garden": (3000, 3000)}, {}, "3,000 at most"),
         (("soft", 3_400_000), {"garden": (3000, 3000)}, {}, ""),  # the paper's, for all arms

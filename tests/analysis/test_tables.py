@@ -210,7 +210,9 @@ def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
     one_trial(tmp_path, 0, psnr=28.0, _densify="none", _budget=second_budget, _events=second)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [row[3] for row in texts(table)] == ["27.00", "*28.00*" if compared else "28.00"]
-    assert ("garden: not compared, no best marked: the arms differ in budget." in table.notes) is not compared
+    assert (
+        "garden: not compared, no best marked: the arms differ in budget." in table.notes
+    ) is not compared
 
 
 def test_the_mean_of_scenes_gives_each_the_same_weight(tmp_path):
@@ -408,7 +410,8 @@ def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, headi
     experiment = load_experiment(tmp_path, "exp")
     table = build_table(experiment, metrics=["gaussians"])
     assert [heading, *cells] == [
-        table.columns[0].heading, *(row.entries[0].text for row in table.rows)
+        table.columns[0].heading,
+        *(row.entries[0].text for row in table.rows),
     ]
     report = build_report(experiment)
     for page in (to_markdown(table), to_latex(table).replace("$\\downarrow$", "↓"), report):

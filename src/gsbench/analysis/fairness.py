@@ -74,9 +74,7 @@ def counts_note(
     return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
 
 
-def limit_notes(
-    trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]
-) -> list[Note]:
+def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
     """A note for each limit on the count that compared arms share and that some did not reach.
 
     The limit held an arm if a trial on each scene came near it, or was refused growth by a cap

@@ -126,8 +126,8 @@ def choose_quantities(
 def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     """The quantity ``name`` (a metric, a cost or an alias) for tables.
 
-    Counts and times have a unit that suits the smallest and the largest trial, unless the name fixes the unit
-    (`FIXED_UNITS`). Raises ``InputError`` for an unknown name.
+    Counts and times have a unit that suits the smallest and the largest trial, unless the name
+    fixes the unit (`FIXED_UNITS`). Raises ``InputError`` for an unknown name.
     """
     trials = list(trials)
     key = ALIASES.get(name, name)

@@ -359,8 +359,8 @@ def newest_code(experiment: Experiment) -> Experiment:
         return experiment
     left_out = {trial.path for trial in older}
     kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
-    versions = tuple(_versions_line(*code, earlier) for code, earlier in replaced.items())
-    return replace(experiment, trials=kept, older=tuple(older), versions=versions)
+    lines = tuple(_versions_line(*code, earlier) for code, earlier in replaced.items())
+    return replace(experiment, trials=kept, older=tuple(older), versions=lines)
 
 
 def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
@@ -370,7 +370,7 @@ def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
 
 
 def _versions_line(part: str, now: str, earlier: Mapping[str, Sequence[TrialResult]]) -> str:
-    """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), 77ab0c1e (2); …``"""
+    """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), …``"""
     trials = [trial for made in earlier.values() for trial in made]
     arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
     versions = [f"{version:.{SHOWN}} ({len(made)})" for version, made in earlier.items()]

@@ -204,8 +204,8 @@ def _warn_of_added_seeds(home: Path, metric: str, before: Planned, added: Planne
     }
     if late:
         log.warning(
-            "%s: seeds are added after the first result of %s: where such an arm is compared with a "
-            "baseline, %s no longer decides alone, but all metrics, adjusted for their number",
+            "%s: seeds are added after the first result of %s: where such an arm is compared with "
+            "a baseline, %s no longer decides alone, but all metrics, adjusted for their number",
             home.name,
             some_of(sorted(late)),
             metric,
@@ -228,7 +228,7 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
             return same_kind[-1]
         write_text(home / DECLARED, record_text([*declarations, asked]))
     if same_kind and asked.kind == "sweep":
-        before = dict(reduce(merge_planned, (one.planned for one in same_kind)))
+        before: Planned = reduce(merge_planned, (one.planned for one in same_kind))
         _warn_of_added_seeds(home, asked.primary, before, asked.planned)
     if same_kind and asked.kind == "claims":  # votes are judged by their own round alone
         log.warning(
