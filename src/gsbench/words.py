@@ -75,7 +75,7 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
 
 
 class NamesAttributes:
-    """Base of dataclasses for a user's code: the error for a wrong attribute lists the right ones."""
+    """Base of dataclasses for a user's code: a wrong attribute's error lists the right ones."""
 
     if not TYPE_CHECKING:  # else a type checker would allow any name
 
