@@ -69,6 +69,17 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
     after = say(declaring(tmp_path, None, 2))
     assert sorted(after[-1].values()) == [[0], [0, 1, 2]]
     assert "first result" not in caplog.text
+    # the time is that of the first declaration of the metric, which the verdict counts
+    record = tmp_path / "exp" / "declared.jsonl"
+    moments = iter(("2020-01-01", "2020-01-02"))
+    lines = [
+        json.loads(line) | {"time": f"{next(moments)}T00:00:00Z"}
+        for line in record.read_text().splitlines()
+    ]
+    record.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with caplog.at_level(logging.INFO):
+        declare([declaring(tmp_path, None, 2)])
+    assert "exp: psnr stays declared, since 2020-01-01 00:00 UTC" in caplog.messages
     # another threshold is another arm, though it has the same name
     changed = declaring(tmp_path, "psnr", name="volumetric", volume_threshold=0.1)
     assert len(say(changed)[-1]) == 3

@@ -5,6 +5,7 @@ that describe it, so that missing trials can be listed. For ``declared.jsonl`` s
 `gsbench.runs.experiments`.
 """
 
+import itertools
 import logging
 import os
 import shutil
@@ -170,7 +171,10 @@ def declare(trials: Sequence[Trial]) -> None:
             if metric is None:
                 continue
             if latest is not None and given is None:
-                log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
+                sweeps = [one for one in declarations if one.kind == "sweep"]
+                same = itertools.takewhile(lambda one: one.primary == metric, reversed(sweeps))
+                first = list(same)[-1]
+                log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
             # Old declarations name no trials: they cover all of this metric.
