@@ -5,7 +5,6 @@ that describe it, so that missing trials can be listed. For ``declared.jsonl`` s
 `gsbench.runs.experiments`.
 """
 
-import itertools
 import logging
 import os
 import shutil
@@ -172,8 +171,8 @@ def declare(trials: Sequence[Trial]) -> None:
                 continue
             if latest is not None and given is None:
                 sweeps = [one for one in declarations if one.kind == "sweep"]
-                same = itertools.takewhile(lambda one: one.primary == metric, reversed(sweeps))
-                first = list(same)[-1]
+                others = [k for k, one in enumerate(sweeps) if one.primary != metric]
+                first = sweeps[max(others, default=-1) + 1]
                 log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
