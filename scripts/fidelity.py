@@ -18,15 +18,18 @@ import itertools
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gsbench.analysis.differences import facts_of, shipped_arms
+import yaml
+
+from gsbench.parsing import LOADER
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "fidelity.md"
+PAGE, CONF = ROOT / "docs" / "fidelity.md", ROOT / "conf" / "densify"
 ROW = re.compile(r"^\| `(\w+)` \|.*\| (0|1e-\d+) \|[^|]*\|$", re.MULTILINE)
 HEAD = """# How near each arm is to its source
 
@@ -53,6 +56,40 @@ every iteration. The differences: DashGaussian prunes before it grows, by opacit
 the pruned Gaussians. Its clones and splits each take the whole allowance. Its window over a spectrum of odd sides is
 one pixel off the mean. In gsbench small pictures have 8 bits.
 """
+
+FACTS = ("Source", "Compared", "Tests", "Otherwise")
+# A fact is one comment line; indented comment lines continue it.
+FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)
+
+
+@cache
+def shipped_arms() -> dict[str, Mapping[str, Any]]:
+    """The settings of each densifier that gsbench ships, by name, without ``densify/external``."""
+    return {path.stem: _with_defaults(path.stem) for path in sorted(CONF.glob("*.yaml"))}
+
+
+@cache
+def facts_of(name: str) -> dict[str, str]:
+    """The facts at the end of the file of the shipped arm ``name``, by their key (`FACTS`)."""
+    content = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
+    return {match["key"]: match["text"].replace("\n#   ", " ") for match in FACT.finditer(content)}
+
+
+@cache
+def _with_defaults(name: str) -> dict[str, Any]:
+    """The settings of an arm, which override those of the arms in its ``defaults``."""
+    content = _own_settings(name)
+    parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
+    return {
+        key: value for parent in parents for key, value in _with_defaults(parent).items()
+    } | content
+
+
+def _own_settings(name: str) -> dict[str, Any]:
+    settings: dict[str, Any] = yaml.load(
+        (CONF / f"{name}.yaml").read_text(encoding="utf-8"), Loader=LOADER
+    )
+    return settings
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@ import re
 import string
 import unicodedata
 from collections.abc import Iterable, Sequence
+from dataclasses import fields
 from pathlib import Path, PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 MAX_NAMED = 3  # names that a message lists; further ones are only counted
 # Characters that a terminal acts on instead of showing: control characters except line feed and
@@ -71,6 +72,27 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
         word.lower(), choices, n=1
     )
     return f"; did you mean {near[0]}?" if near else ""
+
+
+class NamesAttributes:
+    """Base of dataclasses for a user's code: a wrong attribute's error lists the right ones."""
+
+    if not TYPE_CHECKING:  # else a type checker would allow any name
+
+        def __getattr__(self, name: str) -> Any:
+            raise AttributeError(no_such(type(self).__name__, name, attributes_of(type(self))))
+
+
+def attributes_of(cls: Any) -> list[str]:
+    """The fields of a dataclass, then its properties."""
+    properties = [name for name, value in vars(cls).items() if isinstance(value, property)]
+    return [*(field.name for field in fields(cls)), *properties]
+
+
+def no_such(owner: str, name: str, names: Sequence[str], inside: str = "") -> str:
+    """The message of an AttributeError, with the names that ``owner`` has (``inside`` a field)."""
+    guess = did_you_mean(name, names).replace("did you mean ", f"did you mean {inside}")
+    return f"{owner} has no {name!r}; it has {', '.join(f'{inside}{one}' for one in names)}{guess}"
 
 
 def readable_bytes(count: int | None) -> str:

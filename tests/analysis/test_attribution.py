@@ -9,15 +9,14 @@ import yaml
 
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.differences import (
+    DEPARTURES,
     ELSEWHERE,
     NO_RECORD,
-    departures,
     ingredients,
     ingredients_between,
     ingredients_note,
     is_mixed,
     representatives,
-    shipped_arms,
 )
 from gsbench.analysis.pairing import choose_pairs, controls_of
 from gsbench.analysis.report.build import build_report
@@ -26,9 +25,10 @@ from gsbench.analysis.tables import build_table
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
 from tests.analysis.synthetic import write_arms
-from tests.conftest import ROOT
+from tests.conftest import ROOT, script
 from tests.helpers import read_json, write
 
+shipped_arms = script("fidelity").shipped_arms
 SCHEDULE = {"train.densify_start": 500, "train.densify_stop": 15_000, "train.mcmc_stop": 25_000}
 SCHEDULE |= {
     "train.densify_interval": 100,
@@ -97,12 +97,14 @@ def test_settings_of_the_first_configuration_come_first():
         ("adc", "adc", ()),
     ],
 )
-def test_shipped_arms_differ_in_the_ingredients_that_their_files_list(first, second, expected):
+def test_shipped_arms_differ_in_the_ingredients_of_their_classes_and_settings(
+    first, second, expected
+):
     assert ingredients(config(first), config(second)) == expected
 
 
 def test_every_shipped_class_lists_how_it_departs_from_adc():
-    assert {settings["_target_"] for settings in shipped_arms().values()} == set(departures())
+    assert {settings["_target_"] for settings in shipped_arms().values()} == set(DEPARTURES)
 
 
 def test_settings_that_only_name_or_place_a_trial_are_no_ingredients():

@@ -36,21 +36,38 @@ def finished_at(path, seconds):
     return path
 
 
-def test_the_newest_code_counts_and_older_trials_are_named(tmp_path):
+def test_the_newest_code_counts_and_one_line_names_all_earlier_versions(tmp_path):
     for seed in (0, 1):
         finished_at(one_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
+    finished_at(one_trial(tmp_path, 1, "cccccccc", MINE, psnr=26.0, _code=code("3" * 64)), 1500)
     finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW)), 2000)
     words = (
-        "exp/garden/sfm-adc seeds 0, 1: made by an earlier mine (11111111; the "
-        "trials that count have 22222222)"
+        "exp: 3 trials of sfm-adc made by earlier versions of mine: 11111111 (2), 33333333 (1); "
+        "the trials that count have 22222222"
     )
     experiment = load_experiment(tmp_path, "exp")
     assert experiment.warnings == (words,)
     assert [trial.seed for trial in experiment.trials] == [1]
     table = build_table(experiment, metrics=["psnr"])
     assert table.rows[0].entries[0].text == "28.00"
-    assert f"Left out (1): {words}." in table.notes
+    assert f"Left out (3): {words}." in table.notes
     assert words in explain_cell("exp:garden:psnr:adc", tmp_path)
+    page = build_report(experiment)
+    assert (words in page, "Not in this report: 3 of" in page) == (True, True)
+    one_trial(tmp_path, 0, "dddddddd", psnr=26.0, _densify="other", _code=code())
+    assert words not in explain_cell("exp:garden:psnr:other", tmp_path)
+
+
+def test_choices_by_earlier_code_are_counted(tmp_path):
+    one_trial(tmp_path, 0, psnr=26.0, _densify="none", _code=code())
+    for number, (version, views) in enumerate([(OLD, 5), ("3" * 64, 5), (NEW, 5), (NEW, 8)]):
+        made = MINE | {"densify__views": views}
+        finished_at(
+            one_trial(tmp_path, 0, f"{number:08}", made, psnr=27.0, _code=code(version)), number
+        )
+    page = build_report(load_experiment(tmp_path, "exp"))
+    said = "4 choices of settings and code ran here. They differ in densify.views and code of mine,"
+    assert said in page
 
 
 def test_older_trials_with_other_settings_still_count(tmp_path):
@@ -76,7 +93,7 @@ def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
     finished_at(one_trial(tmp_path, 1, psnr=27.0, **new), 2000)
     experiment = load_experiment(tmp_path, "exp")
     assert [trial.seed for trial in experiment.trials] == [1]
-    assert f"made by an earlier {part} (" in experiment.warnings[0]
+    assert f"made by earlier versions of {part}: " in experiment.warnings[0]
 
 
 def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path, monkeypatch):
@@ -126,7 +143,7 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
     one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="other", **second)
     table = table_of(tmp_path)
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
-    said = "garden: not compared, no best marked: code of mine differ."
+    said = "garden: not compared, no best marked: the arms differ in code of mine."
     assert (said in table.notes) == (not best)
 
 

@@ -121,6 +121,16 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
 
+def test_arms_that_one_command_added_share_the_adjustment_and_are_named(tmp_path):
+    day_1, day_2 = grid("momentum", decay=0.9), [*grid("absgs", day=5), *grid("mine", day=5)]
+    write(tmp_path, [*grid("adc"), *day_1, *day_2])
+    declare(tmp_path, (1, [*grid("adc"), *day_1]), (4, day_2))
+    found = {str(one.second): sentence(one) for one in answer(tmp_path).answers}
+    for arm in ("sfm-absgs", "sfm-mine"):
+        assert "adjusted for 2 tests, of sfm-absgs, sfm-mine)" in found[arm]
+    assert "adjusted" not in found["sfm-momentum"]
+
+
 def in_looks(*pairs, scenes="a"):
     """A sweep in looks, declared before all trials, with (baseline, arm) as lists of trials."""
 
@@ -430,7 +440,7 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
     found = answer(tmp_path)
     assert found.answers[0].beforehand
     assert "missing" not in "\n".join(texts(found.declared_notes))
-    assert "made by an earlier mine" in found.experiment.warnings[0]
+    assert "made by earlier versions of mine" in found.experiment.warnings[0]
     # the old code failed before any result: its folder has settings, but no results
     folder = tmp_path / "exp" / old[0].key
     (folder.parent / f"{folder.name}-seed0" / "results.json").unlink()

@@ -352,7 +352,7 @@ def test_declared_trials_that_are_missing_are_counted(tmp_path):
     declare_trials(tmp_path, (EARLY, planned([0, 1, 2, 3])))
     assert standing(experiment).beforehand
     (line,) = texts(compare(experiment).remarks)
-    assert "4 of the 16 declared trials are still missing" in line
+    assert "Still missing: 4 of the 16 declared trials" in line
     assert line in build_report(experiment)
 
 

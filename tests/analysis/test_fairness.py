@@ -161,10 +161,10 @@ def test_settings_that_vary_among_the_arms_are_listed_as_tuning(tmp_path):
     two = tmp_path / "two"
     write_arms(two, {"adc": densifier("adc"), **dict([*arms.items()][:2])})
     assert any(
-        "sfm-volumetric-0.01: 2 choices of its settings" in note
+        "sfm-volumetric-0.01: 2 choices of settings" in note
         for note in sheet(two, "volumetric-0.01").notes
     )
-    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of its settings" in note]
+    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of settings" in note]
     assert (
         "They differ in densify.volume_threshold, and all were measured on the test views" in line
     )
@@ -188,9 +188,8 @@ def test_a_search_that_proposed_the_settings_is_named(tmp_path):
         return [note for note in sheet(tmp_path, "volumetric").notes if note.startswith("Tuning.")]
 
     (line,) = tuning()
-    assert (
-        "densify.volume_threshold=0.1 is the best of 2 points by psnr of validation views" in line
-    )
+    assert "the best of 2 points by psnr of validation views (courtyard; seed 100; the" in line
+    assert "is densify.volume_threshold=0.1, " in line
     assert line.endswith("Tried: 0.1 (27.6), 0.06841 (27.5). These trials have other values.")
     write(tmp_path / "vth" / "tuning.json", record | {"points": points[1:]})
     unequal, line = tuning()

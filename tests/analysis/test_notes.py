@@ -1,12 +1,13 @@
 """Notes below tables, word for word, for made-up trials with known numbers."""
 
+import html
 import itertools
 from dataclasses import replace
 from shlex import split
 
 import pytest
 
-from gsbench.analysis.fairness import counts_note
+from gsbench.analysis.fairness import counts_note, limit_notes
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
@@ -125,6 +126,42 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
     assert sentence.endswith("densify.cap=governor densify.max_gaussians=12300 name=exp_equal`.")
 
 
+@pytest.mark.parametrize(
+    "budget, counts, events, said",
+    [
+        (("governor", 90_000), {"garden": (3000, 3800)}, {}, "ended with 3,800 at most"),
+        # a governor and a curve hold growth back on the way to a limit that is not reached
+        (("governor", 90_000), {"garden": (3000, 3800)}, {"blocked_by_cap": 9}, "3,800 at most"),
+        (("governor", 4000), {"garden": (3950, 3800)}, {}, "trials of sfm-volumetric ended with"),
+        (("governor", 4000), {"garden": (3950, 4010)}, {}, ""),
+        (
+            ("governor", 4000),
+            {"garden": (3950, 3990), "room": (40, 50)},
+            {},
+            "bind on room: trials",
+        ),
+        (("soft", 4000), {"garden": (3000, 3000)}, {"blocked_by_cap": 9}, ""),
+        (("soft", 4000), {"garden": (3000, 3000)}, {}, "3,000 at most"),
+        (("soft", 3_400_000), {"garden": (3000, 3000)}, {}, ""),  # the paper's, for all arms
+        (("hard", None), {"garden": (3000, 3000)}, {}, ""),
+    ],
+)
+def test_a_limit_that_no_arm_reaches_makes_no_counts_equal(tmp_path, budget, counts, events, said):
+    for path in write_runs(tmp_path, Plan(scenes=list(counts), seeds=(0, 1))):
+        data = read_json(path / "results.json")
+        data["num_gaussians"] = counts[data["scene"]][data["densify"] == "volumetric"]
+        limit = {"cap": budget[0], "max_gaussians": budget[1]}
+        write(path / "results.json", data | {"budget": limit, "events": events})
+    experiment = load_experiment(tmp_path, "exp")
+    notes = texts(limit_notes(experiment.trials, [(ADC, VOLUMETRIC)]))
+    assert limit_notes(experiment.trials, []) == []
+    assert len(notes) == bool(said)
+    for note in notes:
+        assert said in note
+        assert note in build_table(experiment).notes
+        assert html.escape(note) in build_report(experiment)
+
+
 @pytest.mark.parametrize("rounds, warns", [(0, True), (1, True), (4, True), (5, False)])
 def test_a_table_warns_of_too_few_rounds(tmp_path, rounds, warns):
     (trial,) = trials_of(tmp_path, scenes=["garden"], densifiers=("adc",), seeds=(0,))
@@ -219,8 +256,8 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
         f"(!) {made[0].label} is not better than one colour: PSNR {psnr} dB, the training views' "
         f"mean colour has {psnr}.",
         "raster=triton is not used: alpha is off.",
-        "garden: 1 of 6 test views have a near twin in training, so they measure memory too.",
-        "garden: 2 photographs left out, since another one has its name or content.",
+        "garden: training has near twins of 1 of 6 test views, which so measure memory too.",
+        "garden: 2 photographs left out: another one has the same name or content.",
         "Before training, garden sfm: a.",
         "Before training, garden sfm: b.",
     ]

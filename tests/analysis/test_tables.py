@@ -19,6 +19,7 @@ from gsbench.analysis.quantities import (
     quantity,
     relative_change,
 )
+from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import escape_latex, to_csv, to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table, with_agreement
@@ -179,7 +180,7 @@ def test_arms_under_different_conditions_are_shown_but_not_compared(tmp_path):
     one_trial(tmp_path, 0, psnr=28.0, _densify="volumetric", _iterations=7000)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [row[3] for row in texts(table)] == ["27.00", "28.00"]
-    assert "garden: not compared, no best marked: iterations differ." in table.notes
+    assert "garden: not compared, no best marked: the arms differ in iterations." in table.notes
 
 
 @pytest.mark.parametrize(
@@ -209,7 +210,9 @@ def test_arms_are_compared_under_one_budget_or_under_none_that_acted(
     one_trial(tmp_path, 0, psnr=28.0, _densify="none", _budget=second_budget, _events=second)
     table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
     assert [row[3] for row in texts(table)] == ["27.00", "*28.00*" if compared else "28.00"]
-    assert ("garden: not compared, no best marked: budget differ." in table.notes) is not compared
+    assert (
+        "garden: not compared, no best marked: the arms differ in budget." in table.notes
+    ) is not compared
 
 
 def test_the_mean_of_scenes_gives_each_the_same_weight(tmp_path):
@@ -265,7 +268,7 @@ def test_the_notes_say_how_to_read_the_table_and_what_is_left_out(tmp_path):
     assert notes[:4] == (
         "Mean over 3 trials; ± is the deviation (n − 1) over trials.",
         "Bold: best mean of a scene after rounding; this is not a test.",
-        "(k/3): only k of 3 trials have a value; —: none.",
+        "(k/3): k of 3 trials with a value; —: none.",
         "Protocol paper-1.",
     )
     assert any(note.endswith("n/a, weights file alexnet.pth not found.") for note in notes)
@@ -385,6 +388,36 @@ def test_latex_has_as_many_cells_as_columns(make_experiment):
     } == {width}
 
 
+@pytest.mark.parametrize(
+    "counts, heading, cells",
+    [
+        ((512, 640), "Gaussians ↓", ["512", "640"]),
+        ((999, 28_012), "Gaussians ↓", ["999", "28,012"]),
+        ((1000, 28_012), "Gaussians (k) ↓", ["1.0", "28.0"]),
+        ((4000, 3_410_000), "Gaussians (k) ↓", ["4.0", "3,410.0"]),
+        ((100_000, 3_410_000), "Gaussians (M) ↓", ["0.10", "3.41"]),
+    ],
+)
+def test_a_small_count_keeps_its_digits_on_every_surface(tmp_path, counts, heading, cells):
+    write_runs(
+        tmp_path,
+        Plan(
+            scenes=("garden",),
+            seeds=(0,),
+            gaussians=dict(zip(("adc", "volumetric"), counts, strict=True)),
+        ),
+    )
+    experiment = load_experiment(tmp_path, "exp")
+    table = build_table(experiment, metrics=["gaussians"])
+    assert [heading, *cells] == [
+        table.columns[0].heading,
+        *(row.entries[0].text for row in table.rows),
+    ]
+    report = build_report(experiment)
+    for page in (to_markdown(table), to_latex(table).replace("$\\downarrow$", "↓"), report):
+        assert all(text in page for text in (heading, *cells))
+
+
 def test_results_files_are_plain_json(make_experiment):
     trial = make_experiment().trials[0]
     assert read_json(trial.path / "results.json")["metrics"] == trial.metrics
@@ -395,10 +428,10 @@ def test_results_files_are_plain_json(make_experiment):
     [
         (999_999, 599.9, ["Gaussians (k)", "train (s)", "initial points (k)", "total (min)"]),
         (1_000_000, 600.0, ["Gaussians (M)", "train (min)", "initial points (k)", "total (min)"]),
-        (900, 2.0, ["Gaussians (k)", "train (s)", "initial points (k)", "total (s)"]),
+        (900, 2.0, ["Gaussians", "train (s)", "initial points (k)", "total (s)"]),
     ],
 )
-def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
+def test_counts_from_a_thousand_and_times_from_ten_minutes_have_the_larger_unit(
     tmp_path, gaussians, seconds, headings
 ):
     write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
@@ -412,13 +445,14 @@ def test_counts_from_a_million_and_times_from_ten_minutes_have_the_larger_unit(
     assert [one.name.partition(" ↓")[0] for one in found] == headings
     values = [one.read(trials[0]) for one in found]
     scales = [
-        {"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}[name.split()[-1]] for name in headings
+        {"(s)": 1, "(min)": 60, "(k)": 1e3, "(M)": 1e6}.get(name.split()[-1], 1)
+        for name in headings
     ]
     own = [gaussians, seconds, 3000, seconds + 7]
     assert values == pytest.approx(
         [value / scale for value, scale in zip(own, scales, strict=True)]
     )
-    decimals = [{"(s)": 1, "(min)": 1, "(k)": 1, "(M)": 2}[name.split()[-1]] for name in headings]
+    decimals = [{"Gaussians": 0, "(M)": 2}.get(name.split()[-1], 1) for name in headings]
     assert [one.format(1.23456) for one in found] == [
         f"{1.23456:.{places}f}" for places in decimals
     ]

@@ -342,7 +342,7 @@ def test_the_fairness_table_states_budget_views_points_and_chosen_values(sweep, 
     assert "Tried: 0.0002 (27.59), " in adc
     page = build_report(load_experiment(runs, "fair"))
     assert "tuning was unequal" not in page
-    assert "is the best of 4 points" in page
+    assert "the best of 4 points" in page
 
 
 UNEVEN = FILE.replace("        densify.gradient_threshold: tag(log, interval(1e-4, 4e-4))\n", "")

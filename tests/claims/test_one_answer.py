@@ -184,7 +184,7 @@ def surfaces(runs, experiment, comparison, words):
     finally:
         stopping.log.removeHandler(handler)
         stopping.log.level = level
-    assert words in lines[0]
+    assert words in next(line for line in lines if " against " in line)
     assert tables(["exp", "--format", "json", "--out", str(runs / "verdicts")], runs) == 0
     (file,) = (runs / "verdicts").glob("*.json")
     (pair,) = json.loads(file.read_text())["pairs"]

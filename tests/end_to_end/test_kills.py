@@ -219,7 +219,7 @@ def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environme
         )
 
     sheet = gsbench("tables small --layout fairness")
-    assert sheet.stdout.count("is the best of 2 points by psnr of validation views") == 2
+    assert sheet.stdout.count("the best of 2 points by psnr of validation views") == 2
     assert "tuning was unequal" not in sheet.stdout
 
 

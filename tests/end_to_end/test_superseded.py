@@ -69,7 +69,7 @@ def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
 
     shown = ask("tables", "edited")
     assert "edited since" not in shown
-    assert "edited/courtyard/random-mine seeds 0, 1: made by an earlier helper" in shown
+    assert "edited: 2 trials of random-mine made by earlier versions of helper: " in shown
     listed = json.loads(ask("status", "edited", "--json"))
     states = {Path(trial["folder"]).name.partition("-")[2]: trial["state"] for trial in listed}
     assert states == {"seed0": "superseded", "seed1": "superseded", "seed2": "done"}

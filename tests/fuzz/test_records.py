@@ -78,7 +78,6 @@ READS_ITSELF = {
     "launch/dry_run.py",  # text of this process
     "init/base.py",
     "runs/keys.py",  # text of this very process
-    "analysis/differences.py",  # arms of the package; those of trials are read by TrialFolder
     "claims/stopping.py",  # text of this process
     "system/install.py",  # files that pip wrote about the package
     "claims/archive.py",  # archives, which anybody may have made

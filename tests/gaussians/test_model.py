@@ -1,5 +1,6 @@
 """Rotations and colours of Gaussians, compared with SciPy."""
 
+import copy
 import math
 
 import numpy as np
@@ -9,8 +10,40 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from scipy.special import lpmv
 
+from gsbench.densify import DensifyContext, RefineEvent, Refinement
 from gsbench.gaussians.model import basis, colors, quaternion_to_matrix
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster import RenderOutput
 from tests.gaussians.helpers import random_gaussians
+
+
+@pytest.mark.parametrize(
+    "of, name, said",
+    [
+        ("gaussians", "scale", "Gaussians has no 'scale'; it has means, log_scales, quaternions, "),
+        ("gaussians", "scale", "sh_rest, scales, opacities, rotations; did you mean scales?"),
+        ("training", "means", "has no 'means'; it has values.means, values.log_scales, "),
+        ("training", "opacity", "values.rotations; did you mean values.opacities?"),
+        ("refinement", "gaussian", "has step, gaussians, rng, event; did you mean gaussians?"),
+        ("context", "views_", "extent, white_background, device, views, schedule, training_views"),
+        ("render", "depths", "RenderOutput has no 'depths'; it has image, alpha, radii, screen_p"),
+    ],
+)
+def test_a_wrong_attribute_names_the_right_ones(of, name, said):
+    gaussians = random_gaussians(3)
+    training = TrainableGaussians(gaussians, LearningRates(), 1.0)
+    owners = {
+        "gaussians": gaussians,
+        "training": training,
+        "refinement": Refinement(1, training, torch.Generator(), RefineEvent(1, 3)),
+        "context": DensifyContext(extent=1.0),
+        "render": RenderOutput(*[torch.zeros(1)] * 4),
+    }
+    with pytest.raises(AttributeError) as caught:
+        getattr(owners[of], name)
+    assert said in str(caught.value)
+    assert copy.deepcopy(owners["gaussians"]).means.equal(gaussians.means)
 
 
 def unit_vectors(count):

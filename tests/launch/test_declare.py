@@ -10,9 +10,9 @@ from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.results import load_experiment
 from gsbench.config.compose import Trial
 from gsbench.launch.record import add_to_plan, declare, declare_questions, declared_metrics
-from gsbench.runs.experiments import Declaration, Question, read_declarations
+from gsbench.runs.experiments import Declaration, Question, declared_now, read_declarations
 from tests.end_to_end.conftest import SMALL
-from tests.helpers import refusal
+from tests.helpers import refusal, write
 from tests.launch.test_jobs import trial
 
 # later words win: a trial of seconds
@@ -65,13 +65,45 @@ def test_trials_are_declared_with_the_metric_and_those_of_later_commands_are_add
     }
     assert say(second_seed) == [first]  # a part of it: nothing new
     assert not caplog.text
-    with caplog.at_level(logging.WARNING):  # a further seed, by a command that declares nothing
-        after = say(declaring(tmp_path, None, 2))
-    assert "trials are added to those declared with psnr" in caplog.text
+    # a further seed, by a command that declares nothing: before any result it is declared in time
+    after = say(declaring(tmp_path, None, 2))
     assert sorted(after[-1].values()) == [[0], [0, 1, 2]]
+    assert "first result" not in caplog.text
+    # the time is that of the first declaration of the metric, which the verdict counts
+    record = tmp_path / "exp" / "declared.jsonl"
+    moments = iter(("2020-01-01", "2020-01-02"))
+    lines = [
+        json.loads(line) | {"time": f"{next(moments)}T00:00:00Z"}
+        for line in record.read_text().splitlines()
+    ]
+    record.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with caplog.at_level(logging.INFO):
+        declare([declaring(tmp_path, None, 2)])
+    assert "exp: psnr stays declared, since 2020-01-01 00:00 UTC" in caplog.messages
     # another threshold is another arm, though it has the same name
     changed = declaring(tmp_path, "psnr", name="volumetric", volume_threshold=0.1)
     assert len(say(changed)[-1]) == 3
+
+
+@pytest.mark.parametrize("in_looks", [False, True])
+@pytest.mark.parametrize(
+    "name, seed, late", [("adc", 1, "a_init-adc"), ("adc", 0, ""), ("later", 1, "")]
+)
+def test_arms_that_get_seeds_after_their_first_result_are_named(
+    tmp_path, caplog, in_looks, name, seed, late
+):
+    first, added = declaring(tmp_path, "psnr"), declaring(tmp_path, "psnr", seed, name=name)
+    declare([first])
+    write(first.folder / "results.json", {})
+    with caplog.at_level(logging.WARNING):
+        if in_looks:
+            question = Question(
+                metric="psnr", scenes={"courtyard": (added.files.key,) * 2}, seeds=(0, seed)
+            )
+            declare_questions(tmp_path / "exp", declared_now(questions=(question,), looks=(2,)))
+        else:
+            declare([added])
+    assert f"{late}: where such an arm is compared" in caplog.text if late else not caplog.text
 
 
 def test_one_command_cannot_declare_two_metrics(tmp_path, refused):

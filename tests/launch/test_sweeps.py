@@ -326,19 +326,24 @@ def test_a_dry_run_tells_arms_and_their_changes_apart(runs):
     "missing, download, note",
     [
         (["lpips_squeeze"], False, ""),
-        (["lpips_squeeze"], True, "  will be checked: it lacks lpips_squeeze, which can be "),
+        (["lpips_squeeze"], True, "  lacks lpips_squeeze: its weights are not here; a run will "),
+        (["flip"], True, "  will be checked: it lacks lpips_squeeze, which can be computed now"),
         ([], False, "  will be checked: it lacks lpips_squeeze, which can be computed now"),
     ],
 )
 def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missing, download, note):
-    monkeypatch.setattr(dry_run, "unavailable_now", lambda options: missing)
+    def unavailable(options):
+        assert not json.loads(options)["download"]  # a dry run downloads nothing
+        return missing
+
+    monkeypatch.setattr(dry_run, "unavailable_now", unavailable)
     values = trial_values()
     values = values | {"eval": values["eval"] | {"download": download}}
     finish(values, awaited=["lpips_squeeze"])
     trial = replace(composed([])[0], values=values)
     line = describe_plan([trial])[0]
     assert note in line
-    assert ("checked" in line) == bool(note)
+    assert ("lpips" in line) == bool(note)
 
 
 # ---- plan and states

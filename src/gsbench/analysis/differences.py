@@ -5,7 +5,6 @@ that belong together share one name. A densifier class adds the ingredients in w
 ADC. All are read from the trials' recorded configurations and code.
 """
 
-import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -14,17 +13,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import yaml
-
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Arm, TrialPair, TrialResult, group_by, seeds_text
 from gsbench.analysis.trial_settings import Configured, canonical
 from gsbench.gaussians.paper_values import RATES
-from gsbench.parsing import LOADER
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED
 from gsbench.runs.freshness import Change, Part, code_changes, present_version
 from gsbench.runs.nested import SHOWN
-from gsbench.system.install import conf_dir
 from gsbench.words import counted, some_of
 
 Versions = dict[str, list[TrialResult]]  # version -> the trials that it made
@@ -94,9 +89,30 @@ WITHOUT_EFFECT = (
 OF_A_SCENE = ("resolution", "data", "budget")
 OWN_SETTINGS = (*WITHOUT_EFFECT, "scene", "init.path", "train.iterations")
 
-FACTS = ("Source", "Compared", "Tests", "Otherwise", "Departs from adc by")
-# A fact is one comment line; indented comment lines continue it.
-FACT = re.compile(rf"^# (?P<key>{'|'.join(FACTS)}): (?P<text>.*(?:\n#   .*)*)$", re.MULTILINE)
+# The ingredients in which each densifier class departs from ADC, beside its settings. They are not
+# attributes of the classes, since importing those loads torch. Another class is one ingredient.
+DEPARTURES: dict[str, tuple[str, ...]] = {
+    "gsbench.densify.AbsGS": ("absolute gradient for splits", "ceiling on opacities"),
+    "gsbench.densify.ADC": (),
+    "gsbench.densify.EdgeAware": ("split", "edge score", "prunings"),
+    "gsbench.densify.FastGS": (
+        "absolute gradient for splits",
+        "ceiling on opacities",
+        "error score",
+        "last prunings",
+    ),
+    "gsbench.densify.GNS": ("split", "edge score", "prunings", "natural selection"),
+    "gsbench.densify.LongAxis": ("split",),
+    "gsbench.densify.MCMC": ("relocation", "growth by a share", "noise", "regularisation"),
+    "gsbench.densify.MRNF": ("edge score", "growth by a share", "noise", "decay"),
+    "gsbench.densify.NoDensifier": ("densification",),
+    "gsbench.densify.PixelGS": ("weights of the gradient",),
+    "gsbench.densify.QuantileADC": ("threshold by a rate", "pruning by a share"),
+    "gsbench.densify.ResGS": ("residual split", "levels", "fading opacity"),
+    "gsbench.densify.SteepGS": ("saddle condition", "split along an eigenvector"),
+    "gsbench.densify.Taming": ("score", "prunings"),
+    "gsbench.densify.Volumetric": ("volume rule",),
+}
 
 
 def differing_conditions(trials: Sequence[TrialResult], code: bool = True) -> dict[str, list[str]]:
@@ -299,8 +315,13 @@ def ingredients(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, 
 
 def differing_keys(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """The settings in which two configurations differ, without those in `WITHOUT_EFFECT`."""
-    keys = [key for key in {**one, **other} if not _is_among(key, WITHOUT_EFFECT)]
-    return [key for key in keys if one.get(key) != other.get(key)]
+    keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
+    return [key for key in keys if is_ingredient(key)]
+
+
+def is_ingredient(key: str) -> bool:
+    """Return whether a setting may change the trained model."""
+    return not _is_among(key, WITHOUT_EFFECT)
 
 
 def _is_among(key: str, settings: Sequence[str]) -> bool:
@@ -388,50 +409,4 @@ def _class_ingredients(config: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     if target == "gsbench.densify.External":
         return (BY_PROGRAM.format(config.get("densify.name")),)
-    return departures().get(str(target), (f"rule {target}",))
-
-
-@cache
-def shipped_arms() -> dict[str, Mapping[str, Any]]:
-    """The settings of each densifier that gsbench ships, by name, without ``densify/external``."""
-    return {path.stem: _with_defaults(path.stem) for path in sorted(_arms_folder().glob("*.yaml"))}
-
-
-@cache
-def facts_of(name: str) -> dict[str, str]:
-    """The facts at the end of the file of the shipped arm ``name``, by their key (`FACTS`)."""
-    content = (_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8")
-    return {match["key"]: match["text"].replace("\n#   ", " ") for match in FACT.finditer(content)}
-
-
-@cache
-def departures() -> dict[str, tuple[str, ...]]:
-    """The ingredients in which each shipped densifier class (by import path) departs from ADC."""
-    by_class = {}
-    for name in shipped_arms():
-        content = _own_settings(name)
-        if "_target_" in content:  # without it, the arm has the class of the arm in its defaults
-            text = facts_of(name).get("Departs from adc by", "")
-            by_class[content["_target_"]] = tuple(filter(None, text.split(", ")))
-    return by_class
-
-
-@cache
-def _with_defaults(name: str) -> dict[str, Any]:
-    """The settings of an arm, which override those of the arms in its ``defaults``."""
-    content = _own_settings(name)
-    parents = [parent for parent in content.pop("defaults", []) if parent != "_self_"]
-    return {
-        key: value for parent in parents for key, value in _with_defaults(parent).items()
-    } | content
-
-
-def _own_settings(name: str) -> dict[str, Any]:
-    settings: dict[str, Any] = yaml.load(
-        (_arms_folder() / f"{name}.yaml").read_text(encoding="utf-8"), Loader=LOADER
-    )
-    return settings
-
-
-def _arms_folder() -> Path:
-    return conf_dir() / "densify"
+    return DEPARTURES.get(str(target), (f"rule {target}",))

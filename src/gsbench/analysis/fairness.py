@@ -6,16 +6,18 @@ recorded.
 
 import itertools
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 from gsbench.analysis.advice import Advice, equal_counts_command
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
+    differing_code,
     differing_keys,
     ingredients_between,
     ingredients_note,
+    is_ingredient,
     is_mixed,
 )
 from gsbench.analysis.notes import Note
@@ -24,10 +26,11 @@ from gsbench.analysis.quantities import COSTS, Reader, relative_change
 from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
+from gsbench.gaussians.paper_values import PAPER_CAP
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
-from gsbench.words import counted
+from gsbench.words import counted, listed
 
 LONGEST = 60  # the most characters of a value that are shown
 UNKNOWN, NONE = "not recorded", "–"
@@ -71,10 +74,66 @@ def counts_note(
     return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
 
 
-def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Table:
+def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
+    """A note for each limit on the count that compared arms share and that some did not reach.
+
+    The limit held an arm if a trial on each scene came near it, or was refused growth by a cap
+    that may end lower. The paper's own cap is no limit for equal counts: all arms have it.
+    """
+    notes, arms = [], set(itertools.chain(*pairs))
+    limited = [trial for trial in trials if trial.arm in arms and _limit(trial)]
+    for limit, sharing in group_by(limited, _limit).items():
+        by_arm = group_by(sharing, lambda trial: trial.arm)
+        free: dict[str, list[TrialResult]] = {}
+        for arm, own in by_arm.items():
+            for of_scene in group_by(own, lambda trial: trial.scene).values():
+                if not any(map(_is_held, of_scene)):
+                    free.setdefault(str(arm), []).extend(of_scene)
+        if not free or len(by_arm) < 2:
+            continue
+        unheld = [trial for own in free.values() for trial in own]
+        scenes = {trial.scene for trial in unheld}
+        places = sorted(scenes) if scenes != {trial.scene for trial in sharing} else []
+        notes.append(
+            Note.of(
+                "limit not reached",
+                arms=list(free),
+                limit=limit,
+                largest=max(trial.record.num_gaussians or 0 for trial in unheld),
+                scenes=listed(places),
+            )
+        )
+    return notes
+
+
+def _limit(trial: TrialResult) -> int:
+    """The limit on the count that the trial's experiment asked for; 0 without one."""
+    budget = trial.record.budget
+    if budget is None or trial.record.num_gaussians is None or trial.made_elsewhere:
+        return 0
+    limit = budget.max_gaussians or 0
+    return 0 if (limit, budget.cap) == (PAPER_CAP, "soft") else limit
+
+
+def _is_held(trial: TrialResult) -> bool:
+    """Return whether the trial's limit held its count."""
+    budget, count = trial.record.budget, trial.record.num_gaussians or 0
+    # a governor and a curve hold growth back early, also if the limit is never reached
+    refuses = budget is not None and budget.cap not in ("governor", "curve")
+    refused = refuses and bool(trial.record.events.get("blocked_by_cap"))
+    return refused or count >= (1 - EQUAL_COUNTS) * _limit(trial)
+
+
+def fairness_table(
+    trials: Sequence[TrialResult],
+    first: Arm,
+    second: Arm,
+    older: Sequence[TrialResult] = (),
+) -> Table:
     """The fairness sheet of two arms as a table with notes.
 
-    ``trials`` are all trials of the experiment, each with its variant. Measured rows cover the
+    ``trials`` are all trials of the experiment that count, each with its variant, ``older`` those
+    of earlier code. Measured rows cover the
     paired trials: one value, or the smallest, the largest and the mean. Raises KeyError for an arm
     without trials.
     """
@@ -93,7 +152,7 @@ def fairness_table(trials: Sequence[TrialResult], first: Arm, second: Arm) -> Ta
     notes = [ingredients_note(ingredients_between(trials, first, second), first, second)]
     notes += between_scenes_notes(*groups)
     notes += [Note.of("compared", pairs=len(pairs))]
-    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second))]
+    tuning = [f"Tuning. {note}" for note in tuning_notes(trials, (first, second), older)]
     columns = tuple(Column("", name, ("", name)) for name in (str(first), str(second), DIFFERS))
     title = f"Fairness sheet: {second} against {first}"
     return Table(title, ("what",), columns, tuple(rows), (*map(str, notes), *tuning), wrapped=True)
@@ -198,7 +257,9 @@ MEASURED: dict[str, Callable[[Sequence[TrialResult]], str]] = {
 }
 
 
-def tuning_notes(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[Note]:
+def tuning_notes(
+    trials: Sequence[TrialResult], pair: Sequence[Arm], older: Sequence[TrialResult] = ()
+) -> list[Note]:
     """List, for each arm of a pair, its searches, and the settings that these trials vary.
 
     These trials are measured on the test views, so varying settings among them is tuning on the
@@ -209,7 +270,7 @@ def tuning_notes(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> list[Not
     for arm in pair:
         own = [trial for trial in trials if trial.arm == arm]
         notes += [_search_note(own, name, record) for name, record in _searches(own[0]).items()]
-        notes += _varied_settings(trials, own[0])
+        notes += _varied_settings([*trials, *older], own[0])
     return notes or [Note.of("no tuning")]
 
 
@@ -300,18 +361,30 @@ def _when(own: Sequence[TrialResult], experiment: str) -> str:
 
 
 def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[Note]:
-    """Name the settings that vary among arms with one initialiser and densifier class."""
+    """Name the settings and code that vary among arms with one initialiser and densifier class."""
     target = own.config.get("densify._target_")
     same_class = [
         t
         for t in trials
         if t.init == own.init and t.config and t.config.get("densify._target_") == target
     ]
-    choices = [group[0] for group in group_by(same_class, lambda trial: trial.arm).values()]
-    keys = sorted({key for other in choices for key in differing_keys(own.config, other.config)})
-    if len(choices) < 2 or not keys:
+    # each scene may have settings of its own, which are no choices
+    by_scene = group_by(same_class, lambda trial: trial.scene).values()
+    most = max((group_by(of_scene, _choice) for of_scene in by_scene), key=len, default={})
+    if len(most) < 2:
         return []
-    return [Note.of("varied", arm=own.arm, choices=len(choices), settings=keys)]
+    firsts = [same[0] for same in most.values()]
+    configs = [trial.config for trial in firsts]
+    keys = {key for config in configs for key in differing_keys(configs[0], config)}
+    code = [str(part) for part in differing_code(firsts) if part.kind != "stage"]
+    return [Note.of("varied", arm=own.arm, choices=len(most), settings=[*sorted(keys), *code])]
+
+
+def _choice(trial: TrialResult) -> Hashable:
+    """What the user chose for a trial: settings, modules, and edits of gsbench's packages."""
+    config = [(k, canonical(v)) for k, v in trial.config.items() if is_ingredient(k)]
+    code = [(part, made) for part, made in trial.code.items() if part.kind != "stage"]
+    return frozenset(config), frozenset(code)
 
 
 def _has_settings(trial: TrialResult, point: SearchPoint | None) -> bool:

@@ -77,6 +77,8 @@ class Verdict:
     like_these: LikeThese | None = None
     scenes: tuple[SceneVerdict, ...] = ()
     family: int = 1
+    # the arms of the family's questions, without those of claims, which have names
+    family_arms: tuple[str, ...] = ()
     final: bool = True
     untestable: Note | None = None
     outlying: tuple[TrialResult, ...] = ()
@@ -205,8 +207,11 @@ def judge(
             candidates = max((_candidate_metrics(unjudged[k]) for k in family), default=1)
             differences = [unjudged[k].pairs.differences for k in family]
             answers = answer_family(differences, declaration.error_rate / candidates)
+            asked = [unjudged[k].question for k in family]
+            arms = tuple(dict.fromkeys(str(one.arm) for one in asked if one.arm and not one.name))
             for k, answer in zip(family, answers, strict=True):
-                decided = _decide(replace(unjudged[k], family=len(family)), answer)
+                own = replace(unjudged[k], family=len(family), family_arms=arms)
+                decided = _decide(own, answer)
                 judged[k] = _without_lacking(decided, trials_of(decided.question), lacking)
     return _with_scenes(judged, declaration.error_rate)
 

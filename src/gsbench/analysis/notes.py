@@ -76,12 +76,16 @@ SENTENCES: dict[str, str] = {
     "not planned": "seeds after an undeclared or missing one do not count",
     "waits": "a look waits for all of its trials",
     "decided before": "the question was decided with {seeds:n seed}",
-    "not asked": "no declared question is about them",
+    "not asked": "in no declared question",
     # ---- arms that are unlike in more than was asked
     "scenes differ": "Scenes of {arms:all} differ in more than the scene: {differences}.",
     "unequal counts": (
         "{arm} has {more} Gaussians than {baseline}, so this does not compare at equal counts. To "
         "do so: {advice}."
+    ),
+    "limit not reached": (
+        "The limit of {limit:,} Gaussians (densify.max_gaussians) did not bind{scenes:if: on %}: "
+        "trials of {arms:all} ended with {largest:,} at most. So it makes no counts equal."
     ),
     "no ingredient": "{arm} and {baseline} differ in no recorded setting.",
     "ingredients": "{arm} differs from {baseline} by {ingredients:all}{alone}.",
@@ -94,12 +98,12 @@ SENTENCES: dict[str, str] = {
     "unlike tuning": "They were not tuned alike: {arms:all}.",
     "vain search": "{arm}: the search {experiment} found nothing.",
     "search": (
-        "{arm}: {chosen:all} is the best of {points:n point} by {metric} of validation views "
-        "({scenes:all}; seed {seeds:list}; the search {experiment}), {when}. Tried: "
+        "{arm}: the best of {points:n point} by {metric} of validation views ({scenes:all}; seed "
+        "{seeds:list}; the search {experiment}) is {chosen:all}, {when}. Tried: "
         "{tried:list}{more:if: and % more}.{others}"
     ),
     "varied": (
-        "{arm}: {choices:n choice} of its settings ran here. They differ in {settings:all}, "
+        "{arm}: {choices:n choice} of settings and code ran here. They differ in {settings:all}, "
         "and all were measured on the test views that the verdict uses."
     ),
     # ---- verdicts, and what was declared
@@ -117,18 +121,18 @@ SENTENCES: dict[str, str] = {
         "{declared:n declared trial}."
     ),
     "early look": (
-        "{missing} of the {declared:n declared trial} are still missing, so this is an early look. "
+        "Still missing: {missing} of the {declared:n declared trial}, so this is an early look. "
         "Do not stop here because the result pleases: that finds effects that do not exist."
     ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation.",
-    "mean": "Mean over {trials} trials; ± is the deviation (n − 1) over {spread}.",
+    "mean": "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}.",
     "bold": "Bold: best mean of a scene after rounding; this is not a test.",
-    "few values": "(k/{trials}): only k of {trials} trials have a value; —: none.",
+    "few values": "(k/{trials}): k of {trials:n trial} with a value; —: none.",
     "protocol": "Protocol {protocols:list}.",
     "not available": "n/a, {reason}.",
     "no mean": "No mean over the scenes is shown, since they differ in conditions or code.",
-    "no best": "{place}: not compared, no best marked: {conditions:list} differ.",
+    "no best": "{place}: not compared, no best marked: the arms differ in {conditions:list}.",
     "unusable": "Left out ({count}): {folders:few}.",
     "agreement": (
         "Metrics agree with people only in part. Their rank correlation with viewers' scores of "
@@ -143,10 +147,10 @@ SENTENCES: dict[str, str] = {
         "on them differ by about 0.3 to 0.45 dB."
     ),
     "near twins": (
-        "{scene}: {near} of {tested} test views have a near twin in training, so they measure "
+        "{scene}: training has near twins of {near} of {tested:n test view}, which so measure "
         "memory too."
     ),
-    "copies": "{scene}: {copies:n photograph} left out, since another one has its name or content.",
+    "copies": "{scene}: {copies:n photograph} left out: another one has the same name or content.",
     "few rounds": FEW_ROUNDS,
     "cloud": "Before training, {scene} {init}: {doubt}.",
     "program's model": (

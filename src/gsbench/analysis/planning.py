@@ -5,9 +5,10 @@ Trainings are simulated with equally noisy scenes, and decided by the thresholds
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from gsbench.analysis.designs import (
     POWER,
     Components,
     Design,
+    designs_needed,
     power_of_mean,
 )
 from gsbench.analysis.looks import look_levels, plan_looks
@@ -83,6 +85,55 @@ class Purpose:
                 low, high = (low, middle) if enough else (middle + 1, high)
             chosen.append(Design(scenes, high))
         return chosen
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The designs that show a difference between two arms, each list with the fewest trials first.
+
+    ``like_these`` are those for scenes like these, None if the pilot has one scene. The pilot's
+    ``factors`` say between which multiples of its deviation the real one lies (`UNSURE`), and
+    ``powers`` the chances at these that the first design shows the difference; None without one.
+    """
+
+    components: Components
+    these: tuple[Design, ...]
+    like_these: tuple[Design, ...] | None
+    factors: tuple[float, float]
+    powers: tuple[float, float] | None
+
+    def to_json(self) -> dict[str, Any]:
+        def listed(designs: Sequence[Design]) -> list[dict[str, int]]:
+            return [asdict(one) | {"trials": one.trials} for one in designs]
+
+        like_these = None if self.like_these is None else listed(self.like_these)
+        components = asdict(self.components)
+        return {
+            "pilot": {"pairs": components.pop("trials")} | components,
+            "these_scenes": listed(self.these),
+            "scenes_like_these": like_these,
+            "share_of_pilots": UNSURE,
+            "deviation_factors": self.factors,
+            "power": self.powers,
+        }
+
+
+def make_plan(components: Components, difference: float, purpose: Purpose, most: int) -> Plan:
+    """The plan to show ``difference``, with at most ``most`` designs for each statement."""
+
+    def fewest(designs: Sequence[Design]) -> tuple[Design, ...]:
+        return tuple(sorted(designs, key=lambda design: (design.trials, design.scenes))[:most])
+
+    these, like_these = fewest(purpose.designs(difference, components.within)), None
+    if components.between is not None:
+        like_these = fewest(designs_needed(difference, components, like_these=True))
+    low, high = deviation_range(replace(components, within=1.0))
+    powers = None
+    if these:
+        of_first = partial(purpose.power, these[0], difference)
+        powers = of_first(high * components.within), of_first(low * components.within)
+    factors = low, high
+    return Plan(components, these, like_these, factors, powers)
 
 
 def deviation_range(components: Components) -> tuple[float, float]:

@@ -44,7 +44,7 @@ class Quantity:
         return self.name + {1: " ↑", -1: " ↓", 0: ""}[self.direction]
 
     def format(self, value: float) -> str:
-        return f"{value:.{self.decimals}f}"
+        return f"{value:,.{self.decimals}f}"
 
 
 def _textured(trial: TrialResult) -> float:
@@ -65,6 +65,9 @@ COSTS: dict[str, tuple[str, Reader]] = {  # name, and value in its own unit (one
     "peak_memory_mb": ("peak memory", lambda trial: trial.record.peak_memory_mb),
 }
 COUNTS = ("gaussians", "init_points")
+# symbol, scale, decimals, and the value of the largest trial from which the unit is used
+COUNT_UNITS = (("M", MILLION, 2, MILLION), ("k", THOUSAND, 1, THOUSAND), ("", 1.0, 0, 0.0))
+TIME_UNITS = (("min", MINUTE, 1, 10 * MINUTE), ("s", 1.0, 1, 0.0))
 # (cost, symbol, scale, decimals) of the names that fix a unit.
 FIXED_UNITS = {
     "gaussians_millions": ("gaussians", "M", MILLION, 2),
@@ -123,8 +126,8 @@ def choose_quantities(
 def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     """The quantity ``name`` (a metric, a cost or an alias) for tables.
 
-    Counts and times have a unit that suits the trials, unless the name fixes the unit
-    (`FIXED_UNITS`). Raises ``InputError`` for an unknown name.
+    Counts and times have a unit that suits the smallest and the largest trial, unless the name
+    fixes the unit (`FIXED_UNITS`). Raises ``InputError`` for an unknown name.
     """
     trials = list(trials)
     key = ALIASES.get(name, name)
@@ -139,18 +142,14 @@ def quantity(name: str, trials: Iterable[TrialResult]) -> Quantity:
     if key not in COSTS:
         names = [*metric_keys(trials, known_keys()), *COSTS]
         raise InputError(f"unknown metric {name!r}; choose among {', '.join(names)}")
-    largest = max((COSTS[key][1](trial) or 0.0 for trial in trials), default=0.0)
-    if key in COUNTS:
-        return (
-            _scaled(key, key, "M", MILLION, 2)
-            if largest >= MILLION
-            else _scaled(key, key, "k", THOUSAND, 1)
-        )
-    return (
-        _scaled(key, key, "min", MINUTE, 1)
-        if largest >= 10 * MINUTE
-        else _scaled(key, key, "s", 1.0, 1)
-    )
+    units = COUNT_UNITS if key in COUNTS else TIME_UNITS
+    values = [value for trial in trials if (value := COSTS[key][1](trial))] or [0.0]
+    for symbol, scale, decimals, start in units[:-1]:
+        # the smallest value must have two digits, as 0.12 M or 1.0 k
+        if max(values) >= start and min(values) >= 10 * scale / 10**decimals:
+            return _scaled(key, key, symbol, scale, decimals)
+    symbol, scale, decimals, _ = units[-1]
+    return _scaled(key, key, symbol, scale, decimals)
 
 
 def asked_quantity(key: str, trials: Iterable[TrialResult] = ()) -> Quantity:
@@ -239,4 +238,5 @@ def _scaled(key: str, cost: str, symbol: str, scale: float, decimals: int) -> Qu
         return None if value is None else value / scale
 
     shown = {"train_time": "train", "total_time": "total"}.get(cost, name)
-    return Quantity(key, f"{shown} ({symbol})", -1, decimals, scaled, cost=True)
+    named = f"{shown} ({symbol})" if symbol else shown
+    return Quantity(key, named, -1, decimals, scaled, cost=True)

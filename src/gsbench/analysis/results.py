@@ -31,6 +31,7 @@ from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
 from gsbench.system.machine import kind_of_machine
+from gsbench.words import counted, some_of
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
@@ -236,18 +237,29 @@ TrialPair = tuple[TrialResult, TrialResult]  # a trial of the baseline and one o
 
 @dataclass(frozen=True)
 class Experiment:
-    """The usable trials of an experiment, and a line for each trial folder that cannot be used.
+    """The usable trials of an experiment, and ``faults``, a line for each folder without one.
 
-    ``older`` are trials of earlier code that `newest_code` left out. ``lacking`` are the folders of
-    trials without a usable result: they failed, were stopped, or are damaged.
+    ``older`` are trials of earlier code that `newest_code` left out, of which ``versions`` has a
+    line for each part of the code. ``lacking`` are the folders of trials without a usable result:
+    they failed, were stopped, or are damaged.
     """
 
     name: str
     folder: Path
     trials: tuple[TrialResult, ...]
-    warnings: tuple[str, ...]
+    faults: tuple[str, ...]
     older: tuple[TrialResult, ...] = ()
+    versions: tuple[str, ...] = ()
     lacking: tuple[Path, ...] = ()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The lines on all folders that do not count; there are `left_out` of these."""
+        return (*self.faults, *self.versions)
+
+    @property
+    def left_out(self) -> int:
+        return len(self.faults) + len(self.older)
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -318,13 +330,15 @@ def read_experiment(folder: Path) -> Experiment:
 
 
 def newest_code(experiment: Experiment) -> Experiment:
-    """The experiment without trials that later code repeated; a warning names them.
+    """The experiment without trials that later code repeated; a warning for each part of the code
+    names its earlier versions, with their numbers of trials.
 
     Trials of one scene, arm and settings that differ only in their code are versions of one thing.
     Those count whose user's code is what it is now, or else those that were finished last.
     """
     older: list[TrialResult] = []
-    lines: list[str] = []
+    # {(part, version that counts): {earlier version: its trials}}
+    replaced: dict[tuple[str, str], dict[str, list[TrialResult]]] = {}
     for of_arm in group_by(experiment.trials, lambda t: (t.scene, t.init, t.densify)).values():
         if len({frozenset(trial.code.items()) for trial in of_arm}) < 2:
             continue
@@ -338,24 +352,32 @@ def newest_code(experiment: Experiment) -> Experiment:
             for made in versions.values():
                 if made is not newest:
                     older += made
-                    lines.append(_left_out_line(made, newest[0]))
+                    change = _change_of_code(made[0], newest[0])
+                    earlier = replaced.setdefault((change.name, change.now), {})
+                    earlier.setdefault(change.made, []).extend(made)
     if not older:
         return experiment
     left_out = {trial.path for trial in older}
     kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
-    return replace(
-        experiment, trials=kept, older=tuple(older), warnings=(*experiment.warnings, *lines)
-    )
+    lines = tuple(_versions_line(*code, earlier) for code, earlier in replaced.items())
+    return replace(experiment, trials=kept, older=tuple(older), versions=lines)
 
 
-def _left_out_line(made: Sequence[TrialResult], newest: TrialResult) -> str:
-    """``sw/garden/sfm-mine seeds 0, 1: made by an earlier mine (3fa9c1d2, now …)``"""
-    parts = dict.fromkeys([*newest.code, *made[0].code], "none")
-    change = next(code_changes(parts | made[0].code, (parts | newest.code).get))
-    cell = f"{made[0].experiment}/{made[0].scene}/{made[0].init}-{made[0].densify}"
+def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
+    """The first part of the code in which two trials differ."""
+    parts = dict.fromkeys([*newest.code, *made.code], "none")
+    return next(code_changes(parts | made.code, (parts | newest.code).get))
+
+
+def _versions_line(part: str, now: str, earlier: Mapping[str, Sequence[TrialResult]]) -> str:
+    """``sw: 6 trials of sfm-mine made by earlier versions of mine: 3fa9c1d2 (4), …``"""
+    trials = [trial for made in earlier.values() for trial in made]
+    arms = sorted({f"{trial.init}-{trial.densify}" for trial in trials})
+    versions = [f"{version:.{SHOWN}} ({len(made)})" for version, made in earlier.items()]
     return (
-        f"{cell} {seeds_text(made)}: made by an earlier {change.name} "
-        f"({change.made:.{SHOWN}}; the trials that count have {change.now:.{SHOWN}})"
+        f"{trials[0].experiment}: {counted(len(trials), 'trial')} of {some_of(arms)} made by "
+        f"earlier versions of {part}: {', '.join(versions)}; the trials that count have "
+        f"{now:.{SHOWN}}"
     )
 
 

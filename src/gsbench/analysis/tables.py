@@ -101,8 +101,9 @@ def build_table(
     notes += _reading_notes(cells, quantities, expected, scene_index is not None)
     notes += between_scenes_notes(varied)
     notes += trials_notes(experiment, trials)
-    if left_out := experiment.warnings:
-        notes.append(Note.of("unusable", count=len(left_out), folders=list(left_out)))
+    # the line on versions stands for many trials, so it comes before the folders that are cut off
+    if lines := [*experiment.versions, *experiment.faults]:
+        notes.append(Note.of("unusable", count=experiment.left_out, folders=lines))
     heading = title or f"Experiment {experiment.name}"
     return Table(heading, tuple(rows), tuple(headings), tuple(shown), tuple(map(str, notes)))
 

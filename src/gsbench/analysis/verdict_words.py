@@ -100,7 +100,7 @@ def with_notes(words: str, verdict: Verdict) -> str:
 def numbers(verdict: Verdict) -> str:
     """``+0.50 (interval +0.30 to +0.70, p 0.012, adjusted for 2 tests)``; "" without a mean.
 
-    The level of the interval is told if it is not 95 %.
+    The level of the interval is told if it is not 95 %, and the arms if the tests are of several.
     """
     answer = verdict.answer
     if answer is None:
@@ -110,7 +110,9 @@ def numbers(verdict: Verdict) -> str:
     level = "" if answer.level == ALPHA else f"{100 * (1 - answer.level):.3g} % "
     facts = [f"{level}interval {verdict.shown_interval(answer.interval)}"]
     facts += [] if answer.p is None else [f"p {p_text(answer.p)}"]
-    facts += [f"adjusted for {verdict.family} tests"] if verdict.family > 1 else []
+    if verdict.family > 1:
+        arms = f", of {some_of(verdict.family_arms)}" if len(verdict.family_arms) > 1 else ""
+        facts.append(f"adjusted for {verdict.family} tests{arms}")
     return f"{verdict.shown(answer.mean)} ({', '.join(facts)})"
 
 
@@ -167,8 +169,9 @@ def outlying_words(verdict: Verdict) -> str:
     if verdict.outlying:
         labels = some_of([trial.label for trial in verdict.outlying])
         word = WORDS[verdict.outcome_without or "undecided"]
+        them = "it" if len(verdict.outlying) == 1 else "them"
         parts.append(
-            f"far outside the other seeds of its scene and arm: {labels}; without it: {word}"
+            f"far outside the other seeds of its scene and arm: {labels}; without {them}: {word}"
         )
     return "; ".join(parts)
 

@@ -15,7 +15,7 @@ import yaml
 from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.fairness import counts_note
+from gsbench.analysis.fairness import counts_note, limit_notes
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
@@ -196,19 +196,18 @@ def finished_trials(home: Path, trials: Iterable[Trial]) -> list[TrialResult]:
 def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what one must know beside them.
 
-    These are unequal counts of Gaussians, said first, trials in no verdict, and earlier code.
+    These are unequal counts and limits without effect, said first, trials in no verdict, and
+    earlier code.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
-        experiment = read_experiment(home)
-        newest = newest_code(experiment)
-        superseded = newest.warnings[len(experiment.warnings) :]
-        comparison = compare(newest)
+        comparison = compare(newest_code(read_experiment(home)))
         counts = [
             counts_note(comparison.trials, *pair, equal_counts_settings)
             for pair in comparison.pairs
         ]
-        unequal = [note for note in counts if note is not None]
-        said = [*texts(unequal), *comparison.sentences, *texts(comparison.remarks), *superseded]
+        before = [*filter(None, counts), *limit_notes(comparison.trials, comparison.pairs)]
+        said = [*texts(before), *comparison.sentences, *texts(comparison.remarks)]
+        said += comparison.experiment.versions
         for line in said:
             log.info("%s", line)
 

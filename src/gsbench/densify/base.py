@@ -19,6 +19,7 @@ from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.trainable import TrainableGaussians
 from gsbench.raster.base import RenderOutput
 from gsbench.settings import Switch, check_settings
+from gsbench.words import NamesAttributes
 
 
 class Lineage:
@@ -104,7 +105,7 @@ class CountSchedule(Protocol):
 
 
 @dataclass(frozen=True)
-class DensifyContext:
+class DensifyContext(NamesAttributes):
     """Facts of a training that its densifier may use."""
 
     extent: float  # size of the scene in world units: 3DGS's cameras_extent
@@ -122,7 +123,7 @@ class DensifyContext:
 
 
 @dataclass
-class Refinement:
+class Refinement(NamesAttributes):
     """One refinement in progress: what its rules read and change, and the record of their edits."""
 
     step: int

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsbench.densify.base import Densifier, DensifyContext, Refinement, Rule
 from gsbench.errors import InputError
 from gsbench.gaussians.model import Gaussians
+from gsbench.gaussians.paper_values import PAPER_CAP
 
 CapKind = Literal["soft", "freeze", "hard", "curve", "governor"]
 BISECTION_STEPS = 40  # of log(factor): the last interval is far below the spacing of float32 scores
@@ -70,7 +71,6 @@ def find_factor(count: Callable[[float], int], target: int, low: float, high: fl
     return min(high, math.exp(log_high))
 
 
-PAPER_CAP = 3_400_000  # arXiv 2508.05187 has it for the baseline and for its own rule
 STRICTNESS_LIMITS = (1e-3, 1e3)  # of the factor on the growth thresholds
 CULL_LIMITS = (1.0, 10.0)  # of the factor on the opacity below which Gaussians are pruned
 # a count up to 1 % above its target does not raise ``cull`` (arXiv 2605.16158: "e.g., 1%")

@@ -9,12 +9,14 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from gsbench.words import NamesAttributes
+
 MAX_SH_DEGREE = 3
 NUM_SH_REST = (MAX_SH_DEGREE + 1) ** 2 - 1  # 15 coefficients per channel besides the constant one
 
 
 @dataclass
-class Gaussians:
+class Gaussians(NamesAttributes):
     """N Gaussians as raw parameters (before activation), of one dtype and on one device.
 
     | field          | shape      | activation                                   |

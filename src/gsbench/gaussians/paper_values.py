@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from pydantic import PositiveFloat, PositiveInt
 
 VOLUME_THRESHOLD = 0.03  # V_th of arXiv 2508.05187, in cubed units of its COLMAP models
+PAPER_CAP = 3_400_000  # Gaussians; the same paper has it for the baseline and for its own rule
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch.optim.adam import adam
 
 from gsbench.gaussians.model import MAX_SH_DEGREE, Gaussians
 from gsbench.gaussians.paper_values import LearningRates
+from gsbench.words import attributes_of, no_such
 
 ADAM_BETAS = (0.9, 0.999)  # torch's defaults, as in 3DGS
 ADAM_EPSILON = 1e-15  # 3DGS
@@ -112,6 +113,12 @@ class TrainableGaussians:
         for name, tensor in self.values.tensors().items():
             first, second = torch.zeros_like(tensor.detach()), torch.zeros_like(tensor.detach())
             self.adam[name] = AdamState(initial[name], 0, first, second)
+
+    if not TYPE_CHECKING:  # else a type checker would allow any name
+
+        def __getattr__(self, name: str) -> Any:
+            names = attributes_of(Gaussians)
+            raise AttributeError(no_such("TrainableGaussians", name, names, inside="values."))
 
     def __len__(self) -> int:
         return len(self.values)

@@ -6,6 +6,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from statistics import fmean
@@ -13,6 +14,7 @@ from typing import Any
 
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
+from gsbench.eval.facts import LPIPS
 from gsbench.launch.states import arm_names, ask_queue, label_of, state_in_queue
 from gsbench.parsing import DamagedError
 from gsbench.runs.config_hash import determining_settings
@@ -91,8 +93,7 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
             state = state_in_queue(folder.path, queue) or state
         note = ""
         if state == "done":
-            if reason := folder.why_not_done(trial.values, unavailable_in_dry_run):
-                note = f"  will be checked: {reason}"
+            note = _what_is_left(trial)
         elif experiment := finished.elsewhere(folder):
             note = f"  as in {experiment}: nothing to compute"
         else:
@@ -125,6 +126,21 @@ def describe_plan(trials: Sequence[Trial], parallel: int = 1) -> list[str]:
     return [*lines, f"time: {time}"]
 
 
+def _what_is_left(trial: Trial) -> str:
+    """A note on what a run would do with a finished trial; "" if nothing. Downloads nothing."""
+    change = trial.files.why_not_done(trial.values, lambda options: ())
+    if change is not None and change.kind == "computable":
+        lacking, asked = change.name.split(", "), trial.values["eval"]
+        absent = unavailable_now(json.dumps(asked | {"download": False}, sort_keys=True))
+        here = [name for name in lacking if name not in absent]
+        if not here:
+            weights = [name for name in lacking if name.startswith(LPIPS)] * asked["download"]
+            missing = f"  lacks {', '.join(weights)}: its weights are not here; a run will try to "
+            return f"{missing}download them" if weights else ""
+        change = replace(change, name=", ".join(here))
+    return "" if change is None else f"  will be checked: {change}"
+
+
 def _change_since_last(trial: Trial, planned: Collection[Path]) -> str:
     """A line on what changed since the arm's last finished trial of this scene and seed.
 
@@ -153,14 +169,6 @@ def _determining(values: Mapping[str, Any], modules: Mapping[str, str]) -> dict[
     """The settings that determine a result, with dotted keys, and the user's code."""
     code = {f"code of {module}": digest[:SHOWN] for module, digest in modules.items()}
     return flatten(determining_settings(values)) | code
-
-
-def unavailable_in_dry_run(options: dict[str, Any]) -> Collection[str]:
-    """The metrics that a run could not compute either, by the ``eval`` settings.
-
-    Downloads nothing.
-    """
-    return () if options["download"] else unavailable_now(json.dumps(options, sort_keys=True))
 
 
 @cache

@@ -11,6 +11,7 @@ import shutil
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,7 @@ from gsbench.files import require_no_links, write_json, write_text
 from gsbench.parsing import Amount, DamagedError, Record, read_typed
 from gsbench.runs.experiments import (
     Declaration,
+    Planned,
     declared_now,
     make_home,
     merge_planned,
@@ -29,9 +31,10 @@ from gsbench.runs.experiments import (
     read_declarations,
     record_text,
 )
-from gsbench.runs.layout import DECLARED, PLAN, RESULTS
+from gsbench.runs.layout import DECLARED, PLAN, RESULTS, SEED
 from gsbench.settings import is_folder_name
 from gsbench.system.locks import hold
+from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +170,10 @@ def declare(trials: Sequence[Trial]) -> None:
             if metric is None:
                 continue
             if latest is not None and given is None:
-                log.info("%s: %s stays declared, since %s", home.name, latest.primary, latest.when)
+                sweeps = [one for one in declarations if one.kind == "sweep"]
+                others = [k for k, one in enumerate(sweeps) if one.primary != metric]
+                first = sweeps[max(others, default=-1) + 1]
+                log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)
             # Old declarations name no trials: they cover all of this metric.
@@ -178,12 +184,7 @@ def declare(trials: Sequence[Trial]) -> None:
             added = declared_now(questions=(open_question(metric),), trials=dict(together))
             write_text(home / DECLARED, record_text([*declarations, added]))
         if same_metric:
-            log.warning(
-                "%s: trials are added to those declared with %s; it no longer decides alone on an "
-                "arm that has results already and gets more of them",
-                home.name,
-                metric,
-            )
+            _warn_of_added_seeds(home, metric, before, asked)
         elif latest is not None:
             log.warning(
                 "%s: %s decides on arms that have no results yet; on the others, %s does",
@@ -193,11 +194,31 @@ def declare(trials: Sequence[Trial]) -> None:
             )
 
 
+def _warn_of_added_seeds(home: Path, metric: str, before: Planned, added: Planned) -> None:
+    """Name the arms that get further seeds after their first result.
+
+    Arms without a result are declared in time.
+    """
+    late = {
+        key.split("/")[1]
+        for key, seeds in added.items()
+        if not set(seeds) <= set(before.get(key, ())) and any(home.glob(f"{key}{SEED}*/{RESULTS}"))
+    }
+    if late:
+        log.warning(
+            "%s: seeds are added after the first result of %s: where such an arm is compared with "
+            "a baseline, %s no longer decides alone, but all metrics, adjusted for their number",
+            home.name,
+            some_of(sorted(late)),
+            metric,
+        )
+
+
 def declare_questions(home: Path, asked: Declaration) -> Declaration:
     """Add the questions of a claims file, a sweep or a round of votes to the experiment's record.
 
     Returns the recorded declaration: if the latest one of its kind is equal, that one with its
-    earlier time.
+    earlier time. In a sweep, each arm is judged by the declaration before its own first result.
     """
     if not asked.questions:
         return asked
@@ -208,7 +229,10 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
         if same_kind and same_kind[-1].hash == asked.hash:
             return same_kind[-1]
         write_text(home / DECLARED, record_text([*declarations, asked]))
-    if same_kind and asked.kind != "votes":  # votes are judged by their own round alone
+    if same_kind and asked.kind == "sweep":
+        before: Planned = reduce(merge_planned, (one.planned for one in same_kind))
+        _warn_of_added_seeds(home, asked.primary, before, asked.planned)
+    if same_kind and asked.kind == "claims":  # votes are judged by their own round alone
         log.warning(
             "%s: other questions were declared before: trials that were measured under them count "
             "as looked at",

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from gsbench.words import NamesAttributes
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -124,7 +126,7 @@ def view_depths(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 @dataclass
-class RenderOutput:
+class RenderOutput(NamesAttributes):
     """One rendered view.
 
     - ``image`` is [H, W, 3], not clamped above; ``alpha`` is [H, W].

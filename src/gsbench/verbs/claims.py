@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import json
 import math
 import tempfile
 from collections.abc import Sequence
@@ -10,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.designs import Components, Design, designs_needed, estimate_components
+from gsbench.analysis.designs import Components, Design, estimate_components
 from gsbench.analysis.notes import texts
 from gsbench.analysis.pairing import BASELINE, pair
-from gsbench.analysis.planning import COMMANDS, UNSURE, Purpose, deviation_range
+from gsbench.analysis.planning import COMMANDS, UNSURE, Plan, Purpose, make_plan
 from gsbench.analysis.quantities import Quantity, quantity
 from gsbench.analysis.results import TrialResult, load_experiment, read_experiment
 from gsbench.analysis.statistics import MIN_SCENES
@@ -199,6 +200,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     parser.add_argument(
         "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
     )
+    parser.flag("--json", "print JSON")
     options = parser.parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     comparison = compare(experiment, options.baseline)
@@ -217,19 +219,27 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    print("\n".join([*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]))
-    purpose = _purpose(options.command, options.questions)
+    purpose, plans = _purpose(options.command, options.questions), list[dict[str, Any]]()
+    lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
     for baseline, arm in comparison.pairs:
+        plans.append({"arm": str(arm), "baseline": str(baseline)})
         question = Question(metric=metric.key, baseline=baseline, arm=arm)
         try:
             components = _components(trials, question, metric)
         except InputError as error:
             if len(comparison.pairs) == 1:
                 raise
-            print(error)
+            lines.append(str(error))
+            plans[-1]["no_plan"] = str(error)
             continue
-        lines = _lines(components, metric, difference, purpose)
-        print("\n".join([f"{arm} against {baseline}", *lines]))
+        planned = make_plan(components, difference, purpose, MAX_DESIGNS)
+        lines += [f"{arm} against {baseline}", *_lines(planned, metric, difference)]
+        plans[-1] |= planned.to_json()
+    if options.json:
+        asked = {"metric": metric.key, "difference": difference, "for": options.command}
+        found = asked | comparison.to_json() | {"plans": plans}
+        lines = [json.dumps(found, indent=1)]
+    print("\n".join(lines))
     return 0
 
 
@@ -260,49 +270,35 @@ def _purpose(command: str, questions: int | None) -> Purpose:
     return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
 
 
-def _lines(
-    components: Components, metric: Quantity, difference: float, purpose: Purpose
-) -> list[str]:
-    digits = f".{metric.decimals + 1}f"
+def _lines(planned: Plan, metric: Quantity, difference: float) -> list[str]:
+    components, digits = planned.components, f".{metric.decimals + 1}f"
     between = ""
     if components.between is not None:
         between = f", between scenes by {components.between:{digits}}"
     lines = [
         f"  differences in {metric.name} vary between seeds by "
         f"{components.within:{digits}}{between} (from {counted(components.trials, 'pair')} on "
-        f"{counted(components.scenes, 'scene')})"
+        f"{counted(components.scenes, 'scene')})",
+        _designs_line("these scenes", planned.these, difference),
     ]
-    groups = {"these scenes": False, f"scenes like these (from {MIN_SCENES} scenes on)": True}
-    for group, like_these in groups.items():
-        if like_these and components.between is None:
-            lines.append(f"  for {group}: run pilot trials on a second scene")
-            continue
-        designs = (
-            designs_needed(difference, components, like_these)
-            if like_these
-            else purpose.designs(difference, components.within)
+    if planned.powers is not None:
+        (low, high), first = planned.factors, planned.these[0]
+        least, most = (100 * power for power in planned.powers)
+        lines.append(
+            f"  the pilot knows the variation between seeds only within {low:.2f} to {high:.2f} "
+            f"times ({100 * UNSURE:.0f} % of pilots): so {first.scenes} × {first.seeds} sees it in "
+            f"{least:.0f} to {most:.0f} of 100 cases"
         )
-        designs.sort(key=lambda design: (design.trials, design.scenes))
-        shown = ", ".join(
-            f"{design.scenes} × {design.seeds} ({design.trials} trials)"
-            for design in designs[:MAX_DESIGNS]
-        )
-        what = f"  to see {difference:g} on {group}, scenes × seeds"
-        lines.append(f"{what}: {shown or 'none that can be run'}")
-        if designs and not like_these:
-            lines.append(_unsure(components, difference, purpose, designs[0]))
-    return lines
+    group = f"scenes like these (from {MIN_SCENES} scenes on)"
+    if planned.like_these is None:
+        return [*lines, f"  for {group}: run pilot trials on a second scene"]
+    return [*lines, _designs_line(group, planned.like_these, difference)]
 
 
-def _unsure(components: Components, difference: float, purpose: Purpose, design: Design) -> str:
-    """A line on the power of the first design, given what the pilot does not know."""
-    low, high = deviation_range(components)
-    least, most = (100 * purpose.power(design, difference, one) for one in (high, low))
-    return (
-        f"  the pilot knows the variation between seeds only within {low / components.within:.2f} "
-        f"to {high / components.within:.2f} times ({100 * UNSURE:.0f} % of pilots): so "
-        f"{design.scenes} × {design.seeds} sees it in {least:.0f} to {most:.0f} of 100 cases"
-    )
+def _designs_line(group: str, designs: Sequence[Design], difference: float) -> str:
+    shown = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs]
+    what = f"  to see {difference:g} on {group}, scenes × seeds"
+    return f"{what}: {', '.join(shown) or 'none that can be run'}"
 
 
 def _above_zero(text: str) -> float:

@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from gsbench.analysis.addresses import CELL, trials_of_arm
@@ -30,7 +31,9 @@ from gsbench.analysis.results import (
     Arm,
     Experiment,
     TrialResult,
+    load_all_trials,
     load_experiment,
+    newest_code,
 )
 from gsbench.analysis.table_formats import FORMATS
 from gsbench.analysis.tables import (
@@ -145,7 +148,7 @@ def _fairness_sheets(experiment: Experiment, format_name: str) -> dict[str, str]
     sheets = {}
     for first, second in pairs:
         end = f"-{FAIRNESS}-{_as_file(second)}-{_as_file(first)}.{suffix}"
-        sheets[end] = writer(fairness_table(trials, first, second))
+        sheets[end] = writer(fairness_table(trials, first, second, experiment.older))
     return sheets
 
 
@@ -276,7 +279,8 @@ def explain_cell(address: str, runs: Path) -> str:
     if len(parts) != 4 or not all(parts):
         raise InputError(f"{address!r} is not {CELL}")
     name, scene, metric, arm = parts
-    experiment = load_experiment(runs, name)
+    everything = load_all_trials(runs, name)
+    experiment = newest_code(everything)
     trials = _trials_at(experiment, scene, arm)
     shown = quantity(metric, trials)
     check_averageable(trials, f"scene={scene} {arm}")
@@ -292,10 +296,11 @@ def explain_cell(address: str, runs: Path) -> str:
     conditions = trials[0].conditions.items()
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
-    place = f"{name}/{scene}/{trials[0].init}-{trials[0].densify}"
-    of_cell = (f"{place}/", f"{place} ")
-    left_out = [line for line in experiment.warnings if line.startswith(of_cell)]
-    if left_out:
+    place = trials[0].path.parent
+    of_cell = [one for one in everything.trials if one.path.parent == place]
+    versions = newest_code(replace(everything, trials=tuple(of_cell))).versions
+    start = f"{place.relative_to(runs).as_posix()}/"
+    if left_out := [*(one for one in experiment.faults if one.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
 

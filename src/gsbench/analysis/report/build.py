@@ -18,7 +18,7 @@ from gsbench.analysis import verdict_words
 from gsbench.analysis.cells import select_trials
 from gsbench.analysis.comparison import VERDICT, compare
 from gsbench.analysis.differences import between_scenes_notes
-from gsbench.analysis.fairness import caveats, fairness_table
+from gsbench.analysis.fairness import caveats, fairness_table, limit_notes
 from gsbench.analysis.images import choose_views, png_uri
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.ledger_table import describe_ledger, ledger_tables
@@ -91,7 +91,7 @@ def build_report(
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,
         trials=trials,
-        versus=[compare_arms(trials, own) for own in judged],
+        versus=[compare_arms(trials, own, experiment.older) for own in judged],
         ledger=show_ledger(experiment.folder),
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
@@ -111,6 +111,7 @@ def build_report(
         figures=trial_figures(trials),
         provenance=provenance(trials),
         warnings=experiment.warnings,
+        left_out=experiment.left_out,
     )
 
 
@@ -139,8 +140,13 @@ def trial_figures(trials: Sequence[TrialResult]) -> list[tuple[str, str]]:
     ]
 
 
-def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[str, Any]:
-    """Everything that the page shows of two arms; notes say what could not be compared or read."""
+def compare_arms(
+    trials: Sequence[TrialResult], judged: PairVerdicts, older: Sequence[TrialResult]
+) -> dict[str, Any]:
+    """Everything that the page shows of two arms; notes say what could not be compared or read.
+
+    ``older`` are the trials of earlier code.
+    """
     first, second = judged.first, judged.second
     baseline, other = _trials_of(trials, first), _trials_of(trials, second)
     views, faults = choose_views(pair_trials(trials, first, second))
@@ -148,8 +154,10 @@ def compare_arms(trials: Sequence[TrialResult], judged: PairVerdicts) -> dict[st
         "judged": judged,
         "title": f"{second} against {first}",
         "has_like_these": any(one.like_these is not None for one in judged.verdicts),
-        "caveats": " ".join(texts(caveats(trials, first, second))),
-        "fairness": fairness_table(trials, first, second),
+        "caveats": " ".join(
+            texts([*caveats(trials, first, second), *limit_notes(trials, [(first, second)])])
+        ),
+        "fairness": fairness_table(trials, first, second, older),
         "facts": [*_costs(baseline, other), *between_scenes_notes(baseline, other)],
         "forests": [_forest(verdict) for verdict in judged.verdicts],
         "views": views,
