@@ -271,7 +271,7 @@ def _lines(
         )
         what = f"  to see {difference:g} on {group}, scenes × seeds"
         lines.append(f"{what}: {shown or 'none that can be run'}")
-        if designs and not like_these:
+        if designs and not like_these and components.within:  # else nothing varies
             lines.append(_unsure(components, difference, purpose, designs[0]))
     return lines
 
