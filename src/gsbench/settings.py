@@ -28,15 +28,17 @@ PathName = Annotated[str, Predicate(is_path), doc("a path")]
 AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
 MAX_INTEGER = 2**63 - 1  # the largest whole number of torch and NumPy
 MAX_NAME_BYTES = 100  # of a name: a folder's name can combine two, and file systems allow 255
+ARM_BYTES = 2 * MAX_NAME_BYTES + 1  # of the folder INIT-DENSIFY
 
 
-def is_folder_name(value: str) -> bool:
-    """Return whether a text can name a folder on any system.
+def is_folder_name(value: str, most: int = MAX_NAME_BYTES) -> bool:
+    """Return whether a text of at most ``most`` bytes can name a folder on any system.
 
-    It must also fit the address of a trial (``x:scene:arm:0``).
+    It must also fit the address of a trial (``x:scene:arm:0``), be no option of a command, and no
+    formula for a spreadsheet.
     """
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
-    return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
+    return is_plain and value[:1] not in ("", *".-=+@") and len(value.encode()) <= most
 
 
 def is_address(value: str) -> bool:

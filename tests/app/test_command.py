@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from gsbench.app import command, plugins
+from gsbench.app import command, hydra_files
 from gsbench.app.command import one_trial_per_scene, summarize
-from gsbench.app import hydra_files
 from gsbench.app.hydra_files import words_for_hydras_files, words_for_new_folder
 from gsbench.app.sweep import Ended, check_sweep_settings
 from gsbench.config.compose import Trial
