@@ -275,6 +275,15 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     assert not (place / "exploded").exists()
 
 
+def test_a_plan_reaches_no_other_experiment(place, refused):
+    add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
+    plan = place / "runs" / "x" / "plan.json"
+    plan.write_text(plan.read_text().replace("name=x", "name=mine"))
+    for words in (["retry", "x"], ["retry", "x", "--dry-run"]):
+        assert "is planned as a trial of mine, not of x" in refused(*words)
+    assert not (place / "runs" / "mine").exists()
+
+
 def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):
     """Hydra imports ``pkg://conf_of_mine`` while it composes: the user's own, not the plan's."""
     theirs = place / "theirs"

@@ -203,6 +203,13 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     trials = [
         recompose(one.folder, one.planned, runs, options.changes, modules) for one in unfinished
     ]
+    # A plan of somebody's must not declare or run anything in an experiment of the user's.
+    for old, trial in zip(unfinished, trials, strict=True):
+        if trial.files.home != home:
+            raise InputError(
+                f"{TrialFolder(old.folder).label} is planned as a trial of {trial.files.home.name}, "
+                f"not of {home.name}: give the sweep's own command"
+            )
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0
