@@ -8,7 +8,6 @@ words. Numbers must be finite, except a default of the class. Rules between fiel
 
 import dataclasses
 import inspect
-import os
 import re
 import reprlib
 import sys
@@ -44,23 +43,6 @@ def is_folder_name(value: str, most: int = MAX_NAME_BYTES) -> bool:
 def is_address(value: str) -> bool:
     """Return whether a text can be the address of a tracker."""
     return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
-
-
-ADDRESS_VARIABLES = ("MLFLOW_TRACKING_URI", "WANDB_BASE_URL")  # by which users name their trackers
-
-
-def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
-    """An address in the settings ``tracking`` that only a file names, which may not be used, or "".
-
-    The user's own are those ``allowed`` on the command line, and those in the environment.
-    """
-    own = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
-    given = (str(value) for key, value in tracking.items() if value and _is_place(key, str(value)))
-    return next((address for address in given if address not in own), "")
-
-
-def _is_place(key: str, value: str) -> bool:
-    return key == "uri" or "://" in value
 
 
 FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]

@@ -13,12 +13,11 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial, compose_one
-from gsbench.config.trust import check_permissions
+from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
 from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.settings import ADDRESS_VARIABLES, foreign_address
 from gsbench.system.install import conf_dir
 from tests.strange import experiment, no_trial
 from tests.strange import place as place
