@@ -41,6 +41,14 @@ def test_plan_answers_for_the_command_given(pilots, capsys):
     assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
 
 
+def test_a_pilot_whose_differences_are_all_equal_gets_a_plan(tmp_path, capsys):
+    write_runs(tmp_path, Plan(effect={}, trial_noise=0, residual_noise=0))
+    assert plan(["exp"], tmp_path) == 0
+    out = capsys.readouterr().out
+    assert "vary between seeds by 0.000" in out
+    assert "only within" not in out
+
+
 def test_pilot_trials_on_one_scene_give_no_plan_for_scenes_like_these(pilots, capsys):
     assert plan(["one"], pilots) == 0
     assert "run pilot trials on a second scene" in capsys.readouterr().out
