@@ -8,7 +8,6 @@ words. Numbers must be finite, except a default of the class. Rules between fiel
 
 import dataclasses
 import inspect
-import os
 import re
 import reprlib
 import sys
@@ -28,37 +27,22 @@ PathName = Annotated[str, Predicate(is_path), doc("a path")]
 AnyPath = Annotated[str | Path, Predicate(lambda path: is_path(str(path))), doc("a path")]
 MAX_INTEGER = 2**63 - 1  # the largest whole number of torch and NumPy
 MAX_NAME_BYTES = 100  # of a name: a folder's name can combine two, and file systems allow 255
+ARM_BYTES = 2 * MAX_NAME_BYTES + 1  # of the folder INIT-DENSIFY
 
 
-def is_folder_name(value: str) -> bool:
-    """Return whether a text can name a folder on any system.
+def is_folder_name(value: str, most: int = MAX_NAME_BYTES) -> bool:
+    """Return whether a text of at most ``most`` bytes can name a folder on any system.
 
-    It must also fit the address of a trial (``x:scene:arm:0``).
+    It must also fit the address of a trial (``x:scene:arm:0``), be no option of a command, and no
+    formula for a spreadsheet.
     """
     is_plain = value.isprintable() and not set(value) & set('/\\:*?"<>|') and value == value.strip()
-    return is_plain and value[:1] not in ("", ".", "-") and len(value.encode()) <= MAX_NAME_BYTES
+    return is_plain and value[:1] not in ("", *".-=+@") and len(value.encode()) <= most
 
 
 def is_address(value: str) -> bool:
     """Return whether a text can be the address of a tracker."""
     return re.fullmatch(r"[a-z][a-z0-9+.-]*://\S*", value) is not None and value.isprintable()
-
-
-ADDRESS_VARIABLES = ("MLFLOW_TRACKING_URI", "WANDB_BASE_URL")  # by which users name their trackers
-
-
-def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
-    """An address in the settings ``tracking`` that only a file names, which may not be used, or "".
-
-    The user's own are those ``allowed`` on the command line, and those in the environment.
-    """
-    own = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
-    given = (str(value) for key, value in tracking.items() if value and _is_place(key, str(value)))
-    return next((address for address in given if address not in own), "")
-
-
-def _is_place(key: str, value: str) -> bool:
-    return key == "uri" or "://" in value
 
 
 FolderName = Annotated[str, Predicate(is_folder_name), doc("a plain folder name")]

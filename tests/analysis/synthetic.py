@@ -12,6 +12,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from scipy.ndimage import gaussian_filter
 
+from gsbench.runs.keys import INIT
 from tests.helpers import read_json, write
 
 METRICS = ("psnr", "ssim", "lpips_vgg_raw", "flip")
@@ -111,7 +112,7 @@ def trial_data(plan, scene, init, densify, seed, views):
         "hashes": {
             "config": "c0ffee00",
             "data": f"data-{scene}",
-            "init": f"init-{scene}-{init}",
+            "init": INIT.key({"scene": scene, "init": init}),
             "train": f"t{seed}",
         },
         "versions": {"gsbench": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1"},

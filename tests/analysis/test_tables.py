@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 from shlex import split
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gsbench.analysis.quantities import (
@@ -21,7 +22,18 @@ from gsbench.analysis.quantities import (
 )
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
-from gsbench.analysis.table_formats import escape_latex, to_csv, to_html_page, to_latex, to_markdown
+from gsbench.analysis.table_formats import (
+    Column,
+    Row,
+    Table,
+    TableEntry,
+    csv_of,
+    escape_latex,
+    to_csv,
+    to_html_page,
+    to_latex,
+    to_markdown,
+)
 from gsbench.analysis.tables import build_table, with_agreement
 from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
 from tests.helpers import read_json, refusal
@@ -329,6 +341,27 @@ class Balance(HTMLParser):
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
+
+
+STRANGE = "=cmd|' /C calc'!A0<img src=x onerror=alert(1)> ![x](http://there)\n| y"
+
+
+def test_a_strangers_text_is_text_in_every_format():
+    column = Column(STRANGE, STRANGE, (STRANGE, STRANGE))
+    rows = (Row((STRANGE,), (TableEntry(STRANGE),)), Row(("x",), (TableEntry("+0.3 ± 0.1"),)))
+    table = Table(STRANGE, ("scene",), (column,), rows, (STRANGE,))
+    lines = to_markdown(table).splitlines()
+    assert len(lines) == 8  # title, table and note have one line each
+    assert not any(tag in line for line in lines for tag in ("]\\(x", "](")), lines
+    assert not any(re.search(r"(?<!\\)<[a-z/]", line) for line in lines)
+    for row in csv.DictReader(to_csv(table).splitlines()):
+        assert all(not text.startswith("=") for text in row.values())
+    assert "+0.3 ± 0.1" in to_csv(table).split(",")
+    for text in ("@SUM(1)", "-1+cmd|x", "+x", " =1"):
+        assert csv_of(pd.DataFrame([[text, -1.5]])).splitlines()[1] == f"'{text},-1.5"
+    latex = to_latex(Table("\\input{x}\n\n^^5cinput%", ("scene",), (column,), rows[1:]))
+    assert "\\input" not in latex
+    assert "\\textasciicircum{}\\textasciicircum{}5cinput\\%" in latex
 
 
 def test_html_is_well_formed_and_escaped(make_experiment):

@@ -7,15 +7,16 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from gsbench.app import command, plugins
+from gsbench.app import command, hydra_files
 from gsbench.app.command import one_trial_per_scene, summarize
-from gsbench.app.plugins import words_for_hydras_files
+from gsbench.app.hydra_files import words_for_hydras_files, words_for_new_folder
 from gsbench.app.sweep import Ended, check_sweep_settings
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
 from gsbench.runs.trial_folder import TrialFolder
 from tests.app.stand_ins import trial
+from tests.helpers import refusal
 
 OWN_FILES = {
     **{"run": {"dir": "."}, "sweep": {"dir": ".", "subdir": "."}},
@@ -63,13 +64,31 @@ def test_hydra_writes_its_files_if_one_is_asked_for(
 ):
     caplog.set_level(logging.INFO, "gsbench")
     own = copy.deepcopy(OWN_FILES)
-    monkeypatch.setattr(plugins, "installed_nodes", lambda words: own)
+    monkeypatch.setattr(hydra_files, "installed_nodes", lambda words: own)
     runtime = {"choices": {"hydra/launcher": "gsbench"}}
     config = OmegaConf.create(
         {"hydra": OWN_FILES | changes | {"runtime": runtime}, "launch": {"name": launch}}
     )
     assert words_for_hydras_files(config, typed, multirun) == added
     assert ("writes no files of Hydra's" in caplog.text) == (launch == "local")
+
+
+def test_another_launchers_jobs_get_a_folder_that_nobody_could_prepare(tmp_path):
+    launcher = {"submitit_folder": "${hydra.sweep.dir}/.submitit/%j", "timeout_min": 60}
+    own = {"hydra": {"sweep": {"dir": str(tmp_path)}, "launcher": launcher}}
+    config = OmegaConf.create(own | {"runs": str(tmp_path)})
+    config.hydra.runtime = {"choices": {"hydra/launcher": "submitit_local"}}
+    (first,), (second,) = (words_for_new_folder(config, ["seed=0"]) for _ in range(2))
+    assert first.startswith("hydra.sweep.dir=${runs}/.hydra/")
+    assert first != second
+    typed = [f"hydra.sweep.dir={tmp_path}"]
+    assert words_for_new_folder(config, typed) == []
+    (tmp_path / ".submitit").mkdir()
+    with refusal("results of jobs would be unpickled from it"):
+        words_for_new_folder(config, typed)
+    for name in ("basic", "gsbench"):
+        config.hydra.runtime.choices["hydra/launcher"] = name
+        assert words_for_new_folder(config, []) == []
 
 
 @pytest.mark.parametrize(

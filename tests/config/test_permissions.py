@@ -13,12 +13,11 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial, compose_one
-from gsbench.config.trust import check_permissions
+from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
 from gsbench.runs.ledger import Ended, Opened, Started, append, begin_ledger
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.settings import ADDRESS_VARIABLES, foreign_address
 from gsbench.system.install import conf_dir
 from tests.strange import experiment, no_trial
 from tests.strange import place as place
@@ -273,6 +272,15 @@ def test_a_plan_gives_no_permission_and_no_folder_of_modules(place, monkeypatch,
     )
     assert sys.modules["mine"].__file__ == str(place / "mine.py")
     assert not (place / "exploded").exists()
+
+
+def test_a_plan_reaches_no_other_experiment(place, refused):
+    add_to_plan(compose_trials(["name=x", "seed=0,1"], multirun=True))
+    plan = place / "runs" / "x" / "plan.json"
+    plan.write_text(plan.read_text().replace("name=x", "name=mine"))
+    for words in (["retry", "x"], ["retry", "x", "--dry-run"]):
+        assert "is planned as a trial of mine, not of x" in refused(*words)
+    assert not (place / "runs" / "mine").exists()
 
 
 def test_a_plan_gives_no_folder_for_packages_of_settings(place, monkeypatch):

@@ -15,7 +15,8 @@ from gsbench.app.command import compose_trials
 from gsbench.config.build import build
 from gsbench.config.command_words import typed_permissions
 from gsbench.config.compose import compose_one
-from gsbench.config.trust import SBATCH_RESOURCES, check_target, foreign_variables, load_class
+from gsbench.config.permissions import check_target, load_class
+from gsbench.config.programs import SBATCH_RESOURCES, foreign_variables
 from gsbench.errors import InputError
 from gsbench.runs.user_code import module_digest
 from gsbench.system.own_modules import allow_modules

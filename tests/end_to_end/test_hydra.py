@@ -108,6 +108,24 @@ def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, l
     written = [path.stat().st_mtime_ns for path in results]
     gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
+    # What the launcher unpickles never lies where a stranger's runs folder could have it already.
+    places = {path.parts[-4] for path in (tmp_path / "runs" / ".hydra").rglob("*_result.pkl")}
+    assert len(places) == 2 * (launcher == "submitit_local")
+    assert all(len(place) == 16 for place in places)
+
+
+@pytest.mark.parametrize("name", [".hydra", ".hydra/multirun.yaml", ".hydra/0/.hydra/config.yaml"])
+@pytest.mark.parametrize("sweeper", ["gsbench", "basic"])
+def test_hydra_writes_through_no_link_of_a_strangers_runs_folder(gsbench, tmp_path, name, sweeper):
+    precious = tmp_path / "precious"
+    precious.mkdir() if name == ".hydra" else precious.write_text("mine")
+    link = tmp_path / "runs" / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(precious)
+    words = ["-m", *TINY, "name=x", "seed=0,1", "hydra.output_subdir=.hydra"]
+    done = gsbench(*words, f"hydra/sweeper={sweeper}", code=2, GSBENCH_RUNS="runs", timeout=SECONDS)
+    assert f"{link} is a link" in done.stderr
+    assert not list(precious.iterdir()) if precious.is_dir() else precious.read_text() == "mine"
 
 
 def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench, tmp_path):

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsbench.system.install import conf_dir
+from gsbench.verbs import VERBS
 from tests.conftest import ROOT
-from tests.end_to_end.conftest import SMALL
+from tests.end_to_end.conftest import FINISHED, SMALL
 from tests.processes import completed
 
 pytestmark = pytest.mark.slow
@@ -29,6 +31,44 @@ def test_truncated_photo_is_named(gsbench, tmp_path):
         "scene=photos", f"scene.path={folder}", code=2, GSBENCH_RUNS=str(tmp_path / "runs")
     )
     assert "2.jpg" in done.stderr.strip().splitlines()[-1]
+
+
+# The words of each verb that reads results or shows characters beyond ASCII, after its name.
+IN_ASCII = {
+    "tables": f"{FINISHED} --format latex",
+    "report": f"{FINISHED} --out report.html",
+    "explain": f"{FINISHED}:courtyard:psnr:adc",
+    "status": FINISHED,
+    "plan": FINISHED,
+    "retry": FINISHED,
+    "sync": FINISHED,
+    "export": f"--results {FINISHED} --out a.zip",
+    "pool": "a.zip --arm volumetric",
+    "site": "a.zip --out site",
+    "vote": f"make {FINISHED} --arms adc,volumetric --out vote",
+    "ledger": f"show {FINISHED}",
+    "check": "{conf}/claims/volumetric.yaml --dry-run",
+    "gate": "a.zip densify=nothing",
+    "ablate": "--help",
+    "bisect": "HEAD HEAD",
+    "evaluate": "nowhere --truth é",
+    "view": "é",
+    "fetch": "é",
+    "bench": "--raster é",
+    "ui": "é",
+    "doctor": "",
+}
+
+
+def test_every_verb_speaks_where_python_knows_only_ascii(gsbench, runs, tmp_path):
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    assert IN_ASCII.keys() == VERBS.keys()
+    for verb, words in IN_ASCII.items():
+        words = words.format(conf=conf_dir())
+        done = gsbench(verb, *words.split(), code=None, GSBENCH_RUNS=str(runs), **ascii_only)
+        assert done.returncode in (0, 1, 2), (verb, done.stderr)
+        assert "Traceback" not in done.stderr, verb
+        assert done.stdout.isascii(), verb
 
 
 def test_wheel_runs_a_trial_outside_the_checkout(environment, tmp_path):

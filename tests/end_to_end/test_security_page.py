@@ -158,6 +158,12 @@ def store(trial, shown):
     assert not any("was changed" in text for text in shown().values())
     with pytest.raises(ValueError, match="differs from what was written"):
         read_manifest(entry, thorough=True)
+    assert run(["export", "init", str(trial), "--out", "whole"]) == 0
+    for cameras in (trial.parents[3] / "store").glob("init/*/sparse/0/cameras.*"):
+        edit(cameras)
+    assert run(["export", "init", str(trial), "--out", "edited"]) == 2
+    assert run(["export", str(trial), "--out", "page.html"]) == 2
+    assert not list(Path().glob("edited*"))
 
 
 def plans(trial, shown):

@@ -15,7 +15,7 @@ from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import parse
 from gsbench.config.compose import Trial, compose_one
 from gsbench.config.groups import GROUPS, options
-from gsbench.config.trust import check_target
+from gsbench.config.permissions import check_target
 from gsbench.errors import InputError
 from gsbench.files import DiskFullError
 from gsbench.launch import dry_run, jobs

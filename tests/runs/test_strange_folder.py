@@ -156,6 +156,52 @@ def test_the_store_builds_nothing_in_a_linked_folder(tmp_path, outside):
     assert (outside / "moved").is_dir()
 
 
+def _edited(made):
+    (made / "lines.txt").write_text("0")
+
+
+def _linked(made):
+    (made / "lines.txt").unlink()
+    (made / "lines.txt").symlink_to(made.parents[3] / "outside" / "private")
+
+
+def _linked_beside(made):
+    (made / "more.txt").symlink_to(made.parents[3] / "outside" / "private")
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (_edited, "lines.txt differs from what was written"),
+        (_linked, "is a link"),
+        (_linked_beside, "is a link"),
+        (lambda made: (made / "manifest.json").unlink(), "is missing or unreadable"),
+        (lambda made: made.rename(made.with_name("abc")), "is gone"),
+    ],
+)
+def test_a_stored_result_that_is_shown_is_as_it_was_written(tmp_path, outside, spoil, words):
+    """`gsbench view` and `gsbench export` read the initial model of somebody's trial."""
+    store = Store(tmp_path / "runs" / "store")
+    step = Step(TOY, toy_inputs(1), lambda folder: build(folder, 1, 0.0))
+    made = store.get(step).path
+    assert store.existing(TOY, step.key) == made
+    for key in ("", f"../toy/{step.key}", str(made)):
+        with refusal("is gone"):
+            store.existing(TOY, key)
+    spoil(made)
+    with refusal(words):
+        store.existing(TOY, step.key)
+
+
+@pytest.mark.parametrize(
+    "name", ["<img src=x>", "=1+1", "@SUM(1)", "a|b", "a\nb", "\u202eab", "-x"]
+)
+def test_a_folder_that_gsbench_could_not_have_made_is_no_trial(tmp_path, trial, caplog, name):
+    trial.parents[1].rename(trial.parents[2] / name)
+    assert read_experiment(tmp_path / "runs" / "x").trials == ()
+    assert "gsbench gives no folder such a name" in caplog.text
+
+
 def test_links_of_a_killed_build_are_removed_and_their_targets_stay(tmp_path, outside):
     partial = tmp_path / "partial"
     (partial / "work").mkdir(parents=True)

@@ -9,6 +9,8 @@ import torch
 from gsbench import cli
 from gsbench.config.compose import compose_one
 from gsbench.gaussians.ply import write_ply
+from gsbench.runs.keys import INIT, Step
+from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs import exchange
 from tests.analysis.synthetic import Plan, write_runs
@@ -25,8 +27,9 @@ def finished_trial(runs, gaussians):
     folder = TrialFolder.of(values).path
     folder.mkdir(parents=True)
     write_ply(gaussians, folder / "point_cloud.ply")
-    write(runs / "store" / "init" / "abc" / "sparse" / "0" / "points3D.bin", b"points")
-    write_results(folder, values, num_gaussians=len(gaussians), hashes={"init": "abc"})
+    model = Step(INIT, {}, lambda made: write(made / "sparse/0/points3D.bin", b"points"))
+    Store(runs / "store").get(model)
+    write_results(folder, values, num_gaussians=len(gaussians), hashes={"init": model.key})
     return folder
 
 
@@ -94,8 +97,8 @@ def test_only_the_3dgs_form_is_written(name, good):
 
 def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, refused):
     folder = finished_trial(runs, gaussians)
-    (runs / "store" / "init" / "abc").rename(runs / "gone")
-    assert "no longer in the store" in refused("export init", folder, "--out", "model")
+    (runs / "store" / "init").rename(runs / "gone")
+    assert "is gone: run this trial again" in refused("export init", folder, "--out", "model")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import torch
 from PIL import Image
 
 from gsbench.gaussians.ply import write_ply
+from gsbench.runs.keys import INIT, Step
+from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_model
 from gsbench.scene.types import Camera
 from tests.analysis.synthetic import Plan, write_runs
@@ -28,7 +30,9 @@ def small_runs(tmp_path_factory):
         for k, (name, (w, h)) in enumerate({"trained.png": (64, 48), **VIEWS}.items())
     }
     cloud = POINTS, np.full((len(POINTS), 3), 200, np.uint8)
-    write_model(runs / "store" / "init" / "init-courtyard-random" / "sparse/0", cameras, cloud)
+    inputs = {"scene": "courtyard", "init": "random"}
+    model = Step(INIT, inputs, lambda folder: write_model(folder / "sparse/0", cameras, cloud))
+    Store(runs / "store").get(model)
     plan = Plan("small", ["courtyard"], ["random"], seeds=[0, 1], views=len(VIEWS))
     for seed, trial in enumerate(write_runs(runs, plan)):
         gaussians = random_gaussians(40, seed, torch.float32, log_scale=(-4.0, -2.2))

@@ -30,6 +30,7 @@ from gsbench.view.trials import (
     find_trial,
     load_viewed,
     model_file,
+    model_folder,
     photograph_at,
     read_causes,
     read_test_views,
@@ -259,7 +260,7 @@ def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):
     assert (first.name, camera.width, camera.height) == ("view000.png", 64, 48)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 55, 33.5, 23)
     assert_allclose(second.camera.center, [2, 2, 0])
-    folder = small_runs / "store" / "init" / "init-courtyard-random" / "sparse" / "0"
+    folder = model_folder(trial)
     centred = configured(trial, scene__principal_point="centred")
     camera = read_test_views(centred, folder)[1].camera
     assert (camera.cx, camera.cy) == (24, 32)
@@ -300,7 +301,7 @@ def test_what_is_gone_from_a_trial_is_named(small_runs, tmp_path):
         read_causes(trial.path / "lineage.npz", 1)
     for folder, words in (
         (trial.path / "ground_truth", "holds no picture of a test view"),
-        (tmp_path / "runs" / "store", "is gone, and it had the cameras of small/courtyard"),
+        (tmp_path / "runs" / "store", "is gone: run this trial again"),
     ):
         shutil.rmtree(folder)
         with refusal(words):

@@ -1,16 +1,22 @@
 """Tables as plain data, and their formats: Markdown, CSV, LaTeX (booktabs) and HTML."""
 
+from __future__ import annotations
+
 import base64
 import hashlib
 import itertools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from gsbench.analysis.cells import Cell
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 TEMPLATES = "gsbench.analysis.report"
 
@@ -88,6 +94,27 @@ def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
+# What a spreadsheet would compute, or start, and is no number such as +0.3 ± 0.1
+FORMULA = re.compile(r"[=@]|[+-](?![\d.,\s±%()]*$)")
+# a tag, or the middle of a link or picture
+MARKUP = re.compile(r"<(?=[a-zA-Z/!?])|(?<=\])\(")
+
+
+def _markdown_text(text: str) -> str:
+    """A text from a trial, which may be a stranger's, in one line without HTML and links."""
+    return MARKUP.sub(r"\\\g<0>", " ".join(text.split()))
+
+
+def csv_of(frame: pd.DataFrame) -> str:
+    """The frame as CSV, in which no text is a formula: an apostrophe precedes it."""
+
+    def plain(value: Any) -> Any:
+        is_formula = isinstance(value, str) and FORMULA.match(value.lstrip())
+        return f"'{value}" if is_formula else value
+
+    return str(frame.map(plain).rename(columns=plain).to_csv(index=False, lineterminator="\n"))
+
+
 def to_markdown(table: Table) -> str:
     """A GitHub-flavoured Markdown table under its title, with its notes as a list."""
     heads = [
@@ -99,14 +126,13 @@ def to_markdown(table: Table) -> str:
         [*row.labels, *(f"**{e.text}**" if e.bold else e.text for e in row.entries)]
         for row in table.rows
     ]
-    lines = [" | ".join(text.replace("|", "\\|") for text in row) for row in (heads, rule, *rows)]
-    notes = [f"- {note}" for note in table.notes]
-    return (
-        "\n".join(
-            [f"### {table.title}", "", *(f"| {line} |" for line in lines), "", *notes]
-        ).rstrip()
-        + "\n"
-    )
+    lines = [
+        " | ".join(_markdown_text(text).replace("|", "\\|") for text in row)
+        for row in (heads, rule, *rows)
+    ]
+    notes = [f"- {_markdown_text(note)}" for note in table.notes]
+    title = f"### {_markdown_text(table.title)}"
+    return "\n".join([title, "", *(f"| {line} |" for line in lines), "", *notes]).rstrip() + "\n"
 
 
 def to_csv(table: Table) -> str:
@@ -134,9 +160,7 @@ def to_csv(table: Table) -> str:
             )
             trials = "" if cell is None else " ".join(trial.label for trial in cell.trials)
             lines.append([*row.labels, *column.key, *numbers, int(entry.bold), entry.text, trials])
-    return str(
-        pd.DataFrame(lines, columns=heads, dtype=object).to_csv(index=False, lineterminator="\n")
-    )
+    return csv_of(pd.DataFrame(lines, columns=heads, dtype=object))
 
 
 def to_latex(table: Table) -> str:
@@ -225,7 +249,7 @@ _LATEX = str.maketrans(
 
 def escape_latex(text: str) -> str:
     """Text as LaTeX source; a character that plain LaTeX does not have becomes a question mark."""
-    return text.translate(_LATEX).encode("latin-1", "replace").decode("latin-1")
+    return " ".join(text.split()).translate(_LATEX).encode("latin-1", "replace").decode("latin-1")
 
 
 def _latex_text(entry: TableEntry) -> str:

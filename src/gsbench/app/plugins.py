@@ -12,9 +12,7 @@ import os
 import shlex
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import (
-    suppress,
-)
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.analysis.results import group_by
 from gsbench.app.grids import GRIDS, run_sweep
+from gsbench.app.hydra_files import check_links, words_for_hydras_files, words_for_new_folder
 from gsbench.app.hydra_main import run_main
 from gsbench.app.sweep import (
     DEFAULT_METRIC,
@@ -48,7 +47,6 @@ from gsbench.config.command_words import (
 from gsbench.config.compose import (
     Trial,
     check_permitted,
-    installed_nodes,
     trial_of_job,
 )
 from gsbench.errors import GsbenchError, InputError
@@ -62,7 +60,6 @@ from gsbench.words import counted
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
 MODE = "hydra.mode"
-HYDRAS_FILES = ("run", "sweep", "output_subdir")  # settings of Hydra's own files
 
 log = logging.getLogger(__name__)
 
@@ -255,41 +252,15 @@ def words_for_plugins(sweep: Sweep) -> list[str] | None:
         files or launcher != OWN or config.hydra.callbacks or config.hydra.hydra_logging.get("root")
     ):
         return None
+    check_links(_runs_of(config))
     # Hydra would resolve the ${…} of grids when it makes the sweeper, before each trial's values.
     grids = [f"{GRIDS}=[]"] if config.hydra.sweeper.get("grids") else []
-    return [*sweep.words, *files, *grids, f"{MODE}={config.hydra.mode.name}"]
+    place = words_for_new_folder(config, sweep.words)
+    return [*sweep.words, *files, *place, *grids, f"{MODE}={config.hydra.mode.name}"]
 
 
-def words_for_hydras_files(config: DictConfig, words: Sequence[str], multirun: bool) -> list[str]:
-    """The words by which Hydra writes its own files as in any app, if one of them was asked for.
-
-    Otherwise Hydra writes nothing, since each trial's folder has its configuration and log.
-    """
-    node, own = (OmegaConf.to_container(config.hydra, resolve=False), installed_nodes(()))
-    assert isinstance(node, dict)
-    logs = node["job_logging"].get("root")
-    if not logs and all(node[key] == own[key] for key in HYDRAS_FILES):
-        return []
-    typed = {key_of(word) for word in words}
-    added = {}
-    if node["output_subdir"] is None and "hydra.output_subdir" not in typed:
-        added["hydra.output_subdir"] = ".hydra"
-    if not logs and "hydra/job_logging" not in typed:
-        added |= {"hydra/job_logging": "default", "hydra.job_logging.root.handlers": "[file]"}
-    if node["run"] == own["run"]:
-        added["hydra.run.dir"] = "${runs}/.hydra"
-    if multirun and node["sweep"]["subdir"] == own["sweep"]["subdir"]:
-        added["hydra.sweep.subdir"] = "${hydra.job.num}"
-    if multirun and config.hydra.runtime.choices["hydra/launcher"] == OWN:
-        if config.launch.name == "serial":
-            # runs one job after the other, with Hydra's files for each
-            added["hydra/launcher"] = "basic"
-        else:
-            log.info(
-                "launch=%s writes no files of Hydra's: each trial's folder has them",
-                config.launch.name,
-            )
-    return [f"{key}={value}" for key, value in added.items()]
+def _runs_of(config: DictConfig) -> Path:
+    return Path(config.runs).expanduser().resolve()
 
 
 # ---- another sweeper than gsbench's own: Hydra's, or one of an installed package
@@ -299,7 +270,9 @@ def other_sweep(sweep: Sweep, run: Callable[[Sequence[Trial]], list[Outcome]]) -
     """Let another sweeper propose the jobs, and run them."""
     name, config = sweep.other_sweeper, sweep.config
     words, objective = prepare_other_sweeper(sweep)
+    check_links(_runs_of(config))
     words += words_for_hydras_files(config, sweep.words, multirun=True)
+    words += words_for_new_folder(config, sweep.words)
     task = TrialTask(run, sweep.composer.allowed, objective=objective, sweep=sweep)
     try:
         run_main(task, [*words, f"{MODE}=MULTIRUN"], config)

@@ -51,7 +51,7 @@ from gsbench.runs.layout import (
     RENDERS,
     RESULTS,
 )
-from gsbench.settings import is_folder_name
+from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.words import readable_bytes
 
 RECORDS = (DECLARED, LEDGER)  # files of the experiment itself
@@ -272,7 +272,7 @@ def _checked_folder(folder: object) -> str:
     Raises InputError for a path that could lead out of the runs folder.
     """
     parts = str(folder).split("/")
-    if len(parts) != 3 or not all(map(is_folder_name, parts)):
+    if len(parts) != 3 or not all(is_folder_name(part, ARM_BYTES) for part in parts):
         raise InputError(f"{folder!r} cannot be the folder of a trial")
     return str(folder)
 

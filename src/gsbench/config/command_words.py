@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from gsbench.config.groups import GROUPS, REMOVABLE, options
-from gsbench.config.trust import PACKAGE, PERMISSIONS, is_allowed, permission_advice
+from gsbench.config.permissions import PACKAGE, PERMISSIONS, is_allowed, permission_advice
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.words import did_you_mean

@@ -28,6 +28,7 @@ from gsbench.config import command_words
 from gsbench.config.command_words import bare_key, key_of, parse_word
 from gsbench.config.explain import explained, not_a_setting
 from gsbench.config.groups import GROUPS
+from gsbench.config.permissions import PERMISSIONS
 from gsbench.config.schema import (
     ROOT_SETTINGS,
     Config,
@@ -36,7 +37,7 @@ from gsbench.config.schema import (
     plain,
     register_schemas,
 )
-from gsbench.config.trust import MADE_NODES, PERMISSIONS, check_composed, check_permissions
+from gsbench.config.trust import MADE_NODES, check_composed, check_permissions
 from gsbench.errors import InputError
 from gsbench.parsing import MAX_VALUES
 from gsbench.runs.trial_folder import TrialFolder

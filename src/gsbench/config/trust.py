@@ -1,41 +1,33 @@
-"""Permissions: a configuration may run gsbench's own classes, and what the command line allows.
-
-Only the command line gives permission; no file can. ``allow_targets`` names modules (``mine``),
-programs (``bash``), environment variables (``PATH``) and addresses; a typed address or place to
-write is allowed, too. `docs/security.md` says what this protects from.
+"""What a configuration may run, reach and overwrite.
 
 `check_composed` checks a composed configuration, Hydra's own settings included, before Hydra makes
 any object of it. `check_permissions` checks the resolved values of each trial before its parts are
-made. Loads no Hydra by itself.
+made. `docs/security.md` says what this protects from. Loads no Hydra by itself.
 """
 
-import importlib
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import GrammarParseError
 from omegaconf.grammar_parser import parse
 
+from gsbench.config.permissions import (
+    PACKAGE,
+    PERMISSIONS,
+    check_target,
+    is_allowed,
+    load_class,
+    packages_allowed_at,
+    permission_advice,
+)
+from gsbench.config.programs import SBATCH_RESOURCES, check_launch, check_program, is_external
 from gsbench.errors import InputError
-from gsbench.external.settings import program_of
 from gsbench.runs.nested import TARGET, entries_of, targets_in
-from gsbench.settings import foreign_address
-from gsbench.system.own_modules import allowed_modules
-from gsbench.words import did_you_mean
 
-# the setting that says what may run; it counts on the command line only
-PERMISSIONS = "allow_targets"
-PACKAGE = "gsbench"
-# groups that name one class each; `eval.extra` names any number
-COMPONENTS = ("init", "densify", "raster", "tracking")
-# import paths of one class
-EXTERNAL = ("gsbench.densify.External", "gsbench.external.settings.External")
-# the permissions for shell lines, and for unusual options of Slurm
-SHELL, SBATCH = "bash", "sbatch"
+ADDRESS_VARIABLES = ("MLFLOW_TRACKING_URI", "WANDB_BASE_URL")  # by which users name their trackers
 # Where gsbench and Hydra write, by gsbench's own configuration (None: what the installed packages
 # say). Only the command line chooses another place: Hydra would overwrite a ``config.yaml`` there.
 WRITTEN = {
@@ -46,32 +38,6 @@ WRITTEN = {
     "hydra.output_subdir": None,
     "hydra.job.name": None,
 }
-# Variables that a configuration may set: they choose numbers of threads and devices. This is a list
-# of harmless ones, since no list of dangerous ones could be complete: MPLBACKEND imports a module,
-# NUMBA_CACHE_DIR unpickles, CUDA_INJECTION64_PATH and GCONV_PATH load libraries, CC names a
-# program.
-FREE_VARIABLES = frozenset(
-    """
-    OMP_NUM_THREADS OMP_THREAD_LIMIT OMP_DYNAMIC OMP_PROC_BIND OMP_PLACES OMP_SCHEDULE OMP_STACKSIZE
-    OMP_WAIT_POLICY MKL_NUM_THREADS OPENBLAS_NUM_THREADS NUMEXPR_NUM_THREADS NUMBA_NUM_THREADS
-    VECLIB_MAXIMUM_THREADS CUDA_VISIBLE_DEVICES CUDA_DEVICE_ORDER CUDA_LAUNCH_BLOCKING
-    CUBLAS_WORKSPACE_CONFIG PYTORCH_CUDA_ALLOC_CONF HIP_VISIBLE_DEVICES ROCR_VISIBLE_DEVICES TZ
-    """.split()  # noqa: SIM905 - words are easier to read than a list of 20 quoted ones
-)
-# Options of sbatch that choose resources (from Slurm's manual). Others can run a program
-# (task_prolog), start a container, or pass on variables (export).
-SBATCH_RESOURCES = frozenset(
-    """
-    account begin clusters comment constraint contiguous core_spec cores_per_socket cpu_freq
-    cpus_per_gpu cpus_per_task deadline dependency exclude exclusive gpu_bind gpu_freq gpus
-    gpus_per_node gpus_per_socket gpus_per_task gres gres_flags hint hold licenses mail_type
-    mail_user mem mem_bind mem_per_cpu mem_per_gpu mincpus network nice nodelist nodes ntasks
-    ntasks_per_core ntasks_per_gpu ntasks_per_node ntasks_per_socket overcommit oversubscribe
-    partition prefer priority qos requeue reservation signal sockets_per_node spread_job switches
-    thread_spec threads_per_core time time_min tmp use_min_nodes wckey
-    """.split()  # noqa: SIM905
-)
-UNQUOTED = re.compile(r"[\w./:+-]+")  # a name that needs no quotes in a list on the command line
 
 # ---- Hydra's own settings
 SPECIAL_KEYS = (  # keys by which Hydra instantiates objects, beside _target_
@@ -120,88 +86,6 @@ PUBLIC_CLASS = re.compile(rf"{PACKAGE}\.\w+\.[A-Z]\w*")
 NOT_SWEPT = re.compile(rf"[\s+~]*(hydra|runs|{PERMISSIONS})\s*([./@:=\[]|$)")
 
 
-def is_allowed(target: str, allowed: Sequence[str]) -> bool:
-    """Return whether ``target``, a class's import path, is one of ``allowed`` or below one."""
-    return any(
-        target == prefix or target.startswith(prefix.rstrip(".") + ".") for prefix in allowed
-    )
-
-
-def permission_advice(missing: Sequence[str], allowed: Sequence[str]) -> str:
-    """Advice for an error: the ``allow_targets=[…]`` that allows ``missing`` and ``allowed``."""
-    names = [
-        name if UNQUOTED.fullmatch(name) else repr(name)
-        for name in dict.fromkeys([*allowed, *missing])
-    ]
-    return f"add allow_targets=[{','.join(names)}] to the command; no file can allow it"
-
-
-def check_target(
-    target: str | None, group: str, allowed: Sequence[str], own: Sequence[str] = (PACKAGE,)
-) -> None:
-    """Refuse a ``_target_`` outside ``own`` and ``allowed``: importing it would run its code."""
-    if not target:
-        raise InputError(f"{group} names no _target_: the class to use")
-    if is_allowed(target, (*own, *allowed)) and target != PACKAGE:
-        return
-    prefix = target.split(".")[0]
-    if prefix == PACKAGE:
-        raise InputError(f"{group}.{TARGET}={target} is not a class for {group}")
-    near = did_you_mean(prefix, allowed)
-    advice = permission_advice([prefix], allowed)
-    raise InputError(
-        f"{group}.{TARGET}={target} is not gsbench's own{near}; if you trust that code, {advice}"
-    )
-
-
-def load_class(target: str, group: str, allowed: Sequence[str]) -> Any:
-    """Load the class at the import path ``target``.
-
-    Raises InputError unless it is gsbench's or ``allowed``.
-    """
-    check_target(target, group, allowed)
-    module_name, _, name = target.rpartition(".")
-    missing = object()
-    try:
-        module = importlib.import_module(module_name)
-        cls = getattr(module, name, missing)
-    # importing a user's file runs it: it may raise anything
-    except (Exception, SystemExit) as error:
-        reason = f"{type(error).__name__}: {error}{_import_advice(error)}"
-        raise InputError(f"{group}.{TARGET}={target} cannot be imported ({reason})") from error
-    if cls is missing:
-        raise InputError(
-            f"{group}.{TARGET}={target} cannot be imported: {module_name} has no "
-            f"{name}{did_you_mean(name, dir(module))}"
-        )
-    # A name that an allowed module merely imports (`mine.Popen`) is the code of another module.
-    defined_as = f"{getattr(cls, '__module__', None)}.{getattr(cls, '__qualname__', name)}"
-    if isinstance(cls, type) and not is_allowed(defined_as, (PACKAGE, *allowed)):
-        advice = permission_advice([defined_as.split(".")[0]], allowed)
-        raise InputError(
-            f"{group}.{TARGET}={target} is {defined_as}; if you trust that code, {advice}"
-        )
-    return cls
-
-
-def _import_advice(error: BaseException) -> str:
-    """Advice for a missing module that lies elsewhere, or beside an allowed one; else ""."""
-    if not isinstance(error, ModuleNotFoundError):
-        return ""
-    name, folders = (error.name or "").split(".")[0], allowed_modules()
-    if name in folders:
-        return f"; your modules are looked for where the command is given: {folders[name]}"
-    if name and any(
-        Path(place, f"{name}.py").is_file() or Path(place, name).is_dir()
-        for place in folders.values()
-    ):
-        return (
-            "; it lies here, but only what allow_targets names is imported from here: add "
-            f"{name} there"
-        )
-    return ""
-
-
 def check_permissions(values: Mapping[str, Any]) -> None:
     """Refuse a trial's resolved configuration that would run what its ``allow_targets`` lacks.
 
@@ -214,7 +98,7 @@ def check_permissions(values: Mapping[str, Any]) -> None:
         check_target(target, group, allowed, packages_allowed_at(place))
     if is_external(values["densify"]):
         check_program(values["densify"], allowed)
-    _check_launch(values["launch"], allowed)
+    check_launch(values["launch"], allowed)
     tracking = values["tracking"]
     if tracking.get("enabled", True) and (address := foreign_address(tracking, allowed)):
         raise InputError(
@@ -223,14 +107,18 @@ def check_permissions(values: Mapping[str, Any]) -> None:
         )
 
 
-def packages_allowed_at(place: Sequence[str]) -> tuple[str, ...]:
-    """The packages of gsbench whose classes a setting at ``place`` may name without permission."""
-    if len(place) == 1 and place[0] in COMPONENTS:
-        own = f"{PACKAGE}.{place[0]}"
-        return (own, f"{PACKAGE}.external") if place[0] == "densify" else (own,)
-    if len(place) == 3 and tuple(place[:2]) == ("eval", "extra"):
-        return (f"{PACKAGE}.eval",)
-    return ()
+def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
+    """An address in the settings ``tracking`` that only a file names, which may not be used, or "".
+
+    The user's own are those ``allowed`` on the command line, and those in the environment.
+    """
+    own = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
+    given = (str(value) for key, value in tracking.items() if value and _is_place(key, str(value)))
+    return next((address for address in given if address not in own), "")
+
+
+def _is_place(key: str, value: str) -> bool:
+    return key == "uri" or "://" in value
 
 
 def check_composed(
@@ -421,65 +309,3 @@ def load_callbacks(callbacks: Any, allowed: Sequence[str]) -> None:
                     else "a class"
                 )
                 raise InputError(f"{'.'.join(place)}.{TARGET}={target} is not {wanted}")
-
-
-def is_external(densify: Mapping[str, Any]) -> bool:
-    """Return whether these settings make another program the trainer.
-
-    They do if their class has one of the import paths `EXTERNAL`.
-    """
-    return densify.get(TARGET) in EXTERNAL
-
-
-def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse a program as trainer unless the user allowed its programs and variables."""
-    # A YAML file may call any program of this machine a trainer, or load code into one by a
-    # variable.
-    options = settings.get("options") or {}
-    programs = [program_of(settings.get("command") or "", options)]
-    if settings.get("version_command") is not None:
-        programs.append(program_of(settings["version_command"], options, "densify.version_command"))
-    programs = [program for program in dict.fromkeys(programs) if program not in allowed]
-    variables = foreign_variables(settings.get("environment") or {}, allowed)
-    if not programs and not variables:
-        return
-    runs = [f"runs the program {' and '.join(map(repr, programs))}"] * bool(programs)
-    sets = ["sets " + ", ".join(f"{name}={value!r}" for name, value in variables.items())] * bool(
-        variables
-    )
-    raise InputError(
-        f"densify={settings['name']} {' and '.join(runs + sets)}; if you trust it, "
-        + permission_advice([*programs, *variables], allowed)
-    )
-
-
-def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:
-    """The ``variables`` that may not be set: neither free nor allowed nor at this value already."""
-    return {
-        name: value
-        for name, value in variables.items()
-        if name not in FREE_VARIABLES and name not in allowed and value != os.environ.get(name)
-    }
-
-
-def _check_launch(launch: Mapping[str, Any], allowed: Sequence[str]) -> None:
-    """Refuse lines for a shell, and values that could become one in the script that Slurm runs."""
-    if launch.get("setup") and SHELL not in allowed:
-        raise InputError(
-            f"launch.setup runs {'; '.join(map(str, launch['setup']))!r} in a shell; if you trust "
-            "it, " + permission_advice([SHELL], allowed)
-        )
-    options = {
-        str(name).replace("-", "_"): value for name, value in (launch.get("sbatch") or {}).items()
-    }
-    if (not_resources := sorted(options.keys() - SBATCH_RESOURCES)) and SBATCH not in allowed:
-        raise InputError(
-            f"launch.sbatch.{not_resources[0]} chooses more than resources; if you trust it, "
-            + permission_advice([SBATCH], allowed)
-        )
-    texts = {f"launch.{name}": launch.get(name) for name in ("partition", "account", "qos")}
-    texts |= {f"launch.sbatch.{name}": value for name, value in options.items()}
-    # a line break would end the comment that Slurm reads, and begin a command
-    for key, value in texts.items():
-        if not str(value).isprintable() or not key.isprintable():
-            raise InputError(f"{key} must be one line, got {value!r}")

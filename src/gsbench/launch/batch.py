@@ -8,8 +8,8 @@ from pathlib import Path
 
 from gsbench.config.compose import Trial
 from gsbench.config.groups import options
+from gsbench.config.permissions import PERMISSIONS
 from gsbench.config.schema import COMPONENTS
-from gsbench.config.trust import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.dry_run import unavailable_now

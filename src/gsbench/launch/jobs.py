@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import secrets
 import signal
 import sys
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
     from submitit import Executor, Job, SlurmExecutor
     from submitit.helpers import DelayedSubmission
 
+
+JOB_LINK = re.compile(r"\.submission_file_.*\.sh")
 
 log = logging.getLogger(__name__)
 
@@ -226,15 +229,21 @@ def job_folder(values: dict[str, Any]) -> Path:
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
     require_no_links(runs, folder)
-    # submitit leaves a link to each job script. It is not read again, and `require_no_links` below
-    # would refuse it.
-    for jobs in (folder, *folder.glob("*")):
-        for link in [] if jobs.is_symlink() else jobs.glob(".submission_file_*.sh"):
-            if link.is_symlink():
-                link.unlink(missing_ok=True)
+    remove_job_links(folder)
     require_no_links(runs, folder, below=True)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+def remove_job_links(folder: Path) -> None:
+    """Remove the links to job scripts that submitit leaves below ``folder``.
+
+    They are not read again, and `gsbench.files.require_no_links` would refuse them.
+    """
+    for place, _, names in os.walk(folder):
+        for link in (Path(place, name) for name in names if JOB_LINK.fullmatch(name)):
+            if link.is_symlink():
+                link.unlink(missing_ok=True)
 
 
 def new_job_folder(values: dict[str, Any]) -> Path:

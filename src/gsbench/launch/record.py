@@ -32,7 +32,7 @@ from gsbench.runs.experiments import (
     record_text,
 )
 from gsbench.runs.layout import DECLARED, PLAN, RESULTS, SEED
-from gsbench.settings import is_folder_name
+from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.system.locks import hold
 from gsbench.words import some_of
 
@@ -52,7 +52,7 @@ class PlannedTrial(Record):
 
 def _checked_folder(name: str) -> str:
     parts = name.split("/")
-    if len(parts) != LEVELS or not all(map(is_folder_name, parts)):
+    if len(parts) != LEVELS or not all(is_folder_name(part, ARM_BYTES) for part in parts):
         raise ValueError("it is not a folder of a trial")
     return name
 

@@ -24,7 +24,7 @@ from gsbench.analysis.trial_settings import config_if_readable
 from gsbench.config.command_words import parse_word, typed_permissions
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
-from gsbench.config.trust import PERMISSIONS
+from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator, summarize
 from gsbench.eval.facts import METRICS

@@ -18,7 +18,7 @@ from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
 from gsbench.runs.layout import DECLARED, IN_RUNS
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_record import Declared, read_rows
-from gsbench.words import is_one_line
+from gsbench.settings import ARM_BYTES, is_folder_name
 
 log = logging.getLogger(__name__)
 
@@ -69,9 +69,9 @@ def folders_in(folder: str | Path) -> list[str]:
         return []
     paths = []
     for entry in found:
-        if is_one_line(entry.name):
+        if is_folder_name(entry.name, ARM_BYTES):
             paths.append(entry.path)
-        else:  # its line breaks would be lines about other folders
+        else:  # such as a line break, or a tag of HTML
             log.warning("left out: %r: gsbench gives no folder such a name", entry.path)
     return paths
 

@@ -7,6 +7,7 @@ built in ``.<key>.partial/``, which a killed build leaves behind. While one proc
 
 import logging
 import os
+import re
 import shutil
 import stat
 import time
@@ -34,6 +35,7 @@ from gsbench.system.locks import BusyError, hold
 
 log = logging.getLogger(__name__)
 
+KEY = re.compile("[0-9a-f]+")
 LEFTOVER_AGE = 86_400.0  # seconds after which temporary folders that no lock guards are removed
 
 
@@ -90,6 +92,21 @@ class Store:
     def folder(self, stage: Stage, key: str) -> Path:
         """The folder of the finished result of ``stage`` under ``key``."""
         return self.root / stage.name / key
+
+    def existing(self, stage: Stage, key: str) -> Path:
+        """The folder of the finished result of ``stage`` under ``key``, all of it compared.
+
+        Raises InputError if there is none, or if it is not as it was written.
+        """
+        folder = self.folder(stage, key)
+        if not KEY.fullmatch(key) or not folder.is_dir():
+            raise InputError(f"{folder} is gone: run this trial again")
+        require_no_links(self.root.parent, folder, below=True)
+        try:
+            read_manifest(folder, thorough=True)
+        except ValueError as error:
+            raise InputError(f"{folder} is damaged ({error}): run this trial again") from None
+        return folder
 
     def path(self, step: Step) -> Path:
         """The folder of the result of ``step`` once it is finished."""

@@ -38,13 +38,13 @@ from queue import Empty, Queue
 from typing import Any, NoReturn
 
 from gsbench.config.build import build
+from gsbench.config.trust import foreign_address
 from gsbench.errors import InputError
 from gsbench.files import write_json
 from gsbench.parsing import read_if_sound
 from gsbench.runs.layout import CONFIG, FAILED, LOG, RESULTS
 from gsbench.runs.nested import GSBENCH
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.settings import foreign_address
 from gsbench.system.isolate import describe_exit, error_lines, python_command
 from gsbench.system.locks import BusyError, hold
 from gsbench.system.own_modules import allowed_modules

@@ -27,7 +27,7 @@ from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, RETRIES
 from gsbench.claims.stopping import KeyAndSeed
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
-from gsbench.config.trust import PERMISSIONS
+from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.files import make_runs_folder, writable_output, write_text
 from gsbench.launch.batch import missing_folders, run_batch

@@ -15,8 +15,6 @@ from gsbench.errors import InputError
 from gsbench.eval.protocol import PROTOCOLS
 from gsbench.files import atomic, own_output, writable_output
 from gsbench.normalization import Normalization
-from gsbench.runs.keys import INIT
-from gsbench.runs.layout import STORE
 from gsbench.settings import is_folder_name
 from gsbench.verbs.arguments import ArgumentParser, add_where, names, path
 from gsbench.words import readable_bytes
@@ -132,15 +130,14 @@ def _export_parser() -> ArgumentParser:
 def export_model(trial: TrialResult, out: Path, is_init: bool) -> None:
     """Write the trained model as a PLY file or a page, or the initial model as a folder."""
     from gsbench.view.page import write_page
-    from gsbench.view.trials import model_file
+    from gsbench.view.trials import model_file, model_folder
 
     is_page = out.suffix.lower() == PAGE
     if not is_init and not is_page:
         check_form(out)
     with writable_output(out):
         if is_init:
-            entry = trial.path.parents[3] / STORE / INIT.name / trial.record.hashes[INIT.name]
-            export_init(entry, out, trial.record.to_training)
+            export_init(model_folder(trial), out, trial.record.to_training)
         elif is_page:
             write_page(trial, out)
         else:
@@ -179,19 +176,14 @@ def check_form(out: Path) -> None:
         )
 
 
-def export_init(entry: Path, out: Path, normalization: Normalization) -> None:
-    """Copy the COLMAP model of the stage result ``entry`` into ``out``, as 3DGS trainers read it.
+def export_init(model: Path, out: Path, normalization: Normalization) -> None:
+    """Copy a trial's COLMAP model into ``out``, as 3DGS trainers read it.
 
     It gets the coordinates in which the scene was given. Raises InputError if ``out`` has a folder
     of models.
     """
     from gsbench.init.base import MODEL_FOLDER
 
-    model = entry / MODEL_FOLDER
-    if not model.is_dir():
-        raise InputError(
-            f"the initial model is no longer in the store ({model}): run the trial again"
-        )
     first = out / MODEL_FOLDER.parts[0]
     if first.exists():
         raise InputError(f"{first} exists already: give another --out")

@@ -35,7 +35,7 @@ from gsbench.analysis.results import (
     load_experiment,
     newest_code,
 )
-from gsbench.analysis.table_formats import FORMATS
+from gsbench.analysis.table_formats import FORMATS, csv_of
 from gsbench.analysis.tables import (
     DEFAULT_ROWS,
     build_table,
@@ -107,7 +107,7 @@ def _refuse_options_of_tables(options: argparse.Namespace, what: str) -> None:
 def _trials(trials: Sequence[TrialResult], options: argparse.Namespace) -> dict[str, str]:
     """A CSV with one row per trial. Raises InputError for options that only a table has."""
     _refuse_options_of_tables(options, f"--format {TRIALS} shows every column of every trial")
-    return {"-trials.csv": to_frame(trials).to_csv(index=False, lineterminator="\n")}
+    return {"-trials.csv": csv_of(to_frame(trials))}
 
 
 def _tables(

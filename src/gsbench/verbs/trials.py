@@ -19,7 +19,7 @@ from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.results import read_experiment
 from gsbench.config.command_words import key_of, makes_other_trials, typed_permissions
 from gsbench.config.compose import Trial, compose_one
-from gsbench.config.trust import PERMISSIONS
+from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
@@ -203,6 +203,13 @@ def retry(argv: Sequence[str], runs: Path) -> int:
     trials = [
         recompose(one.folder, one.planned, runs, options.changes, modules) for one in unfinished
     ]
+    # A plan of somebody's must not declare or run anything in an experiment of the user's.
+    for old, trial in zip(unfinished, trials, strict=True):
+        if trial.files.home != home:
+            raise InputError(
+                f"{TrialFolder(old.folder).label} is planned as a trial of "
+                f"{trial.files.home.name}, not of {home.name}: give the sweep's own command"
+            )
     if options.dry_run:
         print("\n".join(describe_plan(trials, trials[0].values["launch"]["parallel"])))
         return 0

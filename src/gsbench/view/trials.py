@@ -147,14 +147,9 @@ def read_causes(path: Path, num_gaussians: int) -> NDArray[np.uint8]:
 
 
 def model_folder(trial: TrialResult) -> Path:
-    """The COLMAP model that a trial started from; raises InputError if it is gone."""
-    runs = trial.path.parents[3]
-    folder = Store(runs / STORE).folder(INIT, trial.record.hashes.get("init", "")) / MODEL_FOLDER
-    if not folder.is_dir():
-        raise InputError(
-            f"{folder} is gone, and it had the cameras of {trial.label}: run this trial again"
-        )
-    return folder
+    """The COLMAP model that a trial started from; raises InputError if it is gone or changed."""
+    store = Store(trial.path.parents[3] / STORE)
+    return store.existing(INIT, trial.record.hashes.get(INIT.name, "")) / MODEL_FOLDER
 
 
 def read_test_views(trial: TrialResult, model_dir: Path) -> tuple[View, ...]:
