@@ -10,10 +10,11 @@ from gsbench.scene.types import Array
 
 log = logging.getLogger(__name__)
 
-COLOR_NAMES = (
-    ("red", "green", "blue"),
-    ("r", "g", "b"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
+WITHOUT_COLOR = frozenset(("x", "y", "z", "nx", "ny", "nz"))
+# Between parts of a name: CloudCompare writes colours that it computed as scalar_R.
+PREFIX = re.compile(
+    r"^(pos(ition)?|coord(inate)?|point|vertex|colou?r|rgb|diffuse|ambient|scalar)(?=[\W_])"
 )
 # Surveyors' names of the axes, from the first to the third.
 AXES = (("x", "easting", "east"), ("y", "northing", "north"), ("z", "height", "elevation", "up"))
@@ -30,9 +31,12 @@ LAYOUTS: dict[int, tuple[tuple[int, ...], ...]] = {
     10: ((4, 5, 6), (3, 4, 5)),
 }
 DECIMAL_COMMAS = re.compile(r"-?\d+,\d+([\s;]+-?\d+(,\d+)?)+")
-PACKED_COLOR = re.compile(r"#[0-9a-fA-F]{6}\b")
+PACKED_COLOR = re.compile(r"(#|\b0x)[0-9a-fA-F]{6}\b")
 UNIT = 0.01  # the length of a normal written with few digits differs from 1 by less
 MAX_BYTE = 255
+# Colours up to this are fractions, even if tone mapping or rounding went beyond 1. As bytes they
+# would all be black.
+MAX_FRACTION = 2.0
 WANTED = "x y z, or x y z [intensity] red green blue, or a first line such as x,y,z,red,green,blue"
 
 
