@@ -69,7 +69,8 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
         elements = ", ".join(element.name for element in content)
         raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
     vertices = content["vertex"].data
-    names = {plain_name(name): name for name in vertices.dtype.names or ()}
+    written = vertices.dtype.names or ()
+    names = {plain_name(name): name for name in written} | {name.lower(): name for name in written}
     if lacking := [name for name in "xyz" if name not in names]:
         raise ValueError(f"its vertices have no property {', '.join(lacking)}")
 
@@ -77,7 +78,7 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
         return np.stack([vertices[names[name]] for name in wanted], axis=1)
 
     points = columns("xyz").astype(np.float64)
-    if set(DC_NAMES) <= set(vertices.dtype.names):  # a model of Gaussians
+    if set(DC_NAMES) <= set(written):  # a model of Gaussians
         dc = np.stack([vertices[name] for name in DC_NAMES], axis=1).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
     colored = color_columns(names, path)
@@ -85,9 +86,10 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] times 255."""
+    """Colours from 0 to 255: 16-bit values are divided by 257, fractions multiplied by 255."""
     values = colors.astype(np.float64)
-    if colors.dtype.kind == "f" and values.max() <= MAX_FRACTION:
+    is_whole = values.max() > 1 and (values == values.round()).all()
+    if colors.dtype.kind == "f" and values.max() <= MAX_FRACTION and not is_whole:
         values = values * 255
     elif values.max() > 255:
         values = values / 257  # 65535 becomes 255

@@ -40,14 +40,15 @@ FORMATS = frozenset(suffix[1:] for suffix in IMAGE_SUFFIXES)
 WORKSPACES = ("store", "stereo")  # sub-folders of gsbench's runs and of COLMAP's dense workspace
 
 
-def photographs_among(folder: Path, names: Sequence[str]) -> list[str]:
+def photographs_among(folder: Path, names: Sequence[str], report: bool = True) -> list[str]:
     """The ``names`` of image files below ``folder`` that are photographs, in their order.
 
-    One log line says which folders and files are left out. Raises InputError if none is left.
+    With ``report``, one log line says which folders and files are left out, and InputError is
+    raised if none is left.
     """
     reasons = _reasons(folder, names)
-    if not reasons:
-        return list(names)
+    if not reasons or not report:
+        return [name for name in names if name not in reasons]
     counts = Counter(reasons.values())
     listed = ", ".join(f"{place} ({count})" for place, count in sorted(counts.items()))
     files = counted(len(reasons), "file")

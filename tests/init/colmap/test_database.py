@@ -99,6 +99,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
         ({}, 1),
         ({"mm": 6.8004}, 1),  # as written by another program
         ({"film": 52}, 2),  # digital zoom of one lens
+        ({"zoom": 1.0}, 1),  # said by some of the photographs only
         ({"zoom": 2.0}, 2),
         ({"mm": 9.0, "film": 77}, 2),
         ({"lens": "telephoto"}, 2),
