@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 from numpy.testing import assert_array_equal
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
@@ -118,6 +119,23 @@ def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change,
     assert groups[0][0].has_prior_focal_length
     single = made.unknown_camera_groups(images, names, "single", "SIMPLE_RADIAL", None)
     assert len(single) == (2 if "size" in change else 1)
+
+
+@pytest.mark.parametrize(
+    "tags, wanted",
+    [
+        (TELEPHONE, 26 * 40 / 36),  # COLMAP: by the longest side of 36 mm
+        ({}, 1.2 * 40),
+        ({"mm": IFDRational(0, 0), "film": 0}, 1.2 * 40),  # COLMAP alone: NaN, as if known
+        ({"film": 65535}, 1.2 * 40),
+        ({"film": 1}, 1.2 * 40),
+    ],
+)
+def test_a_focal_length_of_exif_that_no_lens_has_is_not_used(tmp_path, tags, wanted):
+    with_exif(tmp_path / "a.jpg", **tags)
+    ((camera, _),) = made.unknown_camera_groups(tmp_path, ["a.jpg"], "exif", "SIMPLE_RADIAL", None)
+    assert camera.focal_length == pytest.approx(wanted, rel=0.1)
+    assert camera.has_prior_focal_length is (tags == TELEPHONE)
 
 
 def test_a_line_names_the_lenses_of_the_photographs(tmp_path, caplog):
