@@ -15,7 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import features, geometry, matches
-from gsbench.init.colmap_initializer import report_lenses
+from gsbench.init.colmap_initializer import report_lenses, report_unused
 from gsbench.scene.exif import (
     DIGITAL_ZOOM,
     EXIF_IFD,
@@ -148,6 +148,14 @@ def test_a_line_names_the_lenses_of_the_photographs(tmp_path, caplog):
     caplog.clear()
     report_lenses(replace(capture, image_names=names[1:]))
     assert not caplog.records
+
+
+def test_settings_of_cameras_that_are_given_are_named(caplog):
+    report_unused(Sfm())
+    assert not caplog.records
+    report_unused(Sfm(camera="single", focal_length=300.0))
+    assert "init.camera=single is not used, since the cameras are given" in caplog.text
+    assert "init.focal_length=300.0 is not used" in caplog.text
 
 
 def test_ids_follow_the_names_and_each_camera_has_a_rig(database):

@@ -148,9 +148,7 @@ def unknown_camera_groups(
     for group in groups.values():
         camera = pycolmap.infer_camera_from_image(images / group[0], options)
         longest = max(camera.width, camera.height)
-        most, least = (
-            longest / 2 / math.tan(math.radians(view) / 2) for view in FIELD_OF_VIEW_DEG
-        )
+        most, least = (longest / 2 / math.tan(math.radians(view) / 2) for view in FIELD_OF_VIEW_DEG)
         inferred = camera.mean_focal_length()
         # EXIF data may be wrong or a division by zero: COLMAP would start from NaN.
         if focal_length is not None or not least < inferred < most:
