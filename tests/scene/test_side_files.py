@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
+from gsbench.scene.images import list_images
 from gsbench.scene.readers import read_photos
+from gsbench.scene.side_files import photographs_among
 from tests.helpers import refusal
 from tests.scene.conftest import smooth_image
 
@@ -132,6 +134,20 @@ def test_photographs_in_folders_of_other_names_are_all_read(tmp_path, caplog, pa
         photographs(tmp_path, pattern, seed=COUNT * number)
     assert len(read_photos("a", tmp_path).image_names) == COUNT * len(patterns)
     assert not caplog.records
+
+
+def test_names_without_a_common_number_belong_to_no_series(tmp_path):
+    """church and garden are two photographs, and 1 and 01 one series, whatever their formats."""
+    for name in ("church.jpg", "church.png", "x/1.jpg", "x/1.png", "x/02.jpg"):
+        photographs(tmp_path, name, change=ImageOps.grayscale)
+    for name in ("garden.jpg", "garden.png", "y_5/2.jpg", "1.jpg"):
+        photographs(tmp_path, name, seed=5)
+    names = photographs_among(tmp_path, list_images(tmp_path))
+    assert {name for name in list_images(tmp_path) if name not in names} == set()
+    photographs(tmp_path, "02.jpg", seed=9)
+    names = photographs_among(tmp_path, list_images(tmp_path))
+    left_out = {name for name in list_images(tmp_path) if name not in names}
+    assert left_out == {"x/1.jpg", "x/1.png", "x/02.jpg"}
 
 
 def test_a_folder_that_is_named_is_read_whatever_its_name(tmp_path):

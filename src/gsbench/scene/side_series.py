@@ -58,9 +58,9 @@ def side_series(folder: Path, names: Sequence[str]) -> dict[str, str]:
                 continue
             if belongs:
                 reason = f"{place[0]}/" if place[0] != other[0] else place[1].replace("#", "…")
-                found |= dict.fromkeys(pictures.values(), reason)
+                found |= {stem_of(name): reason for name in pictures.values()}
                 break
-    return found
+    return {name: found[stem_of(name)] for name in names if stem_of(name) in found}
 
 
 def _series(names: Sequence[str]) -> dict[Place, dict[tuple[object, ...], str]]:
@@ -68,19 +68,18 @@ def _series(names: Sequence[str]) -> dict[Place, dict[tuple[object, ...], str]]:
 
     Of names that are the only one of their form in a folder, the name is the key.
     """
-    forms: dict[Place, list[str]] = defaultdict(list)
+    forms: dict[Place, dict[str, str]] = defaultdict(dict)  # names by stem
     for name in names:
         stem = PurePosixPath(stem_of(name))
-        forms[stem.parent.as_posix(), DIGITS.sub("#", stem.name)].append(name)
+        forms[stem.parent.as_posix(), DIGITS.sub("#", stem.name)][stem.name] = name
     series: dict[Place, dict[tuple[object, ...], str]] = defaultdict(dict)
     for (parent, form), members in forms.items():
-        stems = [PurePosixPath(stem_of(name)).name for name in members]
         if len(members) == 1:
-            series[parent, ""][stems[0].casefold(),] = members[0]
+            series[parent, ""] |= {(stem.casefold(),): name for stem, name in members.items()}
             continue
-        numbers = np.array([[int(run) for run in DIGITS.findall(stem)] for stem in stems], object)
+        numbers = np.array([[int(run) for run in DIGITS.findall(stem)] for stem in members], object)
         varying = (numbers != numbers[0]).any(axis=0)
-        for name, row in zip(members, numbers, strict=True):
+        for name, row in zip(members.values(), numbers, strict=True):
             series[parent, form][tuple(row[varying])] = name
     return series
 
