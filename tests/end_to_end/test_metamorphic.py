@@ -18,7 +18,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from PIL import Image
+from PIL import Image, ImageOps
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -187,10 +187,62 @@ def other_place(folder, model):
     (folder / "images/.DS_Store").write_text("")
 
 
+def junk(folder, model):
+    """Put masks, thumbnails, smaller copies and hidden files beside photographs and model."""
+    for file in sorted((folder / "images").iterdir()):
+        picture = Image.open(file)
+        for place, change in JUNK.items():
+            target = folder / place.format(name=file.name, stem=file.stem)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            change(picture).save(target)
+        (file.parent / f"._{file.name}").write_bytes(b"\0\5\x16\7")
+    other = pycolmap.Reconstruction(model)
+    other.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.ones(3)))
+    (folder / "sparse/0").mkdir(parents=True)
+    other.write_text(folder / "sparse/0")  # not read beside the binary model
+
+
+JUNK = {
+    "images/masks/{name}.png": ImageOps.grayscale,
+    "images/{name}.mask.png": ImageOps.grayscale,
+    "images/{stem}_depth.png": lambda picture: picture.convert("I;16"),
+    "images/@eaDir/{name}/SYNOPHOTO_THUMB_M.jpg": lambda picture: picture.resize((24, 18)),
+    "images/sam/{name}": ImageOps.grayscale,
+    "images/tn_{name}": lambda picture: picture.resize((48, 36)),
+    "images_2/{name}": lambda picture: picture.resize((48, 36)),
+    "__MACOSX/images/{name}": lambda picture: picture,
+}
+
+
+def with_lenses(folder, model):
+    """Give the photographs EXIF data of two lenses, and of orientations that COLMAP ignores."""
+    for number, file in enumerate(sorted((folder / "images").iterdir())):
+        picture = Image.open(file)
+        picture.load()
+        picture.save(file, exif=exif_of(20 + 10 * (number % 2), orientation=1 + number % 8))
+
+
+def exif_of(millimetres, **more):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = round(millimetres)  # on 35 mm film
+    exif[0x010F], exif[0x0112] = "X", more.get("orientation", 1)
+    return exif
+
+
+def at_other_size(factor, folder, model):
+    """Give cameras and keypoints the size that the photographs had before they were shrunk."""
+    for camera in model.cameras.values():
+        camera.rescale(factor)
+
+
 @pytest.mark.parametrize(
     "change, text",
     [
         pytest.param(other_place, True, id="a text model"),
+        pytest.param(junk, False, id="junk folders"),
+        pytest.param(with_lenses, False, id="EXIF"),
+        pytest.param(partial(at_other_size, 2), False, id="twice the size"),
+        pytest.param(partial(at_other_size, 0.25), True, id="a quarter of the size"),
         pytest.param(rename, False, id="other names"),
         pytest.param(partial(convert, ".bmp"), False, id="BMP"),
         pytest.param(partial(convert, ".tif"), True, id="TIFF"),
@@ -206,6 +258,28 @@ def test_another_name_or_format_changes_no_bit(good, original, tmp_path, change,
     assert file_sha256(trial / "point_cloud.ply") == file_sha256(original[0] / "point_cloud.ply")
     renders, before = (sorted((one / "renders").iterdir()) for one in (trial, original[0]))
     assert [file_sha256(file) for file in renders] == [file_sha256(file) for file in before]
+
+
+def test_lenses_are_told_apart_by_exif_as_by_folders(tmp_path):
+    """Every other photograph is zoomed by 1.5, says so in its EXIF data, and has another folder."""
+    render_courtyard(tmp_path / "made", 20, 360, 270)
+    focal = courtyard_cameras(20, 360, 270)["0000.png"].fx
+    for number, file in enumerate(sorted((tmp_path / "made/images").iterdir())):
+        picture, zoom = Image.open(file), 1.5 if number % 2 else 1.0
+        if zoom > 1:
+            picture = picture.resize((360, 270), Image.Resampling.LANCZOS, (60, 45, 300, 225))
+        target = tmp_path / "photos" / str(zoom) / file.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        picture.save(target, exif=exif_of(focal * zoom * 36 / 360))
+    quick = "train=none densify=none eval.lpips=[] tracking=none threads=1 init=sfm_preview"
+    found = []
+    for sharing in ("exif", "per_folder"):
+        runs = tmp_path / "runs" / sharing
+        words = [*split(quick), f"init.camera={sharing}"]
+        trial = trial_of(words, runs, tmp_path / "photos", "scene=photos")
+        found.append(read_json(trial / "init_report.json")["focal_lengths"])
+    assert found[0] == found[1]
+    assert sorted(found[0]) == pytest.approx([focal, 1.5 * focal], rel=0.1)
 
 
 def test_transforms_json_gives_the_result_of_the_colmap_model(good, original, tmp_path):

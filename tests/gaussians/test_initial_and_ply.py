@@ -299,6 +299,7 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, caplog):
         ("scale_t", True, "its Gaussians move with time"),
         ("velocity_x", True, "its Gaussians move with time"),
         ("Beta", True, "Beta Splatting's"),
+        ("beta_0", True, "Beta Splatting's"),
         ("f_offset_0", True, "Scaffold-GS computes its Gaussians by networks"),
         ("f_asg_12", True, "Spec-Gaussian computes its colours by networks"),
         ("FILTER_3d", False, "Mip-Splatting's filter_3D is applied"),
@@ -394,6 +395,7 @@ def test_a_value_beyond_float32_is_refused(tmp_path):
         ("opacity", (0.0, 1.0), r"all opacities lie in \[0, 1\]"),
         ("opacity", (-0.01, 1.0), ""),
         ("opacity", (0.0, 1.01), ""),
+        ("opacity", (0.0, 255.0), r"all opacities lie in \[0, 255\]"),
     ],
 )
 def test_values_that_look_activated_cause_a_warning(tmp_path, prefix, values, said, caplog):

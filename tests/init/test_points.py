@@ -42,6 +42,9 @@ def write(path, properties, values, text, order):
         (("red", "green", "blue"), "u2", 257),
         (("Red", "Green", "Blue"), "u1", 1),
         (("scalar_R", "scalar_G", "scalar_B"), "f4", 1),
+        (("color_red", "color_green", "color_blue"), "u1", 1),
+        (("ambient_red", "ambient_green", "ambient_blue"), "u1", 1),
+        (("red", "green", "blue"), "f4", 1.001 / 255),  # fractions that go beyond 1
     ],
 )
 def test_ply_properties_may_have_any_order_and_type(tmp_path, text, order, names, kind, scale):
@@ -111,6 +114,9 @@ WITH_FIELDS = rows(XYZ, RGB, INTENSITY, ALPHA, between=",")
         ("a.csv", f"x,y,z,r,g,b,Scalar field,Cloud index\n{WITH_FIELDS}", True),
         ("a.csv", '"x","y","z"\n' + re.sub(r"[^,\n]+", r'"\g<0>"', rows(XYZ, between=",")), False),
         ("a.csv", rows(XYZ, RGB, between=",").replace("\n", ",\n"), True),
+        ("a.csv", f"x,y,z,rgb_r,rgb_g,rgb_b\n{rows(XYZ, RGB, between=',')}", True),
+        ("a.xyz", rows(np.arange(len(XYZ)), XYZ), False),  # numbered from 0
+        ("a.xyz", rows(np.arange(len(XYZ)) + 1, XYZ, RGB), True),
     ],
 )
 def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, colored):
@@ -130,6 +136,9 @@ def test_tables_of_scanners_and_other_programs_are_read(tmp_path, name, text, co
         ("a.txt", "#   POINT3D_ID, X, Y, Z, R, G, B\n1 2 3 4 5 6 7 8\n", "init=dataset reads its"),
         ("a.xyz", "1.0D+00 2.0D+00 3.0D+00\n", "no line is a row of numbers"),
         ("a.las", "LASF", "convert it to PLY, for example with CloudCompare"),
+        ("a.xyz", "1 2 3 0xff8000\n", "colours such as #ff8000: write red, green and blue"),
+        ("a.pts", "2\n1 2 3\n1 2 3 4\n", "the line '1 2 3 4' is no row of 3 numbers: wanted"),
+        ("a.xyz", "2\na title\nC 1 2 3\n", "the line 'a title' is no row of 2 numbers: wanted"),
     ],
 )
 def test_tables_that_would_be_read_wrong_are_refused_with_the_remedy(tmp_path, name, text, message):
@@ -242,6 +251,10 @@ def bad_ply(path):
     )
 
 
+def other_ply(path):
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement point 1\nproperty int x\nend_header\n1\n")
+
+
 def empty_ply(path):
     properties = b"".join(b"property float %c\n" % axis for axis in b"xyz")
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\n" + properties + b"end_header\n")
@@ -258,6 +271,7 @@ def empty_ply(path):
             "it has 2 columns without names: wanted are x y z",
         ),
         ("a.ply", empty_ply, "holds no point"),
+        ("a.ply", other_ply, "it has no element vertex, only point"),
         ("a.xyz", lambda path: save(path, np.where(XYZ > 1.9, np.nan, XYZ)), "not finite numbers"),
         ("a.xyz", lambda path: path.write_text("1 2 x\n"), "not a readable file of points"),
         ("a.xyz", lambda path: path.write_text("1,5 2,5 3,5\n"), "decimal commas: write points"),

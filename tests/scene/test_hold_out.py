@@ -136,7 +136,9 @@ def test_lists_of_nerfbaselines_are_found_by_their_names(make_scene):
             {"split": "matched"},
             r"sweep it, as in -m scene\.split=every_nth,sector scene\.match_views=true",
         ),
-        ({"sector": 8}, "the last is 7"),
+        ({"split": "sector", "sector": 8}, "the last is 7"),
+        ({"sector": 2}, r"scene.sector=2 is not read with scene.split=every_nth: add scene.split"),
+        ({"split": "list", "sectors": 4}, "scene.sectors=4 is not read with scene.split=list"),
         ({"split": "sector", "test_list": "a.txt"}, "both say"),
         ({"split": "list", "match_views": True}, "cannot be matched"),
         ({"train_list": "a.txt", "match_views": True}, "cannot be matched"),
@@ -177,7 +179,8 @@ def test_a_setting_has_limits(name, least, most):
     def config(value):
         of_courtyard = name in ("views", "width", "height", "seed")
         kind, path = ("courtyard", None) if of_courtyard else ("colmap", "/a")
-        return SceneConfig(name="a", kind=kind, path=path, **{name: value})
+        split = "sector" if name in ("sector", "sectors") else "every_nth"
+        return SceneConfig(name="a", kind=kind, path=path, split=split, **{name: value})
 
     assert [getattr(config(value), name) for value in (least, most)] == [least, most]
     for value in (least - 1, *([most + 1] if most in (7, 9999, 16384, 2**31 - 1) else [])):

@@ -116,10 +116,27 @@ def test_images_are_listed_by_real_folders_and_outside_ones_by_their_link(photos
     assert list_images(photos) == ["c.png", "far/b.png", "z/a.png"]
 
 
-def test_heic_photographs_are_counted_in_a_warning(photos, caplog):
-    (photos / "d.HEIC").touch()
+@pytest.mark.parametrize(
+    "names, said",
+    [
+        (["d.HEIC"], "1 HEIC file is not read: save as JPEG"),
+        (["d.DNG", "e.nef", "f.avif"], "2 raw files and 1 AVIF file are not read"),
+        (["d.MOV"], "1 video file is not read"),
+        (["._a.png", "Thumbs.db", "a.txt"], ""),
+    ],
+)
+def test_files_that_may_be_photographs_are_counted_in_a_warning(photos, caplog, names, said):
+    for name in names:
+        (photos / name).touch()
     assert list_images(photos) == ["a.png", "b.png", "c.png"]
-    assert f"{photos}: 1 HEIC file is not read" in caplog.text
+    assert said in caplog.text
+    assert bool(caplog.text) is bool(said)
+
+
+def test_a_pointer_of_git_lfs_is_named(photos):
+    (photos / "a.png").write_text("version https://git-lfs.github.com/spec/v1\n")
+    with refusal(r"a\.png: not a readable image, but a pointer of Git LFS \(git lfs pull\)"):
+        read_image(photos / "a.png")
 
 
 def test_a_dangling_link_is_named(photos, tmp_path):

@@ -17,7 +17,7 @@ from gsbench.scene.load import INTRINSICS, Downscaling, ImageToPrepare, load_sce
 from gsbench.scene.options import SplitRule
 from gsbench.scene.readers import read_colmap
 from gsbench.scene.types import CameraModel
-from gsbench.scene.undistortion import check_lenses, folded_shares, undistort
+from gsbench.scene.undistortion import check_lenses, flatten, undistort
 from tests.helpers import read_json, refusal
 
 WIDTH, HEIGHT = 200, 150
@@ -133,7 +133,7 @@ def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not(
 )
 def test_lenses_that_turn_back_inside_the_picture_are_refused(name, params, share, caplog):
     camera = CameraModel(name, 160, 120, tuple(map(float, params)))
-    (found,) = folded_shares([camera])
+    ((found, *_),) = flatten([camera])
     assert found == pytest.approx(share, abs=0.01)
     said = rf"the camera of a.png \({name}: .*\) turns back .*: {found:.1%}"
     with refusal(said if share else None):
@@ -155,10 +155,17 @@ def test_a_lens_turns_back_where_its_polynomial_does():
 
 def test_a_small_fold_in_the_corners_is_reported(caplog):
     camera = CameraModel("SIMPLE_RADIAL", 160, 120, (90.0, 80.0, 60.0, -0.185))
-    (share,) = folded_shares([camera])
+    ((share, *_),) = flatten([camera])
     assert 0 < share < 0.01
     check_lenses({"a.png": camera})
     assert "turns back inside the picture" in caplog.text
+
+
+def test_a_lens_that_leaves_little_of_the_photograph_is_reported(caplog):
+    check_lenses({"a.png": CameraModel("OPENCV", 160, 120, (120.0, 120, 80, 60, -0.3, 0.1, 0, 0))})
+    assert not caplog.records
+    check_lenses({"a.png": CameraModel("OPENCV", 160, 120, (120.0, 120, 80, 60, -45, 1017, 0, 0))})
+    assert "1017, 0, 0) leaves 51x38 of 160x120 px undistorted: check its lens" in caplog.text
 
 
 def test_panoramas_are_refused(tmp_path):

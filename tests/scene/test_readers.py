@@ -15,7 +15,7 @@ from gsbench.scene.hold_out import select_images, split_names
 from gsbench.scene.images import list_images, match_names
 from gsbench.scene.options import SceneConfig, SplitRule
 from gsbench.scene.readers import missing_model, read_colmap, read_photos
-from tests.helpers import refusal
+from tests.helpers import refusal, write
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -291,6 +291,46 @@ def test_missing_folders_images_and_models_are_named(make_scene, tmp_path):
     shutil.rmtree(root / "sparse")
     with refusal("no COLMAP model in sparse/0 or sparse"):
         read_colmap("toy", root)
+
+
+@pytest.mark.parametrize(
+    "place, given, remedy",
+    [
+        ("dense/0/sparse", ".", "dense/0/sparse is one: set scene.path={}/dense/0"),
+        ("sparse/0", "images", "sparse/0 is one: set scene.path={}"),
+        ("sparse/0", "sparse", "sparse/0 is one: set scene.path={}"),
+        ("model", ".", "model is one: set scene.sparse=model"),
+        (".", ".", "is one: set scene.sparse=."),
+    ],
+)
+def test_an_error_says_where_a_model_lies(make_scene, place, given, remedy):
+    root = make_scene(sparse=place)
+    if place.startswith("dense"):
+        (root / "images").rename((root / place).parent / "images")
+    with refusal(f"no COLMAP model in .*: .*{remedy.format(root)}$"):
+        read_colmap("toy", root / given)
+
+
+def test_a_database_without_a_model_is_named(make_scene):
+    root = make_scene()
+    (root / "sparse").rename(root.parent / "elsewhere")
+    (root / "database.db").touch()
+    with refusal("a database holds no poses: make one with COLMAP"):
+        read_colmap("toy", root)
+
+
+def test_what_is_not_read_of_a_folder_is_named(make_scene, caplog):
+    """A text model beside the binary one, photographs without a pose; but no masks."""
+    root = make_scene()
+    plain = read_colmap("toy", root)
+    assert not caplog.records
+    make_scene(names=[f"{k:02d}.png" for k in (0, 2, 4)], text=True)
+    for name in ("00.jpg", "00.png.png", "00_mask.png", "thumbs/00.png", "new.png"):
+        write(root / "images" / name, (root / "images/00.png").read_bytes())
+    capture = read_colmap("toy", root)
+    assert (capture.image_names, capture.test_names) == (plain.image_names, plain.test_names)
+    assert "sparse/0: the binary model is read, and not the text beside it" in caplog.text
+    assert "1 of 7 photographs have no pose in the model: new.png" in caplog.text
 
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "frames"])

@@ -242,6 +242,13 @@ def test_blender_scenes_with_their_angle_names_split_and_alpha_are_read(tmp_path
         assert picture.getpixel((5, 5))[1] == pytest.approx(127, abs=1)
 
 
+def test_a_line_says_which_of_both_forms_of_a_scene_is_read(tmp_path, caplog):
+    folder = write(tmp_path / "in")
+    shutil.copy(folder / "transforms.json", folder / "transforms_train.json")
+    read_transforms(folder)
+    assert "transforms.json is read, and transforms_train.json not" in caplog.text
+
+
 def test_a_file_with_mask_paths_needs_the_folder_of_masks(tmp_path):
     folder = write(tmp_path / "in", lambda d: d["frames"][1].update(mask_path="masks/1.png"))
     (folder / "masks" / "images").mkdir(parents=True)
@@ -261,6 +268,10 @@ def test_the_file_is_a_source_of_the_capture_and_changes_its_fingerprint(tmp_pat
     assert capture_of(folder, tmp_path / "b").fingerprint != capture.fingerprint
 
 
+def transposed(frame):
+    frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+
+
 MIRRORED = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]]
 NO_FOCAL, HIGHER = (
     "no focal length",
@@ -270,6 +281,7 @@ OUTSIDE, ODD_SIZE = "lies outside the folder", "w and h must be whole numbers"
 LISTED = {"train_filenames": ["images/1.png"]}
 WRONG_KEYS = [
     ({"applied_transform": MIRRORED}, "applied_transform .*mirrors"),
+    ({"applied_transform": [*np.eye(4)[:3].tolist(), [1, 0, 0, 1]]}, "applied_transform must end"),
     ({"applied_scale": 0}, "applied_scale must be positive"),
     ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not known here"),
     *(({key: 0.1}, HIGHER) for key in ("k4", "k5", "k6")),
@@ -296,6 +308,7 @@ WRONG_FRAMES = [
     (lambda f: f["transform_matrix"].append([0] * 4), MATRIX),
     (lambda f: f["transform_matrix"].__setitem__(0, [2, 0, 0, 0]), "scales, shears or mirrors"),
     (lambda f: f["transform_matrix"].__setitem__(2, [0.0] * 4), "scales, shears or mirrors"),
+    (transposed, "of ./images/1.png must end with the row 0, 0, 0, 1"),
     (lambda f: f.update(rolling_shutter=[0, 0, 0.1, 0]), r"rolling_shutter \(frame 1\): "),
     (lambda f: f.update(file_path="../secret.png"), OUTSIDE),
     (lambda f: f.update(file_path="/etc/passwd"), OUTSIDE),
@@ -528,6 +541,7 @@ def test_unknown_keys_are_named_in_one_line(tmp_path, caplog):
     [
         ({"train": [0, 1, 2], "val": [3], "test": [4, 5]}, (0, 1, 2), (4, 5)),
         ({"train": [0, 1, 2], "val": [3]}, (0, 1, 2), (3,)),
+        ({"train": [0, 1, 2], "val": [3], "test": []}, (0, 1, 2), (3,)),
         ({"test": [4]}, (0, 1, 2, 3, 5), (4,)),
     ],
 )

@@ -102,6 +102,14 @@ def test_intrinsics_that_no_lens_has_cause_one_warning(scene, cloud, change, sai
     assert all(line in caplog.text for line in lines)
 
 
+@pytest.mark.parametrize("divisor, said", [(16, True), (4, False)])
+def test_photographs_that_are_nearly_black_cause_a_warning(scene, cloud, divisor, said):
+    """As values of 12 bits in files of 16 do."""
+    dark = tuple(replace(view, image=view.image // divisor) for view in scene.train)
+    lines = check_start(*cloud, replace(scene, train=dark), random_points=True).warnings
+    assert any("scale them to their full range" in line for line in lines) is said
+
+
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
 def test_a_cloud_of_one_colour_causes_a_warning(scene, cloud, level):
     points, colors = cloud

@@ -18,7 +18,7 @@ MOVING = "its Gaussians move with time"
 # Names of columns in lower case, and why a model with them is no set of 3D Gaussians that stand
 # still.
 REFUSED = {
-    r"beta|sb_params_\d+": "Beta Splatting's kernels are no Gaussians",
+    r"betas?(_\d+)?|sb_params_\d+": "Beta Splatting's kernels are no Gaussians",
     r"nu_degree|nu": "kernels of Student Splatting are no Gaussians",
     r"shapes?(_\d+)?": "generalised exponentials (GES) are no Gaussians",
     r"t|time|t_\w+|scale_t|rot_[rt]_\d|trbf_\w+|motion_\d+|omega_\d+|velocity_\w+": MOVING,

@@ -165,12 +165,15 @@ def _warn_of_activated(vertices: NDArray[Any], path: Path) -> None:
             path,
         )
     opacity = vertices["opacity"]
-    if ((opacity >= 0) & (opacity <= 1)).all():
-        log.warning(
-            "%s: all opacities lie in [0, 1]: they look like opacities, where 3DGS stores their "
-            "logits",
-            path,
-        )
+    # As logits, half of all opacities would be 1 to seven digits: then they are bytes.
+    for most, is_activated in ((1, opacity.max() <= 1), (255, np.median(opacity) > MAX_LOGIT)):
+        if opacity.min() >= 0 and is_activated:
+            log.warning(
+                "%s: all opacities lie in [0, %d]: they look like opacities, where 3DGS stores "
+                "their logits",
+                path,
+                most,
+            )
 
 
 def _look_like_lengths(vertices: NDArray[Any]) -> bool:

@@ -26,6 +26,7 @@ GAUSSIANS_FILE = "gaussians.ply"  # only if training starts from given Gaussians
 PICTURE_FILE = "cloud.png"  # the cloud and its cameras from above
 # share of images with a pose; with fewer, the search for a mapping goes on, and the report warns
 REGISTERED_SHARE = 0.9
+FIELD_OF_VIEW_DEG = (5.0, 150.0)  # plausible range, along the longest side
 Poses = Literal["shared", "own"]
 PointsFrom = Literal["all", "train"]
 Seed = Annotated[int, Interval(ge=0, le=2**31 - 1)]  # COLMAP accepts no larger seed

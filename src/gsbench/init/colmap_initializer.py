@@ -9,7 +9,7 @@ import logging
 import shutil
 from abc import abstractmethod
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -77,7 +77,9 @@ class ColmapInitializer(ColmapOptions):
         Raises ``InputError`` if no model can be made from the photographs with these settings.
         """
         self.check(capture, reference)
-        if self.camera == "exif" and not self.takes_cameras_from(capture, reference):
+        if self.takes_cameras_from(capture, reference):
+            report_unused(self)
+        elif self.camera == "exif":
             report_lenses(capture)
         output_dir.mkdir(parents=True, exist_ok=True)
         work = output_dir / WORK_FOLDER if work_dir is None else work_dir
@@ -116,6 +118,19 @@ class ColmapInitializer(ColmapOptions):
     def extend(self, model: pycolmap.Reconstruction, report: InitReport) -> InitReport:
         """Change the model before it is written; returns its report. Runs isolated."""
         return report
+
+
+def report_unused(options: ColmapOptions) -> None:
+    """Write a line on each setting for cameras to be estimated, where cameras are given."""
+    for one in fields(ColmapOptions):
+        value = getattr(options, one.name)
+        if one.name in ("camera", "camera_model", "focal_length") and value != one.default:
+            logger.warning(
+                "init.%s=%s is not used, since the cameras are given: init.poses=own "
+                "init.intrinsics=estimate estimates them",
+                one.name,
+                value,
+            )
 
 
 def report_lenses(capture: Capture) -> None:

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.gaussians.ply_files import read_ply_data
-from gsbench.init.point_tables import COLOR_NAMES, read_table
+from gsbench.init.point_tables import MAX_FRACTION, color_columns, plain_name, read_table
 from gsbench.parsing import one_line, without_byte_order_mark
 from gsbench.scene.types import Array
 
 log = logging.getLogger(__name__)
 
-KNOWN_WITHOUT_COLOR = frozenset(("x", "y", "z", "nx", "ny", "nz"))
 DC_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic, by which 3DGS multiplies f_dc
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts", ".asc")
@@ -65,9 +64,13 @@ def read_points(path: Path) -> tuple[Array, NDArray[np.uint8] | None]:
 
 
 def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
-    vertices = read_ply_data(path)["vertex"].data
-    # CloudCompare writes colours that it computed as scalar_R, others use capitals
-    names = {name.lower().removeprefix("scalar_"): name for name in vertices.dtype.names or ()}
+    content = read_ply_data(path)
+    if "vertex" not in content:
+        elements = ", ".join(element.name for element in content)
+        raise ValueError(f"it has no element vertex, only {elements or 'a header'}")
+    vertices = content["vertex"].data
+    written = vertices.dtype.names or ()
+    names = {plain_name(name): name for name in written} | {name.lower(): name for name in written}
     if lacking := [name for name in "xyz" if name not in names]:
         raise ValueError(f"its vertices have no property {', '.join(lacking)}")
 
@@ -75,23 +78,18 @@ def _read_ply(path: Path) -> tuple[Array, NDArray[np.generic] | None]:
         return np.stack([vertices[names[name]] for name in wanted], axis=1)
 
     points = columns("xyz").astype(np.float64)
-    for group in COLOR_NAMES:
-        if names.keys() >= set(group):
-            return points, columns(group)
-    if names.keys() >= set(DC_NAMES):  # a model of Gaussians
-        dc = columns(DC_NAMES).astype(np.float64)
+    if set(DC_NAMES) <= set(written):  # a model of Gaussians
+        dc = np.stack([vertices[name] for name in DC_NAMES], axis=1).astype(np.float64)
         return points, np.clip(0.5 + SH_C0 * dc, 0.0, 1.0)  # NaN stays; `read_points` refuses it
-    if others := [name for name in names.values() if name.lower() not in KNOWN_WITHOUT_COLOR]:
-        log.warning(
-            "%s: it has no red, green and blue, and its %s is not used", path, ", ".join(others)
-        )
-    return points, None
+    colored = color_columns(names, path)
+    return points, columns(colored) if colored else None
 
 
 def _eight_bits(colors: NDArray[np.generic]) -> NDArray[np.uint8]:
-    """Colours from 0 to 255: 16-bit values are divided by 257, floats in [0, 1] times 255."""
+    """Colours from 0 to 255: 16-bit values are divided by 257, fractions multiplied by 255."""
     values = colors.astype(np.float64)
-    if colors.dtype.kind == "f" and values.max() <= 1.0:
+    is_whole = values.max() > 1 and (values == values.round()).all()
+    if colors.dtype.kind == "f" and values.max() <= MAX_FRACTION and not is_whole:
         values = values * 255
     elif values.max() > 255:
         values = values / 257  # 65535 becomes 255

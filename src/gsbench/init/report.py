@@ -13,6 +13,7 @@ from typing import Any
 import pycolmap
 
 from gsbench.init.base import (
+    FIELD_OF_VIEW_DEG,
     MODEL_FOLDER,
     PICTURE_FILE,
     REGISTERED_SHARE,
@@ -30,7 +31,6 @@ ROTATION_WARNING_DEG = 2.0
 CENTER_WARNING = 0.05  # of the reference's scene extent
 # correct models stay below 0.7 px with SIFT, below 1.2 px with learned features
 REPROJECTION_WARNING_PX = 1.5
-FIELD_OF_VIEW_DEG = (5.0, 150.0)  # plausible range, along the longest side
 FEW_POINTS = 100
 
 

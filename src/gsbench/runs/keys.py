@@ -61,8 +61,8 @@ class Step:
 
 
 # (name, version). Bump the version when the stage's code computes something else.
-CAPTURE = Stage("scene", 1)
-INIT = Stage("init", 3, resumable=True)
+CAPTURE = Stage("scene", 2)
+INIT = Stage("init", 4, resumable=True)
 TRAIN = Stage("train", 2, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
 EVALUATE = Stage("evaluate", 2)

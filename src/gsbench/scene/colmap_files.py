@@ -88,6 +88,12 @@ def model_files(folder: Path) -> list[Path]:
     )
 
 
+def has_both_forms(folder: Path) -> bool:
+    """Return whether a complete binary model has a text model beside it, which is not read."""
+    is_text = (folder / "images.txt").is_file()
+    return is_text and model_files(folder)[0].suffix == ".bin"
+
+
 def check_model(folder: Path) -> None:
     """Raise `InputError`, one line, for a file that is cut, too long or has impossible values."""
     checks = ModelChecks()

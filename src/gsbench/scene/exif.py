@@ -30,7 +30,7 @@ class Lens:
             parts.append(f"{self.equivalent:g} mm (on 35 mm film)")
         elif self.focal_length is not None:
             parts.append(f"{self.focal_length:g} mm")
-        if self.digital_zoom not in (None, 1.0):
+        if self.digital_zoom is not None:
             parts.append(f"digital zoom {self.digital_zoom:g}")
         return " ".join(filter(None, parts))
 
@@ -44,12 +44,13 @@ def lens_of(path: Path) -> Lens:
         except Exception:  # noqa: BLE001 - as in `open_image`; the pixels may still be intact
             return Lens()
     make, model = _text(exif.get(MAKE)), _text(exif.get(MODEL))
+    zoom = _number(own.get(DIGITAL_ZOOM))
     return Lens(
         camera=model if model.startswith(make) else f"{make} {model}".strip(),
         lens=_text(own.get(LENS)),
         focal_length=_number(own.get(FOCAL_LENGTH)),
         equivalent=_number(own.get(FOCAL_LENGTH_35MM)),
-        digital_zoom=_number(own.get(DIGITAL_ZOOM)),
+        digital_zoom=None if zoom == 1 else zoom,  # as if the photograph did not say
     )
 
 

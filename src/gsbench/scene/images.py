@@ -15,7 +15,7 @@ import os
 import shutil
 import sys
 import unicodedata
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -34,12 +34,15 @@ log = logging.getLogger(__name__)
 Resample = Literal["lanczos", "area", "bicubic"]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
-# photographs of telephones; neither Pillow nor COLMAP reads them
-HEIC_SUFFIXES = frozenset({".heic", ".heif"})
+# photographs and videos that are not read, and how they are called
+NOT_READ = dict.fromkeys((".heic", ".heif"), "HEIC") | {".avif": "AVIF", ".jxl": "JPEG XL"}
+NOT_READ |= dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "raw")
+NOT_READ |= {".exr": "EXR", ".gif": "GIF"} | dict.fromkeys((".mp4", ".mov", ".insv"), "video")
 # The formats of files with these suffixes. Without this list, Pillow would try some forty formats
 # on every file.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # JPEG includes MPO, which holds several JPEGs
 EXIF_ORIENTATION = 0x0112
+GIT_LFS = b"version https://git-lfs"
 _FILTERS = {
     "lanczos": Image.Resampling.LANCZOS,
     "area": Image.Resampling.BOX,
@@ -66,7 +69,7 @@ def list_images(folder: Path) -> list[str]:
     not UTF-8 or has line breaks, since no file of results could have it.
     """
     names: list[str] = []
-    unread = 0
+    unread: Counter[str] = Counter()
     folders, links, seen = [folder], list[Path](), set[tuple[int, int]]()
     while folders or links:
         # Links come last, so that images are listed under their real folder rather than under a
@@ -83,11 +86,12 @@ def list_images(folder: Path) -> list[str]:
                 (links if entry.is_symlink() else folders).append(Path(entry.path))
             elif Path(entry.name).suffix.lower() in IMAGE_SUFFIXES:
                 names.append(Path(entry.path).relative_to(folder).as_posix())
-            elif Path(entry.name).suffix.lower() in HEIC_SUFFIXES:
-                unread += 1
+            elif kind := NOT_READ.get(Path(entry.name).suffix.lower()):
+                unread[kind] += 1
     if unread:
-        files = f"{counted(unread, 'HEIC file')} {'is' if unread == 1 else 'are'}"
-        log.warning("%s: %s not read: save as JPEG", folder, files)
+        files = " and ".join(counted(count, f"{kind} file") for kind, count in unread.items())
+        is_one = unread.total() == 1
+        log.warning("%s: %s %s not read: save as JPEG", folder, files, "is" if is_one else "are")
     if strange := sorted(name for name in names if not is_one_line(name)):
         advice = "rename them"
         if sys.getfilesystemencoding() != "utf-8":
@@ -306,6 +310,9 @@ def open_image(path: Path) -> Image.Image:
         raise InputError(f"{path}: no such image") from error
     except Exception as error:  # Pillow's readers may raise any exception on a damaged file
         reason = "not a readable image" if isinstance(error, UnidentifiedImageError) else str(error)
+        with path.open("rb") as stream:
+            if stream.read(len(GIT_LFS)) == GIT_LFS:
+                reason += ", but a pointer of Git LFS (git lfs pull)"
         raise InputError(f"{path}: {reason}: replace or remove it") from error
 
 

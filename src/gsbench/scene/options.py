@@ -215,7 +215,7 @@ class SceneConfig:
             )
 
     def _check_that_all_is_read(self) -> None:
-        """Raise InputError for a setting that the scene's kind would ignore."""
+        """Raise InputError for a setting that the scene's kind or split would ignore."""
         defaults = {one.name: one.default for one in fields(self)}
         for kinds, keys in READ_BY.items():
             for key in keys:
@@ -224,6 +224,12 @@ class SceneConfig:
                         f"scene.{key}={getattr(self, key)} is not read by scene.kind={self.kind}, "
                         f"only by {' and '.join(kinds)}: leave it out (default: {defaults[key]})"
                     )
+        for key in () if self.split == "sector" or self.match_views else ("sector", "sectors"):
+            if getattr(self, key) != defaults[key]:
+                raise InputError(
+                    f"scene.{key}={getattr(self, key)} is not read with scene.split={self.split}: "
+                    "add scene.split=sector, or leave it out"
+                )
 
     @property
     def split_rule(self) -> SplitRule:

@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.normalization import find_normalization
 from gsbench.parsing import text_of
-from gsbench.scene.colmap_files import count_images, model_files
+from gsbench.scene.colmap_files import count_images, has_both_forms, model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
 from gsbench.scene.images import (
     IMAGE_SUFFIXES,
@@ -22,6 +22,7 @@ from gsbench.scene.images import (
     list_images,
     match_names,
     same_folder,
+    stem_of,
 )
 from gsbench.scene.options import (
     EVERY_NTH,
@@ -75,6 +76,8 @@ def read_colmap(
         chosen = model_folder.relative_to(root)
         log.warning("%s has %s; %s %s; scene.sparse chooses another", root, found, chosen, why)
     folder = require_subfolder(root, images or "images", "scene.images")
+    if has_both_forms(model_folder):
+        log.warning("%s: the binary model is read, and not the text beside it", model_folder)
     model = read_model(model_folder)
     wanted = registered_names(model)
     mask_folder, files = _masks_and_images(root, folder, masks)
@@ -94,6 +97,12 @@ def read_colmap(
     if moved := [image for image, file in matches.items() if not same_folder(image, file)]:
         pairs = some_of([f"{image} ({matches[image]})" for image in moved])
         log.warning("%s: files found by the last part of their path: %s", folder, pairs)
+    used = {stem_of(file) for file in matches.values()}
+    if any(stem_of(name) not in used for name in files):
+        photographs = photographs_among(folder, files, report=False)
+        if others := [name for name in photographs if stem_of(name) not in used]:
+            share = f"{len(others)} of {len(others) + len(used)} photographs"
+            log.warning("%s: %s have no pose in the model: %s", folder, share, some_of(others))
     model_names = {file: image for image, file in matches.items()}
     capture = _make_capture(
         name,
@@ -410,9 +419,21 @@ def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             model_files(folder)  # its error names what the model lacks
     raise InputError(
-        f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: set scene.sparse, or use "
-        "scene=photos"
+        f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: {_where_a_model_is(root)}"
     )
+
+
+def _where_a_model_is(root: Path) -> str:
+    """What to set, if a model lies near ``root``; else what to do."""
+    folders = [root, *(one for pattern in ("*", "*/*", "*/*/*") for one in root.glob(pattern))]
+    folders += [root.parent / name for name in SPARSE_FOLDERS]
+    model = next((one for one in folders if one.is_dir() and _is_model(one)), None)
+    if model is None:
+        why = "a database holds no poses: " if any(root.glob("*.db")) else ""
+        return f"{why}make one with COLMAP, or use scene=photos"
+    base = next((one for one in model.parents if (one / "images").is_dir()), root)
+    setting = f"path={base}" if base != root else f"sparse={model.relative_to(root)}"
+    return f"{model} is one: set scene.{setting}"
 
 
 def _is_model(folder: Path) -> bool:

@@ -1,16 +1,18 @@
 """Picture files beside photographs that are no photographs: masks, thumbnails, smaller copies.
 
-A capture of bare photographs has no list of its files, so their names and folders decide.
+A capture of bare photographs has no list of its files, so names and folders decide; of series with
+other names, the pixels (`side_series`).
 """
 
 import logging
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from gsbench.errors import InputError
-from gsbench.scene.images import image_size, stem_of
+from gsbench.scene.images import IMAGE_SUFFIXES, stem_of
+from gsbench.scene.side_series import side_series
 from gsbench.words import counted
 
 log = logging.getLogger(__name__)
@@ -19,8 +21,9 @@ log = logging.getLogger(__name__)
 WORDS = frozenset(
     word + ending
     for word in (
-        *("mask", "thumb", "thumbnail", "preview", "depth", "depthmap", "disparity", "normal"),
-        *("segmentation", "seg", "semantic", "matte", "render", "undistorted"),
+        *("mask", "thumb", "thumbnail", "preview", "depth", "depthmap", "monodepth", "disparity"),
+        *("normal", "normalmap", "segmentation", "seg", "semantic", "instance", "label", "matte"),
+        *("annotation", "overlay", "flow", "heatmap", "render", "undistorted"),
     )
     for ending in ("", "s")
 )
@@ -30,18 +33,22 @@ FOLDER_WORDS = WORDS - {"normal"}
 SYSTEM = frozenset({"@eadir", "#recycle", "@recycle", "$recycle.bin", "__macosx", "lost+found"})
 THUMBNAIL = re.compile(r"SYNO(PHOTO|VIDEO|INDEX)_", re.IGNORECASE)  # files of Synology
 WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
-REDUCED = re.compile(r"(.*?)[_-]?(2|4|8|16)")  # images_4: sides divided by 4
+PART = re.compile(r"[^\W\d_]+|\d+")  # of a file's name
+# words in the names of photographs where those of their companions have another word
+PHOTOGRAPH = frozenset({"rgb", "color", "colour", "image", "img", "photo", "frame"})
+FORMATS = frozenset(suffix[1:] for suffix in IMAGE_SUFFIXES)
 WORKSPACES = ("store", "stereo")  # sub-folders of gsbench's runs and of COLMAP's dense workspace
 
 
-def photographs_among(folder: Path, names: Sequence[str]) -> list[str]:
+def photographs_among(folder: Path, names: Sequence[str], report: bool = True) -> list[str]:
     """The ``names`` of image files below ``folder`` that are photographs, in their order.
 
-    One log line says which folders and files are left out. Raises InputError if none is left.
+    With ``report``, one log line says which folders and files are left out, and InputError is
+    raised if none is left.
     """
     reasons = _reasons(folder, names)
-    if not reasons:
-        return list(names)
+    if not reasons or not report:
+        return [name for name in names if name not in reasons]
     counts = Counter(reasons.values())
     listed = ", ".join(f"{place} ({count})" for place, count in sorted(counts.items()))
     files = counted(len(reasons), "file")
@@ -51,7 +58,7 @@ def photographs_among(folder: Path, names: Sequence[str]) -> list[str]:
             "scene.images=FOLDER reads a folder"
         )
     log.warning(
-        "%s: %s left out, by name no photographs or smaller copies of them: %s; "
+        "%s: %s left out, no photographs or smaller copies of them: %s; "
         "scene.images=FOLDER reads one folder alone",
         folder,
         files,
@@ -73,8 +80,7 @@ def _reasons(folder: Path, names: Sequence[str]) -> dict[str, str]:
                 break
     left = [name for name in names if name not in reasons]
     reasons |= _companions(left)
-    reasons |= _smaller_copies(folder, [name for name in left if name not in reasons])
-    return reasons
+    return reasons | side_series(folder, [name for name in left if name not in reasons])
 
 
 def _parents(name: str) -> Iterator[str]:
@@ -96,46 +102,26 @@ def _words(name: str) -> list[str]:
 def _companions(names: Sequence[str]) -> dict[str, str]:
     """Files beside their photograph: ``a_mask.png`` or ``a.jpg.png`` for ``a.jpg``, thumbnails."""
     paths = {name: PurePosixPath(name) for name in names}
-    stems = {stem_of(name).casefold() for name in names}
+    parts = {name: PART.findall(PurePosixPath(stem_of(name)).name.lower()) for name in names}
+    photographs = {
+        (paths[name].parent, _rest(own)) for name, own in parts.items() if WORDS.isdisjoint(own)
+    }
     found: dict[str, str] = {}
     for name, path in paths.items():
-        stem = PurePosixPath(stem_of(name))
-        words = re.split(r"[^A-Za-z]+", stem.name)
-        word = next((word for word in (words[-1], words[0]) if word.lower() in WORDS), "")
-        rest = re.sub(rf"^{word}[^A-Za-z0-9]|[^A-Za-z0-9]{word}$", "", stem.name)
+        own = parts[name]
+        at = next((index for index, part in enumerate(own) if part in WORDS), None)
         if THUMBNAIL.match(path.name):
             found[name] = "SYNO….jpg"
-        elif word and rest != stem.name and str(stem.with_name(rest or "-")).casefold() in stems:
-            found[name] = f"…{word.lower()}{path.suffix}"
-        elif str(stem) in paths:
+        elif stem_of(name) in paths:
             found[name] = f"….*{path.suffix}"
+        # The word may have a number of its own: Blender writes 0001_depth_0001.png.
+        elif at is not None and any(
+            rest and (path.parent, rest) in photographs for rest in (_rest(own), _rest(own[:at]))
+        ):
+            found[name] = f"…{own[at]}{path.suffix}"
     return found
 
 
-def _smaller_copies(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """Files in ``images_2``, ``images_4``, … if ``images``, or the larger of them, has them too."""
-    files: dict[str, dict[str, str]] = defaultdict(dict)  # by folder, the names by stem
-    for name in names:
-        for parent in _parents(name):
-            files[parent][stem_of(PurePosixPath(name).relative_to(parent).as_posix())] = name
-    families: dict[str, list[tuple[int, str]]] = defaultdict(list)
-    for place in files:
-        if match := REDUCED.fullmatch(PurePosixPath(place).name):
-            path = PurePosixPath(place)
-            families[path.with_name(match[1] or path.name).as_posix()].append(
-                (int(match[2]), place)
-            )
-    found: dict[str, str] = {}
-    for original, reduced in families.items():
-        ordered = [original] * (original in files) + [place for _, place in sorted(reduced)]
-        for place in ordered[1:]:
-            common = files[ordered[0]].keys() & files[place].keys()
-            # Folders such as cam_2 and cam_4 of two cameras have photographs of one size.
-            if common and _is_smaller(folder, files[place], files[ordered[0]], min(common)):
-                found |= dict.fromkeys(files[place].values(), f"{place}/")
-    return found
-
-
-def _is_smaller(folder: Path, small: dict[str, str], large: dict[str, str], stem: str) -> bool:
-    one, other = image_size(folder / small[stem]), image_size(folder / large[stem])
-    return one[0] < other[0] and one[1] < other[1]
+def _rest(parts: Sequence[str]) -> tuple[str, ...]:
+    """The parts of a name that a photograph and its companions have in common."""
+    return tuple(part for part in parts if part not in WORDS | PHOTOGRAPH | FORMATS)

@@ -43,7 +43,8 @@ from gsbench.words import some_of
 log = logging.getLogger(__name__)
 Row = Annotated[list[Number], Len(4, 4)]
 Optional = Number | None
-Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row is ignored
+Matrix = Annotated[list[Row], Len(3, 4)]  # a fourth row must be `LAST_ROW`
+LAST_ROW = [0.0, 0.0, 0.0, 1.0]
 
 ONE_FILE = "transforms.json"
 SPLIT_FILES = {
@@ -169,11 +170,14 @@ def find_files(folder: Path) -> dict[str, Path]:
 
     Raises InputError if the folder has neither.
     """
-    if (folder / ONE_FILE).is_file():
-        return {"": folder / ONE_FILE}
     files = {
         split: folder / name for split, name in SPLIT_FILES.items() if (folder / name).is_file()
     }
+    if (folder / ONE_FILE).is_file():
+        if files:
+            others = ", ".join(path.name for path in files.values())
+            log.warning("%s is read, and %s not: move one away", folder / ONE_FILE, others)
+        return {"": folder / ONE_FILE}
     if "train" not in files:
         raise InputError(
             f"{folder}: neither {ONE_FILE} nor {SPLIT_FILES['train']} is here: give the folder "
@@ -321,8 +325,8 @@ def _named_split(
 ) -> tuple[list[str], list[str]] | None:
     """nerfstudio's lists: names to train on, and to test on or, without these, to validate on."""
     train, val, test = record.train_filenames, record.val_filenames, record.test_filenames
-    held_out = val if test is None else test
-    if held_out is None:
+    held_out = test or val
+    if not held_out:
         return None
     written = {"train": train or [], "held-out": held_out}
     chosen = {}
@@ -350,10 +354,17 @@ def _applied_transform(path: Path, record: TransformsRecord) -> AppliedTransform
         raise InputError(f"{path}: applied_scale must be positive, got {scale}")
     if record.applied_transform is None:
         return AppliedTransform(scale=scale)
-    matrix = np.array(record.applied_transform[:3])  # [3, 4]
-    return AppliedTransform(
-        nearest_rotation(matrix[:, :3], f"{path}: applied_transform"), matrix[:, 3], scale
-    )
+    what = f"{path}: applied_transform"
+    matrix = _three_rows(record.applied_transform, what)
+    return AppliedTransform(nearest_rotation(matrix[:, :3], what), matrix[:, 3], scale)
+
+
+def _three_rows(matrix: Matrix, what: str) -> Array:
+    """The first three rows [3, 4]; raises InputError if a fourth one is not `LAST_ROW`."""
+    if matrix[3:] and not np.allclose(matrix[3], LAST_ROW, atol=ROTATION_TOLERANCE):
+        raise InputError(f"{what} must end with the row 0, 0, 0, 1: transpose it if it has columns")
+    rows: Array = np.array(matrix[:3])
+    return rows
 
 
 def nearest_rotation(matrix: Array, what: str) -> Array:
@@ -367,8 +378,9 @@ def nearest_rotation(matrix: Array, what: str) -> Array:
 
 
 def _pose(path: Path, frame: FrameRecord, applied: AppliedTransform) -> tuple[Array, Array]:
-    matrix = np.array(frame.transform_matrix[:3])  # [3, 4]
-    saved = nearest_rotation(matrix[:, :3], f"{path}: transform_matrix of {frame.file_path}")
+    what = f"{path}: transform_matrix of {frame.file_path}"
+    matrix = _three_rows(frame.transform_matrix, what)
+    saved = nearest_rotation(matrix[:, :3], what)
     world_from_camera = applied.rotation.T @ saved @ OPENGL
     center = applied.undo(matrix[None, :, 3])[0]
     rotation = world_from_camera.T

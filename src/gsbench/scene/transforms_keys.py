@@ -57,6 +57,7 @@ REFUSED = {
     "latlong": "a panorama is no pinhole image",
     "equirectangular": "a panorama is no pinhole image",
     **dict.fromkeys(("s1", "s2", "s3", "s4"), "thin-prism distortion is not read"),
+    "distortion_params": "write its numbers as k1, k2, k3, k4, p1 and p2",
     "normal_mts_args": "Mitsuba's axes are not known",
     "n_frames": "it cuts the list of frames: shorten the list itself",
     "sharpness_discard_threshold": "it leaves out frames: shorten the list itself",

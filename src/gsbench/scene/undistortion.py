@@ -22,13 +22,14 @@ log = logging.getLogger(__name__)
 # A larger share of folded pixels is refused, a smaller one is reported: fitted lenses of correct
 # models may turn back in the outermost corners, which hardly change a result.
 MAX_FOLDED = 0.01
+MIN_LEFT = 0.25  # of the pixels of a photograph; if fewer are left by undistorting, a line says so
 
 
 def check_lenses(cameras: Mapping[str, CameraModel]) -> None:
     """Check that the lens of each distorted image maps one to one (`folded_share`).
 
     Raises `InputError` for a lens with a larger share of folded pixels than `MAX_FOLDED`; reports
-    a smaller one.
+    a smaller one, and photographs of which less than `MIN_LEFT` is left.
     """
     names: dict[CameraModel, list[str]] = {}
     for name, camera in cameras.items():
@@ -36,17 +37,20 @@ def check_lenses(cameras: Mapping[str, CameraModel]) -> None:
     if not names:
         return
     try:
-        shares = run_isolated(folded_shares, list(names), what="undistortion")
+        flattened = run_isolated(flatten, list(names), what="undistortion")
     except CrashError as error:
         raise InputError(f"{error}: check the cameras of {some_of(list(cameras))}") from error
-    for (camera, users), share in zip(names.items(), shares, strict=True):
+    for (camera, users), (share, width, height) in zip(names.items(), flattened, strict=True):
+        parameters = ", ".join(f"{value:g}" for value in camera.params)
+        what = f"the camera of {some_of(users)} ({camera.name}: {parameters})"
+        if width * height < MIN_LEFT * camera.width * camera.height:
+            size, full = f"{width}x{height}", f"{camera.width}x{camera.height}"
+            log.warning("%s leaves %s of %s px undistorted: check its lens", what, size, full)
         if share == 0:
             continue
-        parameters = ", ".join(f"{value:g}" for value in camera.params)
         message = (
-            f"the camera of {some_of(users)} ({camera.name}: {parameters}) turns back inside the "
-            f"picture: {max(share, 0.001):.1%} of the undistorted photograph would be a mirrored "
-            "ghost"
+            f"{what} turns back inside the picture: {max(share, 0.001):.1%} of the undistorted "
+            "photograph would be a mirrored ghost"
         )
         if share > MAX_FOLDED:
             raise InputError(
@@ -56,21 +60,24 @@ def check_lenses(cameras: Mapping[str, CameraModel]) -> None:
         log.warning("%s", message)
 
 
-def folded_shares(cameras: Sequence[CameraModel]) -> list[float]:
-    """`folded_share` of each camera; COLMAP's native code can abort, so run it isolated."""
+def flatten(cameras: Sequence[CameraModel]) -> list[tuple[float, int, int]]:
+    """`folded_share` and the size in px of each camera's undistorted photograph.
+
+    COLMAP's native code can abort, so run it isolated.
+    """
     import pycolmap
 
     from gsbench.scene.distortion import folded_share
 
-    shares = []
+    found = []
     for camera in cameras:
         source = _colmap_camera(camera)
         try:
             pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), source)
         except (ValueError, RuntimeError) as error:
             raise InputError(_no_pinhole(camera)) from error
-        shares.append(folded_share(source, pinhole))
-    return shares
+        found.append((folded_share(source, pinhole), pinhole.width, pinhole.height))
+    return found
 
 
 def _colmap_camera(camera: CameraModel) -> pycolmap.Camera:

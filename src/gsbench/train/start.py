@@ -41,6 +41,7 @@ MAX_FIELD_OF_VIEW = 150.0  # degrees; the widest pinhole lenses have 130
 MIN_FIELD_OF_VIEW = 0.2  # degrees; satellites have 1 or 2
 MAX_PIXEL_RATIO = 1.25  # of the focal lengths in x and y; unequal scaling of photographs gives 1.01
 CENTRAL = (0.1, 0.9)  # range of the principal point of an uncropped photograph, as shares of a side
+DARK = 48  # of 255: the brightest value of photographs that do not use their range
 FAR_CAMERA = 20.0  # times the median distance of the training cameras from their median place
 
 
@@ -64,7 +65,7 @@ def check_start(
             f"scene {scene.name}: all training cameras stand at one place, so no depth can be "
             "learnt: take photographs from several places"
         )
-    warnings = far_cameras(scene) + odd_lenses(scene)
+    warnings = far_cameras(scene) + odd_lenses(scene) + dark_photographs(scene)
     _warn(scene, warnings)  # before the errors below, because they may explain an error
     middle, from_middle = camera_distances(scene)
     # A single far camera changes the extent, but not the median distance. The median is 0 if most
@@ -159,6 +160,17 @@ def far_cameras(scene: Scene) -> list[str]:
         for view, distance in zip(scene.train, distances, strict=True)
         if distance > FAR_CAMERA * typical > 0
     ]
+
+
+def dark_photographs(scene: Scene) -> list[str]:
+    """A warning if all photographs are nearly black, so that metrics say little.
+
+    The usual cause are values of 10 or 12 bits in files of 16.
+    """
+    brightest = max(int(view.image.max()) for view in scene.train)
+    if brightest > DARK:
+        return []
+    return [f"no photograph has a value above {brightest} of 255: scale them to their full range"]
 
 
 def odd_lenses(scene: Scene) -> list[str]:

@@ -10,11 +10,12 @@ import pycolmap
 import pytest
 from numpy.testing import assert_array_equal
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from gsbench.init import Sfm
 from gsbench.init.colmap import database as made
 from gsbench.init.colmap import features, geometry, matches
-from gsbench.init.colmap_initializer import report_lenses
+from gsbench.init.colmap_initializer import report_lenses, report_unused
 from gsbench.scene.exif import (
     DIGITAL_ZOOM,
     EXIF_IFD,
@@ -99,6 +100,7 @@ TELEPHONE = {"make": "X", "model": "X 7", "mm": 6.8, "film": 26}
         ({}, 1),
         ({"mm": 6.8004}, 1),  # as written by another program
         ({"film": 52}, 2),  # digital zoom of one lens
+        ({"zoom": 1.0}, 1),  # said by some of the photographs only
         ({"zoom": 2.0}, 2),
         ({"mm": 9.0, "film": 77}, 2),
         ({"lens": "telephoto"}, 2),
@@ -119,6 +121,23 @@ def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change,
     assert len(single) == (2 if "size" in change else 1)
 
 
+@pytest.mark.parametrize(
+    "tags, wanted",
+    [
+        (TELEPHONE, 26 * 40 / 36),  # COLMAP: by the longest side of 36 mm
+        ({}, 1.2 * 40),
+        ({"mm": IFDRational(0, 0), "film": 0}, 1.2 * 40),  # COLMAP alone: NaN, as if known
+        ({"film": 65535}, 1.2 * 40),
+        ({"film": 1}, 1.2 * 40),
+    ],
+)
+def test_a_focal_length_of_exif_that_no_lens_has_is_not_used(tmp_path, tags, wanted):
+    with_exif(tmp_path / "a.jpg", **tags)
+    ((camera, _),) = made.unknown_camera_groups(tmp_path, ["a.jpg"], "exif", "SIMPLE_RADIAL", None)
+    assert camera.focal_length == pytest.approx(wanted, rel=0.1)
+    assert camera.has_prior_focal_length is (tags == TELEPHONE)
+
+
 def test_a_line_names_the_lenses_of_the_photographs(tmp_path, caplog):
     names = tuple(f"{k}.jpg" for k in range(5))
     for k, name in enumerate(names):
@@ -129,6 +148,14 @@ def test_a_line_names_the_lenses_of_the_photographs(tmp_path, caplog):
     caplog.clear()
     report_lenses(replace(capture, image_names=names[1:]))
     assert not caplog.records
+
+
+def test_settings_of_cameras_that_are_given_are_named(caplog):
+    report_unused(Sfm())
+    assert not caplog.records
+    report_unused(Sfm(camera="single", focal_length=300.0))
+    assert "init.camera=single is not used, since the cameras are given" in caplog.text
+    assert "init.focal_length=300.0 is not used" in caplog.text
 
 
 def test_ids_follow_the_names_and_each_camera_has_a_rig(database):

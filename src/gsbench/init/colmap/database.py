@@ -1,5 +1,6 @@
 """COLMAP's database: creating it, and adding keypoints and matches of any extractor."""
 
+import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from gsbench.init.base import FIELD_OF_VIEW_DEG
 from gsbench.init.colmap.pairs import select_pairs
 from gsbench.init.options import ColmapOptions
 from gsbench.scene.colmap import rescaled_camera
@@ -17,6 +19,7 @@ from gsbench.scene.exif import lens_of
 from gsbench.scene.images import image_size, open_image, read_image, write_png
 from gsbench.scene.types import Capture
 
+DEFAULT_FOCAL_LENGTH = 1.2  # of the longest side, as in COLMAP
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
@@ -132,8 +135,8 @@ def unknown_camera_groups(
     ``sharing`` is ``exif`` for one camera for all images of a size with the same lens and zoom
     (`lens_of`), ``single`` for one for all images of a size, ``per_folder`` for one for each size
     in each sub-folder, or ``per_image``. The initial focal length in px is
-    ``focal_length``, else from the EXIF data of the group's first image, else 1.2 x the longest
-    side (COLMAP's default).
+    ``focal_length``, else from the EXIF data of the group's first image if that means a plausible
+    field of view, else `DEFAULT_FOCAL_LENGTH`.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in names:
@@ -144,11 +147,16 @@ def unknown_camera_groups(
     result = []
     for group in groups.values():
         camera = pycolmap.infer_camera_from_image(images / group[0], options)
-        if focal_length is not None:
+        longest = max(camera.width, camera.height)
+        most, least = (longest / 2 / math.tan(math.radians(view) / 2) for view in FIELD_OF_VIEW_DEG)
+        inferred = camera.mean_focal_length()
+        # EXIF data may be wrong or a division by zero: COLMAP would start from NaN.
+        if focal_length is not None or not least < inferred < most:
+            given = DEFAULT_FOCAL_LENGTH * longest if focal_length is None else focal_length
             camera = pycolmap.Camera.create_from_model_name(
-                0, model, focal_length, camera.width, camera.height
+                0, model, given, camera.width, camera.height
             )
-            camera.has_prior_focal_length = True
+            camera.has_prior_focal_length = focal_length is not None
         result.append((camera, group))
     return result
 
