@@ -443,7 +443,7 @@ class FixedViews:
     [
         ({}, lists.Room(1, 10**4)),
         ({"absolute": True}, lists.Room(10**4, 1)),
-        ({"masks": (1,), "visible_only": True}, lists.Room(1, 1)),
+        ({"masks": (1,), "regularized": True, "visible_only": True}, lists.Room(1, 1)),
         ({"masks": (0, 1), "regularized": True}, lists.Room(1, 1)),
     ],
     ids=str,
