@@ -20,12 +20,12 @@ from gsbench.train.direct import DirectStep
 from gsbench.train.loss import SSIM_WEIGHT
 from gsbench.train.loss_triton import TritonLoss
 
-STEPS = 10
-CRAMPED_STEP = 6  # the step before which lists lose their room, so that the render is repeated
+STEPS = 6
+CRAMPED_STEP = 4  # the step before which lists lose their room, so that the render is repeated
 
 
 def direct_fault(rasterizer: TritonRasterizer, device: torch.device, case: Case) -> str:
-    """Train ``case`` for ten steps in three ways; return how they differ, "" if they do not.
+    """Train ``case`` for six steps in three ways; return how they differ, "" if they do not.
 
     The ways are autograd, direct steps launched one by one and, on a GPU, direct steps recorded as
     CUDA graphs. All parameters must have the same bits after the last step. Then the same with a
