@@ -371,20 +371,37 @@ def test_equal_images_have_no_loss_and_an_image_without_gradient_has_the_same_lo
     assert value == TritonLoss(0.2)(image.clone().requires_grad_(), target)[0]
 
 
+class Regularized(ADC):
+    """ADC with terms of the loss: every second step, by one or several paths, or without gradient."""
+
+    def regularizer(self, gaussians):
+        opacities, scales = gaussians.opacities, gaussians.scales
+        crowded = (gaussians.opacity_logits / (1 - opacities)).mean().square()
+        terms = [
+            0.1 * opacities.mean() + 0.2 * scales.mean(),
+            None,
+            crowded + gaussians.sh_rest.sum(),
+        ]
+        self.asked = getattr(self, "asked", -1) + 1
+        return [*terms, None, torch.tensor(2.0)][self.asked % 5]
+
+
 class FixedViews:
     """Trains a small scene from two cameras, by steps with autograd or by direct ones."""
 
-    def __init__(self, direct, absolute=False):
+    def __init__(self, direct, absolute=False, masks=(), regularized=False, visible_only=False):
+        """``masks`` are the views with a mask."""
         generator = torch.Generator().manual_seed(5)
         views = tuple(
             View(
                 f"{k}.png",
                 orbit_camera(angle, width=20, height=17),
                 torch.randint(0, 256, (17, 20, 3), dtype=torch.uint8, generator=generator).numpy(),
+                np.arange(17 * 20).reshape(17, 20) % 7 < 5 if k in masks else None,
             )
             for k, angle in enumerate((0.0, 0.4))
         )
-        densifier = ADC(
+        densifier = (Regularized if regularized else ADC)(
             start=1,
             stop=9,
             interval=3,
@@ -392,15 +409,22 @@ class FixedViews:
             gradient_threshold=1e-7,
             gradient="absolute" if absolute else "signed",
         )
-        options = TrainConfig(name="test", iterations=100, sh_interval=2, densify_start=1)
+        options = TrainConfig(
+            name="test",
+            iterations=100,
+            sh_interval=2,
+            densify_start=1,
+            visible_adam=visible_only,
+        )
         scene = Scene("test", views, ())
         initial = random_gaussians(25, seed=3).map(lambda tensor: tensor.float())
+        initial.means[::4, 2] -= 20  # never seen
         self.trainer = Trainer(scene, initial, densifier, TritonRasterizer(), options, seed=0)
         trainer = self.trainer
         trainer.gaussians.step_all = TritonAdam()
         trainer.loss = TritonLoss(options.ssim_weight)
         self.direct = DirectStep(
-            trainer.rasterizer, TritonLoss(options.ssim_weight), BLACK, graphs=False
+            trainer.rasterizer, TritonLoss(options.ssim_weight), BLACK, False, visible_only
         )
         if direct:
             trainer.direct = self.direct
@@ -414,30 +438,32 @@ class FixedViews:
         return list(tree_leaves([state["gaussians"], state["densifier"]]))
 
 
-@pytest.mark.parametrize("absolute", [False, True])
-def test_direct_steps_have_the_bits_of_steps_with_autograd(absolute):
-    """Statistics, moments and step counts, too; with refinements and an opacity reset between."""
-    expected, found = FixedViews(False, absolute), FixedViews(True, absolute)
+@pytest.mark.parametrize(
+    "settings, room",
+    [
+        ({}, lists.Room(1, 10**4)),
+        ({"absolute": True}, lists.Room(10**4, 1)),
+        ({"masks": (1,), "regularized": True, "visible_only": True}, lists.Room(1, 1)),
+        ({"masks": (0, 1), "regularized": True}, lists.Room(1, 1)),
+    ],
+    ids=str,
+)
+def test_direct_steps_have_the_bits_of_steps_with_autograd(settings, room):
+    """Statistics, moments and step counts, too.
+
+    Between the steps are refinements, an opacity reset, and lists that keep only ``room``.
+    """
+    expected, found = (FixedViews(direct, **settings) for direct in (False, True))
     expected.iterate(7)
-    found.iterate(7)
-    assert found.trainer.is_direct
+    found.iterate(4)
+    before = found.direct.repeats
+    found.direct.limit_room(room)
+    found.iterate(3)
+    assert found.direct.repeats > before
     for own, theirs in zip(found.state(), expected.state(), strict=True):
         same = torch.equal(own, theirs) if isinstance(own, Tensor) else own == theirs
         assert same
     assert found.trainer.losses.wait() == expected.trainer.losses.wait()
-
-
-@pytest.mark.parametrize("room", [lists.Room(1, 10**4), lists.Room(10**4, 1)], ids=str)
-def test_lists_without_room_are_repeated_with_the_same_bits(room):
-    expected, found = FixedViews(False), FixedViews(True)
-    expected.iterate(3)
-    found.iterate(2)
-    before = found.direct.repeats
-    found.direct.limit_room(room)
-    found.iterate(1)
-    assert found.direct.repeats > before
-    for own, theirs in zip(found.state(), expected.state(), strict=True):
-        assert torch.equal(own, theirs) if isinstance(own, Tensor) else own == theirs
 
 
 def test_the_footprint_of_a_direct_step_is_that_of_its_own_view():
@@ -469,14 +495,14 @@ def test_direct_steps_pass_their_proof_and_a_fault_of_them_is_found(monkeypatch)
     assert direct_fault(TritonRasterizer(), cpu, TINY) == ""
     real = TritonAdam.launch
 
-    def late(self, updates, factors, seen):
-        real(self, updates, factors, seen)
+    def late(self, updates, factors, seen, visible):
+        real(self, updates, factors, seen, visible)
         if seen is not None:  # as in direct steps alone
             for update in updates:
                 update.parameter.detach().mul_(1 + 1e-6)
 
     monkeypatch.setattr(TritonAdam, "launch", late)
-    assert "has other bits after 10 direct steps" in direct_fault(TritonRasterizer(), cpu, TINY)
+    assert "has other bits after 6 direct steps" in direct_fault(TritonRasterizer(), cpu, TINY)
 
 
 @pytest.mark.parametrize("active", [None, 9])

@@ -14,7 +14,7 @@ from gsbench.densify import ADC, NoDensifier, SteepGS, Volumetric
 from gsbench.errors import TrainingError
 from gsbench.gaussians.ply import read_ply
 from gsbench.raster.staged import Readback
-from gsbench.train import trainer
+from gsbench.train import loss, trainer
 from gsbench.train.checkpoint import CheckpointWriter
 from gsbench.train.options import TrainConfig
 from gsbench.train.trainer import snapshot_file
@@ -227,6 +227,39 @@ def test_visible_adam_updates_only_visible_gaussians(visible_adam, lab):
     ((degree, visible),) = given
     assert degree == 1
     assert (visible is not None) is visible_adam
+
+
+@pytest.mark.parametrize(
+    "own, proven, kernels, used",
+    [
+        (False, True, True, True),
+        (True, True, True, False),
+        (False, False, True, False),
+        (False, True, False, False),
+    ],
+)
+def test_direct_steps_need_our_rasterizer_its_proof_and_our_loss(
+    own, proven, kernels, used, monkeypatch
+):
+    pytest.importorskip("triton")
+    from gsbench.raster.triton.executor import TritonRasterizer
+
+    class Subclass(TritonRasterizer):
+        """May render otherwise."""
+
+    for module in (trainer, loss):
+        monkeypatch.setattr(
+            module, "find_executor", lambda _: SimpleNamespace(obstacle=lambda _: None)
+        )
+    monkeypatch.setattr(loss, "HAS_KERNELS", kernels)
+    rasterizer = (Subclass if own else TritonRasterizer)()
+    rasterizer.direct_steps = proven
+    options = TrainConfig(name="test", visible_adam=True)
+    place = SimpleNamespace(device=torch.device("cuda"))
+    direct, adam = trainer.fast_steps(rasterizer, loss.PhotometricLoss(), options, place)
+    assert adam is not None
+    assert (direct is not None) == used
+    assert direct is None or direct.visible_only
 
 
 @pytest.mark.parametrize("background, white", [([1.0, 1.0, 1.0], True), ([1.0, 1.0, 0.9], False)])

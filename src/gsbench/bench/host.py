@@ -9,20 +9,23 @@ and operations say how often they are paid.
 from __future__ import annotations
 
 import ctypes
+import itertools
 import statistics
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsbench.bench.measure import UNUSED_FOLDER, constant_scene_options
 from gsbench.bench.scenes import SEED, make_scene
-from gsbench.densify import ADC
+from gsbench.densify import ADC, MCMC, Densifier
 from gsbench.raster.triton import executor, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.train import adam_triton, direct, loss_triton
@@ -32,6 +35,8 @@ from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.trainer import Trainer
 
 WIDTH, HEIGHT, COUNT = 32, 16, 64  # px, px, Gaussians: so few that their values cost nothing
+MASKED = "adc, masks, visible_adam"
+TRAININGS = ("adc", MASKED, "mcmc")
 WAYS = ("autograd", "direct", "recorded")
 STEPS, REPEATS, WARM_UP = 20, 7, 4
 SIZES = [2 * COUNT, 4 * COUNT, 0]  # units, pairs, no bad value
@@ -70,14 +75,20 @@ class _NullPool:
 
 
 class NullDevice:
-    """A training whose kernels do nothing; ``way`` is one of `WAYS`."""
+    """One of `TRAININGS` whose kernels do nothing; ``way`` is one of `WAYS`."""
 
-    def __init__(self, way: str) -> None:
+    def __init__(self, training: str, way: str) -> None:
         self.launches = 0
         gaussians, scene = make_scene("trained", WIDTH, HEIGHT, COUNT)
-        options = constant_scene_options()
+        masked = training == MASKED
+        options = replace(constant_scene_options(), visible_adam=masked)
+        if masked:
+            mask = np.ones((HEIGHT, WIDTH), dtype=np.bool_)
+            scene = replace(scene, train=tuple(replace(view, mask=mask) for view in scene.train))
         never = options.iterations
-        densifier = ADC(start=never - 1, stop=never, opacity_reset_interval=never)
+        densifier: Densifier = ADC(start=never - 1, stop=never, opacity_reset_interval=never)
+        if training == "mcmc":
+            densifier = MCMC(start=never - 1, stop=never)
         self.trainer = Trainer(scene, gaussians, densifier, TritonRasterizer(), options, SEED)
         trainer = self.trainer
         trainer.gaussians.step_all = TritonAdam()
@@ -89,7 +100,8 @@ class NullDevice:
                 TritonRasterizer(),
                 TritonLoss(options.ssim_weight),
                 trainer.background,
-                graphs=recorded,
+                recorded,
+                options.visible_adam,
             )
             trainer.direct._pool = _NullPool()  # type: ignore[assignment]
 
@@ -121,9 +133,9 @@ class NullDevice:
             yield
 
 
-def count_step(way: str) -> tuple[int, int]:
+def count_step(training: str, way: str) -> tuple[int, int]:
     """The numbers of launches and of torch's operations in one step."""
-    device = NullDevice(way)
+    device = NullDevice(training, way)
     with device.running():
         device.launches = 0
         with Counts() as counts:
@@ -132,28 +144,29 @@ def count_step(way: str) -> tuple[int, int]:
 
 
 def time_host() -> list[dict[str, Any]]:
-    """A row for each of `WAYS`: launches, operations and ms of the host in one step, medians.
+    """A row for each of `TRAININGS` and `WAYS`: launches, operations and ms of the host in a step.
 
-    The ways take turns.
+    Times are medians; the rows take turns.
     """
-    devices = {way: NullDevice(way) for way in WAYS}
-    times: dict[str, list[float]] = {way: [] for way in WAYS}
+    devices = {both: NullDevice(*both) for both in itertools.product(TRAININGS, WAYS)}
+    times: dict[tuple[str, str], list[float]] = {both: [] for both in devices}
     for _ in range(REPEATS):
-        for way, device in devices.items():
+        for both, device in devices.items():
             with device.running():
                 begin = time.perf_counter()
                 for _ in range(STEPS):
                     device.step()
-                times[way].append(1e3 * (time.perf_counter() - begin) / STEPS)
+                times[both].append(1e3 * (time.perf_counter() - begin) / STEPS)
     rows = []
-    for way in WAYS:
-        launches, operations = count_step(way)
+    for training, way in devices:
+        launches, operations = count_step(training, way)
         rows.append(
             {
+                "training": training,
                 "way": way,
                 "launches": launches,
                 "operations": operations,
-                "host_ms": round(statistics.median(times[way]), 3),
+                "host_ms": round(statistics.median(times[training, way]), 3),
             }
         )
     return rows

@@ -33,33 +33,41 @@ class Update(NamedTuple):
     """A parameter [N, ...] to update with its ``gradient`` and Adam's ``state``.
 
     The gradient is 0 from column ``active`` on (None: nowhere), where it may be undefined.
+    ``further``, which is defined everywhere, is added to it.
     """
 
     parameter: Tensor
     gradient: Tensor
     state: AdamState
     active: int | None = None
+    further: Tensor | None = None
 
 
 class StepAll(Protocol):
-    """Applies Adam to whole parameters in place, for their step ``state.step`` (1, 2, …).
+    """Applies Adam to parameters in place, for their step ``state.step`` (1, 2, …).
 
-    With ``seen`` [N], gradients are 0 where it is 0, and may be undefined there.
+    With ``seen`` [N], gradients are 0 where it is 0, and may be undefined there. With ``visible``
+    [N], only Gaussians where it is not 0, and their moments, are updated.
     """
 
-    def __call__(self, updates: Sequence[Update], seen: Tensor | None = None) -> None: ...
+    def __call__(
+        self, updates: Sequence[Update], seen: Tensor | None = None, visible: Tensor | None = None
+    ) -> None: ...
 
 
 @dataclass(frozen=True)
 class KnownGradients:
     """Gradients by ``parameters``, in their order, computed without autograd.
 
-    They are those of a step with harmonics up to ``sh_degree``. See `StepAll` for ``seen`` [N].
+    They are those of a step with harmonics up to ``sh_degree``. See `Update` for ``further``, and
+    `StepAll` for ``seen`` and ``visible``.
     """
 
     parameters: list[Tensor]
     gradients: list[Tensor]
+    further: list[Tensor | None]
     seen: Tensor  # [N] int32
+    visible: Tensor | None  # [N]
     sh_degree: int
 
     def updates(self, states: Sequence[AdamState | None]) -> list[Update]:
@@ -69,10 +77,10 @@ class KnownGradients:
         """
         rest = 3 * ((self.sh_degree + 1) ** 2 - 1)
         active: list[int | None] = [*[None] * (len(self.parameters) - 1), rest]
-        found = zip(self.parameters, self.gradients, states, active, strict=True)
+        found = zip(self.parameters, self.gradients, states, active, self.further, strict=True)
         return [
-            Update(parameter, gradient, state, columns)
-            for parameter, gradient, state, columns in found
+            Update(parameter, gradient, state, columns, further)
+            for parameter, gradient, state, columns, further in found
             if state is not None and columns != 0
         ]
 
@@ -158,12 +166,7 @@ class TrainableGaussians:
                 self.adam[name].step += 1
                 updates.append(Update(parameter, parameter.grad, self.adam[name]))
                 parameter.grad = None
-        if visible is None:
-            self.step_all(updates)
-        else:
-            index = visible.nonzero().squeeze(-1)  # [V]
-            for update in updates:
-                _step_rows(update, index)
+        self.step_all(updates, None, visible)
 
     def advance(self, known: KnownGradients) -> list[AdamState | None]:
         """Count a step with ``known`` gradients; return the state of each parameter to update.
@@ -183,7 +186,7 @@ class TrainableGaussians:
     @torch.no_grad()
     def apply(self, known: KnownGradients, states: list[AdamState | None]) -> None:
         """Apply Adam with ``known`` gradients to the parameters with a state from `advance`."""
-        self.step_all(known.updates(states), known.seen)
+        self.step_all(known.updates(states), known.seen, known.visible)
 
     @torch.no_grad()
     def edit(self, keep: Tensor | None = None, append: Gaussians | None = None) -> None:
@@ -246,11 +249,18 @@ class TrainableGaussians:
         return trainable
 
 
-def torch_adam(updates: Sequence[Update], seen: Tensor | None = None) -> None:
-    """Apply Adam (Kingma and Ba 2015) to whole parameters, by torch's fused kernel."""
-    for parameter, gradient, state, active in updates:
-        if seen is not None or active is not None:
-            raise NotImplementedError("torch_adam: gradients must be defined everywhere")
+def torch_adam(
+    updates: Sequence[Update], seen: Tensor | None = None, visible: Tensor | None = None
+) -> None:
+    """Apply Adam (Kingma and Ba 2015), to whole parameters by torch's fused kernel."""
+    index = None if visible is None else visible.nonzero().squeeze(-1)  # [V]
+    for update in updates:
+        parameter, gradient, state, active, further = update
+        if any(known is not None for known in (seen, active, further)):
+            raise NotImplementedError("torch_adam: a gradient is one tensor, defined everywhere")
+        if index is not None:
+            _step_rows(update, index)
+            continue
         fused = parameter.device.type in ("cpu", "cuda")
         # torch counts the step itself. `full` makes the number on the device, without an upload.
         step = torch.full((), state.step - 1.0, device=parameter.device if fused else "cpu")
@@ -275,7 +285,7 @@ def torch_adam(updates: Sequence[Update], seen: Tensor | None = None) -> None:
 def _step_rows(update: Update, index: Tensor) -> None:
     """Apply Adam to the rows ``index`` [V] only. All rows share one step count."""
     beta1, beta2 = ADAM_BETAS
-    parameter, gradients, state, _ = update
+    parameter, gradients, state, *_ = update
     step, gradient = state.step, gradients[index]
     # m = b1 m + (1 - b1) g and v = b2 v + (1 - b2) g^2, then p -= rate m' / (sqrt(v') + eps) with
     # m' = m / (1 - b1^step) and v' = v / (1 - b2^step). As in torch, eps is outside the root.

@@ -25,30 +25,39 @@ EPSILON = tl.constexpr(ADAM_EPSILON)
 def adam_step(
     values,
     gradients,
+    further,
     first,
     second,
     factors,
     seen,
+    visible,
     count,
     WIDTH: tl.constexpr,
     ACTIVE: tl.constexpr,
+    HAS_FURTHER: tl.constexpr,
     HAS_SEEN: tl.constexpr,
+    HAS_VISIBLE: tl.constexpr,
     GROUP: tl.constexpr,
 ):
     """Apply Adam (Kingma and Ba 2015, algorithm 1) to ``values`` [count, WIDTH], in place.
 
     ``first`` and ``second`` are the moments, ``factors`` [2] those of `adam_factors`. The gradient
     is 0 from column ``ACTIVE`` on and, if ``HAS_SEEN``, where ``seen`` [count] is 0; ``gradients``
-    is not read there and may be undefined.
+    is not read there and may be undefined. If ``HAS_FURTHER``, ``further`` is added to it. If
+    ``HAS_VISIBLE``, rows where ``visible`` [count] is 0 do not change.
     """
     place = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
     inside = place < count.to(tl.int64) * WIDTH
+    if HAS_VISIBLE:
+        inside &= tl.load(visible + place // WIDTH, mask=inside, other=0) != 0
     read = inside
     if HAS_SEEN:
         read &= tl.load(seen + place // WIDTH, mask=inside, other=0) > 0
     if ACTIVE < WIDTH:
         read &= place % WIDTH < ACTIVE
     g = tl.load(gradients + place, mask=read, other=0.0)
+    if HAS_FURTHER:
+        g += tl.load(further + place, mask=inside, other=0.0)
     m = BETA1 * tl.load(first + place, mask=inside, other=0.0) + (1 - BETA1) * g
     v = BETA2 * tl.load(second + place, mask=inside, other=0.0) + (1 - BETA2) * (g * g)
     value = tl.load(values + place, mask=inside, other=0.0)
@@ -70,28 +79,42 @@ def adam_factors(rate: float, step: int) -> tuple[float, float]:
 class TritonAdam:
     """Adam for `TrainableGaussians` on a GPU; see `gsbench.gaussians.trainable.StepAll`."""
 
-    def __call__(self, updates: Sequence[Update], seen: Tensor | None = None) -> None:
+    def __call__(
+        self, updates: Sequence[Update], seen: Tensor | None = None, visible: Tensor | None = None
+    ) -> None:
         """Apply Adam; the host does not wait."""
         if updates:
-            factors = [x for one in updates for x in adam_factors(one.state.rate, one.state.step)]
-            self.launch(updates, upload(factors, updates[0].parameter.device).view(-1, 2), seen)
+            numbers = [x for one in updates for x in adam_factors(one.state.rate, one.state.step)]
+            factors = upload(numbers, updates[0].parameter.device).view(-1, 2)
+            self.launch(updates, factors, seen, visible)
 
-    def launch(self, updates: Sequence[Update], factors: Tensor, seen: Tensor | None) -> None:
+    def launch(
+        self,
+        updates: Sequence[Update],
+        factors: Tensor,
+        seen: Tensor | None,
+        visible: Tensor | None,
+    ) -> None:
         """Apply Adam with ``factors`` [updates, 2] in the memory of the device."""
         with torch.cuda.device_of(factors):
-            for (parameter, gradient, state, active), own in zip(
+            for (parameter, gradient, state, active, further), own in zip(
                 updates, factors.unbind(), strict=True
             ):
+                # An input that is not there has no memory; its pointer is any other, not used.
                 width = parameter.shape[1:].numel()
                 launch(adam_step, parameter.numel(), NUMBERS)(
                     values=parameter.detach(),
                     gradients=gradient,
+                    further=gradient if further is None else further,
                     first=state.first,
                     second=state.second,
                     factors=own,
                     seen=gradient if seen is None else seen,
+                    visible=gradient if visible is None else visible,
                     count=len(parameter),
                     WIDTH=width,
                     ACTIVE=width if active is None else active,
+                    HAS_FURTHER=further is not None,
                     HAS_SEEN=seen is not None,
+                    HAS_VISIBLE=visible is not None,
                 )

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsbench.eval.images import replace_ignored
 from gsbench.gaussians.trainable import KnownGradients, TrainableGaussians
 from gsbench.raster.base import CameraNumbers, RenderOutput
 from gsbench.raster.staged import (
@@ -52,7 +53,7 @@ class Differentiated(NamedTuple):
     """Results of a training step before Adam. The next step overwrites their memory."""
 
     render: RenderOutput  # ``screen_points.grad`` is filled
-    losses: Tensor  # [3] loss, L1, SSIM
+    losses: Tensor  # [3] loss, L1, SSIM; [4] with a regulariser: the loss plus it
     known: KnownGradients
 
 
@@ -65,21 +66,30 @@ class Shape(NamedTuple):
     absolute: bool
     extra: str | None
     target: torch.dtype
+    masked: bool
+    further: tuple[bool, ...]  # the parameters by which a regulariser has a gradient
 
 
 class DirectStep:
     """Renders, measures and differentiates training views; applies Adam.
 
-    ``graphs`` turns recording on; without it, the same launches are made one by one.
+    ``graphs`` turns recording on; without it, the same launches are made one by one. With
+    ``visible_only``, Adam updates visible Gaussians only.
     """
 
     def __init__(
-        self, rasterizer: TritonRasterizer, loss: TritonLoss, background: Tensor, graphs: bool
+        self,
+        rasterizer: TritonRasterizer,
+        loss: TritonLoss,
+        background: Tensor,
+        graphs: bool,
+        visible_only: bool = False,
     ) -> None:
         self.rasterizer = rasterizer
         self.loss = loss
         self.background = background
         self.graphs = graphs
+        self.visible_only = visible_only
         self.repeats = 0  # renders that were repeated because lists had too little room
         self._memory: dict[tuple[int, int], _Memory] = {}
         self._plan: dict[tuple[int, int], _Plan] = {}
@@ -95,13 +105,19 @@ class DirectStep:
         degree: int,
         absolute: bool,
         extra: str | None,
+        mask: Tensor | None = None,
+        regularizer: Tensor | None = None,
     ) -> Differentiated:
         """Render ``camera``, and differentiate the loss against ``target`` [H, W, 3].
 
-        Raises ValueError for bad values of parameters.
+        Pixels where ``mask`` [H, W, 1] is False do not count. ``regularizer`` [], a function of the
+        parameters, is added to the loss; only its gradient is computed by autograd. Raises
+        ValueError for bad values of parameters.
         """
         size = camera.width, camera.height
-        shape = Shape(*size, degree, absolute, extra, target.dtype)
+        further = _gradients(regularizer, gaussians)
+        regularized = tuple(gradient is not None for gradient in further)
+        shape = Shape(*size, degree, absolute, extra, target.dtype, mask is not None, regularized)
         memory = self._memory_of(size)
         plan = self._plan.get(size)
         if plan is None or not plan.suits(gaussians, shape):
@@ -114,10 +130,21 @@ class DirectStep:
         # A graph always reads the same memory, so what differs from step to step is copied to it.
         plan.view.copy_(self._numbers(camera), non_blocking=True)
         plan.target.copy_(target, non_blocking=True)
+        if plan.mask is not None and mask is not None:
+            plan.mask.copy_(mask)
+        elif plan.mask is not None:  # other views of this size have one
+            plan.mask.fill_(True)
+        for own, gradient in zip(plan.further, further, strict=True):
+            if own is not None and gradient is not None:
+                own.copy_(gradient)
         with torch.cuda.device_of(self.background):
             while not plan.run():
                 self.repeats += 1
-        return plan.result()
+        found = plan.result()
+        if regularizer is None:
+            return found
+        total = found.losses[0] + regularizer.detach()
+        return found._replace(losses=torch.cat([found.losses.to(total), total.view(1)]))
 
     def optimize(self, gaussians: TrainableGaussians) -> None:
         """Apply Adam with the gradients of the last step; replaced parameters are left out."""
@@ -160,6 +187,18 @@ class DirectStep:
         return known[1]
 
 
+def _gradients(term: Tensor | None, gaussians: TrainableGaussians) -> list[Tensor | None]:
+    """The gradients of ``term`` [] by all parameters; None for those that it does not depend on."""
+    leaves = gaussians.values.tensors().values()
+    if term is not None and term.requires_grad:
+        # Not `torch.autograd.grad`: a densifier may have parameters of its own.
+        term.backward()
+    found = [leaf.grad for leaf in leaves]
+    for leaf in leaves:
+        leaf.grad = None
+    return found
+
+
 class _Memory:
     """Memory of steps with one size of image, and the room for their lists."""
 
@@ -193,6 +232,8 @@ class _Plan:
         size = camera.height, camera.width
         self.view = allocate("view", (len(CameraNumbers._fields),), torch.float32)
         self.target = allocate(f"target_{shape.target}", (*size, 3), shape.target)
+        mask = (*size, 1)
+        self.mask = allocate("mask", mask, torch.bool) if shape.masked else None
         self.one = allocate("one", (), torch.float32).fill_(1.0)
         self.losses = allocate("losses", (3,), torch.float32)
         self.g_image = allocate("g_image", (*size, 3), torch.float32)
@@ -200,6 +241,12 @@ class _Plan:
         self.gradients = [
             allocate(f"g_{name}", tuple(tensor.shape), torch.float32)
             for name, tensor in self.values.tensors().items()
+        ]
+        self.further = [
+            allocate(f"further_{name}", tuple(tensor.shape), torch.float32) if wanted else None
+            for (name, tensor), wanted in zip(
+                self.values.tensors().items(), shape.further, strict=True
+            )
         ]
         self.factors = allocate("factors", (len(self.parameters), 2), torch.float32)
         self.factors_on_host = torch.empty(
@@ -218,9 +265,12 @@ class _Plan:
         self.known: KnownGradients
 
     def suits(self, gaussians: TrainableGaussians, shape: Shape) -> bool:
-        """Return whether a step with these parameters and this shape has these launches."""
+        """Return whether a step with these parameters and this shape has these launches.
+
+        A plan with a mask also serves views without one: their masks are True everywhere.
+        """
         current = gaussians.values.tensors().values()
-        return shape == self.shape and all(
+        return self.shape in (shape, shape._replace(masked=True)) and all(
             own is now for own, now in zip(self.parameters, current, strict=True)
         )
 
@@ -295,9 +345,12 @@ class _Plan:
         assert self.started is not None
         assert memory.room is not None
         self.finished = rasterizer.finish(self.started, memory.room)
-        image, _, _, frame = self.finished
+        image, _, radii, frame = self.finished
+        image = replace_ignored(image, self.target, self.mask)
         measured = loss.measure(image, self.target, self.losses, memory.scratch, True)
         loss.differentiate(measured, self.one, self.g_image)
+        if self.mask is not None:
+            self.g_image.masked_fill_(~self.mask, 0.0)
         found = rasterizer.differentiate(
             frame,
             self.values,
@@ -312,11 +365,19 @@ class _Plan:
         if self.probe is not None:
             self.probe.grad = found.extra
         seen = frame.projected.row_counts
-        self.known = KnownGradients(self.parameters, self.gradients, seen, self.shape.degree)
+        self.known = KnownGradients(
+            self.parameters,
+            self.gradients,
+            self.further,
+            seen,
+            radii if self.owner.visible_only else None,
+            self.shape.degree,
+        )
 
     def _third(self) -> None:
         updates = self.known.updates(self.adam)
-        TritonAdam().launch(updates, self.factors[: len(updates)], self.known.seen)
+        known = self.known
+        TritonAdam().launch(updates, self.factors[: len(updates)], known.seen, known.visible)
 
     def _measure_room(self) -> None:
         """Find the sizes of the lists of this view, and make room for them."""

@@ -8,6 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from gsbench.eval.images import replace_ignored
 from gsbench.gaussians.model import Gaussians
 from gsbench.gaussians.paper_values import LearningRates
 from gsbench.gaussians.trainable import TrainableGaussians
@@ -19,21 +20,26 @@ from gsbench.train.direct import DirectStep
 from gsbench.train.loss import SSIM_WEIGHT
 from gsbench.train.loss_triton import TritonLoss
 
-STEPS = 10
-CRAMPED_STEP = 6  # the step before which lists lose their room, so that the render is repeated
+STEPS = 6
+CRAMPED_STEP = 4  # the step before which lists lose their room, so that the render is repeated
 
 
 def direct_fault(rasterizer: TritonRasterizer, device: torch.device, case: Case) -> str:
-    """Train ``case`` for ten steps in three ways; return how they differ, "" if they do not.
+    """Train ``case`` for six steps in three ways; return how they differ, "" if they do not.
 
     The ways are autograd, direct steps launched one by one and, on a GPU, direct steps recorded as
-    CUDA graphs. All parameters must have the same bits after the last step.
+    CUDA graphs. All parameters must have the same bits after the last step. Then the same with a
+    mask, a regulariser, and Adam of visible Gaussians only.
     """
-    expected = _train(device, case, partial(_with_autograd, rasterizer, case))
+    return _fault(rasterizer, device, case, False) or _fault(rasterizer, device, case, True)
+
+
+def _fault(rasterizer: TritonRasterizer, device: torch.device, case: Case, extended: bool) -> str:
+    expected = _train(device, case, partial(_with_autograd, rasterizer, case, extended))
     for graphs in (False, True) if device.type == "cuda" else (False,):
-        name = "recorded steps" if graphs else "direct steps"
+        name = ("extended " if extended else "") + ("recorded steps" if graphs else "direct steps")
         try:
-            found = _train(device, case, partial(_direct, rasterizer, case, graphs))
+            found = _train(device, case, partial(_direct, rasterizer, case, extended, graphs))
         except torch.OutOfMemoryError:
             raise
         except (RuntimeError, ValueError) as error:
@@ -66,28 +72,42 @@ def _target(case: Case, device: torch.device) -> Tensor:
     return numbers.to(torch.uint8).view(case.height, case.width, 3)
 
 
-def _with_autograd(rasterizer: TritonRasterizer, case: Case, model: TrainableGaussians) -> Step:
+def _regularizer(model: TrainableGaussians) -> Tensor:
+    return model.values.opacities.mean() + model.values.scales.mean()
+
+
+def _with_autograd(
+    rasterizer: TritonRasterizer, case: Case, extended: bool, model: TrainableGaussians
+) -> Step:
     loss, target = TritonLoss(SSIM_WEIGHT), _target(case, model.device)
-    black = torch.zeros(3, device=model.device)
+    black, mask = torch.zeros(3, device=model.device), target[..., :1] > 99 if extended else None
 
     def step(_: int) -> None:
-        image = rasterizer.render(model.values, case.camera(), case.sh_degree, black).image
-        loss(image, target)[0].backward()
-        model.optimizer_step(case.sh_degree)
+        render = rasterizer.render(model.values, case.camera(), case.sh_degree, black)
+        loss(replace_ignored(render.image, target, mask), target)[0].backward()
+        if extended:
+            _regularizer(model).backward()
+        model.optimizer_step(case.sh_degree, render.visible if extended else None)
 
     return step
 
 
 def _direct(
-    rasterizer: TritonRasterizer, case: Case, graphs: bool, model: TrainableGaussians
+    rasterizer: TritonRasterizer,
+    case: Case,
+    extended: bool,
+    graphs: bool,
+    model: TrainableGaussians,
 ) -> Step:
     black, target = torch.zeros(3, device=model.device), _target(case, model.device)
-    direct, camera = DirectStep(rasterizer, TritonLoss(SSIM_WEIGHT), black, graphs), case.camera()
+    direct = DirectStep(rasterizer, TritonLoss(SSIM_WEIGHT), black, graphs, visible_only=extended)
+    camera, mask = case.camera(), target[..., :1] > 99 if extended else None
 
     def step(number: int) -> None:
         if number == CRAMPED_STEP:
             direct.limit_room(Room(1, 1))
-        direct.step(model, camera, target, case.sh_degree, False, None)
+        term = _regularizer(model) if extended else None
+        direct.step(model, camera, target, case.sh_degree, False, None, mask, term)
         direct.optimize(model)
         if number == CRAMPED_STEP and direct.repeats == 0:
             raise RuntimeError("lists without room were not noticed")

@@ -25,9 +25,14 @@ from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch_grid
 
 STRIP = 128  # numbers of a row per program
 MIN_ROWS = 8  # rows per program
-# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds four programs at
-# once: it has 65,536 registers, and each of the 128 lanes of a program uses at most 128.
-MULTIPROCESSORS, PROGRAMS_HELD = 132, 4
+# The numbers of programs are chosen for an H100 or H200. A multiprocessor holds five programs at
+# once: it has 65,536 registers, and each of the 128 lanes of a program uses at most 96 there.
+MULTIPROCESSORS, PROGRAMS_HELD = 132, 5
+# Programs that a multiprocessor needs to be busy: one issued an instruction in every 4.6th cycle
+# (`measure_similarity`) or 7.9th (`differentiate`), by Nsight Compute on an H100.
+PROGRAMS_BUSY = 4
+# Without this limit, `differentiate` takes 108 registers for the same loads. ROCm has none.
+REGISTERS = {} if torch.version.hip else {"maxnreg": 96}
 RADIUS = tl.constexpr(WINDOW_RADIUS)
 CHANNELS = tl.constexpr(3)
 # from the centre outwards
@@ -41,9 +46,9 @@ def rows_of_program(height: int, numbers: int) -> int:
 
     A program filters ``2 * RADIUS`` rows besides its own. So few programs do less work in all, but
     leave multiprocessors idle. The function chooses the number of programs per multiprocessor, all
-    running at once, for which the busiest multiprocessor filters the fewest rows. A single program
-    counts as two, because nothing else runs while it waits for memory. The result depends only on
-    the size of the image, so every GPU adds up in the same order.
+    running at once, for which the busiest multiprocessor filters the fewest rows. Fewer programs
+    than `PROGRAMS_BUSY` count as that many, because nothing runs while they wait for memory. The
+    result depends only on the size of the image, so every GPU adds up in the same order.
     """
     strips = triton.cdiv(numbers, STRIP)
 
@@ -52,7 +57,8 @@ def rows_of_program(height: int, numbers: int) -> int:
 
     def filtered(held: int) -> int:
         programs = strips * triton.cdiv(height, rows(held))
-        return max(2, triton.cdiv(programs, MULTIPROCESSORS)) * (rows(held) + 2 * WINDOW_RADIUS)
+        fullest = triton.cdiv(programs, MULTIPROCESSORS)
+        return max(PROGRAMS_BUSY, fullest) * (rows(held) + 2 * WINDOW_RADIUS)
 
     return rows(min(range(1, PROGRAMS_HELD + 1), key=filtered))
 
@@ -101,14 +107,13 @@ def _load(array, row, number, height, numbers, scale):
 
 @triton.jit
 def _add(sums, x, y, weight):
-    """Add x, y, x^2, y^2 and x y, times ``weight``, to five sums."""
+    """Add x, y, x^2 + y^2 and x y, times ``weight``, to four sums."""
     wx, wy = x * weight, y * weight
     return (
         sums[0] + wx,
         sums[1] + wy,
-        tl.fma(wx, x, sums[2]),
-        tl.fma(wy, y, sums[3]),
-        tl.fma(wx, y, sums[4]),
+        tl.fma(wx, x, tl.fma(wy, y, sums[2])),
+        tl.fma(wx, y, sums[3]),
     )
 
 
@@ -134,8 +139,8 @@ def measure_similarity(
     number = tl.program_id(0) * STRIP + tl.arange(0, STRIP)  # [STRIP] of a row
     first = tl.program_id(1) * rows
     zero = tl.zeros([STRIP], tl.float32)
-    mean_x, mean_y, product = _zeros(zero), _zeros(zero), _zeros(zero)
-    square_x, square_y = _zeros(zero), _zeros(zero)
+    # SSIM needs the squares of both images only as a sum, which saves eleven registers.
+    mean_x, mean_y, squares, product = _zeros(zero), _zeros(zero), _zeros(zero), _zeros(zero)
     total_similarity, total_l1 = zero, zero
     plane = height.to(tl.int64) * numbers
     for row in range(first - RADIUS, tl.minimum(first + rows, height) + RADIUS):
@@ -143,7 +148,7 @@ def measure_similarity(
         x = _load(image, row, number, height, numbers, 1.0)
         y = _load(target, row, number, height, numbers, scale)
         total_l1 += tl.where((row >= first) & (row < first + rows), tl.abs(x - y), 0.0)
-        blurred = _add((zero, zero, zero, zero, zero), x, y, W0)
+        blurred = _add((zero, zero, zero, zero), x, y, W0)
         for k in tl.static_range(1, RADIUS + 1):
             for side in tl.static_range(-1, 2, 2):
                 neighbour = number + side * k * CHANNELS
@@ -153,8 +158,7 @@ def measure_similarity(
         # A row is blurred horizontally once, and added to the eleven rows whose windows it is in.
         # The sums of the row RADIUS above are now complete.
         mean_x, mean_y = _push(mean_x, blurred[0]), _push(mean_y, blurred[1])
-        square_x, square_y = _push(square_x, blurred[2]), _push(square_y, blurred[3])
-        product = _push(product, blurred[4])
+        squares, product = _push(squares, blurred[2]), _push(product, blurred[3])
 
         center = row - RADIUS
         inside = (center >= first) & (number < numbers)
@@ -165,7 +169,7 @@ def measure_similarity(
         a1 = 2 * mx * my + F_C1
         a2 = 2 * (product[0] - mx * my) + F_C2
         b1 = means + F_C1
-        b2 = square_x[0] + square_y[0] - means + F_C2
+        b2 = squares[0] - means + F_C2
         inverse = 1.0 / (b1 * b2)
         similarity = a1 * a2 * inverse
         total_similarity += tl.where(inside, similarity, 0.0)
@@ -332,7 +336,11 @@ class TritonLoss:
     def differentiate(self, measured: Measured, g_loss: Tensor, gradient: Tensor) -> None:
         """Write the gradient by the image to ``gradient`` [H, W, 3], times ``g_loss`` []."""
         launch_grid(differentiate, *measured.grid)(
-            **measured.arguments(), g_loss=g_loss, ssim_weight=self.ssim_weight, gradient=gradient
+            **measured.arguments(),
+            g_loss=g_loss,
+            ssim_weight=self.ssim_weight,
+            gradient=gradient,
+            **REGISTERS,
         )
 
 

@@ -47,6 +47,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 # proof itself.
 SOURCES = (
     "raster",
+    "eval/images.py",
     "eval/ssim.py",
     "gaussians/model.py",
     "gaussians/trainable.py",

@@ -141,7 +141,6 @@ class Trainer:
         self.rngs = generators(seed)
         self.order = CameraOrder(len(scene.train), self.rngs["cameras"])
         self.step = 0
-        self.is_direct = False  # whether ``direct`` made the gradients of this iteration
         self.seconds = 0.0
         self.losses = LossLog()
         self.growth = GrowthWatch()
@@ -262,13 +261,13 @@ class Trainer:
             write_ply(self.gaussians.values, folder / snapshot_file(step))
         self.densifier.observe(step, render)
         if options.step_after_refine:
-            self._optimize(render.visible)
+            self._optimize(render)
         event = self.densifier.refine(step, self.gaussians, self.rngs["densify"])
         if event is not None:
             self.growth.observe(event)
         # As in 3DGS, parameters that the refinement has replaced have no gradient: no step.
         if not options.step_after_refine:
-            self._optimize(render.visible)
+            self._optimize(render)
         self.densifier.after_step(step, self.gaussians, self.rngs["densify"])
         if len(self.gaussians) == 0:
             raise TrainingError(
@@ -285,27 +284,29 @@ class Trainer:
         cameras, targets = self.scaled_views.at(self.scale)
         target, mask = targets.get(index), targets.mask(index)
         regularizer = self.densifier.regularizer(self.gaussians.values)
-        direct = self.direct
-        # Direct steps know only the loss of whole pictures; whatever else enters it needs autograd.
-        self.is_direct = direct is not None and mask is None and regularizer is None
-        if direct is not None and self.is_direct:
-            step = direct.step(
+        if self.direct is not None:
+            step = self.direct.step(
                 self.gaussians,
                 cameras[index],
                 target,
                 self.sh_degree,
                 self.densifier.needs_absolute_gradient,
                 self.densifier.needs_extra,
+                mask,
+                regularizer,
             )
             return step.render, step.losses
         render = self.render(index)
         loss, l1, ssim = self.loss(replace_ignored(render.image, target, mask), target)
-        scalars = [loss, l1, ssim]
-        if regularizer is not None:
-            loss = loss + regularizer
-            scalars.append(loss)
+        scalars, total = [loss, l1, ssim], loss
         loss.backward()
-        return render, torch.stack([scalar.detach().to(loss) for scalar in scalars])
+        if regularizer is not None:
+            # Direct steps, too, add its whole gradient to that of the loss: the same bits.
+            if regularizer.requires_grad:
+                regularizer.backward()
+            total = loss + regularizer
+            scalars.append(total)
+        return render, torch.stack([scalar.detach().to(total) for scalar in scalars])
 
     def render(self, index: int) -> RenderOutput:
         """Render the training view ``index`` as in the current iteration, with gradients."""
@@ -349,12 +350,12 @@ class Trainer:
         """The divisor of the sides of pictures in the current iteration."""
         return 1 if self.resolution is None else self.resolution.scale(self.step)
 
-    def _optimize(self, visible: Tensor) -> None:
-        if self.direct is not None and self.is_direct:
+    def _optimize(self, render: RenderOutput) -> None:
+        if self.direct is not None:
             self.direct.optimize(self.gaussians)
             return
         self.gaussians.optimizer_step(
-            self.sh_degree, visible if self.options.visible_adam else None
+            self.sh_degree, render.visible if self.options.visible_adam else None
         )
 
     def _state(self) -> dict[str, Any]:
@@ -418,13 +419,12 @@ def fast_steps(
 
     kernels, direct = loss.implementation(device.type), None
     if (
-        isinstance(rasterizer, TritonRasterizer)
+        type(rasterizer) is TritonRasterizer  # a user's subclass may render otherwise
         and rasterizer.direct_steps
         and isinstance(kernels, TritonLoss)
-        # Updating only visible Gaussians needs gradients that are 0 elsewhere.
-        and not options.visible_adam
     ):
-        direct = DirectStep(rasterizer, kernels, background, graphs=True)
+        visible_only = options.visible_adam
+        direct = DirectStep(rasterizer, kernels, background, graphs=True, visible_only=visible_only)
     return direct, TritonAdam()
 
 
