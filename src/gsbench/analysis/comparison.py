@@ -201,7 +201,9 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment.folder, arms.trials, experiment.older)
-    answers = judge_pairs(arms.trials, arms.pairs, declared, unfinished(experiment))
+    answers = judge_pairs(
+        arms.trials, arms.pairs, declared, unfinished(experiment), experiment.older
+    )
     if (experiment.folder / LEDGER).exists():
         answers = [
             replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 
+from gsbench.analysis.attempts import of_same_arm, places_of
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
@@ -82,15 +83,11 @@ class ActiveDeclaration:
         keys = {trial.key for trial in arm}
         naming = [one for one in before if keys & one.planned.keys()] or before[:1]
         in_looks = [one for one in naming if one.looks]
-        old = [
-            one
-            for one in self.older
-            if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)
-        ]
-        seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
+        everything = (*arm, *of_same_arm(arm, self.older))
+        seen = [one for one in everything if one.measured < self.records[0].moment]
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
         # first result could not be chosen by it.
-        places, others = _places(baseline), _places(arm)
+        places, others = places_of(baseline), places_of(arm)
         paired = [trial for trial in arm if (trial.scene, trial.seed) in places]
         paired += [t for t in baseline if (t.scene, t.seed) in others and t.measured >= first]
         if before[-1].names_trials:
@@ -148,10 +145,6 @@ class ActiveDeclaration:
         return notes + [
             Note.of("replaced", metric=one.primary, when=one.when) for one in self.earlier
         ]
-
-
-def _places(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:
-    return {(trial.scene, trial.seed) for trial in trials}
 
 
 def active_declaration(
