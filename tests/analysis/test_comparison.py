@@ -1,6 +1,7 @@
 """One question, one answer: what was done before or beside an arm never changes its verdict."""
 
 import html
+import itertools
 import json
 import os
 import random
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
+from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
@@ -451,7 +454,7 @@ def test_the_end_of_a_sweep_names_trials_of_earlier_code(tmp_path, caplog):
     write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
     caplog.set_level("INFO", "gsbench")
     log_verdicts([SimpleNamespace(files=SimpleNamespace(home=tmp_path / "exp"))])
-    assert "exp/a/sfm-mine seeds 0, 1, 2: made by an earlier mine" in caplog.messages[-1]
+    assert "3 trials of sfm-mine made by earlier versions of mine" in caplog.messages[-1]
 
 
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
@@ -484,10 +487,68 @@ def test_an_archive_gives_the_same_answers(tmp_path):
     there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
     assert there.sentences == here.sentences
     assert texts(there.remarks) == texts(here.remarks)
-    assert "made by an earlier mine" in there.to_json()["left_out"][-1]
+    assert "made by earlier versions of mine" in there.to_json()["left_out"][-1]
     question = PooledQuestion(("lost",), ("adc",), "psnr")
     _, notes, _ = read_studies(tmp_path / "exp.zip", question, "ours")
     assert f"ours: left out, exp/{lost[3].key}-seed3: unfinished" in "\n".join(notes)
+
+
+def test_each_version_of_the_code_on_the_same_seeds_has_a_smaller_error_rate(tmp_path):
+    adc, momentum = grid("adc"), grid("momentum")
+    first, second, third = (
+        grid("mine", day=day, code=digit * 64) for digit, day in (("1", 2), ("2", 5), ("3", 7))
+    )
+    write(tmp_path, [*adc, *momentum, *first])
+    declare(tmp_path, (1, [*adc, *momentum, *first]))
+    before = {one.second.densify: one for one in answer(tmp_path).answers}
+    write(tmp_path, [*second, *third])
+    declare(tmp_path, (1, [*adc, *momentum, *first]), (4, second), (6, third))
+    after = {one.second.densify: one for one in answer(tmp_path).answers}
+    # the other arm of the first command is still adjusted for two
+    assert sentence(after["momentum"]) == sentence(before["momentum"])
+    assert "adjusted for 2 tests" in sentence(after["momentum"])
+    assert after["mine"].beforehand
+    assert [after["mine"].primary[0].answer.rate, before["mine"].versions] == [0.05 / 6, 1]
+    assert sentence(after["mine"]).endswith(
+        "It is version 3 of the arm's code on these seeds, so its error rate is 0.83 % (5 % on "
+        "seeds that no version was measured on)."
+    )
+    # of seeds that only the newest code was trained on, nothing was seen
+    fresh = [replace(one, seed=one.seed + 7) for one in (*adc, *third)]
+    for one in (*adc, *third):
+        shutil.rmtree(tmp_path / "exp" / one.key.rpartition("/")[0] / f"{one.hash}-seed{one.seed}")
+    write(tmp_path, fresh)
+    assert {one.second.densify: one.versions for one in answer(tmp_path).answers}["mine"] == 1
+
+
+def test_code_that_changed_for_the_baseline_too_is_no_choice_between_the_arms(tmp_path):
+    both = [grid(name, code=code, day=day) for name in ("adc", "mine") for code, day in EDITED]
+    write(tmp_path, itertools.chain(*both))
+    (found,) = answer(tmp_path).answers
+    assert found.versions == 1
+    assert "version" not in sentence(found)
+
+
+EDITED = ((OLD, 2), (NEW, 5))
+
+
+def test_an_arm_without_an_effect_is_rarely_called_better_however_often_its_code_is_edited():
+    """Twelve versions are tested against one baseline on one scene with three seeds."""
+    rng = np.random.default_rng(8)
+    tries, versions = 4000, 12
+    baseline, arms = rng.normal(size=(tries, 1, 3)), rng.normal(size=(tries, versions, 3))
+    differences = arms - baseline
+    error = differences.std(axis=2, ddof=1) / np.sqrt(3)
+    t = differences.mean(axis=2) / error
+    found = {}
+    for name, rates in (
+        ("whole", np.full(versions, 0.05)),
+        ("shared", [0.05 * share_of_version(number) for number in range(1, versions + 1)]),
+    ):
+        thresholds = stats.t.isf(np.asarray(rates) / 2, 2)
+        found[name] = (t > thresholds).any(axis=1).mean()
+    assert found["whole"] > 0.1
+    assert found["shared"] < 0.05
 
 
 # ---- random experiments
@@ -568,7 +629,7 @@ def experiments(draw):
     return Experiment(trials, frozenset(without), declared, pairs)
 
 
-SEED_OF_ONE = "a seed of one arm"
+SEED_OF_ONE, OLD_VERSIONS = "a seed of one arm", "old versions of an arm"
 ADDED = {
     "an arm": lambda made: [
         replace(one, densify="zzz", options=(), day=2) for one in made.trials[:2]
@@ -593,7 +654,7 @@ ADDED = {
     SEED_OF_ONE: lambda made: [
         replace(one, scene=made.last.scene, seed=9, day=9) for one in (made.baseline[0], made.last)
     ],
-    "old versions of an arm": lambda made: [replace(made.trials[-1], code=OLD, day=1)],
+    OLD_VERSIONS: lambda made: [replace(made.trials[-1], code=OLD, day=1)],
 }
 
 
@@ -629,9 +690,11 @@ def test_what_is_added_never_changes_another_verdict(what):
             (runs / "exp" / "d" / "sfm-mine" / "deadbeef-seed0").mkdir(parents=True)  # it failed
             after = answer(runs)
             assert before.pairs
+            last_arm = next(one.arm for one in before.trials if one.key == made.last.key)
             changed = outcomes(after)
             for pair, found in outcomes(before).items():
                 own = what == SEED_OF_ONE and f"sfm-{made.last.densify}" in pair[0]
+                own = own or (what == OLD_VERSIONS and pair[0] == str(last_arm))
                 assert own or changed[pair] == found
             check_all_is_named(after)
         finally:

@@ -281,7 +281,7 @@ def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, c
     write_archive(there, tmp_path / "exp.zip")
     back = unpack_archive(tmp_path / "exp.zip", tmp_path / "other")
     assert compare(back).sentences == compare(there).sentences
-    assert "1 trial of one arm alone failed or stopped" in compare(back).sentences[0]
+    assert "1 trial of one arm alone failed, stopped" in compare(back).sentences[0]
     assert "unfinished" in back.warnings[0]
     assert b"/home/me" not in b"".join(members(tmp_path / "exp.zip").values())
 

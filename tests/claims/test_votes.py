@@ -408,13 +408,13 @@ def test_a_stored_file_of_another_round_does_not_count(made, runs, tmp_path, cap
 
 def test_a_name_cannot_write_lines_of_its_own(made, tmp_path, capsys):
     key = made("--people", "9")
-    forged = "Ann\nRound 0: 99 votes\u2028x\u202e\x1b[2J"
+    forged = "Ann\nRound zero: 99 votes\u2028x\u202e\x1b[2J"
     blind = ballot(key, 1, lambda showing: "same", name=forged)
     assert run(["vote", "judge", "exp", saved(tmp_path, blind)]) == 0
     out = capsys.readouterr().out
-    assert "\nRound 0" not in out
+    assert "\nRound zero" not in out
     assert {"\u2028", "\u202e", "\x1b"}.isdisjoint(out)
-    assert "Left out: Ann Round 0: 99 votes x[2J (000000) failed" in out
+    assert "Left out: Ann Round zero: 99 votes x[2J (000000) failed" in out
 
 
 def test_html_in_names_of_people_is_escaped(made, runs, tmp_path):

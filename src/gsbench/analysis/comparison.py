@@ -252,7 +252,8 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     usual = arms if baseline == BASELINE else pair_arms(experiment)
     known = {frozenset(pair) for pair in usual.pairs}
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]
-    answers = judge_pairs(arms.trials, arms.pairs, declared, unfinished(experiment), others)
+    lacking, older = unfinished(experiment), experiment.older
+    answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
     if (experiment.folder / LEDGER).exists():
         answers = [
             replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from pathlib import Path
 
+from gsbench.analysis.attempts import of_same_arm, places_of
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
@@ -100,11 +101,7 @@ class ActiveDeclaration:
         A metric that is declared after the arm's first result is in force for later arms alone.
         ``other_pair`` says that the arms would not be compared without a choice made later.
         """
-        old = [
-            one
-            for one in self.older
-            if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)
-        ]
+        old = of_same_arm(arm, self.older)
         first = min((trial.measured for trial in (*arm, *old)), default=math.inf)
         if known := [one for one in self.declared if one.moment <= first]:
             metric = known[-1].primary
@@ -129,7 +126,7 @@ class ActiveDeclaration:
         seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
         # first result could not be chosen by it.
-        places, others = _places(baseline), _places(arm)
+        places, others = places_of(baseline), places_of(arm)
         paired = [trial for trial in arm if (trial.scene, trial.seed) in places]
         paired += [t for t in baseline if (t.scene, t.seed) in others and t.measured >= first]
         if before[-1].names_trials:
@@ -185,10 +182,6 @@ class ActiveDeclaration:
         when = self.records[0].when
         notes = [Note.of("declared" if doubted else "declared beforehand", metric=name, when=when)]
         return notes + ([Note.of("doubted", metric=name)] if doubted else [])
-
-
-def _places(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:
-    return {(trial.scene, trial.seed) for trial in trials}
 
 
 def active_declaration(

@@ -15,7 +15,7 @@ from gsbench.analysis.looks import look_levels
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialResult, group_by
+from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import (
     TOO_SMALL,
     UNDECIDED,
@@ -166,8 +166,27 @@ class Verdict:
         return f"{self.shown(interval.low)} to {self.shown(interval.high)}"
 
 
+@dataclass(frozen=True)
+class OtherTest:
+    """A test beside the questions of a declaration; ``p`` is None if it could not be done."""
+
+    arm: Arm | None
+    secondary: bool
+    p: float | None
+
+
+def other_test(trials: Sequence[TrialResult], question: Question) -> OtherTest:
+    """The test of a question with these trials, as `judge` would do it."""
+    pairs = pair(trials, question)
+    test = t_test(pairs.differences) if pairs.rows else None
+    return OtherTest(question.arm, question.secondary, None if test is None else test.p)
+
+
 def judge(
-    trials: Sequence[TrialResult], declaration: Declaration, lacking: Sequence[Unfinished] = ()
+    trials: Sequence[TrialResult],
+    declaration: Declaration,
+    lacking: Sequence[Unfinished] = (),
+    others: Sequence[OtherTest] = (),
 ) -> list[Verdict]:
     """The verdicts on the questions of ``declaration``, in their order.
 
@@ -175,6 +194,7 @@ def judge(
     so they matter only without looks. Questions share the error rate. If seeds come in looks, each
     question gets an equal share and is answered at the first look that decides it; otherwise
     Holm's method adjusts them as one family. Secondary questions have an error rate of their own.
+    ``others`` share the error rates without being answered here.
     """
     by_arm, by_folder = (
         group_by(trials, lambda trial: trial.arm),
@@ -198,7 +218,10 @@ def judge(
         family = [k for k in testable if unjudged[k].question.secondary == secondary]
         # With looks, the shares of the error rate were fixed beforehand: questions without pairs
         # keep theirs.
-        sharing = sum(question.secondary == secondary for question in declaration.questions)
+        beside = [one for one in others if one.secondary == secondary]
+        sharing = len(beside) + sum(
+            question.secondary == secondary for question in declaration.questions
+        )
         if declaration.looks:
             for k in family:
                 rate = declaration.error_rate / sharing / _candidate_metrics(unjudged[k])
@@ -206,11 +229,15 @@ def judge(
         else:
             candidates = max((_candidate_metrics(unjudged[k]) for k in family), default=1)
             differences = [unjudged[k].pairs.differences for k in family]
-            answers = answer_family(differences, declaration.error_rate / candidates)
+            tests = [one for one in beside if one.p is not None]
+            p_beside = [one.p for one in tests if one.p is not None]
+            answers = answer_family(differences, declaration.error_rate / candidates, p_beside)
             asked = [unjudged[k].question for k in family]
-            arms = tuple(dict.fromkeys(str(one.arm) for one in asked if one.arm and not one.name))
+            arms = {str(one.arm) for one in asked if one.arm and not one.name}
+            named = tuple(sorted(arms | {str(one.arm) for one in tests}))
             for k, answer in zip(family, answers, strict=True):
-                own = replace(unjudged[k], family=len(family), family_arms=arms)
+                size = len(family) + len(tests)
+                own = replace(unjudged[k], family=size, family_arms=named)
                 decided = _decide(own, answer)
                 judged[k] = _without_lacking(decided, trials_of(decided.question), lacking)
     return _with_scenes(judged, declaration.error_rate)

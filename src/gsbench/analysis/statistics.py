@@ -165,15 +165,20 @@ class Answer:
         )
 
 
-def answer_family(members: Sequence[Array], level: float = ALPHA) -> list[Answer]:
+def answer_family(
+    members: Sequence[Array], level: float = ALPHA, others: Sequence[float] = ()
+) -> list[Answer]:
     """Test each of ``members`` [S, K] as a member of one family, by Holm's method (1979).
+
+    ``others`` are the p of tests that belong to the family as well.
 
     The chance that any stated sign is false is at most ``level``; so is the chance that any "too
     small" is false.
     """
     tests = [t_test(member) for member in members]
-    factors = iter(holm_factors([test.p for test in tests if test is not None]))
-    equal_rate = level / max(1, sum(test is not None for test in tests))
+    p_values = [test.p for test in tests if test is not None]
+    factors = iter(holm_factors([*p_values, *others]))
+    equal_rate = level / max(1, len(p_values) + len(others))
     answers = []
     for member, test in zip(members, tests, strict=True):
         if test is None:

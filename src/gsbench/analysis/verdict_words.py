@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import group_by
@@ -16,6 +17,7 @@ from gsbench.analysis.statistics import (
 )
 from gsbench.analysis.unfinished import lacking_words
 from gsbench.analysis.verdicts import DECLARED, SECONDARY, PairVerdicts
+from gsbench.runs.experiments import ERROR_RATE
 from gsbench.words import counted, least_text, some_of
 
 WORDS: dict[Outcome, str] = {
@@ -214,15 +216,29 @@ def sentence(judged: PairVerdicts) -> str:
         waits = "" if first.final else "not decided yet, "
         details = [line for line in (like_these_words(first), outlying_words(first)) if line]
         words = "; ".join([in_words(first), *details])
-        return f"{against}: {waits}{words}. The metric was declared beforehand."
+        return (
+            f"{against}: {waits}{words}. The metric was declared beforehand."
+            f"{_versions_words(judged)}"
+        )
     in_doubt = [one for one in verdicts if one.favours_lacking][:1]
     if all(one.interval is None for one in verdicts):
         return f"{against}: no verdict, {TOO_FEW.format(where)}."
     return (
         f"{against}, on {where}: {_by_word(verdicts, with_numbers=True)}. Exploratory: "
         f"{_why_exploratory(judged)}, so all metrics count, adjusted for their number "
-        f"({max(one.family for one in verdicts)})."
+        f"({max(one.family for one in verdicts)}).{_versions_words(judged)}"
         + "".join(f" Undecided: {lacking_words(one.lacking)}." for one in in_doubt)
+    )
+
+
+def _versions_words(judged: PairVerdicts) -> str:
+    """The sentence on an arm whose code was edited and measured again; "" if it was not."""
+    if judged.versions == 1:
+        return ""
+    rate = 100 * ERROR_RATE * share_of_version(judged.versions)
+    return (
+        f" It is version {judged.versions} of the arm's code on these seeds, so its error rate is "
+        f"{rate:.2g} % ({100 * ERROR_RATE:.2g} % on seeds that no version was measured on)."
     )
 
 

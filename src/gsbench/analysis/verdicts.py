@@ -9,15 +9,19 @@ a metric that got worse is seen. A declaration may be about one question only
 
 Otherwise the question is exploratory: all metrics of its pair of arms are one family, adjusted by
 Holm (1979). So a further arm never changes the verdict on another one.
+
+If several versions of an arm's code were measured on the pairs of a question, its error rate is
+smaller (`gsbench.analysis.attempts`). The other arms of its declaration are still adjusted for it.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from gsbench.analysis.attempts import measured_versions, of_same_arm, share_of_version
 from gsbench.analysis.cells import short_reason
 from gsbench.analysis.declaration import ActiveDeclaration, Standing
 from gsbench.analysis.designs import seeds_needed
-from gsbench.analysis.judgement import Verdict, judge
+from gsbench.analysis.judgement import OtherTest, Verdict, judge, other_test
 from gsbench.analysis.notes import Note
 from gsbench.analysis.quantities import (
     NO_DIRECTION,
@@ -39,7 +43,8 @@ class PairVerdicts:
 
     ``notes`` say what could not be compared, each ``about`` a metric. ``declared`` is the declared
     metric, ``standing`` how the declaration stands to this question. ``undeclared`` says why the
-    question is exploratory if no metric was declared.
+    question is exploratory if no metric was declared. ``versions`` of the arm's code were measured
+    on these pairs.
     """
 
     first: Arm
@@ -49,6 +54,7 @@ class PairVerdicts:
     declared: Quantity | None = None
     standing: Standing | None = None
     undeclared: str = "no metric was declared (eval.primary)"
+    versions: int = 1
 
     @property
     def beforehand(self) -> bool:
@@ -80,25 +86,26 @@ def judge_pairs(
     declared: ActiveDeclaration | None = None,
     lacking: Sequence[Unfinished] = (),
     others: Sequence[ArmPair] = (),
+    older: Sequence[TrialResult] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
-    ``declared`` defines the families of tests; ``lacking`` are trials without a result. The pairs
-    ``others`` are no questions of it.
+    ``declared`` defines the families of tests; ``lacking`` are trials without a result, ``older``
+    those of earlier code. The pairs ``others`` are no questions of the declaration.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primaries: dict[ArmPair, Quantity] = {}
     standings: dict[ArmPair, Standing] = {}
     undirected: dict[ArmPair, list[Note]] = {}
-    asked: list[tuple[ArmPair, Quantity, Question]] = []
-    before: list[tuple[ArmPair, Question, Standing]] = []
-    late: dict[ArmPair, list[TrialResult]] = {}
+    versions: dict[ArmPair, int] = {}
+    asked: list[Asked] = []
+    gone: list[tuple[Asked, OtherTest]] = []
     for pair in pairs:
+        first, second = (by_arm.get(arm, []) for arm in pair)
         metrics = [
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
         ]
         if declared is not None:
-            first, second = (by_arm.get(arm, []) for arm in pair)
             standing = declared.standing(first, second, other_pair=pair in others)
             primary = asked_quantity(standing.active.metric, trials)
             standings[pair], primaries[pair] = standing, primary
@@ -108,35 +115,37 @@ def judge_pairs(
             for metric in metrics
             if not metric.direction
         ]
-        for metric in metrics:
-            if metric.direction:
-                question = _question(by_arm, pair, metric, standings.get(pair))
-                asked.append((pair, metric, question))
-        if (known := standings.get(pair)) is not None and known.added:
-            # The question stays in its family as it was before, so that others keep their verdict.
-            # Looks have fixed shares.
-            whole = replace(known, added=())
-            counts = whole.beforehand and whole.question is None
-            directed = [metric for metric in metrics if metric.direction and counts]
-            before += [(pair, _question(by_arm, pair, one, whole), whole) for one in directed]
-            places = {(trial.scene, trial.seed) for trial in known.added}
-            late[pair] = [t for t in by_arm.get(pair[1], []) if (t.scene, t.seed) in places]
-    questions = [(pair, own, standings.get(pair)) for pair, _, own in asked]
-    verdicts = _judge_families(trials, questions, lacking, before, late)
-    by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0][0])
+        directed = [metric for metric in metrics if metric.direction]
+        versions[pair] = measured_versions(first, second, older)
+        known = standings.get(pair)
+        asked += [
+            Asked(pair, metric, _question(first, pair, metric, known), known, versions[pair])
+            for metric in directed
+        ]
+        if declared is not None:
+            gone += _before_late_trials(pair, directed, first, second, known)
+            gone += _of_earlier_code(pair, directed, first, second, declared)
+    verdicts = _judge_families(by_arm, trials, asked, gone, lacking)
+    by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0].pair)
     judged = []
     for pair in pairs:
         own, notes = [], list[Note]()
-        for (_, metric, _), verdict in by_pair.get(pair, []):
-            found = verdict.notes
+        for question, verdict in by_pair.get(pair, []):
+            metric, found = question.metric, verdict.notes
             if verdict.pairs.rows:
                 own.append(verdict)
             else:
                 found = (_why_missing(_trials_of(by_arm, pair), metric, verdict),)
             notes += [replace(note, about=metric.name) for note in found]
-        said = (*notes, *undirected[pair])
         judged.append(
-            PairVerdicts(*pair, tuple(own), said, primaries.get(pair), standings.get(pair))
+            PairVerdicts(
+                *pair,
+                tuple(own),
+                (*notes, *undirected[pair]),
+                declared=primaries.get(pair),
+                standing=standings.get(pair),
+                versions=versions[pair],
+            )
         )
     return judged
 
@@ -157,50 +166,138 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
     return Note.of("valueless", places=arms, reason=reason)
 
 
+@dataclass(frozen=True)
+class Asked:
+    """A question about a pair of arms, with the standing of the declaration to it."""
+
+    pair: ArmPair
+    metric: Quantity
+    question: Question
+    standing: Standing | None
+    versions: int = 1
+
+    @property
+    def declaration(self) -> Declaration | None:
+        """The declaration that fixed the question beforehand."""
+        in_time = self.standing is not None and self.standing.beforehand
+        return self.standing.declaration if self.standing is not None and in_time else None
+
+    @property
+    def family(self) -> tuple[object, ...]:
+        """Questions with the same value share an error rate.
+
+        The baseline's own settings are a family of their own: questions about ideas pay nothing for
+        them.
+        """
+        named = self.declaration
+        if named is None:
+            return self.pair
+        return named.time, named.hash, bool(self.question.seeds), _is_setting(self.pair)
+
+
 def _judge_families(
+    by_arm: Mapping[Arm, Sequence[TrialResult]],
     trials: Sequence[TrialResult],
-    asked: Sequence[tuple[ArmPair, Question, Standing | None]],
+    asked: Sequence[Asked],
+    gone: Sequence[tuple[Asked, OtherTest]],
     lacking: Sequence[Unfinished],
-    before: Sequence[tuple[ArmPair, Question, Standing | None]],
-    late: Mapping[ArmPair, Sequence[TrialResult]],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair.
 
-    Families also count the questions as they were ``before`` trials came that are too ``late``.
+    Families also count the tests of questions that are ``gone`` from them, so that the verdicts on
+    the others stay.
     """
-
-    def family(entry: tuple[int, tuple[ArmPair, Question, Standing | None]]) -> tuple[object, ...]:
-        pair, question, standing = entry[1]
-        if standing is None or not standing.beforehand:
-            return pair
-        # The baseline's own settings are a family of their own: questions about ideas pay nothing
-        # for them.
-        is_setting = pair[0].densify == pair[1].densify
-        named = standing.declaration
-        return named.time, named.hash, bool(question.seeds), is_setting
-
     verdicts: dict[int, Verdict] = {}
-    for own in group_by(enumerate([*asked, *before]), family).values():
-        standing, questions = own[0][1][2], tuple(question for _, (_, question, _) in own)
-        added = {t.path for at, (pair, _, _) in own if at >= len(asked) for t in late[pair]}
-        counting = [trial for trial in trials if trial.path not in added] if added else trials
-        # Without a time no trial is late, so Holm's method alone adjusts for the number of metrics.
-        declaration = Declaration(time=NO_TIME, questions=questions)
-        if standing is not None and standing.beforehand:
-            named = standing.declaration
-            looks = named.looks if questions[0].seeds else ()
-            # an arm without any trial yet keeps its share of the error rate
-            asked_scenes = [one.scenes for one in questions]
-            waiting = [one for one in named.questions if looks and one.scenes not in asked_scenes]
-            declaration = Declaration(
-                time=NO_TIME,
-                questions=(*questions, *waiting),
-                error_rate=named.error_rate,
-                looks=looks,
-            )
-        places = [place for place, _ in own]
-        verdicts |= dict(zip(places, judge(counting, declaration, lacking), strict=False))
+    for key, whole in group_by(enumerate(asked), lambda entry: entry[1].family).items():
+        # Versions of one number have one error rate. The others count as members of the family.
+        for number, own in group_by(whole, lambda entry: entry[1].versions).items():
+            questions = tuple(one.question for _, one in own)
+            others = [
+                other_test(_trials_of(by_arm, one.pair), one.question)
+                for _, one in whole
+                if one.versions != number
+            ]
+            others += [test for one, test in gone if one.family == key]
+            # Without a time no trial is late, so Holm's method alone adjusts for the number of
+            # metrics.
+            declaration = Declaration(time=NO_TIME, questions=questions)
+            if (named := own[0][1].declaration) is not None:
+                looks = named.looks if questions[0].seeds else ()
+                # an arm without any trial yet keeps its share of the error rate
+                asked_scenes = [one.scenes for one in questions]
+                waiting = [
+                    one for one in named.questions if looks and one.scenes not in asked_scenes
+                ]
+                # a look's own questions wait already
+                others = [one for one in others if one.secondary or not looks]
+                declaration = replace(
+                    declaration,
+                    questions=(*questions, *waiting),
+                    error_rate=named.error_rate,
+                    looks=looks,
+                )
+            rate = declaration.error_rate * share_of_version(number)
+            found = judge(trials, replace(declaration, error_rate=rate), lacking, others)
+            verdicts |= dict(zip((place for place, _ in own), found, strict=False))
     return [verdicts[place] for place in range(len(asked))]
+
+
+def _before_late_trials(
+    pair: ArmPair,
+    metrics: Sequence[Quantity],
+    baseline: Sequence[TrialResult],
+    arm: Sequence[TrialResult],
+    standing: Standing | None,
+) -> list[tuple[Asked, OtherTest]]:
+    """The tests of a pair's questions as they were before trials were added too late.
+
+    Looks have fixed shares, so they need none.
+    """
+    if standing is None or not standing.added:
+        return []
+    whole = replace(standing, added=())
+    if not whole.beforehand or whole.question is not None:
+        return []
+    late = {(trial.scene, trial.seed) for trial in standing.added}
+    in_time = [one for one in arm if (one.scene, one.seed) not in late]
+    questions = [Asked(pair, one, _question(baseline, pair, one, whole), whole) for one in metrics]
+    return [(one, other_test([*baseline, *in_time], one.question)) for one in questions]
+
+
+def _of_earlier_code(
+    pair: ArmPair,
+    metrics: Sequence[Quantity],
+    baseline: Sequence[TrialResult],
+    arm: Sequence[TrialResult],
+    declared: ActiveDeclaration,
+) -> list[tuple[Asked, OtherTest]]:
+    """The tests of a pair's questions with each earlier version of the arm's code.
+
+    The new code is tested in another family.
+    """
+    found = []
+    old = [replace(one, variant=pair[1].variant) for one in of_same_arm(arm, declared.older)]
+    for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
+        # what was known when this version was trained
+        first = min(trial.measured for trial in version)
+        known = replace(
+            declared, older=tuple(one for one in declared.older if one.measured < first)
+        )
+        standing = known.standing(baseline, version)
+        questions = [
+            Asked(pair, one, _question(baseline, pair, one, standing), standing) for one in metrics
+        ]
+        found += [
+            (one, other_test([*baseline, *version], one.question))
+            for one in questions
+            if one.declaration is not None
+        ]
+    return found
+
+
+def _is_setting(pair: ArmPair) -> bool:
+    """Return whether a pair compares two settings of one densifier."""
+    return pair[0].densify == pair[1].densify
 
 
 def _trials_of(by_arm: Mapping[Arm, Sequence[TrialResult]], pair: ArmPair) -> list[TrialResult]:
@@ -208,7 +305,7 @@ def _trials_of(by_arm: Mapping[Arm, Sequence[TrialResult]], pair: ArmPair) -> li
 
 
 def _question(
-    by_arm: Mapping[Arm, Sequence[TrialResult]],
+    of_baseline: Sequence[TrialResult],
     pair: ArmPair,
     metric: Quantity,
     standing: Standing | None,
@@ -225,7 +322,7 @@ def _question(
     if standing is None or not standing.beforehand:
         return question
     active, planned = standing.active, standing.question
-    split_question = next((trial.question for trial in by_arm.get(baseline, [])), "")
+    split_question = next((trial.question for trial in of_baseline), "")
     is_primary = active.question in ("", split_question) and metric.key == active.metric
     if planned is not None:
         question = replace(question, scenes=planned.scenes, seeds=planned.seeds)

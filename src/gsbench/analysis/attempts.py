@@ -1,0 +1,57 @@
+"""Versions of an arm's code that were measured on the same scenes and seeds.
+
+Whoever edits a densifier until its verdict pleases asks one question many times, and keeps the last
+answer. So each further version has a smaller error rate.
+"""
+
+from collections.abc import Iterable, Sequence
+
+from gsbench.analysis.results import Arm, TrialResult
+
+
+def measured_versions(
+    baseline: Sequence[TrialResult], arm: Sequence[TrialResult], older: Iterable[TrialResult]
+) -> int:
+    """The number of versions of the arm's code that were measured on its pairs; at least 1.
+
+    ``older`` are trials of earlier code. What they showed on other scenes or seeds says nothing
+    about the present pairs. Code that changed for the baseline too, as by an update of gsbench,
+    was no choice between the two arms.
+    """
+    older = list(older)
+    of_baseline = [*baseline, *of_same_arm(baseline, older)]
+    of_arm = [*arm, *of_same_arm(arm, older)]
+    pairs = places_of(baseline) & places_of(arm)
+    parts = {part for trial in of_arm for part in trial.code}
+    chosen = [part for part in parts if len({one.code.get(part) for one in of_baseline}) < 2]
+    versions = {
+        tuple(trial.code.get(part) for part in chosen)
+        for trial in of_arm
+        if (trial.scene, trial.seed) in pairs
+    }
+    return max(1, len(versions))
+
+
+def share_of_version(number: int) -> float:
+    """The part of an error rate that the version with this number (from 1) has: 1, 1/3, 1/6, ….
+
+    All parts sum to 2, and a test with two sides is falsely "better" in half of its error rate. So
+    an arm without an effect is ever called better with at most the whole rate, however often its
+    code was edited and whatever its versions have in common.
+    """
+    return 2 / (number * (number + 1))
+
+
+def is_of(arm: Arm, trial: TrialResult) -> bool:
+    """Return whether a trial of earlier code has the name and the swept settings of an arm."""
+    return arm.has(f"{trial.init}-{trial.densify}", trial.config)
+
+
+def of_same_arm(arm: Sequence[TrialResult], older: Iterable[TrialResult]) -> list[TrialResult]:
+    """The trials of earlier code of an arm."""
+    return [one for one in older if arm and is_of(arm[0].arm, one)]
+
+
+def places_of(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:
+    """The scenes and seeds of trials."""
+    return {(trial.scene, trial.seed) for trial in trials}
