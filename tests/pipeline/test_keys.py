@@ -25,11 +25,11 @@ BARE = Capture(
 KEYS = [
     ("config", "efb880968c80cdd904651c24a9fa44e607e6283f150f6dbad8f47651f0e9d49f"),
     # of the reference cameras
-    ("init", "e1e2cc0ffbc07319732fed7422ab68b11ed01ff824860ad4a65d461a0ecf95e4"),
-    ("init", "38db22c2a2523f5c5cc4f47e7aaffbb1327018bcc9211b8f1ae05ed29e39c37b"),
-    ("train", "8f6e851193877c649550b05cb2477f28ff6b3638ed7a7b504c3518a3d758f871"),
-    ("ground_truth", "47c5600464d4eb387175d3ff8484e73c41678360da8a9c7155674afcaef84a65"),
-    ("evaluate", "c832c3ae6a6d906f56a3c3ad09afe5aa63a1f576bb5f0b99f016b8fdb02f8cdc"),
+    ("init", "991c126deb4c8459394f2310586bfbb26251e999e306344a946a5826c7fb07d9"),
+    ("init", "be87afd1f24decd7478d620990cb56e1cc80f616bd5045809f5a0ed92ef3a68a"),
+    ("train", "097f112ce8266f6015db59464b6e89909976c37b5e5c21ebee455db9c73656ce"),
+    ("ground_truth", "3989bfa30383b1f506f4107150a86428b608f6e06dd12db46466e1d0d20cab1e"),
+    ("evaluate", "f45f1c9bae9f05356f790ab9fb640f544b189c7704fab55bb13726a944420734"),
 ]
 
 

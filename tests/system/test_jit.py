@@ -97,6 +97,7 @@ def test_sources_include_every_module_that_kernels_import():
     around = {
         "logs.py",
         "errors.py",
+        "words.py",
         "system/machine.py",
         "system/resources.py",
         "scene/types.py",

@@ -124,7 +124,7 @@ class Comparison:
 
     @cached_property
     def remarks(self) -> list[Note]:
-        """What must be known beside the sentences, wherever they stand.
+        """Notes that belong to the sentences, wherever they stand.
 
         That is what no verdict uses, old code, and declared trials that are missing.
         """

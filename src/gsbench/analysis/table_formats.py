@@ -94,7 +94,7 @@ def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-# What a spreadsheet would compute, or start, and is no number such as +0.3 ± 0.1
+# Text that a spreadsheet would compute, or start, and is no number such as +0.3 ± 0.1
 FORMULA = re.compile(r"[=@]|[+-](?![\d.,\s±%()]*$)")
 # a tag, or the middle of a link or picture
 MARKUP = re.compile(r"<(?=[a-zA-Z/!?])|(?<=\])\(")

@@ -278,7 +278,7 @@ def _of_earlier_code(
     found = []
     old = [replace(one, variant=pair[1].variant) for one in of_same_arm(arm, declared.older)]
     for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
-        # what was known when this version was trained
+        # the state when this version was trained
         first = min(trial.measured for trial in version)
         known = replace(
             declared, older=tuple(one for one in declared.older if one.measured < first)

@@ -87,7 +87,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     unfinished, experiment = [*experiment.lacking], newest_code(experiment)
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
-    # what earlier code showed was seen, so a declaration after it is late
+    # results of earlier code were seen, so a declaration after it is late
     for trial in (*experiment.trials, *experiment.older):
         try:
             views, configuration = read_views(trial), _configuration(trial.path)

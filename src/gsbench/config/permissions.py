@@ -1,4 +1,4 @@
-"""Which classes may run: gsbench's own, each in its group, and what the command line allows.
+"""The classes that may run: gsbench's own, each in its group, and what the command line allows.
 
 Only the command line gives permission; no file can. ``allow_targets`` names modules (``mine``),
 programs (``bash``), environment variables (``PATH``) and addresses.

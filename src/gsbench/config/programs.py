@@ -1,4 +1,4 @@
-"""Which programs, shell lines, options of Slurm and variables a configuration may use."""
+"""The programs, shell lines, options of Slurm and variables a configuration may use."""
 
 import os
 from collections.abc import Mapping, Sequence

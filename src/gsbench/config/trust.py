@@ -1,4 +1,4 @@
-"""What a configuration may run, reach and overwrite.
+"""Rules on all that a configuration may run, reach and overwrite.
 
 `check_composed` checks a composed configuration, Hydra's own settings included, before Hydra makes
 any object of it. `check_permissions` checks the resolved values of each trial before its parts are

@@ -86,7 +86,7 @@ def _series(names: Sequence[str]) -> dict[Place, dict[tuple[object, ...], str]]:
 
 @dataclass(frozen=True)
 class Sample:
-    """What decides whether a picture is a photograph."""
+    """The features of a picture that tell if it is a photograph."""
 
     size: tuple[int, int]  # px
     grey: NDArray[np.float64]  # [GRID, GRID], from 0 to 255
