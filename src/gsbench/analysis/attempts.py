@@ -6,7 +6,7 @@ answer. So each further version has a smaller error rate.
 
 from collections.abc import Iterable, Sequence
 
-from gsbench.analysis.results import Arm, TrialResult
+from gsbench.analysis.results import TrialResult
 
 
 def measured_versions(
@@ -42,14 +42,9 @@ def share_of_version(number: int) -> float:
     return 2 / (number * (number + 1))
 
 
-def is_of(arm: Arm, trial: TrialResult) -> bool:
-    """Return whether a trial of earlier code has the name and the swept settings of an arm."""
-    return arm.has(f"{trial.init}-{trial.densify}", trial.config)
-
-
 def of_same_arm(arm: Sequence[TrialResult], older: Iterable[TrialResult]) -> list[TrialResult]:
-    """The trials of earlier code of an arm."""
-    return [one for one in older if arm and is_of(arm[0].arm, one)]
+    """The trials of earlier code with the name and the swept settings of an arm."""
+    return [one for one in older if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)]
 
 
 def places_of(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:

@@ -168,10 +168,14 @@ class Verdict:
 
 @dataclass(frozen=True)
 class OtherTest:
-    """A test beside the questions of a declaration; ``p`` is None if it could not be done."""
+    """A test beside the questions of a declaration.
+
+    ``paired``: it has pairs of trials. ``p`` is None if these are too few for a test.
+    """
 
     arm: Arm | None
     secondary: bool
+    paired: bool
     p: float | None
 
 
@@ -179,7 +183,8 @@ def other_test(trials: Sequence[TrialResult], question: Question) -> OtherTest:
     """The test of a question with these trials, as `judge` would do it."""
     pairs = pair(trials, question)
     test = t_test(pairs.differences) if pairs.rows else None
-    return OtherTest(question.arm, question.secondary, None if test is None else test.p)
+    p = None if test is None else test.p
+    return OtherTest(question.arm, question.secondary, bool(pairs.rows), p)
 
 
 def judge(
@@ -229,9 +234,9 @@ def judge(
         else:
             candidates = max((_candidate_metrics(unjudged[k]) for k in family), default=1)
             differences = [unjudged[k].pairs.differences for k in family]
-            tests = [one for one in beside if one.p is not None]
-            p_beside = [one.p for one in tests if one.p is not None]
-            answers = answer_family(differences, declaration.error_rate / candidates, p_beside)
+            tests = [one for one in beside if one.paired]
+            known = [one.p for one in tests if one.p is not None]
+            answers = answer_family(differences, declaration.error_rate / candidates, known)
             asked = [unjudged[k].question for k in family]
             arms = {str(one.arm) for one in asked if one.arm and not one.name}
             named = tuple(sorted(arms | {str(one.arm) for one in tests}))

@@ -249,14 +249,11 @@ def _before_late_trials(
     arm: Sequence[TrialResult],
     standing: Standing | None,
 ) -> list[tuple[Asked, OtherTest]]:
-    """The tests of a pair's questions as they were before trials were added too late.
-
-    Looks have fixed shares, so they need none.
-    """
+    """The tests of a pair's questions as they were before trials were added too late."""
     if standing is None or not standing.added:
         return []
     whole = replace(standing, added=())
-    if not whole.beforehand or whole.question is not None:
+    if not whole.beforehand:
         return []
     late = {(trial.scene, trial.seed) for trial in standing.added}
     in_time = [one for one in arm if (one.scene, one.seed) not in late]
