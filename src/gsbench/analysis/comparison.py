@@ -58,12 +58,13 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     # and other pairs of its arms are none, since it stopped by the results of its own.
     planned = _pairs_in_looks(experiment.folder)
     keys = {arm: {trial.key for trial in own} for arm, own in by_arm.items()}
-    ages |= {arm: -math.inf for arm in arms if keys[arm] & {first for first, _ in planned}}
-    in_looks = {arm for arm in arms if keys[arm] & set(itertools.chain(*planned))}
+    ages |= {arm: -math.inf for arm in arms if any(keys[arm] & first for first, _ in planned)}
+    in_looks = {arm for arm in arms if any(keys[arm] & (one | two) for one, two in planned)}
+    # The two arms may have no result on a common scene yet.
     declared = {
         (first, second)
         for first, second in itertools.permutations(arms, 2)
-        if any(one in keys[first] and other in keys[second] for one, other in planned)
+        if any(keys[first] & one and keys[second] & two for one, two in planned)
     }
     pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
     # with another baseline, a declared pair is not also asked the other way round
@@ -80,15 +81,14 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
 
 
-def _pairs_in_looks(home: Path) -> set[tuple[str, str]]:
-    """The pairs of trials, without seeds, that sweeps in looks declared: (baseline, arm)."""
-    return {
-        keys
+def _pairs_in_looks(home: Path) -> list[tuple[set[str], set[str]]]:
+    """The questions of sweeps in looks: keys of the baseline's and of the arm's trials."""
+    return [
+        ({first for first, _ in both}, {second for _, second in both})
         for declaration in read_declarations(home)
         if declaration.looks
-        for question in declaration.questions
-        for keys in question.scenes.values()
-    }
+        for both in (question.scenes.values() for question in declaration.questions)
+    ]
 
 
 @dataclass(frozen=True)
