@@ -510,8 +510,8 @@ def test_each_version_of_the_code_on_the_same_seeds_has_a_smaller_error_rate(tmp
     assert after["mine"].beforehand
     assert [after["mine"].primary[0].answer.rate, before["mine"].versions] == [0.05 / 6, 1]
     assert sentence(after["mine"]).endswith(
-        "It is version 3 of the arm's code on these seeds, so its error rate is 0.83 % (5 % on "
-        "seeds that no version was measured on)."
+        "3 versions of the arm's code were measured on these seeds, so the error rate is 0.83 % "
+        "(with other seeds under another name: 5 %)."
     )
     # of seeds that only the newest code was trained on, nothing was seen
     fresh = [replace(one, seed=one.seed + 7) for one in (*adc, *third)]
@@ -527,6 +527,9 @@ def test_code_that_changed_for_the_baseline_too_is_no_choice_between_the_arms(tm
     (found,) = answer(tmp_path).answers
     assert found.versions == 1
     assert "version" not in sentence(found)
+    (told,) = answer(tmp_path).to_json()["pairs"]
+    assert told["versions"] == 1
+    assert {one["error_rate"] for one in told["verdicts"]} == {0.05}
 
 
 EDITED = ((OLD, 2), (NEW, 5))

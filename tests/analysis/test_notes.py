@@ -55,10 +55,19 @@ def with_record(trial, **values):
 def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path, counts, said):
     made = trials_of(tmp_path, scenes=list(counts))
     trials = [
-        with_record(trial, num_gaussians=counts[trial.scene][trial.densify == "volumetric"])
+        with_record(
+            trial,
+            num_gaussians=counts[trial.scene][trial.densify == "volumetric"],
+            num_init_points=50,
+        )
         for trial in made
     ]
     note = counts_note(trials, ADC, VOLUMETRIC)
+    if said:  # no limit can be below the initial cloud
+        larger = [with_record(trial, num_init_points=10_000) for trial in trials]
+        assert "To do so: start both arms with fewer than 10,000 points" in str(
+            counts_note(larger, ADC, VOLUMETRIC)
+        )
     least = min(filter(None, itertools.chain(*counts.values())))
     words = f"densify.max_gaussians={least} and another name."
     expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}{words}"

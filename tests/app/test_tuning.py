@@ -331,13 +331,11 @@ def test_the_fairness_table_states_budget_views_points_and_chosen_values(sweep, 
     assert sweep(Fake()) == 0
     adc, volumetric = notes(runs)
     best = chosen(runs, "volumetric")
+    settings = " and ".join(f"{key}={best[key]}" for key in sorted(best))
     assert (
-        "random-volumetric: " + " and ".join(f"{key}={best[key]}" for key in sorted(best))
-        in volumetric
-    )
-    assert (
-        "the best of 4 points by psnr of validation views (courtyard; seed 100; the search "
-        "fair-tune-random-volumetric), before any of these trials. Tried: " in volumetric
+        "random-volumetric: the best of 4 points by psnr of validation views (courtyard; seed 100; "
+        f"the search fair-tune-random-volumetric) is {settings}, before any of these trials. "
+        "Tried: " in volumetric
     )
     assert "Tried: 0.0002 (27.59), " in adc
     page = build_report(load_experiment(runs, "fair"))

@@ -231,6 +231,7 @@ def _as_json(one: PairVerdicts) -> dict[str, Any]:
             if verdict.interval is None
             else [verdict.interval.low, verdict.interval.high],
             "p": verdict.p,
+            "error_rate": None if verdict.answer is None else verdict.answer.level,
             "tests": verdict.family,
             "trials": [trial.label for trial in verdict.pairs.trials],
         }
@@ -240,6 +241,7 @@ def _as_json(one: PairVerdicts) -> dict[str, Any]:
         "arm": str(one.second),
         "baseline": str(one.first),
         "sentence": sentence(one),
+        "versions": one.versions,
         "verdicts": verdicts,
         "notes": texts(one.notes),
     }

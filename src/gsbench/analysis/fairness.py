@@ -70,8 +70,17 @@ def counts_note(
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
         return None
     more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
-    how = advise(baseline, other)
+    how = _start_smaller([*baseline, *other]) or advise(baseline, other)
     return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
+
+
+def _start_smaller(trials: Iterable[TrialResult]) -> str:
+    """The advice where an arm ended with fewer Gaussians than initial points; "" elsewhere."""
+    records = [trial.record for trial in trials]
+    points = max((one.num_init_points or 0 for one in records), default=0)
+    if all((one.num_gaussians or points) >= points for one in records):
+        return ""
+    return f"start both arms with fewer than {points:,} points, as no limit can be below these"
 
 
 def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:

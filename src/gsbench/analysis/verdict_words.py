@@ -237,8 +237,8 @@ def _versions_words(judged: PairVerdicts) -> str:
         return ""
     rate = 100 * ERROR_RATE * share_of_version(judged.versions)
     return (
-        f" It is version {judged.versions} of the arm's code on these seeds, so its error rate is "
-        f"{rate:.2g} % ({100 * ERROR_RATE:.2g} % on seeds that no version was measured on)."
+        f" {judged.versions} versions of the arm's code were measured on these seeds, so the error "
+        f"rate is {rate:.2g} % (with other seeds under another name: {100 * ERROR_RATE:.2g} %)."
     )
 
 
