@@ -114,7 +114,9 @@ def _words(settings):
 def test_a_choice_that_leaves_its_groups_folder_is_a_strangers_file(settings, said, refused):
     experiment(settings)
     outside = os.path.relpath("conf/experiment/strange", Path(conf_dir(), "experiment"))
-    assert said in refused(f"+experiment={outside}")
+    told = refused(f"+experiment={outside}")
+    # The next version of Hydra refuses such a choice by itself.
+    assert said in told or "Parent traversal ('..')" in told
 
 
 def _claims(settings):
