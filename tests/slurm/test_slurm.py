@@ -195,7 +195,8 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environme
         "launch.wait=false",
     ]
 
-    first = gsbench(place, environment, *sweep, pause=PAUSE)
+    # The first trial must still train when the sweep is given again, also on a busy machine.
+    first = gsbench(place, environment, *sweep, pause=2 * PAUSE)
     assert first.returncode == 0, first.stderr
     assert re.fullmatch(r"Slurm job \d+: 2 trials; see gsbench status cluster\n", first.stdout)
     array = first.stdout.split()[2].rstrip(":")
@@ -209,7 +210,7 @@ def test_status_and_retry_manage_a_sweep_that_was_left_to_slurm(place, environme
         "2 trials: 1 running, 1 queued" in gsbench(place, environment, *sweep, "--dry-run").stdout
     )
 
-    second = gsbench(place, environment, *sweep, pause=PAUSE)
+    second = gsbench(place, environment, *sweep, pause=2 * PAUSE)
     assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr
     assert len(list(place.glob("runs/.jobs/cluster/*/*_submission.sh"))) == 1, (
         "the trials were submitted a second time"
