@@ -20,7 +20,15 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError, TrainingError
 from gsbench.files import DiskFullError
 from gsbench.launch import jobs
-from gsbench.launch.jobs import Outcome, TrialJob, collect, job_folder, new_job_folder, run_one
+from gsbench.launch.jobs import (
+    Outcome,
+    TrialJob,
+    check_job_links,
+    collect,
+    job_folder,
+    new_job_folder,
+    run_one,
+)
 from gsbench.launch.states import QueuedJob, current_user, read_submission, record_submission
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
@@ -338,6 +346,18 @@ def test_submitits_link_is_removed_and_any_other_link_is_refused(tmp_path):
     (tmp_path / ".jobs" / "other").symlink_to(tmp_path)
     with refusal(r"other is a link"):
         job_folder(trial_values(tmp_path, name="other"))
+
+
+def test_through_a_link_no_file_of_another_folder_is_removed(tmp_path):
+    kept = tmp_path / "elsewhere" / ".submission_file_aaa46bf3.sh"
+    kept.parent.mkdir()
+    kept.symlink_to(tmp_path)
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    (runs / ".hydra").symlink_to(kept.parent)
+    with refusal(r"hydra is a link"):
+        check_job_links(runs, runs / ".hydra")
+    assert kept.is_symlink()
 
 
 def test_no_job_unpickles_what_a_strangers_runs_folder_has(tmp_path):

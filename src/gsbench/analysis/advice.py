@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from gsbench.analysis.results import TrialResult, group_by
@@ -21,6 +21,15 @@ Words = dict[str, list[str]]  # the values of each key of a command, in order
 
 
 Advice = Callable[[Sequence[TrialResult], Sequence[TrialResult]], str]
+
+
+def start_smaller(trials: Iterable[TrialResult]) -> str:
+    """The advice where an arm ended with fewer Gaussians than initial points; "" elsewhere."""
+    records = [trial.record for trial in trials]
+    points = max((one.num_init_points or 0 for one in records), default=0)
+    if all((one.num_gaussians or points) >= points for one in records):
+        return ""
+    return f"start both arms with fewer than {points:,} points, as no limit can be below these"
 
 
 def equal_counts_words(baseline: Sequence[TrialResult], arm: Sequence[TrialResult]) -> str:

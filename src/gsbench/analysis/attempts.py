@@ -10,7 +10,7 @@ from gsbench.analysis.results import TrialResult
 
 
 def measured_versions(
-    baseline: Sequence[TrialResult], arm: Sequence[TrialResult], older: Iterable[TrialResult]
+    baseline: Sequence[TrialResult], arm: Sequence[TrialResult], older: Sequence[TrialResult]
 ) -> int:
     """The number of versions of the arm's code that were measured on its pairs; at least 1.
 
@@ -18,7 +18,6 @@ def measured_versions(
     about the present pairs. Code that changed for the baseline too, as by an update of gsbench,
     was no choice between the two arms.
     """
-    older = list(older)
     of_baseline = [*baseline, *of_same_arm(baseline, older)]
     of_arm = [*arm, *of_same_arm(arm, older)]
     pairs = places_of(baseline) & places_of(arm)

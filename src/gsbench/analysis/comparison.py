@@ -63,8 +63,11 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     # The two arms may have no result on a common scene yet.
     declared = {
         (first, second)
-        for first, second in itertools.permutations(arms, 2)
-        if any(keys[first] & one and keys[second] & two for one, two in planned)
+        for one, two in planned
+        for first in arms
+        if keys[first] & one
+        for second in arms
+        if keys[second] & two and second != first
     }
     pairs = choose_pairs(arms, baseline, controls_of(trials), settings, ages)
     # with another baseline, a declared pair is not also asked the other way round

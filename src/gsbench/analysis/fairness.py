@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
-from gsbench.analysis.advice import Advice, equal_counts_command
+from gsbench.analysis.advice import Advice, equal_counts_command, start_smaller
 from gsbench.analysis.differences import (
     between_scenes_notes,
     compared_trials,
@@ -70,17 +70,8 @@ def counts_note(
     if change is None or abs(change.of_totals) <= EQUAL_COUNTS:
         return None
     more = f"{100 * abs(change.of_totals):.0f} % {'more' if change.of_totals > 0 else 'fewer'}"
-    how = _start_smaller([*baseline, *other]) or advise(baseline, other)
+    how = start_smaller([*baseline, *other]) or advise(baseline, other)
     return Note.of("unequal counts", arm=second, baseline=first, more=more, advice=how)
-
-
-def _start_smaller(trials: Iterable[TrialResult]) -> str:
-    """The advice where an arm ended with fewer Gaussians than initial points; "" elsewhere."""
-    records = [trial.record for trial in trials]
-    points = max((one.num_init_points or 0 for one in records), default=0)
-    if all((one.num_gaussians or points) >= points for one in records):
-        return ""
-    return f"start both arms with fewer than {points:,} points, as no limit can be below these"
 
 
 def limit_notes(trials: Sequence[TrialResult], pairs: Iterable[tuple[Arm, Arm]]) -> list[Note]:
@@ -142,9 +133,8 @@ def fairness_table(
     """The fairness sheet of two arms as a table with notes.
 
     ``trials`` are all trials of the experiment that count, each with its variant, ``older`` those
-    of earlier code. Measured rows cover the
-    paired trials: one value, or the smallest, the largest and the mean. Raises KeyError for an arm
-    without trials.
+    of earlier code. Measured rows cover the paired trials: one value, or the smallest, the largest
+    and the mean. Raises KeyError for an arm without trials.
     """
     pairs = pair_trials(trials, first, second)
     compared = list(itertools.chain(*pairs)) or trials
@@ -390,7 +380,7 @@ def _varied_settings(trials: Sequence[TrialResult], own: TrialResult) -> list[No
 
 
 def _choice(trial: TrialResult) -> Hashable:
-    """What the user chose for a trial: settings, modules, and edits of gsbench's packages."""
+    """The user's choices for a trial: settings, modules, and edits of gsbench's packages."""
     config = [(k, canonical(v)) for k, v in trial.config.items() if is_ingredient(k)]
     code = [(part, made) for part, made in trial.code.items() if part.kind != "stage"]
     return frozenset(config), frozenset(code)

@@ -330,9 +330,9 @@ def read_experiment(folder: Path) -> Experiment:
 
 
 def newest_code(experiment: Experiment) -> Experiment:
-    """The experiment without trials that later code repeated; a warning for each part of the code
-    names its earlier versions, with their numbers of trials.
+    """The experiment without trials that later code repeated.
 
+    A warning for each part of the code names its earlier versions, with their numbers of trials.
     Trials of one scene, arm and settings that differ only in their code are versions of one thing.
     Those count whose user's code is what it is now, or else those that were finished last.
     """

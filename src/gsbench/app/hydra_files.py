@@ -15,8 +15,7 @@ from gsbench.app.sweep import OWN
 from gsbench.config.command_words import key_of
 from gsbench.config.compose import installed_nodes
 from gsbench.errors import InputError
-from gsbench.files import require_no_links
-from gsbench.launch.jobs import remove_job_links
+from gsbench.launch.jobs import check_job_links
 
 FOLDER = ".hydra"  # below the runs folder
 IN_PROCESS = (OWN, "basic")  # launchers that read no results from files
@@ -83,5 +82,4 @@ def words_for_new_folder(config: DictConfig, words: Sequence[str]) -> list[str]:
 
 def check_links(runs: Path) -> None:
     """Raise InputError for a link in the place of Hydra's files, since Hydra would follow it."""
-    remove_job_links(runs / FOLDER)
-    require_no_links(runs, runs / FOLDER, below=True)
+    check_job_links(runs, runs / FOLDER)

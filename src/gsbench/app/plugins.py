@@ -50,6 +50,7 @@ from gsbench.config.compose import (
     trial_of_job,
 )
 from gsbench.errors import GsbenchError, InputError
+from gsbench.files import checked_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher
 from gsbench.launch.jobs import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
@@ -252,15 +253,11 @@ def words_for_plugins(sweep: Sweep) -> list[str] | None:
         files or launcher != OWN or config.hydra.callbacks or config.hydra.hydra_logging.get("root")
     ):
         return None
-    check_links(_runs_of(config))
+    check_links(checked_runs_folder(config.runs))
     # Hydra would resolve the ${…} of grids when it makes the sweeper, before each trial's values.
     grids = [f"{GRIDS}=[]"] if config.hydra.sweeper.get("grids") else []
     place = words_for_new_folder(config, sweep.words)
     return [*sweep.words, *files, *place, *grids, f"{MODE}={config.hydra.mode.name}"]
-
-
-def _runs_of(config: DictConfig) -> Path:
-    return Path(config.runs).expanduser().resolve()
 
 
 # ---- another sweeper than gsbench's own: Hydra's, or one of an installed package
@@ -270,7 +267,7 @@ def other_sweep(sweep: Sweep, run: Callable[[Sequence[Trial]], list[Outcome]]) -
     """Let another sweeper propose the jobs, and run them."""
     name, config = sweep.other_sweeper, sweep.config
     words, objective = prepare_other_sweeper(sweep)
-    check_links(_runs_of(config))
+    check_links(checked_runs_folder(config.runs))
     words += words_for_hydras_files(config, sweep.words, multirun=True)
     words += words_for_new_folder(config, sweep.words)
     task = TrialTask(run, sweep.composer.allowed, objective=objective, sweep=sweep)

@@ -85,6 +85,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     """
     kept, rows, left_out = [], [], list(experiment.warnings)
     unfinished, experiment = [*experiment.lacking], newest_code(experiment)
+    older = {trial.path for trial in experiment.older}
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
     # results of earlier code were seen, so a declaration after it is late
@@ -104,7 +105,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
     contents = {
         TRIALS: _json_lines(
             {"folder": _folder(trial.path), "results": _results(trial)}
-            | ({OLDER: True} if trial in experiment.older else {})
+            | ({OLDER: True} if trial.path in older else {})
             for trial in kept
         ),
         CONFIGURATIONS: _json_lines(

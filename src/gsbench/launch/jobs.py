@@ -13,7 +13,7 @@ import secrets
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,11 +81,10 @@ class Outcome:
         return TrialFolder(self.folder).label
 
 
-def _say_last(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> None:
+def _say_last(outcomes: Sequence[Outcome], labels: Mapping[Path, str]) -> None:
     """Log the outcome of the trial that ended last, and how many have ended."""
-    last = outcomes[-1]
-    label = _labels(trials)[last.folder]
-    log.info("%s: %s  (%d of %d)", label, last.message, len(outcomes), len(trials))
+    last, label = outcomes[-1], labels[outcomes[-1].folder]
+    log.info("%s: %s  (%d of %d)", label, last.message, len(outcomes), len(labels))
 
 
 def _labels(trials: Sequence[Trial]) -> dict[Path, str]:
@@ -228,22 +227,23 @@ def job_folder(values: dict[str, Any]) -> Path:
     """The folder for the output of an experiment's jobs; it is made if it does not exist."""
     runs = TrialFolder.of(values).runs
     folder = runs / JOBS / values["name"]
-    require_no_links(runs, folder)
-    remove_job_links(folder)
-    require_no_links(runs, folder, below=True)
+    check_job_links(runs, folder)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
-def remove_job_links(folder: Path) -> None:
-    """Remove the links to job scripts that submitit leaves below ``folder``.
+def check_job_links(runs: Path, folder: Path) -> None:
+    """Raise InputError for a link at or below ``folder`` in the runs folder ``runs``.
 
-    They are not read again, and `gsbench.files.require_no_links` would refuse them.
+    The links to job scripts that submitit leaves there are removed: they are not read again.
     """
+    # First the folder itself: through a link, files of another folder would be removed.
+    require_no_links(runs, folder)
     for place, _, names in os.walk(folder):
         for link in (Path(place, name) for name in names if JOB_LINK.fullmatch(name)):
             if link.is_symlink():
                 link.unlink(missing_ok=True)
+    require_no_links(runs, folder, below=True)
 
 
 def new_job_folder(values: dict[str, Any]) -> Path:
@@ -265,6 +265,7 @@ def _run(
     If this process is stopped, it stops them; if it is killed, they go on.
     """
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
+    labels = _labels(trials)
     try:
         while waiting or running:
             while waiting and len(running) < parallel:
@@ -277,7 +278,7 @@ def _run(
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
-                _say_last(outcomes, trials)
+                _say_last(outcomes, labels)
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
@@ -441,6 +442,7 @@ def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[
 
 def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
     outcomes: list[Outcome] = []
+    labels = _labels(trials)
     submissions = filter(None, map(read_submission, jobs))
     users = {submission.user or current_user() for submission in submissions} | {current_user()}
     unseen = dict.fromkeys(jobs, 0)  # successive checks in which the queue did not list the job
@@ -459,7 +461,7 @@ def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outco
             outcomes.append(collect(jobs.pop(folder), folder, trials))
             with suppress(OSError):
                 forget_submission(folder)
-            _say_last(outcomes, trials)
+            _say_last(outcomes, labels)
         if not ended:
             time.sleep(SECONDS_BETWEEN_POLLS)
     return outcomes

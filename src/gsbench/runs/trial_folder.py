@@ -198,7 +198,7 @@ class TrialFolder:
         return change_of_files(self.path, origin.digests, origin.published, thorough)
 
     def _known_origin(self) -> MadeOf | None:
-        """What made the results, read if they were not yet; None if unrecorded or unsound."""
+        """The origin of the results, read if it was not yet; None if unrecorded or unsound."""
         if self._origin is None:
             self.sound_record()
         return self._origin

@@ -424,7 +424,7 @@ def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
 
 
 def _where_a_model_is(root: Path) -> str:
-    """What to set, if a model lies near ``root``; else what to do."""
+    """The setting that finds a model near ``root``; without one, advice to make it."""
     folders = [root, *(one for pattern in ("*", "*/*", "*/*/*") for one in root.glob(pattern))]
     folders += [root.parent / name for name in SPARSE_FOLDERS]
     model = next((one for one in folders if one.is_dir() and _is_model(one)), None)

@@ -244,7 +244,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
 
 
 def _components(trials: Sequence[TrialResult], question: Question, metric: Quantity) -> Components:
-    """How a question's differences vary; raises InputError if its trials cannot tell."""
+    """The variation of a question's differences; raises InputError if its trials cannot tell."""
     paired = pair(trials, question)
     arms = f"{question.baseline} and {question.arm}"
     if not paired.rows:
