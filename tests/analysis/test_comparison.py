@@ -32,6 +32,7 @@ from gsbench.claims.export import write_archive
 from gsbench.claims.pooling import PooledQuestion, read_studies
 from gsbench.claims.site import write_site
 from gsbench.claims.stopping import log_verdicts
+from gsbench.launch.record import remove
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
 from gsbench.tracking.comparison import description
 from gsbench.verbs.claims import plan
@@ -457,6 +458,38 @@ def test_the_end_of_a_sweep_names_trials_of_earlier_code(tmp_path, caplog):
     assert "3 trials of sfm-mine made by earlier versions of mine" in caplog.messages[-1]
 
 
+def forget(runs):
+    """Remove the trials of earlier code, as ``status --forget-superseded`` does."""
+    older = load_experiment(runs, "exp").older
+    remove(runs / "exp", [trial.path for trial in older])
+    return len(older)
+
+
+def test_forgotten_trials_of_earlier_code_still_count_as_seen(tmp_path):
+    adc, momentum = grid("adc"), grid("momentum")
+    old, new = grid("mine", code=OLD), grid("mine", day=6, code=NEW)
+    failed = Made("mine", (), seed=0, code="3" * 64)
+    write(tmp_path, [*adc, *momentum, *old, *new, failed])
+    (tmp_path / "exp" / f"{failed.key}-seed0" / "results.json").unlink()
+    declare(tmp_path, (1, [*adc, *momentum, *old, failed]), (5, new))
+    before = answer(tmp_path)
+    assert "2 versions of the arm's code" in before.sentences[0]
+    assert forget(tmp_path) == 3
+    remove(tmp_path / "exp", [tmp_path / "exp" / f"{failed.key}-seed0"])
+    after = answer(tmp_path)
+    assert after.experiment.warnings == ()
+    assert after.sentences == before.sentences
+    assert "missing" not in "\n".join(build_table(after.experiment).notes)
+    write_archive(load_all_trials(tmp_path, "exp"), tmp_path / "exp.zip")
+    there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
+    assert there.sentences == before.sentences
+    # the old code came back, and was forgotten again
+    write(tmp_path, old)
+    assert answer(tmp_path).sentences == before.sentences
+    assert forget(tmp_path) == 3
+    assert answer(tmp_path).sentences == before.sentences
+
+
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
     write(tmp_path, [*grid("adc"), *grid("mine", code=OLD), *grid("mine", day=6, code=NEW)])
     declare(tmp_path, (5, [*grid("adc"), *grid("mine", code=NEW)]))
@@ -704,6 +737,19 @@ def test_what_is_added_never_changes_another_verdict(what):
             shutil.rmtree(runs)
 
     check()
+
+
+@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
+@given(experiments())
+def test_forgetting_earlier_code_never_changes_a_verdict(made):
+    runs = Path(tempfile.mkdtemp())
+    try:
+        made.write(runs)
+        before = answer(runs).sentences
+        forget(runs)
+        assert answer(runs).sentences == before
+    finally:
+        shutil.rmtree(runs)
 
 
 def check_all_is_named(comparison):

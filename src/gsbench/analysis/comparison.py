@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from gsbench.analysis.cells import with_variants
@@ -28,7 +27,7 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.unfinished import unfinished
 from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
-from gsbench.runs.experiments import Question, read_declarations
+from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
 
 VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
@@ -56,7 +55,7 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     ages = {arm: min(trial.measured for trial in own) for arm, own in by_arm.items()}
     # A sweep in looks declared its pairs before any trial began: its baseline stays the baseline,
     # and other pairs of its arms are none, since it stopped by the results of its own.
-    planned = _pairs_in_looks(experiment.folder)
+    planned = _pairs_in_looks(experiment)
     keys = {arm: {trial.key for trial in own} for arm, own in by_arm.items()}
     ages |= {arm: -math.inf for arm in arms if any(keys[arm] & first for first, _ in planned)}
     in_looks = {arm for arm in arms if any(keys[arm] & (one | two) for one, two in planned)}
@@ -84,11 +83,11 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
 
 
-def _pairs_in_looks(home: Path) -> list[tuple[set[str], set[str]]]:
+def _pairs_in_looks(experiment: Experiment) -> list[tuple[set[str], set[str]]]:
     """The questions of sweeps in looks: keys of the baseline's and of the arm's trials."""
     return [
         ({first for first, _ in both}, {second for _, second in both})
-        for declaration in read_declarations(home)
+        for declaration in experiment.declarations
         if declaration.looks
         for both in (question.scenes.values() for question in declaration.questions)
     ]
@@ -253,7 +252,7 @@ def _as_json(one: PairVerdicts) -> dict[str, Any]:
 def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
-    declared = active_declaration(experiment.folder, arms.trials, experiment.older)
+    declared = active_declaration(experiment)
     usual = arms if baseline == BASELINE else pair_arms(experiment)
     known = {frozenset(pair) for pair in usual.pairs}
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]
