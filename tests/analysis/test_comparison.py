@@ -65,11 +65,11 @@ class Made:
         return f"{self.scene}/{self.init}-{self.densify}/{self.hash}"
 
 
-def write(runs, trials):
+def write(runs, trials, experiment="exp"):
     for one in trials:
         rng = random.Random(repr(one))
         views = {m: np.array([20.0 + rng.gauss(0, 0.1)]) for m in METRICS[:2]}
-        data = trial_data(Plan(), one.scene, one.init, one.densify, one.seed, views)
+        data = trial_data(Plan(experiment), one.scene, one.init, one.densify, one.seed, views)
         data["measured"] = f"2026-01-{one.day:02d}T00:00:00Z"
         sources = {"mine": one.code} if one.code else {}
         data["code"] = {"sources": sources, "stages": {"train": 2}}
@@ -488,6 +488,52 @@ def test_forgotten_trials_of_earlier_code_still_count_as_seen(tmp_path):
     assert answer(tmp_path).sentences == before.sentences
     assert forget(tmp_path) == 3
     assert answer(tmp_path).sentences == before.sentences
+
+
+@pytest.mark.parametrize(
+    "there, named",
+    [
+        (grid("mine", code=OLD), True),
+        (grid("mine", code=OLD, lr=1), True),  # other settings
+        (grid("mine", code=NEW), False),  # as with equal counts under another name
+        ([replace(one, seed=one.seed + 5) for one in grid("mine", code=OLD)], False),
+        ([replace(one, scene="b") for one in grid("mine", code=OLD)], False),
+        (grid("other", code=OLD), False),
+    ],
+)
+def test_other_code_on_the_same_seeds_under_another_name_is_named_everywhere(
+    tmp_path, there, named
+):
+    write(tmp_path, [*grid("adc"), *grid("mine", code=NEW)])
+    write(tmp_path, there, "tried")
+    found = answer(tmp_path)
+    line = "tried measured sfm-mine on the same scenes and seeds by other code."
+    for text in (
+        "\n".join(texts(found.remarks)),
+        "\n".join(build_table(found.experiment).notes),
+        build_report(found.experiment),
+        description(found.experiment),
+        found.to_json()["left_out"][0] if named else "",
+    ):
+        assert (line in text) == named
+
+
+@pytest.mark.parametrize("differs", [False, True])
+def test_settings_without_an_effect_are_named(tmp_path, differs):
+    arms = [grid("momentum", decay=decay) for decay in (0.9, 0.99)]
+    write(tmp_path, [*grid("adc"), *arms[0]])
+    for one in arms[0]:
+        here = tmp_path / "exp" / f"{one.key}-seed{one.seed}"
+        copied = here.with_name(f"{arms[1][0].hash}-seed{one.seed}")
+        shutil.copytree(here, copied)
+        config = json.loads((copied / "config.yaml").read_text())
+        config["densify"]["decay"] = 0.99
+        (copied / "config.yaml").write_text(json.dumps(config))
+    if differs:
+        gain(tmp_path, arms[1][:1])
+    note = "sfm-momentum[decay=0.9] and sfm-momentum[decay=0.99] gave the same bits in all trials"
+    said = "\n".join(texts(answer(tmp_path).remarks))
+    assert (note in said) != differs
 
 
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):

@@ -11,12 +11,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+from gsbench.analysis.attempts import measured_elsewhere
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairing import (
     BASELINE,
+    are_equal,
     baseline_settings,
     choose_pairs,
     controls_of,
@@ -128,7 +130,8 @@ class Comparison:
     def remarks(self) -> list[Note]:
         """Notes that belong to the sentences, wherever they stand.
 
-        That is what no verdict uses, old code, and declared trials that are missing.
+        That is what no verdict uses, old code, code in other experiments, arms with the same bits,
+        and declared trials that are missing.
         """
         lacking = [
             note
@@ -137,7 +140,19 @@ class Comparison:
             if note.kind in ("no direction", "valueless")
         ]
         early = [note for note in self._progress if note.kind == "early look"]
-        return [*self.unused, *dict.fromkeys(lacking), *edited_notes(self.trials), *early]
+        of_code = [*edited_notes(self.trials), *self._elsewhere, *same_bits_notes(self.trials)]
+        return [*self.unused, *dict.fromkeys(lacking), *of_code, *early]
+
+    @property
+    def _elsewhere(self) -> list[Note]:
+        """A note for each arm that other experiments measured by other code on its seeds."""
+        by_arm, home = group_by(self.trials, lambda trial: trial.arm), self.experiment.folder
+        notes = {}
+        for first, second in self.pairs:
+            both = by_arm[first], by_arm[second]
+            if others := measured_elsewhere(home.parent, home.name, *both):
+                notes[second] = Note.of("elsewhere", arm=second, experiments=others)
+        return [*notes.values()]
 
     @cached_property
     def _progress(self) -> list[Note]:
@@ -188,6 +203,23 @@ def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
         )
         for module, own in of_module.items()
     ]
+
+
+def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
+    """A note on settings of one densifier that had no effect: all their results are equal."""
+    places: dict[Arm, dict[tuple[str, int], TrialResult]] = {}
+    for trial in trials:
+        places.setdefault(trial.arm, {})[trial.scene, trial.seed] = trial
+    equal: dict[Arm, list[Arm]] = {}
+    for one, two in itertools.combinations(places, 2):
+        both = places[one].keys() & places[two].keys()
+        same = (one.init, one.densify) == (two.init, two.densify) and both
+        known = itertools.chain(*equal.values())
+        if same and one not in known and all(
+            are_equal(places[one][place], places[two][place]) for place in both
+        ):
+            equal.setdefault(one, [one]).append(two)
+    return [Note.of("same bits", arms=own) for own in equal.values()]
 
 
 def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) -> list[Note]:

@@ -124,6 +124,14 @@ SENTENCES: dict[str, str] = {
         "Still missing: {missing} of the {declared:n declared trial}, so this is an early look. "
         "Do not stop here because the result pleases: that finds effects that do not exist."
     ),
+    "elsewhere": (
+        "{experiments:all} measured {arm} on the same scenes and seeds by other code. Each name has "
+        "an error rate of its own: whoever reports the better version errs more often."
+    ),
+    "same bits": (
+        "{arms:all} gave the same bits in all trials of the same scene and seed: the settings in "
+        "which they differ had no effect, so there is nothing to compare."
+    ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation.",
     "mean": "Mean over {trials:n trial}; ± is the deviation (n − 1) over {spread}.",

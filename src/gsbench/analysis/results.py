@@ -324,7 +324,7 @@ def read_experiment(folder: Path) -> Experiment:
     for path in map(Path, trial_folders(folder)):
         try:
             trials.append(read_trial(path, runs_dir, settings))
-        except _UnusableError as reason:
+        except UnusableError as reason:
             faults[path] = one_line(str(reason))
     of_settings = _read_settings(trials, settings)
     faults |= {
@@ -352,7 +352,7 @@ def _forgotten(home: Path, there: Collection[Path]) -> tuple[tuple[TrialResult, 
     for path in map(Path, trial_folders(home / FORGOTTEN)) if (home / FORGOTTEN).is_dir() else ():
         try:
             trial = read_trial(path, home.parent, settings)
-        except _UnusableError as reason:
+        except UnusableError as reason:
             if (path / RESULTS).exists():  # others failed, and showed nothing
                 warnings.append(f"{path.relative_to(home.parent)}: {one_line(str(reason))}")
             continue
@@ -456,31 +456,31 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     return views
 
 
-class _UnusableError(Exception):
+class UnusableError(Exception):
     """A folder is not a usable trial; the text says why."""
 
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
-    """Read and check one trial folder; raises `_UnusableError`."""
+    """Read and check one trial folder; raises `UnusableError`."""
     try:
         require_no_links(runs_dir, path, below=True)
         folder = TrialFolder(path)
         record = folder.record()
         if change := folder.change():
-            raise _UnusableError(
+            raise UnusableError(
                 f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
             )
     except FileNotFoundError:
-        raise _UnusableError(_why_unfinished(path)) from None
+        raise UnusableError(_why_unfinished(path)) from None
     except UnfinishedError as error:
-        raise _UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
+        raise UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
     except DamagedError as error:
-        raise _UnusableError(f"damaged, {error.path.name} {error.reason}") from None
+        raise UnusableError(f"damaged, {error.path.name} {error.reason}") from None
     except InputError as error:
-        raise _UnusableError(f"strange, {error}") from None
+        raise UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
-        raise _UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
+        raise UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
     recorded = {
         "experiment": record.experiment,
         "scene": record.scene,
@@ -490,7 +490,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
     names = (path.relative_to(runs_dir).parts[0], *path.parts[-3:-1], match["seed"])
     for (key, value), name in zip(recorded.items(), names, strict=True):
         if value != name:
-            raise _UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
+            raise UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
 
 
