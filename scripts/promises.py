@@ -425,53 +425,70 @@ def attempt(declaration: Declaration, made: Sequence[TrialResult]) -> Verdict:
     return verdict
 
 
-def night(
-    captures: int, retried: float, correlation: float, ideas: int = 40, seeds: int = 6
-) -> Draw:
+def keys_of(name: str, captures: int) -> dict[str, str]:
+    """The trials of an arm by scene."""
+    return {f"scene{k}": trial_key(f"scene{k}", f"sfm-{name}", "aaaa") for k in range(captures)}
+
+
+def opened_ledger(captures: int, seeds: int, least: float = 0.05) -> records.Opened:
+    return records.Opened(
+        time=TIME,
+        metric=METRIC,
+        sign=1,
+        least=least,
+        ideas=rules.IDEAS,
+        rate=rules.RATE,
+        seeds=tuple(range(seeds)),
+        words=(),
+        keys=keys_of("adc", captures),
+    )
+
+
+def with_idea(entries: Sequence[records.Entry], name: str, captures: int) -> records.Ledger:
+    """The ledger with a further idea, which has begun."""
+    started = records.Started(
+        time=TIME,
+        idea=name,
+        against=records.BASELINE,
+        level=rules.next_level(records.Ledger(tuple(entries), "")),
+        identity=name,
+        words=(),
+        keys=keys_of(name, captures),
+    )
+    return records.Ledger((*entries, started), "")
+
+
+def first_idea(captures: int, seeds: int, gain: float) -> Draw:
+    """The first idea of a ledger, with a ``gain`` that is the least that matters; 1 if kept."""
+    book = with_idea([opened_ledger(captures, seeds, gain)], "arm0", captures)
+    asked = rules.declaration_of(book, "arm0")
+
+    def draw(rng: Rng) -> float:
+        verdict = attempt(asked, arms(rng, noise_of(captures, 1.0), seeds, [gain]))
+        return float(rules.result_of(verdict) == records.KEPT)
+
+    return draw
+
+
+def night(captures: int, retried: float, correlation: float, seeds: int = 6) -> Draw:
     """A night of ideas without any effect; 1 if an idea is kept.
 
     A share of them are other tries of what looked best so far, with correlated noise.
     """
-    keys = {
-        name: {f"scene{k}": trial_key(f"scene{k}", f"sfm-{name}", "aaaa") for k in range(captures)}
-        for name in ("adc", *(f"idea{k}" for k in range(ideas)))
-    }
-    opened = records.Opened(
-        time=TIME,
-        metric=METRIC,
-        sign=1,
-        least=0.05,
-        ideas=ideas,
-        rate=0.1,
-        seeds=tuple(range(seeds)),
-        words=(),
-        keys=keys["adc"],
-    )
 
     def draw(rng: Rng) -> float:
-        entries: list[records.Entry] = [opened]
+        entries: list[records.Entry] = [opened_ledger(captures, seeds)]
         noise, shape = 0.1 * math.sqrt(0.5), (captures, seeds)
         baseline = trials("adc", 25 + noise * rng.standard_normal(shape))
         best, best_noise = -math.inf, np.zeros(shape)
-        for number in range(ideas):
+        for number in range(rules.IDEAS):
             name, own = f"idea{number}", rng.standard_normal(shape)
             if math.isfinite(best) and rng.random() < retried:
                 own = correlation * best_noise + math.sqrt(1 - correlation**2) * own
-            book = records.Ledger(tuple(entries), "")
-            started = records.Started(
-                time=TIME,
-                idea=name,
-                against=records.BASELINE,
-                level=rules.next_level(book),
-                identity=name,
-                words=(),
-                keys=keys[name],
-            )
-            entries.append(started)
-            book = records.Ledger(tuple(entries), "")
+            book = with_idea(entries, name, captures)
             made = [*baseline, *trials(name, 25 + noise * own)]
             verdict = attempt(rules.declaration_of(book, name), made)
-            entries.append(rules.end_of(name, verdict, TIME))
+            entries = [*book.entries, rules.end_of(name, verdict, TIME)]
             if rules.result_of(verdict) == records.KEPT:
                 return 1.0  # of ideas without an effect, the first one kept makes the share 1
             if verdict.mean is not None and verdict.mean > best:
@@ -512,6 +529,8 @@ def planned(command: str, difference: float) -> Draw:
         return sweep(3, seeds, 1.0, difference / 0.1 * math.sqrt(3 * seeds))
     if command == "gate":
         return gate(3, seeds, difference, gates.WORSE)
+    if command == "ledger":
+        return first_idea(3, seeds, difference)
     return check(3, seeds, 1.0, difference, claims)
 
 
@@ -520,6 +539,9 @@ PURPOSES = {
     "looks": Purpose(looks=True),
     "check": Purpose(0.05 / 4, looks=True),
     "gate": Purpose(looks=True),
+    "ledger": Purpose(
+        2 * rules.RATE / rules.RETRIES / rules.IDEAS, looks=True, give_up=rules.GIVE_UP
+    ),
 }
 
 

@@ -518,6 +518,32 @@ def test_other_code_on_the_same_seeds_under_another_name_is_named_everywhere(
         assert (line in text) == named
 
 
+@pytest.mark.parametrize("looks", [False, True])
+def test_a_capture_under_two_names_is_one_scene(tmp_path, looks):
+    first, second = grid("adc"), grid("mine")
+    trials = [*first, *second]
+    write(tmp_path, [*trials, *(replace(one, scene="b") for one in trials)])
+    if looks:
+        declare_looks(tmp_path, (first, second), scenes="ab")
+    before = answer(tmp_path).answers[0].verdicts[0]
+    for file in (tmp_path / "exp" / "b").glob("*/*/results.json"):
+        data = json.loads(file.read_text())
+        data["hashes"]["data"] = "data-a"
+        file.write_text(json.dumps(data))
+    found = answer(tmp_path)
+    verdict, note = found.answers[0].verdicts[0], "b has the photographs of a, so it is no further"
+    assert note in "\n".join(texts(found.remarks)) + found.sentences[0]
+    assert len(before.pairs.rows) == 2
+    assert (verdict.untestable is not None) == looks
+    assert looks or verdict.pairs.scenes == ("a",)
+
+
+def test_a_seed_that_only_one_of_two_verdicts_uses_is_named(tmp_path):
+    write(tmp_path, [*grid("adc"), *grid("mine"), *grid("more", seeds=2)])
+    line = "sfm-more against sfm-adc: without exp/a/sfm-adc/"
+    assert [text for text in texts(answer(tmp_path).remarks) if text.startswith(line)]
+
+
 @pytest.mark.parametrize("differs", [False, True])
 def test_settings_without_an_effect_are_named(tmp_path, differs):
     arms = [grid("momentum", decay=decay) for decay in (0.9, 0.99)]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import reduce
 from pathlib import Path
 
+from gsbench.analysis.attempts import places_of
 from gsbench.analysis.results import TrialResult, group_by
 from gsbench.parsing import DamagedError, read_json
 from gsbench.runs.experiments import Planned, merge_planned, read_declarations
@@ -56,9 +57,11 @@ def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialRes
     It repeats the words of the trials' own commands, as the experiment's plan records them. If
     the plan does not have them, only the words to add are named.
     """
-    added, trials = equal_counts_words(baseline, arm), (*baseline, *arm)
+    added = equal_counts_words(baseline, arm)
     if not added:
         return ""
+    both = places_of(baseline) & places_of(arm)
+    trials = [one for one in (*baseline, *arm) if (one.scene, one.seed) in both]
     home = baseline[0].path.parents[2]
     planned = _planned_words(home)
     if not all(planned.get(trial.path) for trial in trials):

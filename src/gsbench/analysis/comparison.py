@@ -124,7 +124,31 @@ class Comparison:
         # Where an arm has no verdict at all, its sentence says why.
         asked = {arm for one in self.answers if one.verdicts for arm in (one.first, one.second)}
         trials = [trial for trial in self.trials if trial.arm in asked]
-        return [*self.arms.uncompared, *unused_trials(trials, verdicts)]
+        return [*self.arms.uncompared, *unused_trials(trials, verdicts), *self._apart]
+
+    @property
+    def _apart(self) -> list[Note]:
+        """Notes on trials that some verdicts on their arm use, and others do not."""
+        used = {
+            (one.first, one.second): {
+                trial.path for verdict in one.verdicts for trial in verdict.pairs.trials
+            }
+            for one in self.answers
+            if one.verdicts
+        }
+        anywhere, apart = set(itertools.chain(*used.values())), dict[tuple[Arm, tuple[str, ...]], list[Arm]]()
+        for (first, second), own in used.items():
+            beside = tuple(
+                trial.label
+                for trial in self.trials
+                if trial.arm in (first, second) and trial.path in anywhere - own
+            )
+            if beside:
+                apart.setdefault((first, beside), []).append(second)
+        return [
+            Note.of("judged apart", arms=arms, baseline=first, trials=trials)
+            for (first, trials), arms in apart.items()
+        ]
 
     @cached_property
     def remarks(self) -> list[Note]:

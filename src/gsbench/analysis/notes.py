@@ -44,6 +44,7 @@ SENTENCES: dict[str, str] = {
     # ---- pairs of trials that cannot be compared
     "unlike": "{text}",  # the whole text of an error
     "conditions": "{scene}: the arms differ in {conditions:list}, so they are not compared",
+    "same capture": "{scene} has the photographs of {other}, so it is no further scene",
     "unpaired": "{scene}: seed {seed} has no partner",
     "valueless": "{places:few} not compared: {reason}",
     "no direction": "in no verdict, {reason}",
@@ -73,6 +74,10 @@ SENTENCES: dict[str, str] = {
         "{arm} is not compared: other arms have a baseline with settings nearer to theirs."
     ),
     "unused": "In no verdict: {trials:few} ({reasons:few}).",
+    "judged apart": (
+        "{arms:few} against {baseline}: without {trials:few}, which are in other verdicts and in "
+        "tables."
+    ),
     "not planned": "seeds after an undeclared or missing one do not count",
     "waits": "a look waits for all of its trials",
     "decided before": "the question was decided with {seeds:n seed}",
