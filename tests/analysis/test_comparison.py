@@ -344,6 +344,17 @@ def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
     assert set(before) < set(after.sentences)
 
 
+def test_initialisers_stay_compared_when_an_arm_is_added(tmp_path):
+    other = [replace(one, init="random", day=3) for one in grid("adc")]
+    write(tmp_path, [*grid("adc"), *other])
+    (before,) = answer(tmp_path).sentences
+    assert before.startswith("random-adc against sfm-adc")
+    write(tmp_path, grid("mine", day=4))
+    assert before in answer(tmp_path).sentences
+    write(tmp_path, [replace(one, init="random", day=5) for one in grid("mine")])
+    assert before in answer(tmp_path).sentences
+
+
 @pytest.mark.parametrize(
     "arms, pairs, named",
     [
@@ -507,7 +518,7 @@ def test_other_code_on_the_same_seeds_under_another_name_is_named_everywhere(
     write(tmp_path, [*grid("adc"), *grid("mine", code=NEW)])
     write(tmp_path, there, "tried")
     found = answer(tmp_path)
-    line = "tried measured sfm-mine on the same scenes and seeds by other code."
+    line = "Also measured by other code on these scenes and seeds: sfm-mine, in tried."
     for text in (
         "\n".join(texts(found.remarks)),
         "\n".join(build_table(found.experiment).notes),
@@ -540,8 +551,8 @@ def test_a_capture_under_two_names_is_one_scene(tmp_path, looks):
 
 def test_a_seed_that_only_one_of_two_verdicts_uses_is_named(tmp_path):
     write(tmp_path, [*grid("adc"), *grid("mine"), *grid("more", seeds=2)])
-    line = "sfm-more against sfm-adc: without exp/a/sfm-adc/"
-    assert [text for text in texts(answer(tmp_path).remarks) if text.startswith(line)]
+    line = "which other verdicts and tables use: sfm-more against sfm-adc."
+    assert line in "\n".join(texts(answer(tmp_path).remarks))
 
 
 @pytest.mark.parametrize("differs", [False, True])
@@ -557,7 +568,7 @@ def test_settings_without_an_effect_are_named(tmp_path, differs):
         (copied / "config.yaml").write_text(json.dumps(config))
     if differs:
         gain(tmp_path, arms[1][:1])
-    note = "sfm-momentum[decay=0.9] and sfm-momentum[decay=0.99] gave the same bits in all trials"
+    note = "scene and seed: sfm-momentum[decay=0.9] and sfm-momentum[decay=0.99]."
     said = "\n".join(texts(answer(tmp_path).remarks))
     assert (note in said) != differs
 
@@ -752,6 +763,9 @@ ADDED = {
     ],
     "an arm of another initialiser": lambda made: [
         replace(one, init="random", densify="mine", options=(), day=2) for one in made.trials[:2]
+    ],
+    "the baseline of another initialiser": lambda made: [
+        replace(one, init="random", code="", day=9) for one in made.baseline
     ],
     "a scene that only one arm has": lambda made: [replace(made.trials[-1], scene="z")],
     "a setting of another arm": lambda made: [

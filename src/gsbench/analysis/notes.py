@@ -75,8 +75,8 @@ SENTENCES: dict[str, str] = {
     ),
     "unused": "In no verdict: {trials:few} ({reasons:few}).",
     "judged apart": (
-        "{arms:few} against {baseline}: without {trials:few}, which are in other verdicts and in "
-        "tables."
+        "Judged without {trials:few}, which other verdicts and tables use: {arms:few} against "
+        "{baseline}."
     ),
     "not planned": "seeds after an undeclared or missing one do not count",
     "waits": "a look waits for all of its trials",
@@ -130,12 +130,12 @@ SENTENCES: dict[str, str] = {
         "Do not stop here because the result pleases: that finds effects that do not exist."
     ),
     "elsewhere": (
-        "{experiments:all} measured {arm} on the same scenes and seeds by other code. Each name has "
-        "an error rate of its own: whoever reports the better version errs more often."
+        "Also measured by other code on these scenes and seeds: {arm}, in {experiments:all}. Each "
+        "name has an error rate of its own, so whoever reports the better version errs more often."
     ),
     "same bits": (
-        "{arms:all} gave the same bits in all trials of the same scene and seed: the settings in "
-        "which they differ had no effect, so there is nothing to compare."
+        "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
+        "differ had no effect, so there is nothing to compare."
     ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation.",

@@ -301,17 +301,16 @@ def choose_pairs(
 def baseline_settings(
     arms: Sequence[Arm], ages: Mapping[Arm, float], baseline: str = BASELINE
 ) -> list[tuple[Arm, Arm]]:
-    """The pairs of the baseline's own settings: the oldest of each initialiser, and each other.
+    """The pairs of the baseline's own settings and initialisers: the oldest, and each other.
 
-    They are compared whatever other arms there are, so that a further arm takes no verdict away.
+    Settings are compared within an initialiser. All this is compared whatever other arms there are,
+    so that a further arm takes no verdict away.
     """
-    pairs = []
-    for own in group_by(
-        [arm for arm in arms if arm.densify == baseline], lambda arm: arm.init
-    ).values():
-        oldest = min(own, key=lambda arm: ages.get(arm, 0.0))
-        pairs += [(oldest, arm) for arm in own if arm != oldest]
-    return pairs
+    of_baseline = [arm for arm in arms if arm.densify == baseline]
+    by_init = group_by(sorted(of_baseline, key=lambda arm: ages.get(arm, 0.0)), lambda arm: arm.init)
+    oldest = [own[0] for own in by_init.values()]
+    pairs = [(own[0], arm) for own in by_init.values() for arm in sorted(own[1:])]
+    return pairs + [(oldest[0], arm) for arm in sorted(oldest[1:])]
 
 
 def _unlike(arm: Arm, other: Arm, settings: Mapping[Arm, Mapping[str, Any]]) -> int:
