@@ -22,6 +22,7 @@ from scipy import stats
 from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
+from gsbench.analysis.quantities import quantity
 from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_all_trials, load_experiment
 from gsbench.analysis.statistics import t_test
@@ -42,6 +43,7 @@ from tests.conftest import script
 
 DECLARED_AT = "2026-01-01T00:00:00Z"
 OLD, NEW = "1" * 64, "2" * 64
+EXAMPLES = int(os.environ.get("GSBENCH_EXAMPLES", "0"))  # of random experiments
 
 
 @dataclass(frozen=True)
@@ -792,9 +794,7 @@ def outcomes(comparison):
 
 @pytest.mark.parametrize("what", ADDED)
 def test_what_is_added_never_changes_another_verdict(what):
-    examples = 500 if os.environ.get("GSBENCH_EXAMPLES") else 12
-
-    @settings(max_examples=examples, deadline=None)
+    @settings(max_examples=EXAMPLES or 12, deadline=None)
     @given(experiments(), st.booleans())
     def check(made, other_metric):
         runs = Path(tempfile.mkdtemp())
@@ -825,7 +825,7 @@ def test_what_is_added_never_changes_another_verdict(what):
     check()
 
 
-@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
+@settings(max_examples=EXAMPLES or 8, deadline=None)
 @given(experiments())
 def test_forgetting_earlier_code_never_changes_a_verdict(made):
     runs = Path(tempfile.mkdtemp())
@@ -855,7 +855,7 @@ def check_all_is_named(comparison):
         assert known or str(trial.arm) in named or label in named or " more" in named
 
 
-@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
+@settings(max_examples=EXAMPLES or 8, deadline=None)
 @given(experiments())
 def test_all_surfaces_state_the_same(made):
     runs = Path(tempfile.mkdtemp())
@@ -878,7 +878,32 @@ def test_all_surfaces_state_the_same(made):
         shutil.rmtree(runs)
 
 
-@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 12, deadline=None)
+@settings(max_examples=EXAMPLES or 8, deadline=None)
+@given(experiments())
+def test_a_metric_where_lower_is_better_gives_the_mirrored_verdict(made):
+    scale = quantity("flip", []).worthwhile / quantity("psnr", []).worthwhile
+    runs = Path(tempfile.mkdtemp())
+    try:
+        replace(made, declared=[], looks=[]).write(runs)
+        for file in runs.glob("exp/*/*/*/results.json"):
+            data, moment = json.loads(file.read_text()), file.stat().st_mtime
+            if "psnr" in data["metrics"]:
+                data["metrics"]["flip"] = 1 - scale * data["metrics"]["psnr"]
+            file.write_text(json.dumps(data))
+            os.utime(file, (moment, moment))
+        for pair in answer(runs).answers:
+            by_metric = {one.question.metric: one for one in pair.verdicts}
+            if "psnr" in by_metric:
+                one, other = by_metric["psnr"], by_metric["flip"]
+                assert (one.outcome, one.pairs.seeds) == (other.outcome, other.pairs.seeds)
+                if one.interval is not None:
+                    mirrored = [-scale * one.interval.high, -scale * one.interval.low]
+                    assert [other.interval.low, other.interval.high] == pytest.approx(mirrored)
+    finally:
+        shutil.rmtree(runs)
+
+
+@settings(max_examples=EXAMPLES or 12, deadline=None)
 @given(experiments(), st.randoms(use_true_random=False))
 def test_the_order_of_commands_does_not_matter(made, shuffler):
     found = []

@@ -35,7 +35,7 @@ from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.claims.test_check import content
 
 EARLY, LEAST = "2020-01-01T00:00:00Z", 0.1
-EXAMPLES = 500 if os.environ.get("GSBENCH_EXAMPLES") else 12
+EXAMPLES = int(os.environ.get("GSBENCH_EXAMPLES", "12"))
 
 
 @st.composite

@@ -6,7 +6,7 @@ arms, and a line for each arm and trial that no verdict uses.
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -253,7 +253,8 @@ def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) ->
     found = []
     for own in group_by(left_out, lambda trial: trial.arm).values():
         asked = [one for one in verdicts if any(_asks(one.question, trial) for trial in own)]
-        reasons = [reason for verdict in asked for reason in _reasons(verdict)]
+        scenes = {trial.scene for trial in own}
+        reasons = [reason for verdict in asked for reason in _reasons(verdict, scenes)]
         if not reasons:
             reasons = [Note.of("not planned" if asked else "not asked").sentence]
         labels = [trial.label for trial in own]
@@ -268,9 +269,10 @@ def _asks(question: Question, trial: TrialResult) -> bool:
     return trial.arm in (question.baseline, question.arm)
 
 
-def _reasons(verdict: Verdict) -> list[str]:
-    """The reasons why a verdict leaves trials of its question out."""
-    reasons = [note.sentence for note in (verdict.untestable, *verdict.notes) if note]
+def _reasons(verdict: Verdict, scenes: Collection[str]) -> list[str]:
+    """The reasons why a verdict leaves trials of its question on these scenes out."""
+    notes = [note for note in (verdict.untestable, *verdict.notes) if note]
+    reasons = [one.sentence for one in notes if dict(one.facts).get("scene") in (None, *scenes)]
     if verdict.question.seeds and verdict.answer is not None and verdict.final:
         reasons.append(Note.of("decided before", seeds=verdict.pairs.seeds).sentence)
     if not reasons and verdict.question.seeds and verdict.answer is None:
