@@ -2,10 +2,10 @@
 
 import calendar
 import json
-from dataclasses import replace
 import os
 import shutil
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest

@@ -136,18 +136,16 @@ class Comparison:
             for one in self.answers
             if one.verdicts
         }
-        anywhere, apart = set(itertools.chain(*used.values())), dict[tuple[Arm, tuple[str, ...]], list[Arm]]()
-        for (first, second), own in used.items():
-            beside = tuple(
-                trial.label
-                for trial in self.trials
-                if trial.arm in (first, second) and trial.path in anywhere - own
-            )
+        anywhere = set().union(*used.values())
+        apart: dict[tuple[Arm, tuple[str, ...]], list[Arm]] = {}
+        for pair, own in used.items():
+            beside = [one for one in self.trials if one.arm in pair and one.path in anywhere - own]
             if beside:
-                apart.setdefault((first, beside), []).append(second)
+                labels = tuple(trial.label for trial in beside)
+                apart.setdefault((pair[0], labels), []).append(pair[1])
         return [
-            Note.of("judged apart", arms=arms, baseline=first, trials=trials)
-            for (first, trials), arms in apart.items()
+            Note.of("judged apart", arms=arms, baseline=first, trials=labels)
+            for (first, labels), arms in apart.items()
         ]
 
     @cached_property
@@ -239,8 +237,10 @@ def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
         both = places[one].keys() & places[two].keys()
         same = (one.init, one.densify) == (two.init, two.densify) and both
         known = itertools.chain(*equal.values())
-        if same and one not in known and all(
-            are_equal(places[one][place], places[two][place]) for place in both
+        if (
+            same
+            and one not in known
+            and all(are_equal(places[one][place], places[two][place]) for place in both)
         ):
             equal.setdefault(one, [one]).append(two)
     return [Note.of("same bits", arms=own) for own in equal.values()]

@@ -307,7 +307,9 @@ def baseline_settings(
     so that a further arm takes no verdict away.
     """
     of_baseline = [arm for arm in arms if arm.densify == baseline]
-    by_init = group_by(sorted(of_baseline, key=lambda arm: ages.get(arm, 0.0)), lambda arm: arm.init)
+    by_init = group_by(
+        sorted(of_baseline, key=lambda arm: ages.get(arm, 0.0)), lambda arm: arm.init
+    )
     oldest = [own[0] for own in by_init.values()]
     pairs = [(own[0], arm) for own in by_init.values() for arm in sorted(own[1:])]
     return pairs + [(oldest[0], arm) for arm in sorted(oldest[1:])]

@@ -348,8 +348,7 @@ def of_latest_metric(sweeps: Sequence[Declaration]) -> tuple[Declaration, ...]:
     return tuple(
         one
         for one in sweeps
-        if one is latest
-        or (one.primary == latest.primary and one.moment > max(others, default=-1))
+        if one is latest or (one.primary == latest.primary and one.moment > max(others, default=-1))
     )
 
 

@@ -44,13 +44,12 @@ DEFAULT_METRIC = "psnr"
 MOST_QUESTIONS = 10_000
 # what `plan` answers for each command
 PLANNED = {
-    "sweep": "Planned for a sweep: each question errs in {:.3g} %, and all seeds are judged at once.",
+    "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
     "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
-    "check": "Planned for a check of claims: each claim errs in {:.3g} %. It is shown for each, not "
-    "for all at once.",
+    "check": "Planned for a check: each claim errs in {:.3g} %, and is shown by itself.",
     "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
-    "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter of "
-    "the ideas were tested and none was kept.",
+    "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
+    "of the ideas were tested and none was kept.",
 }
 NEW_TRIALS = (
     "Train all of them with seeds that the pilot does not have (it has {}), under another name: "

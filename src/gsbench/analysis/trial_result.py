@@ -1,0 +1,209 @@
+"""A complete trial as tables and verdicts see it: its record, settings, code and conditions."""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.trial_settings import Configurations, canonical, config_if_readable
+from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
+from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
+from gsbench.runs.layout import RESULTS
+from gsbench.runs.nested import SHOWN
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, split_text
+from gsbench.system.machine import kind_of_machine
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """One complete trial.
+
+    ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings``
+    reads the configurations of its experiment.
+    """
+
+    path: Path
+    config_hash: str
+    record: TrialRecord = field(repr=False)
+    # swept settings that distinguish arms of one initialiser and densifier
+    variant: tuple[tuple[str, str], ...] = ()
+    settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+
+    @property
+    def experiment(self) -> str:
+        return self.record.experiment
+
+    @property
+    def scene(self) -> str:
+        return self.record.scene
+
+    @property
+    def init(self) -> str:
+        return self.record.init
+
+    @property
+    def densify(self) -> str:
+        return self.record.densify
+
+    @property
+    def seed(self) -> int:
+        return self.record.seed
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """The means of metrics over the test views."""
+        return self.record.metrics
+
+    @property
+    def unavailable(self) -> Mapping[str, str]:
+        """The reasons why metrics are missing."""
+        return self.record.unavailable
+
+    @cached_property
+    def arm(self) -> Arm:
+        """The trial's arm in comparisons."""
+        return Arm(self.init, self.densify, self.variant)
+
+    @property
+    def label(self) -> str:
+        """Experiment, scene, arm and folder: enough to find the trial."""
+        return f"{self.experiment}/{self.scene}/{self.init}-{self.densify}/{self.path.name}"
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The settings that determine the result, with dotted keys; empty if unreadable.
+
+        They are read once for all trials that share them; `whole_config` is read from the trial's
+        own file.
+        """
+        return self.settings.shared(self.key, self.path)
+
+    @cached_property
+    def key(self) -> str:
+        """The folder in the experiment without the seed, ``<scene>/<init>-<densify>/<hash8>``.
+
+        Trials that differ only in their seeds share it.
+        """
+        return trial_key(self.scene, f"{self.init}-{self.densify}", self.config_hash)
+
+    @cached_property
+    def whole_config(self) -> Mapping[str, Any]:
+        """Every setting with dotted keys, also those that change no result; empty if unreadable."""
+        return config_if_readable(self.path)
+
+    @cached_property
+    def folder(self) -> TrialFolder:
+        """The files of the trial."""
+        return TrialFolder(self.path)
+
+    @cached_property
+    def code(self) -> dict[Part, str]:
+        """The versions of the code that made the trial; empty if another program made it."""
+        return code_of(self.record.code)
+
+    @property
+    def code_texts(self) -> list[str]:
+        """``code of mine 3fa9c1d2`` for each of the user's modules and of gsbench's stages."""
+        shown = [part for part in self.code if part.kind != "package"]
+        return [f"{part} {self.code[part]:.{SHOWN}}" for part in shown]
+
+    @cached_property
+    def edits(self) -> list[Change]:
+        """The user's modules that were edited since, as far as they are found from here."""
+        modules = {part: made for part, made in self.code.items() if part.kind == "module"}
+        return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
+
+    @property
+    def finished(self) -> float:
+        """The Unix time at which the trial was finished."""
+        return (self.path / RESULTS).stat().st_mtime
+
+    @cached_property
+    def machine(self) -> str | None:
+        """The kind of machine that trained the trial, in a phrase; None if it was not recorded."""
+        try:
+            return None if self.record.machine is None else kind_of_machine(self.record.machine)
+        except KeyError:
+            return None
+
+    @property
+    def cloud(self) -> str:
+        """The hash of the initial model's files (cameras, poses, points); "" if unrecorded."""
+        return self.record.hashes.get("cloud", "")
+
+    @cached_property
+    def measured(self) -> float:
+        """The Unix time of measuring the metrics; if unrecorded, that of the file."""
+        moment = unix_time(self.record.measured)
+        return self.finished if moment is None else moment
+
+    @cached_property
+    def conditions(self) -> Mapping[str, str]:
+        """The conditions that trials must share before they are averaged, as text."""
+        conditions = {
+            "protocol": self.record.protocol,
+            "resolution": "x".join(map(str, self.record.resolution or (None,))),
+            "data": str(self.record.hashes.get("data")),
+        }
+        if self.split:
+            conditions["split"] = self.split
+        if not self.from_renders:
+            conditions["raster"] = self.record.raster
+        if not self.made_elsewhere:
+            conditions["iterations"] = str(self.record.iterations)
+        if not self.made_elsewhere and not self.program:
+            conditions["budget"] = (
+                "null" if self.record.budget is None else canonical(asdict(self.record.budget))
+            )
+        return conditions
+
+    @cached_property
+    def split(self) -> str:
+        """The rule that holds views out, as short text; "" if nothing tells it."""
+        if self.record.split:
+            return self.record.split
+        return split_text(self.config) if self.config.get("scene.split") else ""
+
+    @cached_property
+    def question(self) -> str:
+        """The question of the held-out views, interpolation or extrapolation; "" for a list."""
+        kind = re.split("[ ,]", self.split, maxsplit=1)[0]
+        return QUESTIONS.get(kind, "")
+
+    @property
+    def from_renders(self) -> bool:
+        """Return whether another program's renders were measured, without its model."""
+        return self.record.evaluated_from == FROM_RENDERS
+
+    @property
+    def made_elsewhere(self) -> bool:
+        """Return whether model or renders come from elsewhere: no time or budget is known."""
+        return self.record.evaluated_from is not None and not self.program
+
+    @property
+    def program(self) -> str:
+        """The name of the program that gsbench ran to train this trial; "" if gsbench ran none."""
+        return "" if self.record.trained_by is None else self.record.trained_by.program
+
+    @property
+    def trainer_version(self) -> str:
+        """The version of `program`; "" without one."""
+        return "" if self.record.trained_by is None else self.record.trained_by.version
+
+    @property
+    def budget_acted(self) -> bool:
+        """Return whether a cap on Gaussians or a time limit may have changed the result."""
+        if self.made_elsewhere or self.program:
+            return False
+        budget, events = self.record.budget, self.record.events
+        if budget is None or not events:
+            return True
+        return (
+            budget.cap == "governor"
+            or budget.seconds is not None
+            or events.get("blocked_by_cap") != 0
+        )
