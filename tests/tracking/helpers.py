@@ -89,7 +89,7 @@ def write_trial(folder, values, records=RECORDS, psnr=20.0):
         "events": {"cloned": 150},
         "protocol": "paper-1",
         "raster": "cpu",
-        "hashes": {"config": "abc", "data": "0123456789abcdef" * 4},
+        "hashes": {"config": "abc", "data": f"data of {values['scene']['name']}"},
         "train_views": 20,
         "test_views": 3,
         "init_report": {
