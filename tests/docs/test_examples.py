@@ -66,7 +66,7 @@ def folder(tmp_path, monkeypatch):
         "llff",
         "mine",
         "shell",
-        "untiled",
+        "oversampled",
     ):  # of other tests, or of another document
         monkeypatch.delitem(sys.modules, name, raising=False)
     before = set(sys.modules)
@@ -98,8 +98,8 @@ def test_the_densifier_of_its_document_runs(folder):
 
 def test_the_rasterizer_of_its_document_runs(folder):
     run_blocks(ROOT / "docs" / "rasterizer.md", folder)
-    run_command("rasterizer.md", "raster._target_=untiled.Untiled")
-    assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
+    run_command("rasterizer.md", "raster._target_=oversampled.Oversampled")
+    assert len(list(Path("runs").glob("oversampled/courtyard/*/*/results.json"))) == 1
 
 
 def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
