@@ -17,6 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = {
+    "README.md": "first_steps.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "CODE_OF_CONDUCT.md": "conduct.md",
@@ -25,6 +26,7 @@ PAGES = {
     "findings/simulations.md": "findings/simulations.md",
 }  # file of the repository: page of the site
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
+PICTURE = re.compile(r"(!\[[^\]]*\]\()docs/")  # the README's, from the root
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 # page: the part that `reference.py` or `fidelity.py` adds to its end
 GENERATED = {"settings.md": "settings", "results.md": "results", "fidelity.md": "fidelity"}
@@ -59,8 +61,6 @@ def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
 
 def page_of(name: str) -> str | None:
     """The page of the site that a file of the repository becomes; None for other files."""
-    if name == "README.md":
-        return "index.md"
     if name.startswith("docs/"):
         return name.removeprefix("docs/")
     return name if name.startswith("findings/") and name.endswith(".md") else PAGES.get(name)
@@ -95,6 +95,7 @@ def write_pages(target: Path, repository: str | None) -> None:
         text = path.read_text(encoding="utf-8")
         if name.removeprefix("docs/") in GENERATED:
             text += "\n" + parts[GENERATED[name.removeprefix("docs/")]]()
+        text = PICTURE.sub(r"\1", text)
         place.write_text(with_site_links(text, path.parent, repository), encoding="utf-8")
     (target / "api.md").write_text(reference.api_page(), encoding="utf-8")
     (target / "results.schema.json").write_text(reference.schema_text(), encoding="utf-8")
