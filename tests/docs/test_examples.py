@@ -227,7 +227,7 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
     def rounds(state, first, last):
         """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given."""
         densifier = largest.SplitLargest(
-            start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
+            start=0, stop=100, interval=1, size=0.05, prune_opacity=0.3
         )
         context, rates = DensifyContext(2.0), LearningRates()
         if state is None:
@@ -318,21 +318,18 @@ def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
     from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
 
-    (code,) = (
-        b
-        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
-        if b.startswith("# opaque.py")
-    )
-    (folder / "opaque.py").write_text(code)
-    import opaque
+    run_blocks(ROOT / "docs" / "densifier.md", folder)
+    from largest import SplitLargest
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
-    densifier = opaque.CloneOpaque(start=0, stop=500, max_gaussians=150, cap="governor")
+    densifier = SplitLargest(
+        start=0, stop=500, max_gaussians=150, cap="governor", prune_opacity=0.0
+    )
     densifier.begin(gaussians, DensifyContext(1.0))
     trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
     for step in (100, 200, 300, 400):
+        densifier.statistics["seen"][:] = True
         event = densifier.refine(step, trainable, rng)
-        trainable.values.opacity_logits.data += 0.1 * torch.randn(len(trainable), generator=rng)
     assert abs(event.after - 150) <= 3
 
 
