@@ -174,7 +174,11 @@ def _run(check: Check) -> None:
 
 def plan(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
-    parser = ArgumentParser("plan", "An estimate from an experiment's trials, for 80 % power.")
+    parser = ArgumentParser(
+        "plan",
+        "An estimate from an experiment's trials, for 80 % power. The seeds are new ones: those of "
+        "the trials are seen (docs/verdict.md).",
+    )
     parser.add_argument("experiment")
     parser.add_argument(
         "--for",
