@@ -1,4 +1,4 @@
-"""How far each arm is from a restatement of its source: the table of the site's page *Fidelity*.
+"""The table of the page on fidelity: how far each arm is from a restatement of its source.
 
     python scripts/fidelity.py              print it, from the facts at the ends of conf/densify/*.yaml
     python scripts/fidelity.py --measure    measure each largest difference anew
