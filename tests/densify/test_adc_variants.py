@@ -187,8 +187,7 @@ def test_views_that_see_only_an_edge_do_not_lower_the_mean_gradient():
 def test_under_a_hard_cap_pixel_gs_grows_the_largest_weighted_gradients():
     densifier = PixelGS(max_gaussians=COUNT + 5, cap="hard", prune_opacity=0.0)
     trainable, views = started(1, densifier)
-    event = densifier.refine(600, trainable, generator())
-    assert event.after == COUNT + 5
+    assert densifier.refine(600, trainable, generator()).after == COUNT + 5
     parents = densifier.lineage.state_dict()["parents"][COUNT:].unique()
     largest = np.argsort(-views.mean_gradient(0.37), kind="stable")[:5]
     assert sorted(parents.tolist()) == sorted(largest.tolist())
@@ -340,8 +339,7 @@ def test_under_a_hard_cap_steep_gs_splits_the_least_eigenvalues_first():
     assert (event.split_gradient, event.after) == (3, 63)
     assert event.blocked_by_cap > 0
     kept = {tuple(row) for row in trainable.values.sh_dc.detach()[:57].tolist()}
-    gone = {i for i in range(60) if tuple(before[i].tolist()) not in kept}
-    assert gone == set(order[:3])
+    assert {i for i in range(60) if tuple(before[i].tolist()) not in kept} == set(order[:3])
 
 
 def test_a_round_of_steep_gs_computes_eigenvectors_once(monkeypatch):

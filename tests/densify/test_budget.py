@@ -64,8 +64,7 @@ def test_bisection_finds_the_factor_that_meets_the_target(seed):
         return int((scores > factor).sum())
 
     best = min(abs(count(f) - target) for f in scores)
-    found = find_factor(count, target, 1e-3, 1e3)
-    assert abs(count(found) - target) == best == 0
+    assert abs(count(find_factor(count, target, 1e-3, 1e3)) - target) == best == 0
     assert find_factor(count, 0, 1e-3, 1e-2) == pytest.approx(1e-2)  # even the strictest has more
     assert find_factor(count, 300, 1e-3, 1e3) == 1e-3  # even the least strict has fewer
 
@@ -153,8 +152,7 @@ def test_the_governor_scales_the_volume_threshold_or_its_size(dimension):
     size = np.cbrt(0.03 / (4 / 3 * np.pi)) * (factor if dimension == 3 else np.cbrt(factor))
     geometric_mean = np.cbrt((sizes / np.where(over & large, 1.6, 1)[:, None]).prod(-1))
     # A Gaussian and its clone have the same volume, and so have the children of a split.
-    copies = np.where(over, 2, 1)
-    assert event.split_volume == copies[geometric_mean > size].sum() > 0
+    assert event.split_volume == np.where(over, 2, 1)[geometric_mean > size].sum() > 0
     assert abs(event.after - event.target) <= 2
 
 

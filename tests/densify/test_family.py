@@ -52,8 +52,7 @@ def test_shared_opacity_preserves_centre_and_integral(copies, opacity):
 
 def test_revised_opacity_of_two_children_equals_the_parent():
     logits = torch.tensor([-4.0, 0.0, 3.0], dtype=torch.float64)
-    child = torch.sigmoid(revised_logits(logits))
-    assert_close(1 - (1 - child) ** 2, torch.sigmoid(logits))
+    assert_close(1 - (1 - torch.sigmoid(revised_logits(logits))) ** 2, torch.sigmoid(logits))
     assert revised_logits(torch.tensor([-40.0])).sigmoid().item() == pytest.approx(1e-6)
     assert_close(faded(logits, 0.3).sigmoid(), 0.3 * logits.sigmoid())
 
@@ -248,8 +247,7 @@ def test_mcmc_shares_an_opacity_among_at_most_fifty_copies():
     densifier, trainable = mcmc_state(2, max_gaussians=200, growth=50.0)
     trainable.values.opacity_logits.data[:] = torch.tensor([-4.0, 8.0])
     opacity = float(trainable.values.opacities[1].detach())
-    event = densifier.refine(600, trainable, generator(0))
-    assert event.added == 100
+    assert densifier.refine(600, trainable, generator(0)).added == 100
     expected = max(1 - (1 - opacity) ** (1 / 50), densifier.min_opacity)
     assert float(trainable.values.opacities[1].detach()) == pytest.approx(expected, rel=1e-9)
 

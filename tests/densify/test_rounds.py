@@ -40,8 +40,7 @@ def observe(densifier, trainable, rng, step):
     gradient, radii = rng.exponential(2e-4, (count, 2)), rng.integers(0, 3, count)
     probe = torch.zeros(count, 3, 3, dtype=torch.float64, requires_grad=True)
     probe.grad = torch.zeros_like(probe)
-    absolute = torch.from_numpy(gradient)
-    densifier.observe(step, rendered(gradient, radii, absolute, extra=probe))
+    densifier.observe(step, rendered(gradient, radii, torch.from_numpy(gradient), extra=probe))
     return gradient, radii
 
 
@@ -187,8 +186,7 @@ def test_opacity_reset_zeroes_the_opacity_moments_only():
     densifier = ADC(start=5000, stop=20_000)
     trainable, _ = prepared(densifier, 1)
     before = trainable.values.detach().map(torch.clone)
-    event = densifier.refine(3000, trainable, generator())
-    assert event.opacity_reset
+    assert densifier.refine(3000, trainable, generator()).opacity_reset
     assert_close(trainable.values.opacities, before.opacities.clamp_max(0.01))
     assert torch.equal(trainable.values.means, before.means)
     assert not trainable.adam["opacity_logits"].first.any()

@@ -158,8 +158,7 @@ def test_draws_are_in_proportion_and_without_replacement():
 
 def started(densifier, seed):
     """Gaussians with moments and mean gradients, in a room with views."""
-    gaussians = random_gaussians(COUNT, seed, log_scale=(-5.0, 0.3))
-    trainable = with_moments(gaussians)
+    trainable = with_moments(random_gaussians(COUNT, seed, log_scale=(-5.0, 0.3)))
     densifier.begin(trainable.values.detach(), DensifyContext(EXTENT, views=Room()))
     gradient = np.random.default_rng(seed).uniform(0, 6e-4, COUNT)
     gathered(densifier, gradient)

@@ -184,7 +184,6 @@ def test_state_can_be_loaded_from_a_checkpoint_on_a_gpu():
     assert again.lineage.ids.tolist() == list(range(4, 9))
     assert again.lineage.state_dict()["ids"].numpy().tolist() == list(range(4, 9))
     like = gaussians.values.means.detach()
-    first = [standard_normal((9, 3), generator(5), like) for _ in range(2)]
-    assert torch.equal(*first)
+    assert torch.equal(*[standard_normal((9, 3), generator(5), like) for _ in range(2)])
     rng = generator(5)
     assert not torch.equal(standard_normal((9, 3), rng, like), standard_normal((9, 3), rng, like))

@@ -125,8 +125,7 @@ def test_the_auto_threshold_does_not_depend_on_the_scale_of_the_scene():
 
 def test_admit_chooses_the_best_scores_and_counts_the_refused():
     candidates = torch.tensor([True, True, False, True])
-    score = torch.tensor([1.0, 3.0, 9.0, 3.0])
-    admitted, refused = admit(candidates, score, 1, 2)
+    admitted, refused = admit(candidates, torch.tensor([1.0, 3.0, 9.0, 3.0]), 1, 2)
     assert admitted.tolist() == [False, True, False, True]
     assert refused == 1
     admitted, refused = admit(torch.ones(4).bool(), torch.arange(4.0), 2, 5)

@@ -40,8 +40,7 @@ def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     ]
     assert len(commands) == 2
     for command in commands:
-        done = gsbench(*command, GSBENCH_MIRROR=server.url)
-        assert "licence:" in done.stdout
+        assert "licence:" in gsbench(*command, GSBENCH_MIRROR=server.url).stdout
     after = gsbench("+experiment=table1", "--dry-run")
     assert "does not exist" not in after.stdout
     assert "fetch" not in after.stdout

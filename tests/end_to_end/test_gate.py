@@ -70,11 +70,9 @@ def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_pat
     assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
     # in the same runs folder, with trials of another version
     write_class(tmp_path, 1, worse=True)
-    worse = do("gate", "good.zip", *WORDS, code=1)
-    assert "worse in PSNR (dB) on this scene: −" in worse.stdout
+    assert "worse in PSNR (dB) on this scene: −" in do("gate", "good.zip", *WORDS, code=1).stdout
     (tmp_path / "mine.py").write_text("raise RuntimeError('broken')\n")
-    broken = do("gate", "good.zip", *WORDS, code=None)
-    assert broken.returncode in (1, 2)
+    assert do("gate", "good.zip", *WORDS, code=None).returncode in (1, 2)
     write_class(tmp_path, 0, worse=False)
     other = do("gate", "good.zip", *WORDS, "train.iterations=61", code=2)
     assert "the arms differ in iterations" in other.stderr

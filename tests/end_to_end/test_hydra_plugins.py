@@ -176,8 +176,7 @@ def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
 def test_colours_of_a_log_reach_the_terminal(gsbench, tmp_path):
     need("hydra_colorlog")
     words = [*TINY, "name=x", "hydra/job_logging=colorlog", "hydra/hydra_logging=colorlog"]
-    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert "\x1b[32mINFO" in done.stdout
+    assert "\x1b[32mINFO" in gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS).stdout
 
 
 def test_debug_lines_are_shown_if_they_are_asked_for(gsbench, tmp_path):

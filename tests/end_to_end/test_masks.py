@@ -152,8 +152,7 @@ def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, c
     def said(*words):
         capfd.readouterr()
         assert run([*QUICK, f"scene.path={capture}", f"runs={tmp_path / 'runs'}", *words]) != 0
-        lines = [line for line in capfd.readouterr().err.splitlines() if str(capture) in line]
-        return lines[-1]
+        return [line for line in capfd.readouterr().err.splitlines() if str(capture) in line][-1]
 
     Image.new("L", SIZE, 0).save(mask)
     assert f"{mask}: the mask is black all over" in said("init=random")

@@ -236,8 +236,7 @@ def test_a_finished_trial_is_not_repeated_and_another_version_is_another_trial(
     } == before
     capsys.readouterr()
     assert run([*words, "densify.version=9", "--dry-run"]) == 0
-    planned = capsys.readouterr().out
-    assert "missing" in planned
+    assert "missing" in capsys.readouterr().out
     assert run([*words, "densify.version=9"]) == 2
     assert "says 'painter 1.2.3'" in capsys.readouterr().err
 

@@ -172,8 +172,7 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
     assert verdict.startswith("random-solid against random-adc: ")
     assert verdict.endswith("The metric was declared beforehand.")
     gsbench(*second, GSBENCH_RUNS=str(tmp_path / "runs"))
-    page = (tmp_path / "runs" / "opacity" / "report.html").read_text()
-    assert verdict in html.unescape(page)
+    assert verdict in html.unescape((tmp_path / "runs" / "opacity" / "report.html").read_text())
 
 
 @pytest.mark.slow
@@ -197,8 +196,7 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
         "seeds": 2,
     }
     (tmp_path / "claims.yaml").write_text(yaml.safe_dump(content))
-    checked = gsbench("check claims.yaml", GSBENCH_RUNS=str(runs))
-    assert " points: " in checked.stdout
+    assert " points: " in gsbench("check claims.yaml", GSBENCH_RUNS=str(runs)).stdout
     page = (runs / "check_it" / "claims.html").read_text()
     gsbench("export --results check_it --out published.zip", GSBENCH_RUNS=str(runs))
     gsbench("check claims.yaml --from published.zip --out again.html", GSBENCH_RUNS="elsewhere")
@@ -219,8 +217,7 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
     ],
 )
 def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word, hint):
-    done = gsbench(word, code=2, GSBENCH_RUNS=str(tmp_path / "runs"))
-    (line,) = done.stderr.strip().splitlines()
+    (line,) = gsbench(word, code=2, GSBENCH_RUNS=str(tmp_path / "runs")).stderr.strip().splitlines()
     assert line.startswith("gsbench:")
     assert word.split("=")[-1] in line or word.split("=")[0] in line
     assert hint in line

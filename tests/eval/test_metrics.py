@@ -16,8 +16,7 @@ def distorted_pair(height=40, width=53, seed=0):
     """A smooth image and a noisy copy, [H, W, 3] float64 in [0, 1]."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0:height, 0:width]
-    phases = rng.uniform(0, 6, 3)
-    image = 0.5 + 0.4 * np.sin(rows[..., None] / 5 + columns[..., None] / 7 + phases)
+    image = 0.5 + 0.4 * np.sin(rows[..., None] / 5 + columns[..., None] / 7 + rng.uniform(0, 6, 3))
     return image, np.clip(image + rng.normal(0, 0.08, image.shape), 0, 1)
 
 

@@ -93,8 +93,7 @@ def test_raw_lpips_variants_get_values_from_0_to_1_and_others_from_minus_1_to_1(
     evaluator = Evaluator(
         PAPER, lpips=["squeeze", "squeeze_raw"], flip=False, weights=shared / "weights"
     )
-    rng = np.random.default_rng(0)
-    render, truth = rng.integers(0, 256, (2, 40, 40, 3), dtype=np.uint8)
+    render, truth = np.random.default_rng(0).integers(0, 256, (2, 40, 40, 3), dtype=np.uint8)
     values = evaluator.evaluate_view(render, truth)
     first, second = (torch.tensor(x).permute(2, 0, 1)[None].float() / 255 for x in (render, truth))
     network = load_lpips("squeeze", shared / "weights")

@@ -73,8 +73,7 @@ def test_steps_at_degree_0_count_for_the_unused_harmonics():
 def test_load_restores_parameters_and_moments():
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     step_with(trainable, 0)
-    keep = torch.tensor([True, True, False, True, True])
-    trainable.edit(keep, random_gaussians(2, seed=4))
+    trainable.edit(torch.tensor([True, True, False, True, True]), random_gaussians(2, seed=4))
     copy = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 3.0)
     for seed in (1, 2):
         step_with(trainable, seed)

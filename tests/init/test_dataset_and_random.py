@@ -34,8 +34,7 @@ def add_points(model_dir, target, count):
         )
         copy.add_image_with_trivial_frame(new, image.cam_from_world())
     for index, point in enumerate(points):
-        seen_by = dict.fromkeys((1, 2, 3), index)
-        add_point(copy, point, (index, 2 * index, 255 - index), seen_by)
+        add_point(copy, point, (index, 2 * index, 255 - index), dict.fromkeys((1, 2, 3), index))
     target.mkdir(parents=True)
     copy.write_binary(target)
     return points
@@ -113,8 +112,7 @@ def test_carved_keeps_points_in_view_of_enough_training_cameras(courtyard, tmp_p
         )
         if views >= seen_by:
             expected.append(point)
-    found = read_cloud(tmp_path / "carved" / MODEL_FOLDER).points
-    assert_array_equal(found, expected)
+    assert_array_equal(read_cloud(tmp_path / "carved" / MODEL_FOLDER).points, expected)
     assert 0 < len(expected) == report.num_points < 300
 
 
@@ -153,15 +151,13 @@ def test_a_trained_model_becomes_points_and_is_copied_unchanged(courtyard, tmp_p
     gaussians = random_gaussians(20, dtype=torch.float32)
     gaussians.opacity_logits[0] = torch.inf
     write_ply(gaussians, tmp_path / "model.ply")
-    report = Ply(path=str(tmp_path / "model.ply")).run(courtyard, tmp_path / "out")
-    assert report.num_points == 20
+    assert Ply(path=str(tmp_path / "model.ply")).run(courtyard, tmp_path / "out").num_points == 20
     cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
     assert_allclose(cloud.points, gaussians.means.double().numpy())
     red = 0.5 + 0.28209479177387814 * gaussians.sh_dc[:, 0].numpy()  # Y00 = 1 / (2 sqrt(pi))
     assert_allclose(cloud.colors[:, 0] / 255, red.clip(0, 1), atol=0.5 / 255 + 1e-6)
     assert caplog.text.count("opacity of exactly 0 or 1") == 1  # the file is read once
-    kept = read_ply(tmp_path / "out" / GAUSSIANS_FILE)
-    assert torch.equal(kept.log_scales, gaussians.log_scales)
+    assert torch.equal(read_ply(tmp_path / "out" / GAUSSIANS_FILE).log_scales, gaussians.log_scales)
     with refusal(r"init\.path=nowhere\.ply"):
         Ply(path="nowhere.ply")
     (tmp_path / "words.ply").write_text("no model")

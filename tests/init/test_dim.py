@@ -182,8 +182,7 @@ def test_superpoint_keypoints_are_the_maxima_of_its_score_map(untrained_weights,
     image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         keypoints, descriptors, scores = extract(image)
-        luma = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
-        gray = (image * luma).sum(1, keepdim=True)
+        gray = (image * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1, keepdim=True)
         encoded = network.encoder(gray).last_hidden_state
         score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
     border = SUPERPOINT_BORDER
@@ -257,8 +256,7 @@ def test_disk_is_loaded_from_its_published_layout(tmp_path):
     torch.manual_seed(0)
     content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
     torch.save(content, tmp_path / "depth-save.pth")
-    disk = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50)
-    settings = disk.feature_settings()
+    settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).feature_settings()
     extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
     with torch.inference_mode():
         keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
@@ -410,8 +408,7 @@ def test_mutual_nearest_matches_equal_those_of_brute_force():
         row, column = np.sort(distance[i]), np.sort(distance[:, j])
         if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
             expected.append((i, j))
-    matches = mutual_nearest_matcher(0.9, CPU)(*sides)
-    assert sorted(map(tuple, matches.tolist())) == expected
+    assert sorted(map(tuple, mutual_nearest_matcher(0.9, CPU)(*sides).tolist())) == expected
     assert len(expected) > 3
 
 

@@ -111,8 +111,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path, center):
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
-    features = extract(tmp_path / "blob.png", 1600)
-    assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
+    assert_allclose(extract(tmp_path / "blob.png", 1600).colmap_keypoints[0], center, atol=0.05)
 
 
 def test_keypoints_are_scaled_separately_in_x_and_y():

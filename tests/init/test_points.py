@@ -231,8 +231,7 @@ def test_a_cloud_is_thinned_and_written_with_the_reference_cameras(courtyard, tm
     report = options.run(courtyard, tmp_path / "out")
     cloud = read_cloud(tmp_path / "out" / MODEL_FOLDER)
     assert report.num_points == len(cloud) == 30
-    distances = np.linalg.norm(cloud.points[:, None] - XYZ[None], axis=2).min(axis=1)
-    assert distances.max() < 1e-9
+    assert np.linalg.norm(cloud.points[:, None] - XYZ[None], axis=2).min(axis=1).max() < 1e-9
     assert len(np.unique(cloud.points, axis=0)) == 30
     seen = seen_colors(cloud.points, courtyard, pycolmap.Reconstruction(courtyard.model))
     assert_array_equal(cloud.colors, np.where(seen < 0, GREY, seen))

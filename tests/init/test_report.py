@@ -183,8 +183,7 @@ def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
     moved = CENTERS.copy()
     moved[3, 2] += 0.3
     model, reference = model_of(moved), model_of(CENTERS)
-    identity = similarity_to(reference, reference)
-    errors = compare_poses(model, reference, identity, 2.0, exact=True)
+    errors = compare_poses(model, reference, similarity_to(reference, reference), 2.0, exact=True)
     assert errors.center_max == pytest.approx(0.3)
     assert errors.center_mean == pytest.approx(0.3 / 4)
     assert errors.center_rmse == pytest.approx(0.3 / 2)

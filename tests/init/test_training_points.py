@@ -79,8 +79,7 @@ def test_dataset_keeps_the_points_that_two_training_views_see(with_points, tmp_p
     kept, total = len(wanted), before.num_points3D()
     assert (points.choice, points.kept, points.total) == ("train", kept, total)
     assert points.removed == pytest.approx(1 - kept / total)
-    said = read_json(tmp_path / REPORT_FILE)["training_points"]
-    assert said["removed"] == points.removed
+    assert read_json(tmp_path / REPORT_FILE)["training_points"]["removed"] == points.removed
     assert not (tmp_path / "work").exists()
 
 

@@ -241,8 +241,7 @@ print(float((output.image.double() - expected.image).abs().max()), worst)
         "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
     }
     root = Path(__file__).resolve().parents[2]
-    command = [sys.executable, "-c", script]
-    run = completed(command, env=environment, cwd=root)
+    run = completed([sys.executable, "-c", script], env=environment, cwd=root)
     value_error, gradient_error = map(float, run.stdout.split())
     assert value_error < 1e-4
     assert gradient_error < 1e-3
@@ -264,8 +263,7 @@ def _vector_functions(a, b, out):
 
 
 def test_vector_functions_match_numpy():
-    generator = np.random.default_rng(0)
-    a, b = generator.normal(size=(2, 16)).astype(np.float32)
+    a, b = np.random.default_rng(0).normal(size=(2, 16)).astype(np.float32)
     out = np.full(96, np.nan, np.float32)
     bits, lowest = _vector_functions(a, b, out)
     mask = (a < b) & ~(a > 0)

@@ -74,8 +74,7 @@ def test_the_real_program_trains_with_it_and_records_its_source(folder):
 
 def test_its_options_are_checked_and_are_part_of_the_key(folder):
     values = composed(*OWN, "+raster.rows=7")
-    rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
-    key = rasterizer_inputs(rasterizer)
+    key = rasterizer_inputs(build_own_rasterizer(values["raster"], values["allow_targets"]))
     assert key["rows"] == 7
     assert rasterizer_inputs(create_rasterizer("reference", CPU)) == "reference"
     for words, message in (

@@ -21,8 +21,7 @@ def brute_force(gaussians, camera, background):
     """
     items = []
     for i in range(len(gaussians)):
-        mean = gaussians.means[i].numpy()
-        view = camera.rotation @ mean + camera.translation
+        view = camera.rotation @ gaussians.means[i].numpy() + camera.translation
         if view[2] <= 0.2:
             continue
         w, x, y, z = (gaussians.quaternions[i] / gaussians.quaternions[i].norm()).tolist()

@@ -184,8 +184,7 @@ def test_a_quaternion_of_length_zero_and_a_bad_background_are_named():
     assert bad_values(random_gaussians(4), BLACK + math.nan)
     with pytest.raises(ValueError, match="background"):
         raise_for_values(random_gaussians(4), BLACK + math.nan)
-    nothing = random_gaussians(4).select(torch.zeros(0, dtype=torch.long))
-    assert not bad_values(nothing, BLACK)
+    assert not bad_values(random_gaussians(4).select(torch.zeros(0, dtype=torch.long)), BLACK)
 
 
 class Event:

@@ -101,8 +101,7 @@ def test_a_point_is_seen_at_the_pixel_where_pycolmap_undistorts_it(
         for point in np.random.default_rng(0).uniform((-1, -1, 4), (1, 1, 6), (20, 3)):
             x, y, z = camera.rotation @ point + camera.translation
             seen = [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
-            expected = wanted.img_from_cam(image.cam_from_world() * point)
-            assert_allclose(seen, expected, atol=1e-3)
+            assert_allclose(seen, wanted.img_from_cam(image.cam_from_world() * point), atol=1e-3)
 
 
 def test_distortion_below_a_twentieth_of_a_pixel_is_ignored_and_above_it_is_not():
@@ -222,8 +221,7 @@ def test_downscaled_and_distorted_views_come_back_from_the_cache(make_scene, tmp
     assert done == [("views", 6, 6)]
     second = load()
     assert done == [("views", 6, 6)]  # nothing was prepared again
-    third = load(tmp_path / "other")
-    for scene in (second, third):
+    for scene in (second, load(tmp_path / "other")):
         for a, b in zip(first.train, scene.train, strict=True):
             assert_array_equal(a.image, b.image)
             assert_array_equal(a.camera.rotation, b.camera.rotation)

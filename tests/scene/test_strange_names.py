@@ -31,8 +31,7 @@ def test_runs_and_current_folder_have_utf8_names(where, words, tmp_path, monkeyp
     folder = tmp_path / BAD
     folder.mkdir()
     monkeypatch.chdir(folder if where == "current" else tmp_path)
-    runs = tmp_path / "runs" if where == "current" else folder
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs" if where == "current" else folder))
     assert "not UTF-8, or has a line break: rename it" in refused(*words) or where == "runs"
     assert not (folder / "runs").exists()
 

@@ -49,8 +49,7 @@ def test_the_newest_checkpoint_is_loaded_and_two_are_kept(tmp_path):
     for step in (10, 20, 30):
         save_checkpoint(tmp_path, step, state(step))
     assert kept(tmp_path) == [20, 30]
-    loaded = load_checkpoint(tmp_path)
-    assert equal(loaded, state(30))
+    assert equal(load_checkpoint(tmp_path), state(30))
 
 
 def test_the_folder_is_synced_and_the_thread_ends(tmp_path, monkeypatch):

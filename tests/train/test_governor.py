@@ -28,8 +28,7 @@ def test_trainings_end_within_two_percent_of_one_count(arm, lab):
     kind, own = ARMS[arm]
     if kind is not MCMC:
         own = own | {"opacity_reset_interval": 120}  # in the middle of the window
-    trained = lab.train(kind(**(WINDOW | own)), iterations=260)
-    assert len(trained) == pytest.approx(LIMIT, rel=0.02)
+    assert len(lab.train(kind(**(WINDOW | own)), iterations=260)) == pytest.approx(LIMIT, rel=0.02)
     rounds = [event for event in lab.records(EVENTS) if "target" in event]
     assert [event["step"] for event in rounds] == list(range(40, 240, 20))
     assert rounds[-1]["target"] == LIMIT
@@ -77,8 +76,7 @@ def test_a_frozen_training_changes_no_gaussian_after_the_limit(lab):
     rounds = rounds_of(lab, ADC(**(WINDOW | own)))
     beyond = [event for event in rounds if event["before"] > 100]
     assert len(beyond) > 3
-    counts = {event[when] for event in beyond for when in ("before", "after")}
-    assert counts == {rounds[0]["after"]}
+    assert {event[when] for event in beyond for when in ("before", "after")} == {rounds[0]["after"]}
     assert all(event["blocked_by_cap"] > 0 for event in beyond)
     assert not any(
         event["pruned_opacity"] + event["cloned"] + event["split_gradient"] for event in beyond

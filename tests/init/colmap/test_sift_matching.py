@@ -33,8 +33,7 @@ def test_every_pair_is_matched_once(pairs, block, processes):
 
 
 def test_shares_are_about_equal_and_parts_hold_few_images():
-    pairs = list(itertools.combinations(range(1, 101), 2))
-    parts = divide_pairs(pairs, 10)
+    parts = divide_pairs(list(itertools.combinations(range(1, 101), 2)), 10)
     assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
     assert divide_pairs(list(itertools.combinations(range(1, 5), 2)), 2) == [
         [(1, 2)],
@@ -145,8 +144,7 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     files = tmp_path / "database.db", bare_photos.images
     task = DatabaseTask(*files, names, pairs, bare_photos, tmp_path)
     monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
-    two_each = partial(best_pairs, partners=2)
-    monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", two_each)
+    monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", partial(best_pairs, partners=2))
     monkeypatch.setattr("gsbench.init.colmap.features.extract_sift", lambda *_: None)
     counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)

@@ -79,8 +79,7 @@ def test_a_surface_point_looks_alike_from_two_views():
         inside = (pixel > 2).all(1) & (pixel < [397, 297]).all(1) & (local[:, 2] > 0)
         # a point is visible if no object is between it and the camera
         for share in np.linspace(0.05, 0.9, 30):
-            way = points + share * (camera.center - points)
-            inside &= surface_distance(way) > 0.02
+            inside &= surface_distance(points + share * (camera.center - points)) > 0.02
         kept &= inside
         column, row = np.clip(pixel.astype(int), 0, [399, 299]).T
         samples.append(image[row, column])
