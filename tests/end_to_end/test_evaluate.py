@@ -88,7 +88,6 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
             truth,
             *settings,
             "--json",
-            GSBENCH_RUNS=str(runs),
         )
         found = json.loads(done.stdout)
         assert found["metrics"] == results(own)["metrics"]
@@ -103,7 +102,6 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
         str(own / "ground_truth"),
         "--protocol",
         "standard",
-        GSBENCH_RUNS=str(runs),
     )
     assert "protocol standard-1" in shown.stdout
 
@@ -115,7 +113,6 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = gsbench(
             f"evaluate {folder} --truth courtyard --as small:theirs --seed {seed}",
-            GSBENCH_RUNS=str(runs),
         )
         assert "names matched apart from leading zeros" in done.stdout
     entered = trial(runs, "random-theirs", 1)
@@ -126,7 +123,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
     assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
 
-    table = gsbench("tables small", GSBENCH_RUNS=str(runs))
+    table = gsbench("tables small")
     assert (
         "Renders of another program, measured as they are (its conditions are not known): "
         "random-theirs." in table.stdout
@@ -134,7 +131,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     row = next(line for line in table.stdout.splitlines() if "theirs" in line)
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
     assert "**" in row  # compared, and best
-    gsbench("report small", GSBENCH_RUNS=str(runs))
+    gsbench("report small")
     text = (runs / "small" / "report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
@@ -202,11 +199,11 @@ def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_pa
         *scene,
         *split(f"init=ply init.name=random init.path={model} train=none densify=none name=small"),
     ]
-    gsbench(*words, "densify.name=model", GSBENCH_RUNS=str(runs))
+    gsbench(*words, "densify.name=model")
     found = results(trial(runs, "random-model"))
     assert found["metrics"] == results(trial(runs))["metrics"]
     assert found["evaluated_from"] == "model"
     assert found["num_gaussians"] == results(trial(runs))["num_gaussians"]
-    table = gsbench("tables small", GSBENCH_RUNS=str(runs))
+    table = gsbench("tables small")
     assert "A model that another program trained, rendered here" in table.stdout
     assert "not compared" not in table.stdout

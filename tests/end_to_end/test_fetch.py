@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from shlex import split
 
 import pytest
 
@@ -53,7 +54,7 @@ def test_a_killed_fetch_continues(server, tmp_path, environment, gsbench):
         return body
 
     server.manners = Manners(damage=slowly)
-    command = [sys.executable, "-m", "gsbench.cli", "fetch", "mipnerf360", "--mirror", server.url]
+    command = [sys.executable, *split("-m gsbench.cli fetch mipnerf360 --mirror"), server.url]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while (

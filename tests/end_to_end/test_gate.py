@@ -1,6 +1,7 @@
 """Real trainings of versions of a densifier: the gate's exit codes, and the commit of bisect."""
 
 import os
+from shlex import split
 
 import pytest
 
@@ -35,20 +36,11 @@ WORDS = [
         "train.densify_interval=10",
         "train.densify_stop=55",
     ),
-    *(
-        "init.count=800",
-        "scene.width=64",
-        "scene.height=48",
-        "eval.lpips=[]",
-        "eval.flip=false",
-        "tracking=none",
+    *split(
+        "init.count=800 scene.width=64 scene.height=48 eval.lpips=[] eval.flip=false tracking=none"
     ),
-    *(
-        "densify=adc",
-        "densify.name=mine",
-        "densify._target_=mine.Mine",
-        "allow_targets=[mine]",
-        "raster=cpu",
+    *split(
+        "densify=adc densify.name=mine densify._target_=mine.Mine allow_targets=[mine] raster=cpu"
     ),
 ]
 
@@ -65,7 +57,7 @@ def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_pat
 
     write_class(tmp_path, 0, worse=False)
     do("-m", *WORDS, "name=good", "seed=0,1,2")
-    do("export", "--results", "good", "--out", "good.zip")
+    do(*split("export --results good --out good.zip"))
     same = do("gate", "good.zip", *WORDS)
     assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
     # in the same runs folder, with trials of another version
@@ -107,12 +99,10 @@ def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchang
 
     def bisect():
         words = ["HEAD~12", "HEAD", *WORDS, "--least", "0.2", "--seeds", "3"]
-        return gsbench(
-            "bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs")
-        )
+        return gsbench("bisect", *words, cwd=home, timeout=1500)
 
     done = bisect()
-    found = git("log", "-1", "--format=%h", "--abbrev=10", "HEAD~5")
+    found = git(*split("log -1 --format=%h --abbrev=10 HEAD~5"))
     assert f"It became worse with {found}" in done.stdout
     assert "Commit 7" in done.stdout.splitlines()[-1]
     # The last commit has a verdict of its own, and each step is compared with both ends.

@@ -10,7 +10,7 @@ import pytest
 
 from gsbench.claims.ledger import RETRIES
 from gsbench.runs.ledger import Ended, Started, read_ledger
-from tests.end_to_end.conftest import SMALL, start
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
@@ -37,14 +37,10 @@ def do(gsbench, folder, *words):
     return gsbench(*words, code=None, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
 
 
-def attempt(environment, folder, *words):
-    return start(environment, folder, folder / "runs", "ledger", "try", "night", *words)
-
-
-def test_two_ideas_at_once_share_the_baseline(gsbench, environment, tmp_path):
+def test_two_ideas_at_once_share_the_baseline(gsbench, start, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
     words = (["densify=volumetric"], ["densify.split_size=0.1"])
-    both = [attempt(environment, tmp_path, *own) for own in words]
+    both = [start("ledger", "try", "night", *own) for own in words]
     ends = [process.communicate(timeout=300) for process in both]
     assert {process.returncode for process in both} <= {0, 1, 3}, ends
     ledger = read_ledger(tmp_path / "runs" / "night")
@@ -58,10 +54,10 @@ def test_two_ideas_at_once_share_the_baseline(gsbench, environment, tmp_path):
     assert len(baselines) == 2  # that of the ledger, and that of the second idea
 
 
-def test_a_killed_try_continues_with_its_level(gsbench, environment, tmp_path):
+def test_a_killed_try_continues_with_its_level(gsbench, start, tmp_path):
     do(gsbench, tmp_path, *NEW, "seed=0,1,2")
     home = tmp_path / "runs" / "night"
-    killed = attempt(environment, tmp_path, "densify=volumetric")
+    killed = start("ledger", "try", "night", "densify=volumetric")
     deadline = time.monotonic() + 120
     while not list(home.glob("*/*/*/results.json")) and time.monotonic() < deadline:
         time.sleep(0.05)

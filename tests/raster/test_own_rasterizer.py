@@ -49,27 +49,24 @@ def gsbench(folder, *words):
 
 @pytest.mark.slow
 def test_the_real_program_trains_with_it_and_records_its_source(folder):
-    gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
+    def run(*words):
+        done = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", *words)
+        return done.stdout + done.stderr
+
+    run()
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
     assert read_json(path)["raster"] == "untiled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
     recorded = read_json(manifest)["inputs"]["raster"]
-    assert (recorded["class"], recorded["name"], recorded["rows"]) == (
-        "untiled.Untiled",
-        "untiled",
-        36,
-    )
+    assert recorded["class"] == "untiled.Untiled"
+    assert (recorded["name"], recorded["rows"]) == ("untiled", 36)
     assert len(recorded["source"]["untiled"]) == 64
 
-    assert "already done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
-    with (folder / "untiled.py").open("a") as stream:
-        stream.write("# a comment makes no other version\n")
-    same = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
-    assert "missing" not in same.stdout
-    with (folder / "untiled.py").open("a") as stream:
-        stream.write("VERSION = 2\n")
-    changed = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
-    assert "missing" in changed.stdout
+    assert "already done" in run()
+    for text, missing in (("# a comment makes no other version\n", False), ("VERSION = 2\n", True)):
+        with (folder / "untiled.py").open("a") as stream:
+            stream.write(text)
+        assert ("missing" in run("--dry-run")) is missing
 
 
 def test_its_options_are_checked_and_are_part_of_the_key(folder):

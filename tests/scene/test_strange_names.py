@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from shlex import split
 
 import pytest
 
@@ -39,7 +40,7 @@ def test_runs_and_current_folder_have_utf8_names(where, words, tmp_path, monkeyp
 @pytest.mark.parametrize(
     "words",
     [
-        ["scene=photos", "scene.path=photos", "init=sfm", "tracking=none"],
+        split("scene=photos scene.path=photos init=sfm tracking=none"),
         ["evaluate", "photos", "--truth", "photos"],
     ],
 )
