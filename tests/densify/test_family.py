@@ -1,7 +1,5 @@
 """Properties of ADC, MCMC, MRNF and the functions that densifiers share."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
@@ -186,23 +184,6 @@ def test_no_densifier_changes_nothing():
     trainable = trained(gaussians, 1.0)
     assert all(densifier.refine(step, trainable, generator()) is None for step in range(1, 3001))
     assert len(trainable) == 4
-
-
-def test_a_densifier_that_is_saved_and_loaded_gives_the_same_events():
-    events = {False: [], True: []}
-    for interrupted, found in events.items():
-        kind = partial(ADC, max_gaussians=500, cap="curve", start=500, stop=3000)
-        densifier, trainable = kind(), trained(random_gaussians(50, log_scale=(-5, -1)))
-        densifier.begin(trainable.values.detach(), DensifyContext(4.0))
-        rng, draws = generator(5), np.random.default_rng(0)
-        for step in range(599, 701):
-            densifier.observe(step, rendered(draws.exponential(3e-4, (len(trainable), 2))))
-            found.append(densifier.refine(step, trainable, rng))
-            if interrupted and step == 650:
-                saved, densifier = densifier.state_dict(), kind()
-                densifier.load_state_dict(saved, DensifyContext(4.0))
-    assert events[False] == events[True]
-    assert [i for i, event in enumerate(events[True]) if event] == [1, 101]
 
 
 def test_a_gradient_at_the_threshold_grows_only_if_it_is_inclusive():

@@ -7,8 +7,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis
 from gsbench.densify.scores import draw
-from gsbench.gaussians.paper_values import LearningRates
-from gsbench.gaussians.trainable import TrainableGaussians
 from tests.densify import restatement
 from tests.densify.helpers import (
     EXTENT,
@@ -19,7 +17,6 @@ from tests.densify.helpers import (
     generator,
     rendered,
     to_rows,
-    trained,
 )
 from tests.densify.restatement import logit, opacity
 from tests.densify.test_rounds import observe, prepared
@@ -357,10 +354,3 @@ def test_the_selection_continues_after_saving_and_loading():
         seen(densifier, step)
         seen(twin, step)
     assert twin.weight == densifier.weight != 2e-4
-
-
-def test_the_learning_rate_of_a_parameter_is_saved():
-    trainable = trained(random_gaussians(4))
-    trainable.set_rate("opacity_logits", 0.2)
-    again = TrainableGaussians.load(trainable.state_dict(), LearningRates(), EXTENT)
-    assert again.adam["opacity_logits"].rate == 0.2

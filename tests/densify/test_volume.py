@@ -18,13 +18,6 @@ def scales(*rows):
     return torch.tensor(rows, dtype=torch.float64).log()
 
 
-def test_children_of_an_isotropic_gaussian_have_its_size():
-    sphere = scales((0.2, 0.2, 0.2))
-    assert math.exp(log_volume(sphere)) == pytest.approx(4 / 3 * math.pi * 0.008)
-    assert math.exp(log_condition(sphere)) == pytest.approx(1)
-    assert_close(Volumetric().child_log_scales(sphere), sphere)
-
-
 def test_children_of_an_elongated_gaussian_match_a_calculation_by_hand():
     """A Gaussian with axes 2, 1, 1 has kappa = 4.
 

@@ -27,7 +27,7 @@ from gsbench.files import file_sha256
 from gsbench.scene.colmap import write_model
 from gsbench.scene.courtyard.render import courtyard_cameras, render_courtyard
 from tests.end_to_end.conftest import trial_of
-from tests.helpers import read_json, write
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -280,28 +280,3 @@ def test_lenses_are_told_apart_by_exif_as_by_folders(tmp_path):
         found.append(read_json(trial / "init_report.json")["focal_lengths"])
     assert found[0] == found[1]
     assert sorted(found[0]) == pytest.approx([focal, 1.5 * focal], rel=0.1)
-
-
-def test_transforms_json_gives_the_result_of_the_colmap_model(good, original, tmp_path):
-    folder = tmp_path / "frames"
-    shutil.copytree(good / "images", folder / "images")
-    model = pycolmap.Reconstruction(good / "sparse/0")
-    frames = []
-    for image in model.images.values():
-        world_from_camera = np.eye(4)
-        world_from_camera[:3] = image.cam_from_world().inverse().matrix()
-        matrix = world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/{image.name}", "transform_matrix": matrix.tolist()})
-    fx, fy, cx, cy = next(iter(model.cameras.values())).params
-    model.export_PLY(folder / "points.ply")
-    shared = {
-        "w": WIDTH,
-        "h": HEIGHT,
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        "ply_file_path": "points.ply",
-    }
-    write(folder / "transforms.json", shared | {"frames": frames})
-    require_same_up_to_a_seed(train(tmp_path / "runs", folder, "scene=transforms"), original)

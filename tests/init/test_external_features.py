@@ -77,9 +77,8 @@ def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_phot
     for point_id, point in first.points3D.items():
         assert_array_equal(point.xyz, second.points3D[point_id].xyz)
     for image_id, image in first.images.items():
-        assert_array_equal(
-            image.cam_from_world().matrix(), second.images[image_id].cam_from_world().matrix()
-        )
+        other = second.images[image_id].cam_from_world().matrix()
+        assert_array_equal(image.cam_from_world().matrix(), other)
 
 
 def extract(path, max_image_size):
@@ -117,8 +116,7 @@ def test_a_blob_is_found_at_its_centre(tmp_path, center):
 def test_keypoints_are_scaled_separately_in_x_and_y():
     features = Features(
         np.array([[0, 0], [99, 49]], dtype=np.float32),
-        np.zeros((2, 8), dtype=np.float32),
-        np.ones(2, dtype=np.float32),
+        *(np.zeros((2, 8), np.float32), np.ones(2, np.float32)),
         network_size=(100, 50),
         file_size=(400, 201),
     )

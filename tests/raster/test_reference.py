@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
 from gsbench.raster.reference import ReferenceRasterizer, project
-from gsbench.scene.types import Camera
 from tests.gaussians.helpers import front_camera, leaves, random_gaussians
 
 
@@ -183,28 +182,3 @@ def test_projection_matches_gsplat():
     assert_close(projected.conics, conics[0, projected.index])
     assert_close(projected.depths, depths[0, projected.index])
     assert len(projected.index) > 150
-
-
-def test_spherical_harmonics_match_gsplat():
-    gsplat = pytest.importorskip(
-        "gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed"
-    )
-    from gsbench.gaussians.model import colors
-
-    gaussians = random_gaussians(50, seed=9)
-    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
-    coefficients = torch.cat([gaussians.sh_dc[:, None], gaussians.sh_rest], 1)  # [N, 16, 3]
-    for degree in range(4):
-        theirs = gsplat._spherical_harmonics(degree, directions, coefficients)
-        ours = colors(gaussians.sh_dc, gaussians.sh_rest, directions, degree)
-        assert_close(ours, (theirs + 0.5).clamp_min(0))
-
-
-def test_the_alpha_of_the_pixel_at_a_mean_is_the_opacity():
-    # a principal point of 20.5 is the centre of pixel 20
-    camera = Camera(40, 30, 36.0, 36.0, 20.5, 15.5, np.eye(3), np.zeros(3))
-    one = random_gaussians(1)
-    one.means[0] = torch.tensor([0.0, 0.0, 4.0])
-    out = ReferenceRasterizer().render(one, camera, 0, torch.zeros(3, dtype=torch.float64))
-    assert float(out.alpha[15, 20]) == pytest.approx(float(one.opacity_logits.sigmoid()))
-    assert out.alpha[15, 20] == out.alpha.max()

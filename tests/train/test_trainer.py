@@ -54,12 +54,6 @@ def test_counts_in_events_add_up_to_the_trained_gaussians(lab):
     assert living["split_volume"] > 0
 
 
-def test_nothing_is_refined_in_the_last_iteration(lab):
-    """3DGS saves its model before it refines and steps."""
-    lab.train(small(), iterations=100)
-    assert lab.steps(EVENTS) == [40, 60, 80]
-
-
 class Explode(NoDensifier):
     def __init__(self, at):
         self.left = at
@@ -125,14 +119,6 @@ def test_every_view_is_used_once_before_any_is_used_again():
     drawn = [order.next() for _ in range(21)]
     assert [sorted(drawn[i : i + 7]) for i in (0, 7, 14)] == [list(range(7))] * 3
     assert drawn[:7] != drawn[7:14]
-
-
-def test_the_learning_rate_of_the_means_is_log_linear():
-    rates = TrainConfig(name="x")
-    assert rates.position(0) == pytest.approx(1.6e-4)
-    assert rates.position(15_000) == pytest.approx(1.6e-5)  # the geometric middle
-    assert rates.position(30_000) == pytest.approx(1.6e-6)
-    assert rates.position(99_000) == pytest.approx(1.6e-6)
 
 
 def test_a_rasterizer_without_an_output_that_the_densifier_needs_is_refused_at_once(lab):

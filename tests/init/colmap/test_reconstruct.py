@@ -64,11 +64,9 @@ def database(tmp_path_factory):
 def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change(
     database, tmp_path
 ):
-    said = []
-    images, reference = database.parent / "images", model_of(poses())
-    model = mapping.triangulate(
-        database, images, tmp_path, reference, NAMES[:3], Sfm(), lambda *at: said.append(at)
-    )
+    said, tell = [], lambda *at: said.append(at)
+    inputs = database, database.parent / "images", tmp_path, model_of(poses())
+    model = mapping.triangulate(*inputs, NAMES[:3], Sfm(), tell)
     assert said == [("triangulate", 0, 1), ("triangulate", 1, 1)]
     placed = {image.name: image for image in model.images.values()}
     assert sorted(placed) == NAMES  # an image without points has its camera, too
