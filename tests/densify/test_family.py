@@ -201,28 +201,6 @@ def test_a_gradient_at_the_threshold_grows_only_if_it_is_inclusive():
     assert counts == {True: 1, False: 0}
 
 
-@pytest.mark.parametrize("rule", ["relocate", "add"])
-def test_mcmc_zeroes_the_moments_of_all_six_tensors_at_the_sources(rule):
-    densifier, trainable = mcmc_state(max_gaussians=60, growth=0.5)
-    for tensor in trainable.values.tensors().values():
-        tensor.grad = torch.ones_like(tensor)
-    trainable.optimizer_step()
-    if rule == "add":
-        trainable.values.opacity_logits.data[:10] = -1.0  # none is dead
-    before = trainable.values.opacity_logits.detach().clone()
-    densifier.refine(600, trainable, generator(0))
-    after = trainable.values.opacity_logits.detach()
-    count = 30 if rule == "relocate" else 40  # the living come first, in order
-    sources = (after[:count] != before[40 - count :]).numpy()
-    assert 0 < sources.sum() < count
-    for name, state in trainable.adam.items():
-        for moment in (state.first, state.second):
-            rows = moment.flatten(1) if moment.dim() > 1 else moment[:, None]
-            is_zero = (rows == 0).all(-1).numpy()
-            assert is_zero[:count].tolist() == sources.tolist(), name
-            assert is_zero[count:].all(), name
-
-
 def test_mcmc_shares_an_opacity_among_at_most_fifty_copies():
     """The authors limit the number to 50, although their table of binomials has 51 rows."""
     densifier, trainable = mcmc_state(2, max_gaussians=200, growth=50.0)

@@ -28,18 +28,9 @@ SCENE = split("scene.views=12 scene.width=96 scene.height=72")
 def trained(tmp_path_factory, environment):
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
-    changed = environment | {"GSBENCH_RUNS": str(runs)}
-    command = [
-        sys.executable,
-        "-m",
-        "gsbench.cli",
-        "-m",
-        *SMALL,
-        "name=small",
-        "densify=adc",
-        "seed=0,1",
-    ]
-    completed(command, cwd=runs, env=changed)
+    words = [*split("-m gsbench.cli -m"), *SMALL, *split("name=small densify=adc seed=0,1")]
+    own = environment | {"GSBENCH_RUNS": str(runs)}
+    completed([sys.executable, *words], cwd=runs, env=own)
     return runs
 
 
@@ -138,12 +129,8 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     assert "by a training elsewhere, which left no record" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     (runs / "mlflow.db").unlink()  # its addresses are those of the folder that was copied
-    for words in (
-        ["status", "small"],
-        ["explain", "small:courtyard:psnr:theirs"],
-        ["sync", "small"],
-    ):
-        assert run(words) == 0
+    for words in ("status small", "explain small:courtyard:psnr:theirs", "sync small"):
+        assert run(words.split()) == 0
     for words in (["view"], split("export --out x.ply")):
         capsys.readouterr()
         assert run([*words, "small:courtyard:theirs"]) == 2
@@ -163,31 +150,6 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
     capsys.readouterr()
     assert run(["tables", "new"]) == 0
     assert "| toy | renders | theirs | **" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "words, said",
-    [
-        (split("SMALLER --truth small:courtyard:adc"), "sizes are never changed"),
-        (
-            split("FEWER --truth small:courtyard:adc"),
-            "1 of 2 photographs have no picture of their name (0008.png)",
-        ),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
-)
-def test_bad_requests_are_refused_in_one_line(runs, tmp_path, monkeypatch, capsys, words, said):
-    folders = {name: tmp_path / name.lower() for name in ("SMALLER", "FEWER")}
-    for folder in folders.values():
-        shutil.copytree(trial(runs) / "renders", folder)
-    for file in folders["SMALLER"].glob("*.png"):
-        Image.open(file).resize((48, 36)).save(file)
-    (folders["FEWER"] / "0008.png").unlink()
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    assert run(["evaluate", *(str(folders.get(word, word)) for word in words), *EVAL]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("gsbench: ") == 1
 
 
 def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_path):

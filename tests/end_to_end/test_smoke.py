@@ -252,11 +252,3 @@ def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
     task = dict(f"SLURM_{word}".split("=") for word in task) | {"SUBMITIT_EXECUTOR": "slurm"}
     completed(command, cwd=tmp_path, env=os.environ | task)
     assert list(trials_of(runs, "x")) == ["none-1"]
-
-
-@pytest.mark.slow
-def test_hydra_multirun_with_another_launcher(gsbench, runs):
-    words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
-    gsbench(*words)
-    assert list(trials_of(runs, "x")) == ["none-0", "none-1"]
-    assert "2 trials: 2 done" in gsbench("status x").stdout

@@ -8,7 +8,7 @@ import torch
 from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
-from gsbench.raster.reference import ReferenceRasterizer, project
+from gsbench.raster.reference import ReferenceRasterizer
 from tests.gaussians.helpers import front_camera, leaves, random_gaussians
 
 
@@ -157,28 +157,3 @@ def test_screen_gradient_is_the_gradient_of_the_projected_mean_in_ndc():
     assert gradient[:, 0].sum() / (32 / 2) == pytest.approx(float(numeric), rel=1e-4)
     assert (absolute >= gradient.abs() - 1e-12).all()
     assert (absolute > 1.01 * gradient.abs()).any()
-
-
-def test_projection_matches_gsplat():
-    gsplat = pytest.importorskip(
-        "gsplat.cuda._torch_impl", reason="gsplat (group dev) is not installed"
-    )
-    gaussians, camera = random_gaussians(200, seed=7), front_camera(64, 48)
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3] = torch.from_numpy(camera.rotation)
-    matrix[:3, 3] = torch.from_numpy(camera.translation)
-    intrinsics = torch.tensor(
-        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
-    )
-    covariances, _ = gsplat._quat_scale_to_covar_preci(
-        gaussians.quaternions, gaussians.scales, True, False
-    )
-    _, means, depths, conics, _ = gsplat._fully_fused_projection(
-        gaussians.means, covariances, matrix[None], intrinsics[None], 64, 48, eps2d=0.3
-    )
-    projected = project(gaussians, camera)
-    # gsplat's first pixel centre is at 0.5
-    assert_close(projected.means + 0.5, means[0, projected.index])
-    assert_close(projected.conics, conics[0, projected.index])
-    assert_close(projected.depths, depths[0, projected.index])
-    assert len(projected.index) > 150

@@ -198,21 +198,6 @@ def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there():
     assert np.abs(counts - 128).max() < 5 * 128**0.5
 
 
-def test_pebbles_are_the_two_nearest_of_all_feature_points():
-    rng = np.random.default_rng(8)
-    cells = [(i, j) for i in range(-9, 9) for j in range(-9, 9)]
-    places = np.array(
-        [[i + PLAIN.random_cell(i, j, 1, 2), j + PLAIN.random_cell(i, j, 2, 2)] for i, j in cells]
-    )
-    for x, y in rng.uniform(-1, 1, (40, 2)):
-        distances = np.linalg.norm(places - [x / 0.2, y / 0.2], axis=1)
-        nearest, second = np.argsort(distances)[:2]
-        first, border, shade = PLAIN.pebbles(x, y, 0.2, 2)
-        assert first == pytest.approx(distances[nearest])
-        assert border == pytest.approx(distances[second] - distances[nearest])
-        assert shade == PLAIN.random_cell(*cells[nearest], 3, 2)
-
-
 def test_light_is_encoded_as_srgb_up_to_a_soft_shoulder():
     for value in np.linspace(0, 0.6, 20) / kernels.EXPOSURE:
         light = kernels.EXPOSURE * value
