@@ -10,13 +10,11 @@ from tests.helpers import read_json, write
 pytestmark = pytest.mark.slow
 SECONDS = 900  # a limit for a trial of three iterations on a busy machine
 
-TINY = [
-    *split(
-        "scene=courtyard scene.views=6 scene.width=64 scene.height=48 init=random init.count=300"
-    ),
-    *split("densify=none train.iterations=3 raster=reference device=cpu threads=1 tracking=none"),
-    *("eval.download=false", "eval.lpips=[]"),
-]
+TINY = split(
+    "scene=courtyard scene.views=6 scene.width=64 scene.height=48 init=random init.count=300 "
+    "densify=none train.iterations=3 raster=reference device=cpu threads=1 tracking=none "
+    "eval.download=false eval.lpips=[]"
+)
 CALLBACK = """
 from hydra.experimental.callback import Callback
 
