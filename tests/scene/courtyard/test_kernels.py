@@ -185,19 +185,6 @@ def test_textures_change_only_with_the_version(name):
     assert found == pytest.approx(PINNED[name], rel=1e-9), found
 
 
-def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there():
-    for i in range(-3, 3):
-        corner = 2 * PLAIN.random_cell(i, 4 - i, 0, 7) - 1
-        assert PLAIN.noise2(i, 4 - i, 7) == pytest.approx(corner)
-        assert PLAIN.noise3(i, 4 - i, 0, 7) == pytest.approx(corner)
-        for x, y in ((i + 1e-4, 4 - i), (i - 1e-4, 4 - i), (i, 4 - i + 1e-4), (i, 4 - i - 1e-4)):
-            assert PLAIN.noise2(x, y, 7) == pytest.approx(corner, abs=1e-9)  # no slope at a corner
-    cells = np.array([PLAIN.random_cell(i - 8, j - 8, k, 0) for i, j, k in np.ndindex(16, 16, 4)])
-    assert 0 <= cells.min() < 0.01 < 0.99 < cells.max() < 1
-    counts, _ = np.histogram(cells, bins=8, range=(0, 1))
-    assert np.abs(counts - 128).max() < 5 * 128**0.5
-
-
 def test_light_is_encoded_as_srgb_up_to_a_soft_shoulder():
     for value in np.linspace(0, 0.6, 20) / kernels.EXPOSURE:
         light = kernels.EXPOSURE * value
