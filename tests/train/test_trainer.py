@@ -54,6 +54,12 @@ def test_counts_in_events_add_up_to_the_trained_gaussians(lab):
     assert living["split_volume"] > 0
 
 
+def test_nothing_is_refined_in_the_last_iteration(lab):
+    """3DGS saves its model before it refines and steps."""
+    lab.train(small(), iterations=100)
+    assert lab.steps(EVENTS) == [40, 60, 80]
+
+
 class Explode(NoDensifier):
     def __init__(self, at):
         self.left = at
