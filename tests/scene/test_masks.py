@@ -267,8 +267,7 @@ def test_a_mask_is_undistorted_with_its_photograph(make_scene, tmp_path):
         save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
         save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
     raw = read_colmap("toy", root, masks="masks")
-    scene = load_scene(raw, raw.model, tmp_path / "cache")
-    view = scene.train[0]
+    view = load_scene(raw, raw.model, tmp_path / "cache").train[0]
     assert view.mask.shape != (90, 120), "undistorting changes the size"
     assert_array_equal(view.mask, view.image[..., 0] == 255)
 

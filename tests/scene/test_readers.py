@@ -170,8 +170,7 @@ def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
     root = make_scene(names=names, text=text)
     for file in (root / "sparse/0").glob("*.txt"):
         file.write_bytes(mark + file.read_bytes().replace(b"\n", line_end))
-    capture = read_colmap("toy", root)
-    assert list(capture.image_names) == names
+    assert list(read_colmap("toy", root).image_names) == names
     model = read_model(root / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == names
     (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)

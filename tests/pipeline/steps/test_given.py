@@ -106,8 +106,7 @@ def trainer(tmp_path, model, cameras=True, **settings):
 @pytest.mark.parametrize("cameras", [True, False])
 def test_a_program_gets_the_training_views_and_the_settings(views, tmp_path, monkeypatch, cameras):
     monkeypatch.setenv("GSBENCH_RUNS", "here")
-    gaussians = random_gaussians(9, dtype=torch.float32)
-    write_ply(gaussians, tmp_path / "model.ply")
+    write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
     program = trainer(tmp_path, str(tmp_path / "model.ply"), cameras)
     step = external_step(views, program, parts_of())
     folder = tmp_path / "built"

@@ -114,8 +114,7 @@ def test_ground_truth_has_the_test_views_and_their_masks(tmp_path, tiny_scene):
     counts = np.zeros((32, 40), dtype=bool)
     counts[:, 7:] = True
     scene = replace(tiny_scene, test=(tiny_scene.test[0], replace(tiny_scene.test[1], mask=counts)))
-    init = Step(INIT, {}, lambda folder: None)
-    views = SimpleNamespace(scene=scene, inputs={}, init=init)
+    views = SimpleNamespace(scene=scene, inputs={}, init=Step(INIT, {}, lambda folder: None))
     ground_truth_step(views).build(tmp_path)
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png")) == [
         "00.png",
