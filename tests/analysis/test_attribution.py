@@ -19,14 +19,12 @@ from gsbench.analysis.differences import (
     representatives,
 )
 from gsbench.analysis.pairing import choose_pairs, controls_of
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
-from gsbench.analysis.tables import build_table
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
-from tests.analysis.synthetic import write_arms
+from tests.analysis.helpers import loaded, page_of, table_of
 from tests.conftest import ROOT, script
 from tests.helpers import read_json, write
+from tests.trials import write_arms
 
 shipped_arms = script("fidelity").shipped_arms
 SCHEDULE = {"train.densify_start": 500, "train.densify_stop": 15_000, "train.mcmc_stop": 25_000}
@@ -58,7 +56,7 @@ def densifier(name, **changes):
 
 def trials_of(runs, arms, **settings):
     write_arms(runs, arms, **settings)
-    return with_variants(load_experiment(runs, "exp").trials)
+    return with_variants(loaded(runs).trials)
 
 
 def sentence(trials, first, second):
@@ -171,21 +169,19 @@ def test_a_comparison_of_several_ingredients_is_reported(tmp_path):
     assert sentence(trials, "adc", "longaxis") == (
         "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
     )
-    page = build_report(load_experiment(tmp_path, "exp"))
+    page = page_of(tmp_path)
     assert (
         "longaxis differs from sfm-adc by split, gradient and threshold"
         in page.split("</strong>")[0]
     )
-    notes = build_table(load_experiment(tmp_path, "exp")).notes
+    notes = table_of(tmp_path).notes
     assert sentence(trials, "adc", "longaxis") in notes
 
 
 def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path):
     trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
     assert sentence(trials, "adc", "volumetric") == ""
-    assert not any(
-        "differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes
-    )
+    assert not any("differs from" in note for note in table_of(tmp_path).notes)
 
 
 def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path):
@@ -200,9 +196,7 @@ def test_trials_without_recorded_settings_are_reported(tmp_path):
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")}):
         if "longaxis" in path.parent.name:
             (path / "config.yaml").unlink()
-    assert sentence(list(load_experiment(tmp_path, "exp").trials), "adc", "longaxis").endswith(
-        f"by {NO_RECORD}."
-    )
+    assert sentence(list(loaded(tmp_path).trials), "adc", "longaxis").endswith(f"by {NO_RECORD}.")
 
 
 def test_another_program_counts_as_many_ingredients(tmp_path):
@@ -221,7 +215,7 @@ def test_a_training_elsewhere_has_unknown_ingredients(tmp_path):
         if path.parent.name == "sfm-theirs":
             data = read_json(path / "results.json")
             write(path / "results.json", data | {"evaluated_from": "model"})
-    trials = list(load_experiment(tmp_path, "exp").trials)
+    trials = list(loaded(tmp_path).trials)
     assert trials[-1].made_elsewhere
     assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."
 
@@ -229,9 +223,7 @@ def test_a_training_elsewhere_has_unknown_ingredients(tmp_path):
 def test_points_of_a_search_are_not_compared(tmp_path):
     trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
     (tmp_path / "exp" / "tuning.json").write_text("{}")
-    assert not any(
-        "differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes
-    )
+    assert not any("differs from" in note for note in table_of(tmp_path).notes)
 
 
 # --- controls
@@ -245,7 +237,7 @@ def test_arms_are_compared_with_their_controls(tmp_path):
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), controls=controls_of(trials))
     against = [(first.densify, second.densify) for first, second in pairs]
     assert against == [("adc", "absgrad"), ("adc", "longaxis"), ("absgrad", "longaxis")]
-    assert "sfm-longaxis against sfm-absgrad" in build_report(load_experiment(tmp_path, "exp"))
+    assert "sfm-longaxis against sfm-absgrad" in page_of(tmp_path)
     varied = [
         Arm("sfm", name, (("cap", str(cap)),))
         for name in ("absgrad", "adc", "longaxis")

@@ -14,23 +14,19 @@ from gsbench.analysis import fairness
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
 from gsbench.analysis.notes import Note
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import to_latex
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import tables
-from tests.analysis.synthetic import write_arms
+from tests.analysis.helpers import page_of, trials_of
 from tests.analysis.test_attribution import densifier
-from tests.finished import search_record
 from tests.helpers import read_json, refusal, write
+from tests.trials import search_record, write_arms
 
 LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
 
 def sheet(runs, second="longaxis", first="adc"):
-    return fairness_table(
-        with_variants(load_experiment(runs, "exp").trials), Arm("sfm", first), Arm("sfm", second)
-    )
+    return fairness_table(with_variants(trials_of(runs)), Arm("sfm", first), Arm("sfm", second))
 
 
 def shown(table):
@@ -229,7 +225,7 @@ def test_the_sheet_says_whether_a_search_ended_before_the_trials(searched, said,
 
 
 def test_the_report_shows_the_sheet_before_the_numbers_of_the_verdict(tmp_path, paths):
-    page = build_report(load_experiment(tmp_path, "exp"))
+    page = page_of(tmp_path)
     assert (
         page.index('<h2 id="h-verdict"')
         < page.index("Fairness sheet: sfm-longaxis")

@@ -8,8 +8,9 @@ import pytest
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.trial_record import read_rows
-from tests.analysis.synthetic import Plan, write_arms, write_runs
+from tests.analysis.helpers import loaded, trials_of
 from tests.helpers import read_json, refusal, write
+from tests.trials import write_arms, write_runs
 
 
 def rewrite(path, **changes):
@@ -18,8 +19,8 @@ def rewrite(path, **changes):
 
 
 def test_every_complete_trial_is_read(tmp_path):
-    paths = write_runs(tmp_path, Plan())
-    experiment = load_experiment(tmp_path, "exp")
+    paths = write_runs(tmp_path)
+    experiment = loaded(tmp_path)
     assert {trial.path for trial in experiment.trials} == set(paths)
     assert experiment.warnings == ()
     assert experiment.seeds == (0, 1, 2)
@@ -28,7 +29,7 @@ def test_every_complete_trial_is_read(tmp_path):
 def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
     for cap in (1, 2):
         write_arms(tmp_path, {"adc": {"cap": cap}}, seeds=(1, 0))
-    trials = load_experiment(tmp_path, "exp").trials
+    trials = trials_of(tmp_path)
     assert [trial.seed for trial in trials] == [0, 0, 1, 1]
     assert [trial.config_hash for trial in trials] == sorted(
         {trial.config_hash for trial in trials}
@@ -36,11 +37,11 @@ def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
 
 
 def test_hydra_and_report_files_beside_the_trials_are_ignored(tmp_path):
-    write_runs(tmp_path, Plan())
+    write_runs(tmp_path)
     (tmp_path / "exp" / ".hydra").mkdir()
     (tmp_path / "exp" / "report.html").write_text("")
     (tmp_path / "exp" / "multirun.yaml").write_text("")
-    assert load_experiment(tmp_path, "exp").warnings == ()
+    assert loaded(tmp_path).warnings == ()
 
 
 DAMAGES = {
@@ -80,10 +81,10 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", list(DAMAGES))
 def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path, damage):
-    paths = write_runs(tmp_path, Plan())
+    paths = write_runs(tmp_path)
     spoil, words = DAMAGES[damage]
     spoil(paths[4])
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     assert len(experiment.trials) == len(paths) - 1
     assert len(experiment.warnings) == 1
     assert words in experiment.warnings[0]
@@ -91,18 +92,18 @@ def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path, damage):
 
 
 def test_a_failed_trial_says_why(tmp_path):
-    path = write_runs(tmp_path, Plan())[0]
+    path = write_runs(tmp_path)[0]
     (path / "results.json").unlink()
     write(
         path / "failed.json", {"error": "TrainingError", "message": "the loss is not finite at 812"}
     )
-    assert load_experiment(tmp_path, "exp").warnings == (
+    assert loaded(tmp_path).warnings == (
         "exp/courtyard/sfm-adc/c0ffee00-seed0: failed, the loss is not finite at 812",
     )
 
 
 def test_an_unknown_experiment_names_the_known_ones(tmp_path):
-    write_runs(tmp_path, Plan())
+    write_runs(tmp_path)
     (tmp_path / "store").mkdir()
     assert list_experiments(tmp_path) == ["exp"]
     with refusal("there: exp"):
@@ -112,15 +113,15 @@ def test_an_unknown_experiment_names_the_known_ones(tmp_path):
 
 
 def test_an_experiment_without_a_usable_trial_is_an_error(tmp_path):
-    for path in write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,))):
+    for path in write_runs(tmp_path, scenes=("garden",), seeds=(0,)):
         (path / "results.json").unlink()
     with refusal("no complete trial among 2 folders"):
-        load_experiment(tmp_path, "exp")
+        loaded(tmp_path)
 
 
 def test_views_must_average_to_the_metrics_of_their_trial(tmp_path):
-    path = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))[0]
-    trial = next(trial for trial in load_experiment(tmp_path, "exp").trials if trial.path == path)
+    path = write_runs(tmp_path, seeds=(0,), scenes=("garden",))[0]
+    trial = next(trial for trial in trials_of(tmp_path) if trial.path == path)
     views = read_views(trial)
     assert len(views) == 6
     assert set(views["view000"]) == {"psnr", "ssim", "lpips_vgg_raw", "flip"}

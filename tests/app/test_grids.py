@@ -11,8 +11,8 @@ from gsbench.config.compose import compose_one
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan, read_plan
 from gsbench.runs.trial_folder import TrialFolder
-from tests.finished import write_results
 from tests.helpers import refusal, write
+from tests.trials import write_results
 
 # Some trials of `threshold` by their names, which stay as they are from version to version.
 KNOWN = {

@@ -29,9 +29,10 @@ from gsbench.claims.gate import (
     too_small_to_place,
 )
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.runs.trial_record import Code
-from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
+from tests.analysis.helpers import loaded
+from tests.helpers import refusal
+from tests.trials import write_as, write_runs, write_trial
 
 VALUES = {"eval": {"extra": {}}}
 SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
@@ -49,13 +50,8 @@ def trials(runs, effect, noise, seeds=4, scenes=tuple(SCENES)):
     for scene in scenes:
         for seed in range(seeds):
             rng = np.random.default_rng([seed, len(scene), int(1000 * abs(effect))])
-            views = {
-                "psnr": 26 + effect + rng.normal(0, noise) + np.zeros(3),
-                "flip": 0.1 + np.zeros(3),
-            }
-            write_trial(
-                runs, trial_data(Plan(experiment="gate"), scene, "sfm", "adc", seed, views), views
-            )
+            psnr = 26 + effect + rng.normal(0, noise)
+            write_trial(runs, seed, experiment="gate", scene=scene, psnr=psnr, flip=0.1)
     return load_experiment(runs, "gate").trials
 
 
@@ -170,9 +166,9 @@ def test_questions_that_cannot_be_judged_are_refused():
         (("psnr", "0"), "above 0"),
         (("psnr", "much"), "above 0"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             asked(*words)
-    with pytest.raises(InputError, match="needs at least 2 seeds, and there is 1"):
+    with refusal("needs at least 2 seeds, and there is 1"):
         asked(seeds=1)
     assert asked("gaussians", "10%").questions[0].sign == -1
     assert asked(least=None).questions[0].least == 0.1
@@ -197,8 +193,8 @@ def test_questions_that_cannot_be_judged_are_refused():
 def test_bad_input_of_gate_is_refused(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GSBENCH_RUNS", raising=False)
-    write_runs(tmp_path / "made", Plan(densifiers=("adc", "volumetric")))
-    write_archive(load_experiment(tmp_path / "made", "exp"), tmp_path / "exp.zip")
+    write_runs(tmp_path / "made", densifiers=("adc", "volumetric"))
+    write_archive(loaded(tmp_path / "made"), tmp_path / "exp.zip")
     given = any(word.startswith(("scene=", "densify=")) for word in words)
     assert run(["gate", *words, *([] if given or not words else ["densify=adc", "init=sfm"])]) == 2
     assert message in capsys.readouterr().err
@@ -212,11 +208,8 @@ def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effe
 
     def train(planned):
         for trial in planned:
-            seed, folder = trial.values["seed"], trial.folder
-            trained.append(seed)
-            views = {"psnr": 26 + effect + 0.001 * seed + np.zeros(3)}
-            data = trial_data(Plan(experiment="gate"), "courtyard", "sfm", "adc", seed, views)
-            write_trial(trial.files.runs, data, views, folder.name.partition("-")[0])
+            trained.append(trial.values["seed"])
+            write_as(trial, psnr=26 + effect + 0.001 * trained[-1])
         return 0
 
     monkeypatch.chdir(tmp_path)

@@ -10,8 +10,8 @@ from gsbench.claims.check import Checked, claim_verdicts
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
 from gsbench.runs.experiments import Declaration
-from tests.analysis.synthetic import Plan, write_runs
 from tests.claims.test_check import content
+from tests.trials import write_runs
 
 EARLY = "2020-01-01T00:00:00Z"
 SIZE = "nine scenes, 30,000 iterations"
@@ -19,7 +19,7 @@ SIZE = "nine scenes, 30,000 iterations"
 
 def made(runs, scenes, seeds=4, **plan):
     write_runs(
-        runs, Plan(scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0}, **plan)
+        runs, scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0}, **plan
     )
     return list(read_experiment(runs / "exp").trials)
 

@@ -1,6 +1,5 @@
 """The mean of many studies by Student's t, refusals, and archives as studies."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, t_test
 from gsbench.claims.export import write_archive
 from gsbench.claims.pooling import (
@@ -23,9 +21,10 @@ from gsbench.claims.pooling import (
     read_studies,
 )
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import loaded, trials_of
+from tests.helpers import read_json, refusal, write
+from tests.trials import write_runs
 
 WANTED = PooledQuestion(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
 EFFECTS = (0.5, 0.9, 0.4, 0.7)
@@ -38,7 +37,6 @@ STUDIES = [
 def test_the_mean_is_tested_with_studies_as_units():
     found, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     interval = expected.confidence_interval()
-    assert found.test is not None
     assert found.test.mean == pytest.approx(np.mean(EFFECTS))
     assert found.test.p == pytest.approx(expected.pvalue)
     own = found.test.interval()
@@ -53,7 +51,6 @@ def test_intervals_contain_the_truth_as_often_as_they_claim():
     for _ in range(600):
         effects = rng.normal(1.0, 0.3, 5) + rng.normal(0, rng.uniform(0.1, 0.5, 5))
         found = pool([Study(str(k), float(effect)) for k, effect in enumerate(effects)])
-        assert found.test is not None
         held += found.test.interval().low <= 1.0 <= found.test.interval().high
     assert held / 600 > 0.95 - 3 * (0.05 * 0.95 / 600) ** 0.5
 
@@ -67,14 +64,13 @@ def test_studies_of_different_protocols_have_no_mean():
     unknown = pool([studies[0], Study("c", 1.0)])
     assert "c: unknown" in unknown.refusal
     alike = pool([studies[0], Study("c", 1.0, None, "paper-1")]).test
-    assert alike is not None
     assert alike.mean == pytest.approx(1.0)
 
 
 def test_one_study_has_no_mean_and_a_study_given_twice_is_refused():
     assert pool(STUDIES[:1]).test is None
     assert pool([]).test is None
-    with pytest.raises(InputError, match="twice"):
+    with refusal("twice"):
         pool([STUDIES[0], STUDIES[0]])
 
 
@@ -101,25 +97,25 @@ def test_studies_are_rows_of_a_table():
 def archive(tmp_path, name, seed=0, protocol="paper-1", budget=None, **plan):
     """Write the archive of a laboratory in which "volumetric" gains 1 dB."""
     runs = tmp_path / f"runs_{name}_{seed}"
-    paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
+    paths = write_runs(runs, effect={"psnr": 1.0}, random_seed=seed, **plan)
     for number, path in enumerate(paths):
-        results = json.loads((path / "results.json").read_text())
+        results = read_json(path / "results.json")
         results["protocol"] = (
             protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
         )
         results["budget"] = budget or results["budget"]
         # no two trainings take exactly the same time
         results["seconds"]["train"] += seed + number / 1000
-        (path / "results.json").write_text(json.dumps(results))
+        write(path / "results.json", results)
     file = tmp_path / f"{name}.zip"
-    write_archive(load_experiment(runs, "exp"), file)
+    write_archive(loaded(runs), file)
     return file
 
 
 def test_an_archive_is_a_study_of_its_paired_differences(tmp_path):
     file = archive(tmp_path, "lab")
     ((study,), _, _) = read_studies(file, WANTED, "lab")
-    trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
+    trials = trials_of(tmp_path / "runs_lab_0")
     by_arm = {(one.densify, one.scene, one.seed): one.metrics["psnr"] for one in trials}
     pairs = np.array(
         [
@@ -129,8 +125,6 @@ def test_an_archive_is_a_study_of_its_paired_differences(tmp_path):
     )
     assert study.effect == pytest.approx(pairs.mean())
     test = t_test(pairs)
-    assert test is not None
-    assert study.interval is not None
     assert (study.interval.low, study.interval.high) == pytest.approx(
         (test.interval().low, test.interval().high)
     )
@@ -144,7 +138,7 @@ def test_initialisers_on_different_scenes_are_one_study(tmp_path):
         "both (dataset)",
         "both (sfm)",
     ]
-    trials = load_experiment(tmp_path / "runs_both_0", "exp")
+    trials = loaded(tmp_path / "runs_both_0")
     kept = [trial for trial in trials.trials if (trial.init == "sfm") == (trial.scene == "garden")]
     write_archive(replace(trials, trials=tuple(kept)), tmp_path / "one.zip")
     (study,), notes, _ = read_studies(tmp_path / "one.zip", WANTED, "one")
@@ -243,9 +237,9 @@ def test_scenes_of_an_archive_under_other_conditions_are_noted(tmp_path):
     file = archive(tmp_path, "lab")
     runs = tmp_path / "runs_lab_0"
     for path in (runs / "exp" / "garden").glob("*/*"):
-        results = json.loads((path / "results.json").read_text()) | {"iterations": 7000}
-        (path / "results.json").write_text(json.dumps(results))
-    write_archive(load_experiment(runs, "exp"), file)
+        results = read_json(path / "results.json") | {"iterations": 7000}
+        write(path / "results.json", results)
+    write_archive(loaded(runs), file)
     _, notes, _ = read_studies(file, WANTED, "lab")
     assert notes[1:] == [
         "lab: Scenes of sfm-adc and sfm-volumetric differ in more than the scene: iterations (2000 "
@@ -272,9 +266,7 @@ def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
         assert pairs(adc, once, twice, arm=name) == [(adc, twice)]
         assert pairs(adc, once, twice, arm="adc", baseline=name) == [(twice, adc)]
     for names in ({}, {"arm": "adc", "baseline": "volumetric"}):
-        with pytest.raises(
-            InputError, match=re.escape(f"the name fits {once} and {twice}: choose")
-        ):
+        with refusal(re.escape(f"the name fits {once} and {twice}: choose")):
             pairs(adc, once, twice, **names)
 
 

@@ -1,7 +1,6 @@
 """The Python blocks of the documents run, in order, as a reader would run them."""
 
 import csv
-import json
 import os
 import re
 import sys
@@ -14,6 +13,7 @@ from PIL import Image
 
 from gsbench.cli import run
 from tests.conftest import ROOT
+from tests.helpers import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -91,7 +91,7 @@ def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
     )
     assert len(trials) == 4
     for trial in trials:
-        results = json.loads((trial / "results.json").read_text())
+        results = read_json(trial / "results.json")
         assert results["metric_facts"]["gradients"]["direction"] == -1
         assert list(results["code"]["sources"]) == ["gradients"]
         with (trial / "per_view.csv").open(newline="") as stream:
@@ -122,9 +122,9 @@ def test_the_initialiser_of_its_document_runs(folder, capsys):
     found = run_blocks(ROOT / "docs" / "initialiser.md", folder)
     assert found["status"] == found["scan_status"] == 0, capsys.readouterr().err
     (scan,) = Path("runs").glob("scan/courtyard/points-none/*/results.json")
-    assert json.loads(scan.read_text())["num_init_points"] == 900
+    assert read_json(scan)["num_init_points"] == 900
     (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
-    values = json.loads(results.read_text())
+    values = read_json(results)
     assert values["num_init_points"] == 500
     assert values["init_report"]["init"] == "shell"
 
@@ -143,7 +143,7 @@ def test_the_tracker_of_its_document_gets_every_trial(folder, capsys):
 
 
 def _json(path):
-    return json.loads(path.read_text())
+    return read_json(path)
 
 
 def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):

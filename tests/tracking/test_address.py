@@ -1,13 +1,11 @@
 """A tracker that a stranger's file names gets nothing unless the user types its address."""
 
-import json
-
 import pytest
 
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.tracking import connect, default_uri, tracker_uri
 from gsbench.tracking.mlflow_sink import VARIABLE
+from tests.helpers import read_json, refusal, write
 from tests.tracking.helpers import (
     STATE,
     begin_trial,
@@ -15,9 +13,9 @@ from tests.tracking.helpers import (
     free_port,
     mirror_trial,
     options,
-    trial_values,
     write_trial,
 )
+from tests.trials import trial_values
 
 
 def test_the_address_is_the_configured_one_else_the_environments_else_the_runs_folders(
@@ -68,9 +66,9 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     values = trial_values(tmp_path, name="theirs")
     folder = begin_trial(values)
     write_trial(folder, values)
-    content = json.loads((folder / "config.yaml").read_text())
+    content = read_json(folder / "config.yaml")
     del content[lacking]
-    (folder / "config.yaml").write_text(json.dumps(content))
+    write(folder / "config.yaml", content)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     assert run(["sync", "theirs"]) == 0
     said = capfd.readouterr()
@@ -91,7 +89,7 @@ def test_artifacts_outside_the_runs_folder_are_refused(place, tmp_path, monkeypa
     monkeypatch.delenv(VARIABLE, raising=False)
     address = place.format(port=free_port(), outside=outside, runs=runs)
     connect(None, runs).create_experiment("theirs", artifact_location=address)
-    with pytest.raises(InputError, match="would send artifacts to"):
+    with refusal("would send artifacts to"):
         mirror_trial(options(), folder, values)
     assert not list(outside.iterdir())
 
@@ -108,9 +106,9 @@ def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
     shown = runs / "mlartifacts" / "theirs" / made.info.run_id / "artifacts" / "config.yaml"
     shown.unlink()
     shown.symlink_to(private)
-    state = json.loads((folder / STATE).read_text())
-    (folder / STATE).write_text(json.dumps(state | {"complete": None}))
-    with pytest.raises(InputError, match="follows no links"):
+    state = read_json(folder / STATE)
+    write(folder / STATE, state | {"complete": None})
+    with refusal("follows no links"):
         mirror_trial(options(), folder, values)
     assert private.read_text() == "secret"
 

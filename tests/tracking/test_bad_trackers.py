@@ -20,7 +20,6 @@ from tests.end_to_end.conftest import SMALL
 from tests.helpers import read_json
 from tests.processes import completed, heed_interrupts
 from tests.tracking.helpers import (
-    RECORDS,
     begin_trial,
     child_environment,
     found_runs,
@@ -29,10 +28,10 @@ from tests.tracking.helpers import (
     mirror_command,
     mirror_trial,
     options,
-    trial_values,
     write_trial,
 )
 from tests.tracking.servers import Gate, Listener
+from tests.trials import STEPS, trial_values
 
 pytestmark = pytest.mark.slow
 # A limit for programs that hang; a slow machine needs less.
@@ -221,7 +220,7 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
     for run in found:
         assert run.info.status == "FINISHED"
         assert history(client, run.info.run_id, "train/loss") == [
-            (i, 1 / i) for i in range(1, RECORDS + 1)
+            (i, 1 / i) for i in range(1, STEPS + 1)
         ]
         assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
 

@@ -27,9 +27,9 @@ from tests.tracking.helpers import (
     mirror_trial,
     options,
     run_of,
-    trial_values,
     write_trial,
 )
+from tests.trials import trial_values
 from tests.view.browser import Browser
 
 NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.gsbench"

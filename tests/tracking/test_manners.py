@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
-from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, default_uri
+from tests.helpers import refusal
 from tests.tracking.helpers import (
     begin_trial,
     child_environment,
@@ -17,9 +17,9 @@ from tests.tracking.helpers import (
     mirror_trial,
     options,
     run_of,
-    trial_values,
     write_trial,
 )
+from tests.trials import trial_values
 
 pytestmark = pytest.mark.slow
 
@@ -66,9 +66,7 @@ def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
     shutil.copytree(runs, moved)
     values = trial_values(moved, seed=26)
     folder = TrialFolder.of(values).path
-    with pytest.raises(
-        InputError, match=r"if this runs folder was moved, remove mlflow.db and mlartifacts there"
-    ):
+    with refusal(r"if this runs folder was moved, remove mlflow.db and mlartifacts there"):
         mirror_trial(options(), folder, values)
     (moved / "mlflow.db").unlink()
     shutil.rmtree(moved / "mlartifacts")

@@ -12,6 +12,7 @@ import pytest
 
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror, connect, ensure_experiment
+from tests.helpers import read_json, write
 from tests.processes import bytes_written
 from tests.tracking.helpers import (
     STATE,
@@ -22,10 +23,10 @@ from tests.tracking.helpers import (
     free_port,
     options,
     run_of,
-    trial_values,
     write_trial,
 )
 from tests.tracking.servers import Listener
+from tests.trials import trial_values
 
 SECONDS = 240  # a limit for what never comes; a slow machine needs less
 
@@ -33,9 +34,7 @@ SECONDS = 240  # a limit for what never comes; a slow machine needs less
 def wait_for_run(folder):
     """Wait until the trial's folder records its run."""
     deadline = time.monotonic() + SECONDS
-    while "described" not in (
-        json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}
-    ):
+    while "described" not in (read_json(folder / STATE) if (folder / STATE).exists() else {}):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 
@@ -49,7 +48,7 @@ def test_runs_of_failed_and_stopped_trials_say_so_and_are_continued(runs):
         with pytest.raises(type(error)), following(options(), folder):  # noqa: PT012
             wait_for_run(folder)
             if status == "FAILED":  # as a trial does before its error is raised
-                (folder / "failed.json").write_text(json.dumps({"message": "x"}))
+                write(folder / "failed.json", {"message": "x"})
             raise error
         run = run_of(client, 4)
         assert run.info.status == status

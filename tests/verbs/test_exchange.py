@@ -13,10 +13,9 @@ from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs import exchange
-from tests.analysis.synthetic import Plan, write_runs
-from tests.finished import write_results
 from tests.gaussians.helpers import random_gaussians
 from tests.helpers import refusal, write
+from tests.trials import write_results, write_runs
 
 pytestmark = pytest.mark.usefixtures("runs")
 
@@ -60,7 +59,7 @@ def test_export_of_the_model_and_the_initial_cloud(runs, gaussians, tmp_path, ca
 
 
 def test_the_archive_of_results_gets_the_name_of_the_experiment_or_of_out(runs, tmp_path, said):
-    write_runs(runs, Plan())
+    write_runs(runs)
     (tmp_path / "new").mkdir()
     for out, file in (([], "exp.zip"), (["--out", "new"], "new/exp.zip"), (["--out", "a"], "a")):
         assert said("export --results exp", *out).startswith(f"{file}: results of exp, ")
@@ -115,7 +114,7 @@ def test_an_initial_model_that_is_no_longer_stored_is_named(runs, gaussians, ref
 def test_a_file_that_the_user_did_not_name_is_not_overwritten(
     words, file, tmp_path, monkeypatch, refused, said
 ):
-    write_runs(tmp_path / "runs", Plan())
+    write_runs(tmp_path / "runs")
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.chdir(tmp_path)
     said("export --results exp --out a.zip")
