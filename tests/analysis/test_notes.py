@@ -20,11 +20,10 @@ from gsbench.runs.trial_record import (
     InitialCloud,
     TwinViews,
 )
-from tests.analysis.helpers import loaded, page_of, table_of
+from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
-from tests.trials import write_runs
+from tests.trials import write_runs, write_trial
 
-ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 COMPARED = (
     "so this does not compare at equal counts. To do so: give both arms densify.cap=governor "
 )
@@ -54,20 +53,15 @@ def with_record(trial, **values):
 )
 def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path, counts, said):
     made = trials_of(tmp_path, scenes=list(counts))
-    trials = [
-        with_record(
-            trial,
-            num_gaussians=counts[trial.scene][trial.densify == "volumetric"],
-            num_init_points=50,
-        )
-        for trial in made
-    ]
+    trials = []
+    for trial in made:
+        count = counts[trial.scene][trial.densify == "volumetric"]
+        trials.append(with_record(trial, num_gaussians=count, num_init_points=50))
     note = counts_note(trials, ADC, VOLUMETRIC)
     if said:  # no limit can be below the initial cloud
         larger = [with_record(trial, num_init_points=10_000) for trial in trials]
-        assert "To do so: start both arms with fewer than 10,000 points" in str(
-            counts_note(larger, ADC, VOLUMETRIC)
-        )
+        words = "To do so: start both arms with fewer than 10,000 points"
+        assert words in str(counts_note(larger, ADC, VOLUMETRIC))
     least = min(filter(None, itertools.chain(*counts.values())))
     words = f"densify.max_gaussians={least} and another name."
     expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}{words}"
@@ -117,18 +111,11 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         for trial in made
     ]
     words = {"adc": baseline, "volumetric": arm}
-    planned = {
-        trial.path.relative_to(tmp_path / "exp").as_posix(): {
-            "overrides": [
-                *words[trial.densify],
-                f"seed={trial.seed}",
-                "scene=garden",
-                "name=exp",
-                "densify.cap=governor",
-            ]
-        }
-        for trial in trials
-    }
+    planned = {}
+    for trial in trials:
+        own = [*words[trial.densify], f"seed={trial.seed}", "scene=garden", "name=exp"]
+        place = trial.path.relative_to(tmp_path / "exp").as_posix()
+        planned[place] = {"overrides": [*own, "densify.cap=governor"]}
     write(tmp_path / "exp" / "plan.json", {"trials": planned})
     sentence = str(counts_note(trials, ADC, VOLUMETRIC))
     assert f"To do so: {command}" in sentence
@@ -156,11 +143,11 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
     ],
 )
 def test_a_limit_that_no_arm_reaches_makes_no_counts_equal(tmp_path, budget, counts, events, said):
-    for path in write_runs(tmp_path, scenes=list(counts), seeds=(0, 1)):
-        data = read_json(path / "results.json")
-        data["num_gaussians"] = counts[data["scene"]][data["densify"] == "volumetric"]
-        limit = {"cap": budget[0], "max_gaussians": budget[1]}
-        write(path / "results.json", data | {"budget": limit, "events": events})
+    limit = {"cap": budget[0], "max_gaussians": budget[1]}
+    for scene, own in counts.items():
+        for densify, count in zip(("adc", "volumetric"), own, strict=True):
+            place = {"scene": scene, "densify": densify, "psnr": 20.0}
+            write_trial(tmp_path, **place, _num_gaussians=count, _budget=limit, _events=events)
     experiment = loaded(tmp_path)
     notes = texts(limit_notes(experiment.trials, [(ADC, VOLUMETRIC)]))
     assert limit_notes(experiment.trials, []) == []

@@ -6,13 +6,7 @@ from gsbench.verbs.results import explain_cell
 from tests.analysis.helpers import page_of, table_of, trials_of
 from tests.trials import write_trial
 
-XEON = {
-    "cpu": "Xeon",
-    "architecture": "x86_64",
-    "kernels": "skylake-avx512",
-    "torch": "AVX512",
-    "device": "cpu",
-}
+XEON = {"cpu": "Xeon", "kernels": "skylake-avx512", "torch": "AVX512", "device": "cpu"}
 RYZEN = XEON | {"cpu": "Ryzen", "kernels": "znver3", "torch": "AVX2"}
 A, B = "a" * 64, "b" * 64
 

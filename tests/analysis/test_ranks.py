@@ -55,21 +55,14 @@ def test_the_best_arm_has_rank_one(seven, metric):
 
 
 def test_groups_are_the_largest_that_do_not_differ():
-    made = Ranking(
-        quantity("psnr", []),
-        tuple(Arm("sfm", c) for c in "abcde"),
-        (1.0, 1.8, 2.7, 4.0, 5.5),
-        SCENES,
-        1.2,
-        0.01,
-    )
-    assert made.groups == [(0, 1), (1, 2)]
-    assert Ranking(
-        made.quantity, made.arms, (1.0, 1.1, 1.2, 1.3, 5.0), SCENES, 1.2, 0.01
-    ).groups == [(0, 3)]
-    assert (
-        Ranking(made.quantity, made.arms, (1.0, 2.0, 3.0, 4.0, 5.0), SCENES, 0.9, 0.01).groups == []
-    )
+    assert ranked((1.0, 1.8, 2.7, 4.0, 5.5)).groups == [(0, 1), (1, 2)]
+    assert ranked((1.0, 1.1, 1.2, 1.3, 5.0)).groups == [(0, 3)]
+    assert ranked((1.0, 2.0, 3.0, 4.0, 5.0), critical=0.9).groups == []
+
+
+def ranked(ranks, names="abcde", critical=1.2):
+    arms = tuple(Arm("sfm", name) for name in names)
+    return Ranking(quantity("psnr", []), arms, ranks, SCENES, critical, None)
 
 
 @pytest.mark.parametrize(
@@ -99,14 +92,9 @@ def test_a_scene_that_lacks_an_arm_is_left_out(seven):
 
 
 def test_equal_arms_do_not_differ(make_experiment):
-    experiment = make_experiment(
-        scenes=SCENES,
-        densifiers=ARMS,
-        trial_noise=0.0,
-        residual_noise=0.0,
-        effect_noise=0.0,
-        scene_noise=0.0,
-    )
+    noises = ("trial_noise", "residual_noise", "effect_noise", "scene_noise")
+    plan = {"scenes": SCENES, "densifiers": ARMS} | dict.fromkeys(noises, 0.0)
+    experiment = make_experiment(**plan)
     ranking = rank_arms(experiment.trials, quantity("psnr", experiment.trials))
     assert set(ranking.ranks) == {2.0}
     assert ranking.p == 1.0
@@ -131,9 +119,8 @@ def numbers(pattern, text):
 
 def test_a_rank_plot_puts_arms_ranks_and_groups_where_they_belong():
     """Five arms with names of five letters: the scale is from 20 + 5 x 6.6 px to 380 - 30 px."""
-    arms = tuple(Arm("sfm", c) for c in "abcde")
     ranks = (1.0, 1.8, 2.7, 4.0, 4.5)
-    svg = rank_plot(Ranking(quantity("psnr", []), arms, ranks, SCENES, 1.2, None))
+    svg = rank_plot(ranked(ranks))
     assert 'viewBox="0 0 401.0 204.0"' in svg
     step, rows = 297 / 4, [57, 83, 109, 135, 161]
     assert numbers("<circle cx=# cy=#", svg) == [
@@ -157,7 +144,6 @@ def test_a_rank_plot_puts_arms_ranks_and_groups_where_they_belong():
     assert "Not different: sfm-a to sfm-b; sfm-b to sfm-c; sfm-d to sfm-e." in svg
     assert "Friedman" not in svg
     # Long names leave at least 160 px to the scale.
-    long = (Arm("sfm", "x" * 50), Arm("sfm", "y" * 49))
-    svg = rank_plot(Ranking(quantity("psnr", []), long, (1.0, 2.0), SCENES, 0.5, None))
+    svg = rank_plot(ranked((1.0, 2.0), ("x" * 50, "y" * 49), 0.5))
     assert [x for x, _ in numbers("<circle cx=# cy=#", svg)] == pytest.approx([376.4, 536.4])
     assert "Not different: none." in svg

@@ -307,10 +307,10 @@ CHARTS = {
 def test_charts_are_well_formed_and_stay_inside(chart):
     svg = next(ElementTree.fromstring(CHARTS[chart]("<&>")).iter("svg"))
     _, _, width, height = map(float, svg.attrib["viewBox"].split())
+    limits = dict.fromkeys(("x", "cx", "x1"), width) | dict.fromkeys(("y", "cy", "y1"), height)
     for element in svg.iter():
-        for names, limit in (("x cx x1", width), ("y cy y1", height)):
-            for name in names.split():
-                assert 0 <= float(element.attrib.get(name, 0)) <= limit
+        for name, limit in limits.items():
+            assert 0 <= float(element.attrib.get(name, 0)) <= limit
     assert svg.attrib["aria-label"].startswith("<&>")
 
 

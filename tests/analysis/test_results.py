@@ -9,13 +9,8 @@ from gsbench.analysis.results import load_experiment, read_views
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.trial_record import read_rows
 from tests.analysis.helpers import loaded, trials_of
-from tests.helpers import read_json, refusal, write
+from tests.helpers import change_json, refusal, write
 from tests.trials import write_arms, write_runs
-
-
-def rewrite(path, **changes):
-    data = read_json(path / "results.json")
-    write(path / "results.json", data | changes)
 
 
 def test_every_complete_trial_is_read(tmp_path):
@@ -44,29 +39,20 @@ def test_hydra_and_report_files_beside_the_trials_are_ignored(tmp_path):
     assert loaded(tmp_path).warnings == ()
 
 
-DAMAGES = {
-    "half a file": (
-        lambda path: (path / "results.json").write_text('{"status": "comp'),
-        "not JSON",
-    ),
-    "binary": (lambda path: (path / "results.json").write_bytes(b"\xff\xfe\x00"), "not JSON"),
-    "a list": (lambda path: (path / "results.json").write_text("[]"), "should be an object"),
-    "nan": (lambda path: rewrite(path, metrics={"psnr": float("nan")}), "metrics.psnr is nan"),
-    "text for a number": (
-        lambda path: rewrite(path, metrics={"psnr": "27"}),
-        "metrics.psnr is '27'",
-    ),
-    "no seconds": (lambda path: rewrite(path, seconds=None), "seconds is None"),
-    "no count": (lambda path: rewrite(path, num_gaussians=None), "num_gaussians"),
-    "no protocol": (lambda path: rewrite(path, protocol=None), "protocol is None"),
-    "still running": (lambda path: rewrite(path, status="running"), "unfinished"),
-    "another scene": (
-        lambda path: rewrite(path, scene="kitchen"),
-        "foreign, its results.json is of scene 'kitchen'",
-    ),
-    "another experiment": (lambda path: rewrite(path, experiment="other"), "of experiment 'other'"),
-    "another arm": (lambda path: rewrite(path, densify="none"), "of arm 'sfm-none'"),
-    "another seed": (lambda path: rewrite(path, seed=7), "of seed '7'"),
+DAMAGES = {  # keys of results.json, its new content, or a change of the folder
+    "half a file": ('{"status": "comp', "not JSON"),
+    "binary": (b"\xff\xfe\x00", "not JSON"),
+    "a list": ("[]", "should be an object"),
+    "nan": ({"metrics": {"psnr": float("nan")}}, "metrics.psnr is nan"),
+    "text for a number": ({"metrics": {"psnr": "27"}}, "metrics.psnr is '27'"),
+    "no seconds": ({"seconds": None}, "seconds is None"),
+    "no count": ({"num_gaussians": None}, "num_gaussians"),
+    "no protocol": ({"protocol": None}, "protocol is None"),
+    "still running": ({"status": "running"}, "unfinished"),
+    "another scene": ({"scene": "kitchen"}, "foreign, its results.json is of scene 'kitchen'"),
+    "another experiment": ({"experiment": "other"}, "of experiment 'other'"),
+    "another arm": ({"densify": "none"}, "of arm 'sfm-none'"),
+    "another seed": ({"seed": 7}, "of seed '7'"),
     "a copy under another name": (
         lambda path: path.rename(path.with_name("copy of run")),
         "not named",
@@ -83,7 +69,12 @@ DAMAGES = {
 def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path, damage):
     paths = write_runs(tmp_path)
     spoil, words = DAMAGES[damage]
-    spoil(paths[4])
+    if callable(spoil):
+        spoil(paths[4])
+    elif isinstance(spoil, dict):
+        change_json(paths[4] / "results.json", **spoil)
+    else:
+        write(paths[4] / "results.json", spoil)
     experiment = loaded(tmp_path)
     assert len(experiment.trials) == len(paths) - 1
     assert len(experiment.warnings) == 1

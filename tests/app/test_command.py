@@ -105,11 +105,8 @@ def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
     config = OmegaConf.create({"hydra": hydra, "launch": launch})
     for key, value in changes.items():
         OmegaConf.update(config, key, value, merge=False)
-    if said is None:
+    with refusal(said):
         check_sweep_settings(config, multirun)
-    else:
-        with refusal(said):
-            check_sweep_settings(config, multirun)
 
 
 # ---- the end of a command

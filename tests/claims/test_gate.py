@@ -115,28 +115,25 @@ def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(sign
 
 def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
     old = trials(tmp_path, 0, 0.1)
-    (verdict,) = ask_gate(
-        asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]
-    ).judged()
+    garden = [one for one in old if one.scene == "garden"]
+    (verdict,) = ask_gate(asked(), lambda: old, lambda: garden).judged()
     assert not verdict.final
     assert result_of(verdict) == NOT_DECIDED
     assert "trials are missing" in describe(verdict)
 
 
 def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
-    def made_by(own, state, measured):
-        code = Code(rooms={"densify": state})
-        return [
-            replace(one, record=replace(one.record, code=code, measured=measured)) for one in own
-        ]
+    def made_by(own, state, year):
+        made = {"code": Code(rooms={"densify": state}), "measured": f"{year}-01-01T00:00:00Z"}
+        return [replace(one, record=replace(one.record, **made)) for one in own]
 
-    old = made_by(trials(tmp_path / "a", 0, 0.01), "one", "2019-01-01T00:00:00Z")
-    new = made_by(trials(tmp_path / "b", -1, 0.01), "two", "2021-01-01T00:00:00Z")
+    old = made_by(trials(tmp_path / "a", 0, 0.01), "one", 2019)
+    new = made_by(trials(tmp_path / "b", -1, 0.01), "two", 2021)
     (verdict,) = ask_gate(asked(), lambda: old, lambda: new).judged()
     assert (result_of(verdict), verdict.seen) == (WORSE, ())
     (other,) = ask_gate(asked(), lambda: new, lambda: old).judged()
     assert len(other.seen) == 8
-    mixed = [*new[:1], *made_by(new[1:], "three", "2021-01-01T00:00:00Z")]
+    mixed = [*new[:1], *made_by(new[1:], "three", 2021)]
     (refused,) = ask_gate(asked(), lambda: old, lambda: mixed).judged()
     assert "different versions" in str(refused.notes[0])
     assert result_of(refused) == NOT_DECIDED
@@ -244,12 +241,12 @@ def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse):
 def test_bisecting_skips_commits_that_are_undecided_or_do_not_train():
     assert first_worse(12, lambda commit: PASSED) is None
     answers = {6: NOT_DECIDED, 7: None}
-    assert first_worse(
-        12, lambda commit: answers.get(commit, WORSE if commit >= 9 else PASSED)
-    ) == (8, 9)
-    assert first_worse(
-        12, lambda commit: answers.get(commit, WORSE if commit >= 8 else PASSED)
-    ) == (5, 8)
+    for worse, found in ((9, (8, 9)), (8, (5, 8))):
+
+        def result(commit, worse=worse):
+            return answers.get(commit, WORSE if commit >= worse else PASSED)
+
+        assert first_worse(12, result) == found
     asked_for = []
 
     def never(commit):

@@ -1,5 +1,6 @@
 """Words of a command line, without a composition."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -19,11 +20,9 @@ from gsbench.config.command_words import (
     parse_word,
     search_path,
     searched_folders,
-    typed_permissions,
     value_text,
 )
 from gsbench.config.groups import hint_for, options
-from gsbench.errors import InputError
 from tests.helpers import refusal
 
 
@@ -62,9 +61,8 @@ def test_options_and_words_may_come_in_any_order(tmp_path):
     ],
 )  # fmt: skip
 def test_options_that_do_not_exist_are_explained(words, said):
-    with pytest.raises(InputError) as error:
+    with refusal(re.escape(said)):
         parse(words)
-    assert said in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -92,12 +90,8 @@ def test_options_that_do_not_exist_are_explained(words, said):
     ],
 )
 def test_words_without_effect_are_refused(words, said):
-    if said is None:
+    with refusal(said and re.escape(said)):
         check_words(words)
-    else:
-        with pytest.raises(InputError) as error:
-            check_words(words)
-        assert said in str(error.value)
 
 
 def test_brackets_are_counted_while_they_are_open():
@@ -107,14 +101,6 @@ def test_brackets_are_counted_while_they_are_open():
         check_text(f"{name}=12, a ,3")
         with refusal(r"type '.*=\"1_0\"'"):
             check_text(f"{name}=a, 1_0")
-
-
-def test_only_a_list_of_plain_names_gives_permission():
-    assert typed_permissions(["a=1", "allow_targets=[a]", "+allow_targets=[b,c.d]"]) == ("b", "c.d")
-    assert typed_permissions(["allow_targets=[a]", "allow_targets=[b],[c]"]) == ("a",)
-    for wrong in ("a", "[1]", "[a,'']", "['${a}']", "{a:1}"):
-        with refusal("is a list of names"):
-            typed_permissions([f"allow_targets={wrong}"])
 
 
 @pytest.mark.parametrize(
@@ -130,11 +116,8 @@ def test_only_a_list_of_plain_names_gives_permission():
     ],
 )  # fmt: skip
 def test_packages_of_settings_need_permission(word, said):
-    if said is None:
-        check_search_path([word], ["mine"])
-    else:
-        with refusal(said):
-            check_search_path(["a=1", word], ["mine"])
+    with refusal(said):
+        check_search_path(["a=1", word], ["mine"])
 
 
 def points(*words):

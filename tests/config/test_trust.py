@@ -348,7 +348,7 @@ def test_an_allowed_search_path_is_read(place):
         "allow_targets=['${name}']",
         "allow_targets=[null]",
         "allow_targets=[1]",
-        "allow_targets=['']",
+        "allow_targets=[a,'']",
     ],
 )
 def test_permissions_must_be_a_list_of_names(word):
@@ -357,10 +357,9 @@ def test_permissions_must_be_a_list_of_names(word):
 
 
 def test_the_last_permission_counts():
-    assert typed_permissions(["allow_targets=[a]", "seed=1", "++allow_targets=[b,c.D]"]) == (
-        "b",
-        "c.D",
-    )
+    words = ["allow_targets=[a]", "seed=1", "++allow_targets=[b,c.D]"]
+    assert typed_permissions(words) == ("b", "c.D")
+    assert typed_permissions([words[0], "allow_targets=[b],[c]"]) == ("a",)
     assert typed_permissions(["seed=1"]) == ()
 
 

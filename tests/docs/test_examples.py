@@ -12,8 +12,13 @@ import torch
 from PIL import Image
 
 from gsbench.cli import run
+from gsbench.densify import ADC, DensifyContext
+from gsbench.gaussians.paper_values import LearningRates
+from gsbench.gaussians.trainable import TrainableGaussians
+from gsbench.raster.base import RenderOutput
 from tests.conftest import ROOT
-from tests.helpers import read_json
+from tests.gaussians.helpers import random_gaussians
+from tests.helpers import read_json, write
 
 pytestmark = pytest.mark.slow
 
@@ -132,18 +137,14 @@ def test_the_initialiser_of_its_document_runs(folder, capsys):
 def test_the_tracker_of_its_document_gets_every_trial(folder, capsys):
     found = run_blocks(ROOT / "docs" / "hydra.md", folder)
     assert found["status"] == 0, capsys.readouterr().err
-    shown = {one["tags"]["seed"]: one for one in map(_json, Path("runs/told/shown").iterdir())}
-    results = {one["seed"]: one for one in map(_json, Path("runs/told").rglob("results.json"))}
+    shown = {one["tags"]["seed"]: one for one in map(read_json, Path("runs/told/shown").iterdir())}
+    results = {one["seed"]: one for one in map(read_json, Path("runs/told").rglob("results.json"))}
     assert set(shown) == {"0", "1"}
     for seed, one in results.items():
         told = shown[str(seed)]
         assert told["metrics"]["eval/psnr_dB 5"] == one["metrics"]["psnr"]
         assert told["end"] == {"status": "FINISHED", "reason": None}
         assert "kept" not in one["code"]["sources"]  # a tracker changes no result
-
-
-def _json(path):
-    return read_json(path)
 
 
 def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):
@@ -155,131 +156,82 @@ def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):
     (own,), (colmap,) = (
         list(Path("runs", name).rglob("results.json")) for name in ("llff", "colmap")
     )
-    assert _json(own)["metrics"]["psnr"] == pytest.approx(
-        _json(colmap)["metrics"]["psnr"], abs=1e-3
+    assert read_json(own)["metrics"]["psnr"] == pytest.approx(
+        read_json(colmap)["metrics"]["psnr"], abs=1e-3
     )
-    assert list(_json(own)["code"]["sources"]) == ["llff"]
+    assert list(read_json(own)["code"]["sources"]) == ["llff"]
+
+
+def module_of(folder, name):
+    """A module whose code is a block of the densifiers' document."""
+    blocks = BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
+    (code,) = (block for block in blocks if block.startswith(f"# {name}.py"))
+    write(folder / f"{name}.py", code)
+    return __import__(name)
+
+
+def rounds(make, first, last, state=None, check=None):
+    """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given.
+
+    Each has other radii and gradients. Returns the states of Gaussians, densifier and generator.
+    """
+    densifier, rng = make(), torch.Generator().manual_seed(5)
+    context, rates = DensifyContext(2.0), LearningRates()
+    if state is None:
+        initial = random_gaussians(60, seed=1, dtype=torch.float32)
+        gaussians = TrainableGaussians(initial, rates, 2.0)
+        densifier.begin(gaussians.values, context)
+    else:
+        gaussians = TrainableGaussians.load(state[0], rates, 2.0)
+        densifier.load_state_dict(state[1], context)
+        rng.set_state(state[2])
+    for step in range(first, last + 1):
+        n, own = len(gaussians), torch.Generator().manual_seed(step)
+        radii = torch.randint(0, 3, (n,), generator=own, dtype=torch.int32)
+        points = torch.zeros(n, 2)
+        points.grad = torch.rand(n, 2, generator=own)
+        densifier.observe(step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, points))
+        event = densifier.refine(step, gaussians, rng)
+        if check:
+            check(event, gaussians, densifier)
+    return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
+
+
+def check_resumed(make, cut, last, check=None):
+    """The same bits come from a training in one piece and from one in two; returns its states."""
+    whole = rounds(make, 1, last, check=check)
+    resumed = rounds(make, cut + 1, last, rounds(make, 1, cut, check=check), check)
+    for part, states in ((0, "gaussians"), (1, "lineage")):
+        for name, tensor in whole[part][states].items():
+            assert torch.equal(resumed[part][states][name], tensor), name
+    return whole
 
 
 def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
     """It passes the checklist of the document."""
-    from gsbench.densify import DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from gsbench.raster.base import RenderOutput
-    from tests.gaussians.helpers import random_gaussians
+    largest = module_of(folder, "largest")
+    settings = {"start": 0, "stop": 100, "interval": 1, "share": 0.1, "prune_opacity": 0.3}
 
-    (code,) = (
-        b
-        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
-        if b.startswith("# largest.py")
-    )
-    (folder / "largest.py").write_text(code)
-    import largest
+    def check(event, gaussians, densifier):
+        after = event.before + event.split_volume - event.pruned_opacity
+        assert event.after == after == len(gaussians)
+        assert len(densifier.lineage.ids) == len(gaussians)
+        assert len(densifier.statistics["seen"]) == len(gaussians)
 
-    def rounds(state, first, last):
-        """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given."""
-        densifier = largest.SplitLargest(
-            start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
-        )
-        context, rates = DensifyContext(2.0), LearningRates()
-        if state is None:
-            gaussians = TrainableGaussians(
-                random_gaussians(60, seed=1, dtype=torch.float32), rates, 2.0
-            )
-            densifier.begin(gaussians.values, context)
-            rng = torch.Generator().manual_seed(5)
-        else:
-            gaussians = TrainableGaussians.load(state[0], rates, 2.0)
-            densifier.load_state_dict(state[1], context)
-            rng = torch.Generator()
-            rng.set_state(state[2])
-        for step in range(first, last + 1):
-            n = len(gaussians)
-            radii = torch.randint(
-                0, 3, (n,), generator=torch.Generator().manual_seed(step), dtype=torch.int32
-            )
-            densifier.observe(
-                step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, torch.zeros(n, 2))
-            )
-            event = densifier.refine(step, gaussians, rng)
-            assert (
-                event.after
-                == event.before + event.split_volume - event.pruned_opacity
-                == len(gaussians)
-            )
-            assert len(densifier.lineage.ids) == len(gaussians)
-            assert len(densifier.statistics["seen"]) == len(gaussians)
-        return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
-
-    through = rounds(None, 1, 6)
-    resumed = rounds(rounds(None, 1, 3), 4, 6)
-    for name, tensor in through[0]["gaussians"].items():
-        assert torch.equal(resumed[0]["gaussians"][name], tensor), name
-    for name, tensor in through[1]["lineage"].items():
-        assert torch.equal(resumed[1]["lineage"][name], tensor), name
+    check_resumed(lambda: largest.SplitLargest(**settings), 3, 6, check)
 
 
 @pytest.mark.parametrize("module, name", [("careful", "Careful"), ("peak", "Peak")])
 def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name):
-    from gsbench.densify import ADC, DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from gsbench.raster.base import RenderOutput
-    from tests.gaussians.helpers import random_gaussians
-
-    (code,) = (
-        block
-        for block in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
-        if block.startswith(f"# {module}.py")
-    )
-    (folder / f"{module}.py").write_text(code)
-    cls = getattr(__import__(module), name)
-
-    def rounds(cls, state, first, last):
-        densifier = cls(start=0, stop=100, interval=2, gradient_threshold=0.5)
-        context, rates = DensifyContext(2.0), LearningRates()
-        rng = torch.Generator()
-        if state is None:
-            initial = random_gaussians(60, seed=1, dtype=torch.float32)
-            gaussians = TrainableGaussians(initial, rates, 2.0)
-            densifier.begin(gaussians.values, context)
-            rng.manual_seed(5)
-        else:
-            gaussians = TrainableGaussians.load(state[0], rates, 2.0)
-            densifier.load_state_dict(state[1], context)
-            rng.set_state(state[2])
-        for step in range(first, last + 1):
-            n, own = len(gaussians), torch.Generator().manual_seed(step)
-            radii = torch.randint(0, 3, (n,), generator=own, dtype=torch.int32)
-            points = torch.zeros(n, 2)
-            points.grad = torch.rand(n, 2, generator=own)
-            densifier.observe(step, RenderOutput(torch.zeros(1), torch.zeros(1), radii, points))
-            densifier.refine(step, gaussians, rng)
-        return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
-
-    whole = rounds(cls, None, 1, 8)
-    resumed = rounds(cls, rounds(cls, None, 1, 5), 6, 8)
-    plain = rounds(ADC, None, 1, 8)
-    for key, tensor in whole[0]["gaussians"].items():
-        assert torch.equal(resumed[0]["gaussians"][key], tensor), key
+    settings = {"start": 0, "stop": 100, "interval": 2, "gradient_threshold": 0.5}
+    cls = getattr(module_of(folder, module), name)
+    whole = check_resumed(lambda: cls(**settings), 5, 8)
+    plain = rounds(lambda: ADC(**settings), 1, 8)
     assert len(whole[1]["lineage"]["ids"]) != len(plain[1]["lineage"]["ids"])
 
 
 def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
-    from gsbench.densify import DensifyContext
-    from gsbench.gaussians.paper_values import LearningRates
-    from gsbench.gaussians.trainable import TrainableGaussians
-    from tests.gaussians.helpers import random_gaussians
-
-    (code,) = (
-        b
-        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
-        if b.startswith("# opaque.py")
-    )
-    (folder / "opaque.py").write_text(code)
-    import opaque
-
+    opaque = module_of(folder, "opaque")
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
     densifier = opaque.CloneOpaque(start=0, stop=500, max_gaussians=150, cap="governor")
     densifier.begin(gaussians, DensifyContext(1.0))

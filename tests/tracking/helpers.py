@@ -11,7 +11,7 @@ from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
 from gsbench.tracking.mirror import mirror_ended
 from tests.helpers import write, write_lines
-from tests.trials import STEPS, results_of
+from tests.trials import STEPS, results_of, trial_values
 
 ROOT = Path(__file__).resolve().parents[2]
 STATE = "mlflow.json"  # in the trial's folder
@@ -71,6 +71,19 @@ def write_trial(folder, values, records=STEPS, psnr=20.0, **changes):
     write(folder / "results.json", results | changes)
 
 
+def begun_trial(runs, seed=0, name="tracked", uri=None, patience=30.0, **more):
+    """A trial that has begun, as (folder, configuration)."""
+    values = trial_values(runs, seed, name)
+    return begin_trial(values, uri, patience, **more), values
+
+
+def ended_trial(runs, seed=0, name="tracked", uri=None, **more):
+    """A finished trial, as (folder, configuration)."""
+    folder, values = begun_trial(runs, seed, name, uri, **more)
+    write_trial(folder, values)
+    return folder, values
+
+
 def found_runs(client, name):
     experiment = client.get_experiment_by_name(name)
     return [] if experiment is None else client.search_runs([experiment.experiment_id])
@@ -85,11 +98,9 @@ def run_of(client, seed):
 MIRROR = """
 import sys
 from pathlib import Path
-from tests.tracking.helpers import begin_trial, following, options, write_trial
-from tests.trials import trial_values
+from tests.tracking.helpers import begun_trial, following, options, write_trial
 runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3]), float(sys.argv[4])
-values = trial_values(runs, seed)
-folder = begin_trial(values, uri, patience)
+folder, values = begun_trial(runs, seed, uri=uri, patience=patience)
 with following(options(uri, patience), folder):
     write_trial(folder, values)
 """

@@ -17,8 +17,14 @@ from gsbench.tracking import connect
 from gsbench.tracking.mirror import TrackerRun, make_sink
 from tests.conftest import ROOT
 from tests.helpers import read_json, write
-from tests.tracking.helpers import begin_trial, found_runs, mirror_trial, options, write_trial
-from tests.trials import STEPS, trial_values
+from tests.tracking.helpers import (
+    begun_trial,
+    found_runs,
+    mirror_trial,
+    options,
+    write_trial,
+)
+from tests.trials import STEPS
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 METHODS = ("open", "params", "tags", "metrics", "artifacts", "close")
@@ -204,8 +210,7 @@ def shown(request, runs, tmp_path, monkeypatch):
 
 def finished(runs, psnr=20.0):
     """A finished trial with a picture, which was also measured at iteration 50."""
-    values = trial_values(runs, 1)
-    folder = begin_trial(values)
+    folder, values = begun_trial(runs, 1)
     write_trial(folder, values, psnr=psnr, metrics_at=AT)
     for kind, value in (("renders", 200), ("ground_truth", 50)):
         (folder / kind).mkdir(exist_ok=True)
@@ -294,8 +299,7 @@ def test_changed_results_replace_those_that_were_shown(shown, mirrored):
 
 
 def test_a_failure_is_shown_with_its_reason_until_the_trial_succeeds(shown):
-    values = trial_values(shown.runs, 1)
-    folder = begin_trial(values)
+    folder, values = begun_trial(shown.runs, 1)
     write(folder / "failed.json", {"message": "the loss became nan\nagain"})
     assert shown.mirror(folder, values)
     run = shown.one()
