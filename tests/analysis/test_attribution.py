@@ -104,7 +104,7 @@ def test_every_shipped_class_lists_how_it_departs_from_adc():
 
 
 def test_settings_that_only_name_or_place_a_trial_are_no_ingredients():
-    other = config("adc", name="adc-2") | {"eval.primary": "psnr", "eval.lpips": []}
+    other = config("adc") | {"densify.name": "adc-2", "eval.primary": "psnr", "eval.lpips": []}
     other |= {"train.log_every": 1, "seed": 4, "threads": 2, "launch.name": "slurm"}
     assert ingredients(config("adc"), other) == ()
 

@@ -401,7 +401,8 @@ def test_counts_from_a_thousand_and_times_from_ten_minutes_have_the_larger_unit(
     for one, name, value, unscaled in zip(found, headings, values, own, strict=True):
         unit = name.split()[-1]
         assert value == pytest.approx(unscaled / scales.get(unit, 1))
-        assert one.format(1.23456) == f"{1.23456:.{({'Gaussians': 0, '(M)': 2}).get(unit, 1)}f}"
+        decimals = {"Gaussians": 0, "(M)": 2}.get(unit, 1)
+        assert one.format(1.23456) == f"{1.23456:.{decimals}f}"
     asked = asked_quantity("gaussians")
     assert (asked.key, asked.name, asked.read(trial)) == ("gaussians", "Gaussians", gaussians)
     fixed, values = read("gaussians_millions train_minutes peak_memory_mb")
