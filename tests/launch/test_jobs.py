@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 import submitit
 
-from gsbench.config.compose import Trial
 from gsbench.errors import InputError, TrainingError
 from gsbench.files import DiskFullError
 from gsbench.launch import jobs
@@ -33,28 +32,16 @@ from gsbench.launch.states import QueuedJob, current_user, read_submission, reco
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
-from tests.finished import record_of, write_results
 from tests.helpers import refusal
-from tests.tracking.helpers import trial_values
+from tests.trials import LOCAL, record_of, trial_values, write_results
+from tests.trials import bare_trial as trial
 
-LOCAL = {"name": "local", "parallel": 2, "timeout_min": None}
 SLURM = {
     **dict.fromkeys(("partition", "account", "qos", "mem_gb"), None),
     **{"name": "slurm", "parallel": 2, "timeout_min": 60, "wait": False},
     **{"cpus_per_trial": 4, "gpus_per_trial": 0, "signal_seconds": 90},
     **{"setup": [], "sbatch": {}, "max_requeues": 5},
 }
-
-
-def trial(runs, seed=0, launch=LOCAL, **settings):
-    more = {
-        "launch": launch,
-        "tracking": {"sink": f"of {seed}"},
-        "device": "auto",
-        "threads": 3,
-        "eval": {},
-    }
-    return Trial(trial_values(runs, seed, "x") | more | settings, ())
 
 
 class Mirrored:

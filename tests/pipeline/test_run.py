@@ -20,10 +20,10 @@ from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.locks import BusyError, hold
-from tests.finished import record_of
 from tests.gaussians.helpers import random_gaussians
 from tests.helpers import read_json, write
-from tests.launch.test_jobs import trial
+from tests.trials import bare_trial as trial
+from tests.trials import record_of
 
 # ---- the frame
 

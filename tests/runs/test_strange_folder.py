@@ -18,9 +18,9 @@ from gsbench.runs.keys import Step
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import describe_holder, hold, is_held
-from tests.finished import write_results
 from tests.helpers import refusal
 from tests.runs.toy import TOY, build, toy_inputs
+from tests.trials import trial_values, write_results
 
 SECRET = "what nobody else may read or change"
 
@@ -38,10 +38,7 @@ def outside(tmp_path):
 def trial(tmp_path):
     """A finished trial in the runs folder, with results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
-    named = {
-        group: {"name": name} for group, name in {"scene": "s", "init": "a", "densify": "b"}.items()
-    }
-    write_results(folder, {"name": "x", "seed": 0, **named})
+    write_results(folder, trial_values("runs", name="x", scene="s", init="a", densify="b"))
     return folder
 
 

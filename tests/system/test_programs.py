@@ -153,8 +153,7 @@ def test_every_python_starts_without_the_current_folder_in_its_search_path():
 @pytest.mark.parametrize("entry", [".", "", "bin"])
 def test_no_program_of_the_current_folder_starts(name, start, entry, tmp_path, monkeypatch):
     for folder in (tmp_path, tmp_path / "bin"):
-        write(folder / name, f"#!/bin/sh\ntouch {tmp_path}/exploded\n")
-        (folder / name).chmod(0o755)
+        write(folder / name, f"#!/bin/sh\ntouch {tmp_path}/exploded\n").chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", entry)
     start(tmp_path)
@@ -187,16 +186,10 @@ def test_the_current_folder_is_no_place_for_modules_and_programs(
     assert (str(tmp_path) in sys.path) == (given in ("", "{here}"))
 
 
-READ_BY_LIBRARIES = ("sitecustomize.py", "usercustomize.py", "json.py", "yaml.py", "requests.py")
-READ_BY_LIBRARIES += (
-    "wandb/settings",
-    ".env",
-    ".netrc",
-    "MLproject",
-    "pyproject.toml",
-    "conftest.py",
-)
-READ_BY_LIBRARIES += ("matplotlibrc", ".numba_config.yaml", "alembic.ini", "uname", "git", "python")
+READ_BY_LIBRARIES = """
+sitecustomize.py usercustomize.py json.py yaml.py requests.py wandb/settings .env .netrc MLproject
+pyproject.toml conftest.py matplotlibrc .numba_config.yaml alembic.ini uname git python
+"""
 WATCHED = """
 import os, sys
 here, seen = os.getcwd(), set()
@@ -217,11 +210,9 @@ TINY += " densify=none train.iterations=1 eval.lpips=[] raster=reference name=ti
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["", ".:"])
 def test_no_library_reads_what_lies_in_the_current_folder(path, tmp_path):
-    (tmp_path / "wandb").mkdir()
-    for name in READ_BY_LIBRARIES:
-        file = tmp_path / name
-        file.write_text("#!/bin/sh\ntouch exploded\n" if "." not in name else "raise SystemExit(9)")
-        file.chmod(0o755)
+    for name in READ_BY_LIBRARIES.split():
+        text = "#!/bin/sh\ntouch exploded\n" if "." not in name else "raise SystemExit(9)"
+        write(tmp_path / name, text).chmod(0o755)
     environment = os.environ | {"PATH": path + os.environ["PATH"], "PYTHONPATH": str(SRC.parent)}
     for words in (TINY.split(), ["sync"], ["tables", "tiny"], ["report", "tiny"], ["doctor"]):
         command = [sys.executable, "-P", "-c", WATCHED, *words]
