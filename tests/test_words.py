@@ -55,6 +55,9 @@ REFUSED = {  # command line: a part of the line that refuses it
     "photos": "did you mean scene=photos?",
     "path=/x": "did you mean scene.path?",
     "densify=adc densify.volume_threshold=1": "it belongs to densify=volumetric",
+    "-m densify=adc,volumetric densify.volme_threshold=1": "did you mean volume_threshold? it "
+    "belongs to densify=volumetric",
+    "densify=adc densify.max_gausians=1": "did you mean max_gaussians? (densify has: ",
     f"seed={'1' * 5000}": "is not a setting like key=value",
     "+experiment=typo --config-dir conf": "train.iteration is not a setting in "
     "experiment/typo.yaml; did you mean it",

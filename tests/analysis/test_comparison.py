@@ -2,6 +2,7 @@
 
 import html
 import itertools
+import json
 import os
 import random
 import shutil
@@ -21,6 +22,7 @@ from scipy import stats
 from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
+from gsbench.analysis.quantities import quantity
 from gsbench.analysis.results import load_all_trials
 from gsbench.analysis.statistics import t_test
 from gsbench.analysis.verdict_words import sentence
@@ -29,6 +31,7 @@ from gsbench.claims.export import write_archive
 from gsbench.claims.pooling import PooledQuestion, read_studies
 from gsbench.claims.site import write_site
 from gsbench.claims.stopping import log_verdicts
+from gsbench.launch.record import remove
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
 from gsbench.tracking.comparison import description
 from gsbench.verbs.claims import plan
@@ -40,6 +43,7 @@ from tests.helpers import write as write_file
 from tests.trials import write_trial
 
 OLD, NEW = "1" * 64, "2" * 64
+EXAMPLES = int(os.environ.get("GSBENCH_EXAMPLES", "0"))  # of random experiments
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class Made:
         return runs / "exp" / f"{self.key}-seed{self.seed}" / "results.json"
 
 
-def write(runs, trials):
+def write(runs, trials, experiment="exp"):
     for one in trials:
         rng = random.Random(repr(one))
         path = write_trial(
@@ -342,6 +346,17 @@ def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
     assert set(before) < set(after.sentences)
 
 
+def test_initialisers_stay_compared_when_an_arm_is_added(tmp_path):
+    other = [replace(one, init="random", day=3) for one in grid("adc")]
+    write(tmp_path, [*grid("adc"), *other])
+    (before,) = answer(tmp_path).sentences
+    assert before.startswith("random-adc against sfm-adc")
+    write(tmp_path, grid("mine", day=4))
+    assert before in answer(tmp_path).sentences
+    write(tmp_path, [replace(one, init="random", day=5) for one in grid("mine")])
+    assert before in answer(tmp_path).sentences
+
+
 @pytest.mark.parametrize(
     "arms, pairs",
     [
@@ -444,6 +459,110 @@ def test_the_end_of_a_sweep_names_trials_of_earlier_code(tmp_path, caplog):
     caplog.set_level("INFO", "gsbench")
     log_verdicts([SimpleNamespace(files=SimpleNamespace(home=tmp_path / "exp"))])
     assert "3 trials of sfm-mine made by earlier versions of mine" in caplog.messages[-1]
+
+
+def forget(runs):
+    """Remove the trials of earlier code, as ``status --forget-superseded`` does."""
+    older = loaded(runs).older
+    remove(runs / "exp", [trial.path for trial in older])
+    return len(older)
+
+
+def test_forgotten_trials_of_earlier_code_still_count_as_seen(tmp_path):
+    adc, momentum = grid("adc"), grid("momentum")
+    old, new = grid("mine", code=OLD), grid("mine", day=6, code=NEW)
+    failed = Made("mine", (), seed=0, code="3" * 64)
+    write(tmp_path, [*adc, *momentum, *old, *new, failed])
+    (tmp_path / "exp" / f"{failed.key}-seed0" / "results.json").unlink()
+    declare(tmp_path, (1, [*adc, *momentum, *old, failed]), (5, new))
+    before = answer(tmp_path)
+    assert "2 versions of the arm's code" in before.sentences[0]
+    assert forget(tmp_path) == 3
+    remove(tmp_path / "exp", [tmp_path / "exp" / f"{failed.key}-seed0"])
+    after = answer(tmp_path)
+    assert after.experiment.warnings == ()
+    assert after.sentences == before.sentences
+    assert "missing" not in "\n".join(table_of(tmp_path).notes)
+    write_archive(load_all_trials(tmp_path, "exp"), tmp_path / "exp.zip")
+    there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
+    assert there.sentences == before.sentences
+    # the old code came back, and was forgotten again
+    write(tmp_path, old)
+    assert answer(tmp_path).sentences == before.sentences
+    assert forget(tmp_path) == 3
+    assert answer(tmp_path).sentences == before.sentences
+
+
+@pytest.mark.parametrize(
+    "there, named",
+    [
+        (grid("mine", code=OLD), True),
+        (grid("mine", code=OLD, lr=1), True),  # other settings
+        (grid("mine", code=NEW), False),  # as with equal counts under another name
+        ([replace(one, seed=one.seed + 5) for one in grid("mine", code=OLD)], False),
+        ([replace(one, scene="b") for one in grid("mine", code=OLD)], False),
+        (grid("other", code=OLD), False),
+    ],
+)
+def test_other_code_on_the_same_seeds_under_another_name_is_named_everywhere(
+    tmp_path, there, named
+):
+    write(tmp_path, [*grid("adc"), *grid("mine", code=NEW)])
+    write(tmp_path, there, "tried")
+    found = answer(tmp_path)
+    line = "Also measured by other code on these scenes and seeds: sfm-mine, in tried."
+    for text in (
+        "\n".join(texts(found.remarks)),
+        "\n".join(table_of(tmp_path).notes),
+        page_of(tmp_path),
+        description(found.experiment),
+        found.to_json()["left_out"][0] if named else "",
+    ):
+        assert (line in text) == named
+
+
+@pytest.mark.parametrize("looks", [False, True])
+def test_a_capture_under_two_names_is_one_scene(tmp_path, looks):
+    first, second = grid("adc"), grid("mine")
+    trials = [*first, *second]
+    write(tmp_path, [*trials, *(replace(one, scene="b") for one in trials)])
+    if looks:
+        declare_looks(tmp_path, (first, second), scenes="ab")
+    before = answer(tmp_path).answers[0].verdicts[0]
+    for file in (tmp_path / "exp" / "b").glob("*/*/results.json"):
+        data = json.loads(file.read_text())
+        data["hashes"]["data"] = "data-a"
+        file.write_text(json.dumps(data))
+    found = answer(tmp_path)
+    verdict, note = found.answers[0].verdicts[0], "b has the photographs of a, so it is no further"
+    assert note in "\n".join(texts(found.remarks)) + found.sentences[0]
+    assert len(before.pairs.rows) == 2
+    assert (verdict.untestable is not None) == looks
+    assert looks or verdict.pairs.scenes == ("a",)
+
+
+def test_a_seed_that_only_one_of_two_verdicts_uses_is_named(tmp_path):
+    write(tmp_path, [*grid("adc"), *grid("mine"), *grid("more", seeds=2)])
+    line = "which other verdicts and tables use: sfm-more against sfm-adc."
+    assert line in "\n".join(texts(answer(tmp_path).remarks))
+
+
+@pytest.mark.parametrize("differs", [False, True])
+def test_settings_without_an_effect_are_named(tmp_path, differs):
+    arms = [grid("momentum", decay=decay) for decay in (0.9, 0.99)]
+    write(tmp_path, [*grid("adc"), *arms[0]])
+    for one in arms[0]:
+        here = tmp_path / "exp" / f"{one.key}-seed{one.seed}"
+        copied = here.with_name(f"{arms[1][0].hash}-seed{one.seed}")
+        shutil.copytree(here, copied)
+        config = json.loads((copied / "config.yaml").read_text())
+        config["densify"]["decay"] = 0.99
+        (copied / "config.yaml").write_text(json.dumps(config))
+    if differs:
+        gain(tmp_path, arms[1][:1])
+    note = "scene and seed: sfm-momentum[decay=0.9] and sfm-momentum[decay=0.99]."
+    said = "\n".join(texts(answer(tmp_path).remarks))
+    assert (note in said) != differs
 
 
 def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
@@ -635,6 +754,9 @@ ADDED = {
     "an arm of another initialiser": lambda made: [
         replace(one, init="random", densify="mine", options=(), day=2) for one in made.trials[:2]
     ],
+    "the baseline of another initialiser": lambda made: [
+        replace(one, init="random", code="", day=9) for one in made.baseline
+    ],
     "a scene that only one arm has": lambda made: [replace(made.trials[-1], scene="z")],
     "a setting of another arm": lambda made: [
         replace(one, densify="zzz", options=(("decay", decay), ("lr", 1)))
@@ -658,9 +780,7 @@ def outcomes(comparison):
     }
 
 
-many_examples = settings(
-    max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 12, deadline=None
-)
+many_examples = settings(max_examples=EXAMPLES or 12, deadline=None)
 
 
 @pytest.mark.parametrize("what", ADDED)
@@ -692,6 +812,17 @@ def test_what_is_added_never_changes_another_verdict(what):
     check()
 
 
+@settings(max_examples=EXAMPLES or 8, deadline=None)
+@given(experiments())
+def test_forgetting_earlier_code_never_changes_a_verdict(made):
+    with TemporaryDirectory() as folder:
+        runs = Path(folder)
+        made.write(runs)
+        before = answer(runs).sentences
+        forget(runs)
+        assert answer(runs).sentences == before
+
+
 def check_all_is_named(comparison):
     """Each trial is in a verdict, or its arm is named in a sentence with the reason."""
     used = {
@@ -709,7 +840,7 @@ def check_all_is_named(comparison):
         assert known or str(trial.arm) in named or label in named or " more" in named
 
 
-@settings(max_examples=500 if os.environ.get("GSBENCH_EXAMPLES") else 8, deadline=None)
+@settings(max_examples=EXAMPLES or 8, deadline=None)
 @given(experiments())
 def test_all_surfaces_state_the_same(made):
     with TemporaryDirectory() as folder:
@@ -727,6 +858,29 @@ def test_all_surfaces_state_the_same(made):
         for line in texts(comparison.remarks):
             assert line in notes
             assert line in page
+
+
+@many_examples
+@given(experiments())
+def test_a_metric_where_lower_is_better_gives_the_mirrored_verdict(made):
+    scale = quantity("flip", []).worthwhile / quantity("psnr", []).worthwhile
+    with TemporaryDirectory() as folder:
+        runs = Path(folder)
+        replace(made, declared=[], looks=[]).write(runs)
+        for file in runs.glob("exp/*/*/*/results.json"):
+            data, moment = read_json(file), file.stat().st_mtime
+            if "psnr" in data["metrics"]:
+                data["metrics"]["flip"] = 1 - scale * data["metrics"]["psnr"]
+            file.write_text(json.dumps(data))
+            os.utime(file, (moment, moment))
+        for pair in answer(runs).answers:
+            by_metric = {one.question.metric: one for one in pair.verdicts}
+            if "psnr" in by_metric:
+                one, other = by_metric["psnr"], by_metric["flip"]
+                assert (one.outcome, one.pairs.seeds) == (other.outcome, other.pairs.seeds)
+                if one.interval is not None:
+                    mirrored = [-scale * one.interval.high, -scale * one.interval.low]
+                    assert [other.interval.low, other.interval.high] == pytest.approx(mirrored)
 
 
 @many_examples

@@ -335,7 +335,7 @@ def test_a_record_may_name_no_trials_and_a_damaged_record_declares_nothing(tmp_p
     for trials in ({"a": [0]}, {"a/b/c/d": [0]}, {"a/b/c": 3}, {"a/b/d": ["x"]}):
         declare_trials(tmp_path, (EARLY, trials), metric="psnr")
         # a damaged line declares nothing
-        assert active_declaration(experiment.folder, experiment.trials) is None
+        assert active_declaration(replace(experiment)) is None
 
 
 def test_declarations_are_read_back_as_they_were_written(tmp_path):

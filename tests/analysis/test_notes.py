@@ -69,6 +69,7 @@ def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path,
     assert counts_note(trials, ADC, Arm("sfm", "mcmc")) is None
 
 
+OF_FILE = ["hydra.searchpath=['file:///home/me/conf']"]
 DEMO, MINE = (
     ["+experiment=demo"],
     split("densify=adc densify._target_=mine.A allow_targets=[mine]"),
@@ -81,7 +82,7 @@ DEMO, MINE = (
         (
             [*DEMO, "densify=adc"],
             [*DEMO, "densify=volumetric"],
-            "`gsbench +experiment=demo scene=garden densify.cap=governor",
+            "`gsbench -m +experiment=demo densify=adc,volumetric seed=0,1 scene=garden ",
         ),
         (
             ["densify=adc"],
@@ -92,13 +93,19 @@ DEMO, MINE = (
             ["densify=adc"],
             MINE,
             "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor "
-            "densify.max_gaussians=12300 name=exp_equal` && `gsbench -m densify=adc "
+            "densify.max_gaussians=12300 name=exp_equal && gsbench -m densify=adc "
             "densify._target_=mine.A 'allow_targets=[mine]' seed=0,1 scene=garden",
         ),
         (
             ["densify=adc", "launch.stop_when_decided=True"],
             MINE,  # looks need two arms in one command
             "`gsbench -m densify=adc seed=0,1 scene=garden densify.cap=governor",
+        ),
+        (
+            [*OF_FILE, "densify=adc", "launch.stop_when_decided=True"],
+            [*OF_FILE, "densify=volumetric", "launch.stop_when_decided=True"],
+            "`gsbench -m --config-dir /home/me/conf densify=adc,volumetric "
+            "launch.stop_when_decided=True seed=0,1 scene=garden ",
         ),
         # a stranger's plan: nothing of it reaches the shell
         (["densify=$(rm x)"], ["densify=y"], "`gsbench -m 'densify=$(rm x),y' seed=0,1"),

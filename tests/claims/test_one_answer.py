@@ -32,7 +32,7 @@ from tests.helpers import read_json
 from tests.trials import write_trial
 
 LEAST = 0.1
-EXAMPLES = 500 if os.environ.get("GSBENCH_EXAMPLES") else 12
+EXAMPLES = int(os.environ.get("GSBENCH_EXAMPLES", "12"))
 
 
 @st.composite

@@ -166,7 +166,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path, 
     (declared,) = read_declarations(tmp_path / "exp")
     assert results["declared"] == {"metric": "psnr", "time": declared.time}
     experiment = load_experiment(tmp_path, "exp")
-    found = active_declaration(experiment.folder, experiment.trials)
+    found = active_declaration(experiment)
     assert found.standing([], experiment.trials).beforehand
     assert experiment.trials[0].measured >= declared.moment
 
@@ -175,7 +175,7 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path, 
     said(*words, "eval.primary=ssim")
     assert file.read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("store/*/*")} == store
-    found = active_declaration(experiment.folder, load_experiment(tmp_path, "exp").trials)
+    found = active_declaration(load_experiment(tmp_path, "exp"))
     standing = found.standing([], experiment.trials)  # the metric of the arm's first result
     assert (found.metric, standing.active.metric, standing.beforehand) == ("ssim", "psnr", True)
 
@@ -183,5 +183,5 @@ def test_results_keep_what_was_declared_and_a_change_computes_nothing(tmp_path, 
     # declaration.
     said(*words, "name=again", "eval.primary=ssim")
     again = load_experiment(tmp_path, "again")
-    found = active_declaration(again.folder, again.trials)
+    found = active_declaration(again)
     assert not found.standing([], again.trials).beforehand

@@ -37,6 +37,8 @@ def test_plan_answers_for_the_command_given(pilots, capsys):
         assert plan(["exp", "--difference", "0.5", "--for", *words], pilots) == 0
         out = capsys.readouterr().out
         trials[words[0]] = int(re.search(r"on these scenes.*?\((\d+) trials", out)[1])
+        assert "seeds that the pilot does not have (it has 0, 1, 2), under another name" in out
+        assert claims.PLANNED[words[0]].partition(" {")[0] in out
         assert re.search(r"only within 0\.\d+ to 1\.\d+ times \(80 % of pilots\)", out)
     assert trials["sweep"] < trials["looks"] < trials["check"] < trials["ledger"]
 
@@ -83,6 +85,8 @@ def test_json_has_the_facts_of_the_text(pilots, capsys, experiment):
         (line,) = [line for line in text.splitlines() if said in line and "to see" in line] or [""]
         assert line.endswith(", ".join(shown))
     assert (one["scenes_like_these"] is None) == (experiment == "one")
+    assert found["pilot_seeds"] == [0, 1, 2]
+    assert f"each question errs in {100 * found['error_rate']:.3g} %" in text
     low, high = one["deviation_factors"]
     assert f"within {low:.2f} to {high:.2f} times ({100 * one['share_of_pilots']:.0f} %" in text
     least, most = one["power"]

@@ -1,21 +1,24 @@
 """The command that compares two arms again, at equal numbers of Gaussians."""
 
+import itertools
 import math
+import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 
+from gsbench.analysis.attempts import places_of
 from gsbench.analysis.results import TrialResult, group_by
 from gsbench.parsing import DamagedError, read_json
+from gsbench.runs.experiments import Planned, merge_planned, read_declarations
 from gsbench.runs.layout import PLAN
 
 DIGITS = 3  # significant digits of a number of Gaussians
-# Looks need both arms in one command, but the advice may give each arm its own.
-LOOKS = "launch.stop_when_decided"
-# words that the advice gives itself or leaves out
-REPLACED = ("name", "densify.cap", "densify.max_gaussians", LOOKS)
-
-EXPERIMENT = "+experiment"
+LOOKS = "launch.stop_when_decided"  # needs both arms in one command
+REPLACED = ("name", "densify.cap", "densify.max_gaussians")  # words that the advice gives itself
+# what ``--config-dir`` is recorded as
+OF_CONFIG_DIR = re.compile(r"hydra\.searchpath=\['file://([\w./-]+)'\]")
 
 Words = dict[str, list[str]]  # the values of each key of a command, in order
 
@@ -57,25 +60,26 @@ def equal_counts_command(baseline: Sequence[TrialResult], arm: Sequence[TrialRes
     added = equal_counts_words(baseline, arm)
     if not added:
         return ""
+    both = places_of(baseline) & places_of(arm)
+    trials = [one for one in (*baseline, *arm) if (one.scene, one.seed) in both]
     home = baseline[0].path.parents[2]
     planned = _planned_words(home)
-    sides = [_words_of([planned.get(trial.path, ()) for trial in own]) for own in (baseline, arm)]
-    if not all(sides):
+    if not all(planned.get(trial.path) for trial in trials):
         return equal_counts_settings(baseline, arm)
+    # a sweep in looks may have stopped before its last seed
+    looks = [one.planned for one in read_declarations(home) if one.looks]
+    most: Planned = reduce(merge_planned, looks, {})
+    commands: list[Words] = []
+    for trial in trials:
+        words = {key: [value] for key, _, value in (w.partition("=") for w in planned[trial.path])}
+        seeds = most.get(trial.key, (trial.seed,))
+        words |= {"seed": [*map(str, seeds)]}
+        commands.append({key: words[key] for key in words if key not in REPLACED})
+    commands = _merged(commands)
+    if len(commands) > 1:
+        commands = [{key: own[key] for key in own if key != LOOKS} for own in commands]
     end = f"{added} name={shlex.quote(f'{home.name}_equal')}"
-    if EXPERIMENT in sides[0] and sides[0][EXPERIMENT] == sides[1].get(EXPERIMENT):
-        # The experiment's file has the arms and seeds; what all trials share was typed.
-        shared = {
-            key: values
-            for key, values in sides[0].items()
-            if sides[1].get(key) == values and len(values) == 1
-        }
-        return f"`gsbench {_joined(shared)} {end}`"
-    differing = [key for key in {**sides[0], **sides[1]} if sides[0].get(key) != sides[1].get(key)]
-    if len(differing) == 1 and all(differing[0] in own for own in sides):
-        values = sides[0][differing[0]] + sides[1][differing[0]]
-        sides = [sides[0] | {differing[0]: list(dict.fromkeys(values))}]
-    return " && ".join(f"`gsbench -m {_joined(own)} {end}`" for own in sides)
+    return f"`{' && '.join(f'gsbench -m {_joined(own)} {end}' for own in commands)}`"
 
 
 def _planned_words(home: Path) -> Mapping[Path, Sequence[str]]:
@@ -89,22 +93,27 @@ def _planned_words(home: Path) -> Mapping[Path, Sequence[str]]:
         return {}
 
 
-def _words_of(trials: Sequence[Sequence[str]]) -> Words:
-    """The words of an arm's trials as one command's; {} if a trial's are not known."""
-    if not all(trials):
-        return {}
-    words: Words = {}
-    for key, own in group_by(
-        (word for trial in trials for word in trial), lambda word: word.partition("=")[0]
-    ).items():
-        if key not in REPLACED:
-            words[key] = list(dict.fromkeys(word.partition("=")[2] for word in own))
-    return words
+def _merged(commands: list[Words]) -> list[Words]:
+    """As few commands as have the same trials: those that differ in the values of one key join."""
+    for key in dict.fromkeys(["seed", *itertools.chain(*commands)]):
+
+        def others(words: Words, key: str = key) -> tuple[bool, str]:
+            return key in words, repr(sorted((k, v) for k, v in words.items() if k != key))
+
+        commands = [
+            same[0] | {key: list(dict.fromkeys(itertools.chain(*(own[key] for own in same))))}
+            if key in same[0]
+            else same[0]
+            for same in group_by(commands, others).values()
+        ]
+    return commands
 
 
 def _joined(words: Words) -> str:
     """The words as a shell takes them."""
-    return " ".join(
-        shlex.quote(f"{key}={','.join(values)}" if any(values) else key)
-        for key, values in words.items()
-    )
+    texts = []
+    for key, values in words.items():
+        folder = OF_CONFIG_DIR.fullmatch(f"{key}={','.join(values)}")
+        word = f"{key}={','.join(values)}" if any(values) else key
+        texts.append(f"--config-dir {folder[1]}" if folder else shlex.quote(word))
+    return " ".join(texts)

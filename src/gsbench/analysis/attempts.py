@@ -5,8 +5,11 @@ answer. So each further version has a smaller error rate.
 """
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import TrialResult, UnusableError, read_trial
+from gsbench.analysis.trial_settings import Configurations
+from gsbench.runs.experiments import folders_in, list_experiments
 
 
 def measured_versions(
@@ -29,6 +32,39 @@ def measured_versions(
         if (trial.scene, trial.seed) in pairs
     }
     return max(1, len(versions))
+
+
+def measured_elsewhere(
+    runs: Path, name: str, baseline: Sequence[TrialResult], arm: Sequence[TrialResult]
+) -> list[str]:
+    """The other experiments in ``runs`` than ``name`` that measured the arm by other user's code.
+
+    Only trials of its scenes, data and seeds count: among these, the better code could be chosen.
+    """
+    shared = {part for trial in baseline for part in trial.code}
+    versions = {
+        part: {trial.code.get(part) for trial in arm}
+        for part in {part for trial in arm for part in trial.code}
+        if part.kind == "module" and part not in shared
+    }
+    places = {(trial.scene, trial.seed, trial.record.hashes.get("data")) for trial in arm}
+
+    def is_other(path: str) -> bool:
+        try:
+            trial = read_trial(Path(path), runs, settings)
+        except UnusableError:
+            return False
+        own = trial.code
+        edited = any(part in own and own[part] not in known for part, known in versions.items())
+        return edited and (trial.scene, trial.seed, trial.record.hashes.get("data")) in places
+
+    settings, found = Configurations(), []
+    for other in list_experiments(runs) if versions else ():
+        arms = {runs / other / one.scene / f"{one.init}-{one.densify}" for one in arm}
+        paths = (path for folder in sorted(arms) if folder.is_dir() for path in folders_in(folder))
+        if other != name and any(map(is_other, paths)):
+            found.append(other)
+    return found
 
 
 def share_of_version(number: int) -> float:

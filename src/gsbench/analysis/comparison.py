@@ -6,18 +6,19 @@ arms, and a line for each arm and trial that no verdict uses.
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
+from gsbench.analysis.attempts import measured_elsewhere
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.declaration import ActiveDeclaration, active_declaration
 from gsbench.analysis.judgement import Verdict
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairing import (
     BASELINE,
+    are_equal,
     baseline_settings,
     choose_pairs,
     controls_of,
@@ -28,7 +29,7 @@ from gsbench.analysis.results import Arm, Experiment, TrialResult, group_by
 from gsbench.analysis.unfinished import unfinished
 from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
-from gsbench.runs.experiments import Question, read_declarations
+from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
 
 VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
@@ -56,7 +57,7 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     ages = {arm: min(trial.measured for trial in own) for arm, own in by_arm.items()}
     # A sweep in looks declared its pairs before any trial began: its baseline stays the baseline,
     # and other pairs of its arms are none, since it stopped by the results of its own.
-    planned = _pairs_in_looks(experiment.folder)
+    planned = _pairs_in_looks(experiment)
     keys = {arm: {trial.key for trial in own} for arm, own in by_arm.items()}
     ages |= {arm: -math.inf for arm in arms if any(keys[arm] & first for first, _ in planned)}
     in_looks = {arm for arm in arms if any(keys[arm] & (one | two) for one, two in planned)}
@@ -84,11 +85,11 @@ def pair_arms(experiment: Experiment, baseline: str = BASELINE) -> Pairing:
     return Pairing(trials, tuple(pairs), tuple(uncompared(arms, pairs, baseline)))
 
 
-def _pairs_in_looks(home: Path) -> list[tuple[set[str], set[str]]]:
+def _pairs_in_looks(experiment: Experiment) -> list[tuple[set[str], set[str]]]:
     """The questions of sweeps in looks: keys of the baseline's and of the arm's trials."""
     return [
         ({first for first, _ in both}, {second for _, second in both})
-        for declaration in read_declarations(home)
+        for declaration in experiment.declarations
         if declaration.looks
         for both in (question.scenes.values() for question in declaration.questions)
     ]
@@ -123,13 +124,41 @@ class Comparison:
         # Where an arm has no verdict at all, its sentence says why.
         asked = {arm for one in self.answers if one.verdicts for arm in (one.first, one.second)}
         trials = [trial for trial in self.trials if trial.arm in asked]
-        return [*self.arms.uncompared, *unused_trials(trials, verdicts)]
+        return [*self.arms.uncompared, *unused_trials(trials, verdicts), *self._apart]
+
+    @property
+    def _apart(self) -> list[Note]:
+        """Notes on trials that some verdicts on their arm use, and others do not."""
+        used = {
+            (one.first, one.second): {
+                trial.path for verdict in one.verdicts for trial in verdict.pairs.trials
+            }
+            for one in self.answers
+            if one.verdicts
+        }
+        anywhere, apart = (
+            set(itertools.chain(*used.values())),
+            dict[tuple[Arm, tuple[str, ...]], list[Arm]](),
+        )
+        for (first, second), own in used.items():
+            beside = tuple(
+                trial.label
+                for trial in self.trials
+                if trial.arm in (first, second) and trial.path in anywhere - own
+            )
+            if beside:
+                apart.setdefault((first, beside), []).append(second)
+        return [
+            Note.of("judged apart", arms=arms, baseline=first, trials=trials)
+            for (first, trials), arms in apart.items()
+        ]
 
     @cached_property
     def remarks(self) -> list[Note]:
         """Notes that belong to the sentences, wherever they stand.
 
-        That is what no verdict uses, old code, and declared trials that are missing.
+        That is what no verdict uses, old code, code in other experiments, arms with the same bits,
+        and declared trials that are missing.
         """
         lacking = [
             note
@@ -138,7 +167,19 @@ class Comparison:
             if note.kind in ("no direction", "valueless")
         ]
         early = [note for note in self._progress if note.kind == "early look"]
-        return [*self.unused, *dict.fromkeys(lacking), *edited_notes(self.trials), *early]
+        of_code = [*edited_notes(self.trials), *self._elsewhere, *same_bits_notes(self.trials)]
+        return [*self.unused, *dict.fromkeys(lacking), *of_code, *early]
+
+    @property
+    def _elsewhere(self) -> list[Note]:
+        """A note for each arm that other experiments measured by other code on its seeds."""
+        by_arm, home = group_by(self.trials, lambda trial: trial.arm), self.experiment.folder
+        notes = {}
+        for first, second in self.pairs:
+            both = by_arm[first], by_arm[second]
+            if others := measured_elsewhere(home.parent, home.name, *both):
+                notes[second] = Note.of("elsewhere", arm=second, experiments=others)
+        return [*notes.values()]
 
     @cached_property
     def _progress(self) -> list[Note]:
@@ -191,6 +232,25 @@ def edited_notes(trials: Sequence[TrialResult]) -> list[Note]:
     ]
 
 
+def same_bits_notes(trials: Sequence[TrialResult]) -> list[Note]:
+    """A note on settings of one densifier that had no effect: all their results are equal."""
+    places: dict[Arm, dict[tuple[str, int], TrialResult]] = {}
+    for trial in trials:
+        places.setdefault(trial.arm, {})[trial.scene, trial.seed] = trial
+    equal: dict[Arm, list[Arm]] = {}
+    for one, two in itertools.combinations(places, 2):
+        both = places[one].keys() & places[two].keys()
+        same = (one.init, one.densify) == (two.init, two.densify) and both
+        known = itertools.chain(*equal.values())
+        if (
+            same
+            and one not in known
+            and all(are_equal(places[one][place], places[two][place]) for place in both)
+        ):
+            equal.setdefault(one, [one]).append(two)
+    return [Note.of("same bits", arms=own) for own in equal.values()]
+
+
 def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) -> list[Note]:
     """A note with the reasons for the trials of each arm that are in none of ``verdicts``."""
     used = {trial.path for verdict in verdicts for trial in verdict.pairs.trials}
@@ -198,7 +258,8 @@ def unused_trials(trials: Sequence[TrialResult], verdicts: Sequence[Verdict]) ->
     found = []
     for own in group_by(left_out, lambda trial: trial.arm).values():
         asked = [one for one in verdicts if any(_asks(one.question, trial) for trial in own)]
-        reasons = [reason for verdict in asked for reason in _reasons(verdict)]
+        scenes = {trial.scene for trial in own}
+        reasons = [reason for verdict in asked for reason in _reasons(verdict, scenes)]
         if not reasons:
             reasons = [Note.of("not planned" if asked else "not asked").sentence]
         labels = [trial.label for trial in own]
@@ -213,9 +274,10 @@ def _asks(question: Question, trial: TrialResult) -> bool:
     return trial.arm in (question.baseline, question.arm)
 
 
-def _reasons(verdict: Verdict) -> list[str]:
-    """The reasons why a verdict leaves trials of its question out."""
-    reasons = [note.sentence for note in (verdict.untestable, *verdict.notes) if note]
+def _reasons(verdict: Verdict, scenes: Collection[str]) -> list[str]:
+    """The reasons why a verdict leaves trials of its question on these scenes out."""
+    notes = [note for note in (verdict.untestable, *verdict.notes) if note]
+    reasons = [one.sentence for one in notes if dict(one.facts).get("scene") in (None, *scenes)]
     if verdict.question.seeds and verdict.answer is not None and verdict.final:
         reasons.append(Note.of("decided before", seeds=verdict.pairs.seeds).sentence)
     if not reasons and verdict.question.seeds and verdict.answer is None:
@@ -253,7 +315,7 @@ def _as_json(one: PairVerdicts) -> dict[str, Any]:
 def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     """Answer all questions of an experiment: each of its arms against ``baseline``."""
     arms = pair_arms(experiment, baseline)
-    declared = active_declaration(experiment.folder, arms.trials, experiment.older)
+    declared = active_declaration(experiment)
     usual = arms if baseline == BASELINE else pair_arms(experiment)
     known = {frozenset(pair) for pair in usual.pairs}
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from gsbench.analysis.attempts import of_same_arm, places_of
 from gsbench.analysis.notes import Note
-from gsbench.analysis.results import TrialResult
+from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
-from gsbench.runs.experiments import Declaration, Question, merge_planned, read_declarations
-from gsbench.runs.layout import SEED
+from gsbench.runs.experiments import Declaration, Question, merge_planned, of_latest_metric
+from gsbench.runs.layout import FORGOTTEN, SEED
 from gsbench.words import counted
 
 
@@ -71,18 +71,7 @@ class ActiveDeclaration:
 
     @cached_property
     def records(self) -> tuple[Declaration, ...]:
-        latest, others = self.declared[-1], self.replaced
-        return tuple(
-            one
-            for one in self.declared
-            if one.primary == latest.primary
-            and (not others or one.moment > others[-1].moment or one is latest)
-        )
-
-    @property
-    def replaced(self) -> tuple[Declaration, ...]:
-        """The declarations of other metrics."""
-        return tuple(one for one in self.declared if one.primary != self.declared[-1].primary)
+        return of_latest_metric(self.declared)
 
     @property
     def metric(self) -> str:
@@ -167,8 +156,9 @@ class ActiveDeclaration:
         That is so if the planned trial failed and its code was repaired.
         """
         for seed in seeds:
-            config = config_if_readable(self.folder / f"{key}{SEED}{seed}")
-            if not config:
+            homes = (self.folder, self.folder / FORGOTTEN)
+            found = (config_if_readable(home / f"{key}{SEED}{seed}") for home in homes)
+            if not (config := next(filter(None, found), None)):
                 continue
             place = key.rpartition("/")[0]
             same_arm = [one for one in trials if one.key.rpartition("/")[0] == place]
@@ -184,16 +174,10 @@ class ActiveDeclaration:
         return notes + ([Note.of("doubted", metric=name)] if doubted else [])
 
 
-def active_declaration(
-    folder: Path, trials: Sequence[TrialResult], older: Sequence[TrialResult] = ()
-) -> ActiveDeclaration | None:
-    """The declarations in force for the sweep in ``folder``; None if nothing was declared.
+def active_declaration(experiment: Experiment) -> ActiveDeclaration | None:
+    """The declarations in force for a sweep; None if nothing was declared.
 
-    ``trials`` are the trials of the sweep that count, ``older`` those of earlier code. The latest
-    metric is in force. Further commands may add trials to an arm until its first result.
+    The latest metric is in force. Further commands may add trials to an arm until its first result.
     """
-    recorded = read_declarations(folder, (trial.record.declared for trial in trials))
-    declared = [one for one in recorded if one.kind == "sweep"]
-    if not declared:
-        return None
-    return ActiveDeclaration(tuple(declared), folder, tuple(older))
+    declared = tuple(one for one in experiment.declarations if one.kind == "sweep")
+    return ActiveDeclaration(declared, experiment.folder, experiment.older) if declared else None

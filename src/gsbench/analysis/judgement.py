@@ -13,7 +13,7 @@ import numpy as np
 from gsbench.analysis.differences import between_scenes_notes
 from gsbench.analysis.looks import look_levels
 from gsbench.analysis.notes import Note
-from gsbench.analysis.pairing import Pairs, are_equal, pair
+from gsbench.analysis.pairing import SAME_CAPTURE, Pairs, are_equal, pair
 from gsbench.analysis.quantities import Quantity, asked_quantity
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.statistics import (
@@ -262,8 +262,11 @@ def _with_pairs(
     verdict = Verdict(
         question, quantity, pairs, notes=notes, seen=seen, final=not declaration.looks
     )
-    if not pairs.rows and pairs.left_out and question.scenes:
-        return replace(verdict, untestable=pairs.left_out[0], notes=pairs.left_out[1:], final=True)
+    same = [note for note in pairs.left_out if note.kind == SAME_CAPTURE]
+    if question.scenes and (same or (pairs.left_out and not pairs.rows)):
+        reasons = dict.fromkeys([*same, *pairs.left_out])
+        why, *others = reasons
+        return replace(verdict, untestable=why, notes=tuple(others), final=True)
     if question.scenes and len(pairs.rows) < len(question.scenes):  # a look waits for every scene
         none = pairs.first(0) if declaration.looks else replace(pairs, rows=())
         return replace(verdict, pairs=none)

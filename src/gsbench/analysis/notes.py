@@ -44,6 +44,7 @@ SENTENCES: dict[str, str] = {
     # ---- pairs of trials that cannot be compared
     "unlike": "{text}",  # the whole text of an error
     "conditions": "{scene}: the arms differ in {conditions:list}, so they are not compared",
+    "same capture": "{scene} has the photographs of {other}, so it is no further scene",
     "unpaired": "{scene}: seed {seed} has no partner",
     "valueless": "{places:few} not compared: {reason}",
     "no direction": "in no verdict, {reason}",
@@ -73,6 +74,10 @@ SENTENCES: dict[str, str] = {
         "{arm} is not compared: other arms have a baseline with settings nearer to theirs."
     ),
     "unused": "In no verdict: {trials:few} ({reasons:few}).",
+    "judged apart": (
+        "Judged without {trials:few}, which other verdicts and tables use: {arms:few} against "
+        "{baseline}."
+    ),
     "not planned": "seeds after an undeclared or missing one do not count",
     "waits": "a look waits for all of its trials",
     "decided before": "the question was decided with {seeds:n seed}",
@@ -123,6 +128,14 @@ SENTENCES: dict[str, str] = {
     "early look": (
         "Still missing: {missing} of the {declared:n declared trial}, so this is an early look. "
         "Do not stop here because the result pleases: that finds effects that do not exist."
+    ),
+    "elsewhere": (
+        "Also measured by other code on these scenes and seeds: {arm}, in {experiments:all}. Each "
+        "name has an error rate of its own, so whoever reports the better version errs more often."
+    ),
+    "same bits": (
+        "The same bits in all trials of one scene and seed: {arms:all}. The settings in which they "
+        "differ had no effect, so there is nothing to compare."
     ),
     # ---- how to read a table
     "one trial": "One trial per cell, so there is no deviation.",

@@ -28,6 +28,7 @@ from gsbench.runs.experiments import Arm, Question
 
 BASELINE = "adc"
 CONTROLS = "eval.controls."
+SAME_CAPTURE = "same capture"  # the kind of a note
 
 Array = NDArray[np.float64]
 
@@ -138,9 +139,10 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
     only under equal conditions. Budgets may differ if the question names its trials itself,
     since a claim may be about arms with different budgets. If the seeds have a planned order,
     those after the first missing seed do not count: a seed that comes late cannot change what
-    an earlier look saw.
+    an earlier look saw. One capture under two names is one scene: its trainings would count twice.
     """
     rows, left_out = [], list[Note]()
+    captures: dict[object, str] = {}
     for scene, sides in _sides(trials, question).items():
         try:
             row, faults = _pair_scene(scene, *sides, question)
@@ -148,7 +150,15 @@ def pair(trials: Sequence[TrialResult], question: Question) -> Pairs:
             left_out.append(Note.of("unlike", text=str(error)))
             continue
         left_out += faults
-        rows += [row] if row.seeds else []
+        if not row.seeds:
+            continue
+        first = row.trials[0][0]
+        data = first.record.hashes.get("data")
+        known = captures.setdefault((data, first.split) if data else scene, scene)
+        if known == scene:
+            rows.append(row)
+        else:
+            left_out.append(Note.of(SAME_CAPTURE, scene=scene, other=known))
     if uneven := {
         len(row.seeds) for row in rows if len(row.seeds) > min(len(row.seeds) for row in rows)
     }:
@@ -291,17 +301,18 @@ def choose_pairs(
 def baseline_settings(
     arms: Sequence[Arm], ages: Mapping[Arm, float], baseline: str = BASELINE
 ) -> list[tuple[Arm, Arm]]:
-    """The pairs of the baseline's own settings: the oldest of each initialiser, and each other.
+    """The pairs of the baseline's own settings and initialisers: the oldest, and each other.
 
-    They are compared whatever other arms there are, so that a further arm takes no verdict away.
+    Settings are compared within an initialiser. All this is compared whatever other arms there are,
+    so that a further arm takes no verdict away.
     """
-    pairs = []
-    for own in group_by(
-        [arm for arm in arms if arm.densify == baseline], lambda arm: arm.init
-    ).values():
-        oldest = min(own, key=lambda arm: ages.get(arm, 0.0))
-        pairs += [(oldest, arm) for arm in own if arm != oldest]
-    return pairs
+    of_baseline = [arm for arm in arms if arm.densify == baseline]
+    by_init = group_by(
+        sorted(of_baseline, key=lambda arm: ages.get(arm, 0.0)), lambda arm: arm.init
+    )
+    oldest = [own[0] for own in by_init.values()]
+    pairs = [(own[0], arm) for own in by_init.values() for arm in sorted(own[1:])]
+    return pairs + [(oldest[0], arm) for arm in sorted(oldest[1:])]
 
 
 def _unlike(arm: Arm, other: Arm, settings: Mapping[Arm, Mapping[str, Any]]) -> int:

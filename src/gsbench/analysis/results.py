@@ -8,7 +8,7 @@ tables over thousands of trials start quickly.
 import math
 import os
 import re
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,10 +23,18 @@ from gsbench.analysis.trial_settings import (
 from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
-from gsbench.runs.experiments import QUESTIONS, experiment_home, trial_folders, trial_key, unix_time
+from gsbench.runs.experiments import (
+    QUESTIONS,
+    Declaration,
+    experiment_home,
+    read_declarations,
+    trial_folders,
+    trial_key,
+    unix_time,
+)
 from gsbench.runs.experiments import Arm as Arm
 from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
-from gsbench.runs.layout import CONFIG, FAILED, PER_VIEW, RESULTS, SEED
+from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SEED
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, UnfinishedError, split_text
@@ -240,8 +248,9 @@ class Experiment:
     """The usable trials of an experiment, and ``faults``, a line for each folder without one.
 
     ``older`` are trials of earlier code that `newest_code` left out, of which ``versions`` has a
-    line for each part of the code. ``lacking`` are the folders of trials without a usable result:
-    they failed, were stopped, or are damaged.
+    line for each part of the code, and those that were forgotten (``status --forget-superseded``).
+    ``lacking`` are the folders of trials without a usable result: they failed, were stopped, or
+    are damaged.
     """
 
     name: str
@@ -252,6 +261,11 @@ class Experiment:
     versions: tuple[str, ...] = ()
     lacking: tuple[Path, ...] = ()
 
+    @cached_property
+    def declarations(self) -> list[Declaration]:
+        """All declarations, the oldest first, also those that only the trials' results repeat."""
+        return read_declarations(self.folder, (trial.record.declared for trial in self.trials))
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """The lines on all folders that do not count; there are `left_out` of these."""
@@ -259,7 +273,8 @@ class Experiment:
 
     @property
     def left_out(self) -> int:
-        return len(self.faults) + len(self.older)
+        forgotten = sum(FORGOTTEN in trial.path.parts for trial in self.older)
+        return len(self.faults) + len(self.older) - forgotten
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -310,7 +325,7 @@ def read_experiment(folder: Path) -> Experiment:
     for path in map(Path, trial_folders(folder)):
         try:
             trials.append(read_trial(path, runs_dir, settings))
-        except _UnusableError as reason:
+        except UnusableError as reason:
             faults[path] = one_line(str(reason))
     of_settings = _read_settings(trials, settings)
     faults |= {
@@ -320,13 +335,31 @@ def read_experiment(folder: Path) -> Experiment:
     usable.sort(
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
+    forgotten, unread = _forgotten(folder, {trial.path for trial in usable})
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     lacking = tuple(
         path
         for path, fault in sorted(faults.items())
         if TRIAL_FOLDER.fullmatch(path.name) and not fault.startswith(FOREIGN)
     )
-    return Experiment(folder.name, folder, tuple(usable), tuple(warnings), lacking=lacking)
+    return Experiment(
+        folder.name, folder, tuple(usable), (*warnings, *unread), forgotten, lacking=lacking
+    )
+
+
+def _forgotten(home: Path, there: Collection[Path]) -> tuple[tuple[TrialResult, ...], list[str]]:
+    """The forgotten trials of an experiment that are not ``there`` again, and warnings."""
+    found, warnings, settings = list[TrialResult](), [], Configurations()
+    for path in map(Path, trial_folders(home / FORGOTTEN)) if (home / FORGOTTEN).is_dir() else ():
+        try:
+            trial = read_trial(path, home.parent, settings)
+        except UnusableError as reason:
+            if (path / RESULTS).exists():  # others failed, and showed nothing
+                warnings.append(f"{path.relative_to(home.parent)}: {one_line(str(reason))}")
+            continue
+        if home / path.relative_to(home / FORGOTTEN) not in there:
+            found.append(trial)
+    return tuple(sorted(found, key=lambda trial: trial.path)), warnings
 
 
 def newest_code(experiment: Experiment) -> Experiment:
@@ -360,7 +393,7 @@ def newest_code(experiment: Experiment) -> Experiment:
     left_out = {trial.path for trial in older}
     kept = tuple(trial for trial in experiment.trials if trial.path not in left_out)
     lines = tuple(_versions_line(*code, earlier) for code, earlier in replaced.items())
-    return replace(experiment, trials=kept, older=tuple(older), versions=lines)
+    return replace(experiment, trials=kept, older=(*experiment.older, *older), versions=lines)
 
 
 def _change_of_code(made: TrialResult, newest: TrialResult) -> Change:
@@ -424,41 +457,41 @@ def read_views(trial: TrialResult) -> dict[str, dict[str, float]]:
     return views
 
 
-class _UnusableError(Exception):
+class UnusableError(Exception):
     """A folder is not a usable trial; the text says why."""
 
 
 def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialResult:
-    """Read and check one trial folder; raises `_UnusableError`."""
+    """Read and check one trial folder; raises `UnusableError`."""
     try:
         require_no_links(runs_dir, path, below=True)
         folder = TrialFolder(path)
         record = folder.record()
         if change := folder.change():
-            raise _UnusableError(
+            raise UnusableError(
                 f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
             )
     except FileNotFoundError:
-        raise _UnusableError(_why_unfinished(path)) from None
+        raise UnusableError(_why_unfinished(path)) from None
     except UnfinishedError as error:
-        raise _UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
+        raise UnusableError(f"unfinished, {error.path.name} {error.reason}") from None
     except DamagedError as error:
-        raise _UnusableError(f"damaged, {error.path.name} {error.reason}") from None
+        raise UnusableError(f"damaged, {error.path.name} {error.reason}") from None
     except InputError as error:
-        raise _UnusableError(f"strange, {error}") from None
+        raise UnusableError(f"strange, {error}") from None
     match = TRIAL_FOLDER.fullmatch(path.name)
     if match is None:
-        raise _UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
+        raise UnusableError(f"{FOREIGN}, the folder is not named <hash8>-seed<k>")
     recorded = {
         "experiment": record.experiment,
         "scene": record.scene,
         "arm": f"{record.init}-{record.densify}",
     }
     recorded["seed"] = str(record.seed)
-    names = (*path.relative_to(runs_dir).parts[-4:-1], match["seed"])
+    names = (path.relative_to(runs_dir).parts[0], *path.parts[-3:-1], match["seed"])
     for (key, value), name in zip(recorded.items(), names, strict=True):
         if value != name:
-            raise _UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
+            raise UnusableError(f"{FOREIGN}, its {RESULTS} is of {key} {value!r}")
     return TrialResult(path, match["hash"], record, settings=settings)
 
 

@@ -101,7 +101,12 @@ def not_a_setting(key: str, node: Any, words: Sequence[str], file: str = "") -> 
     # Hydra's plug-ins are chosen by name, not by class
     hidden = "_target_" if parent.startswith("hydra") else "hydra"
     keys = [str(own) for own in node if own != hidden] if isinstance(node, DictConfig) else []
-    near = _belongs_to(parent, name) or did_you_mean(name, keys)
+    elsewhere = _settings_of_choices(parent)
+    near = did_you_mean(name, [*keys, *elsewhere])
+    for known in elsewhere.keys() - set(keys):
+        belongs = f"it belongs to {parent}={' or '.join(elsewhere[known][:3])}"
+        meant = f"; did you mean {known}?"
+        near = f"; {belongs}" if known == name else near.replace(meant, f"{meant} {belongs}")
     if not parent:
         near = near or did_you_mean(name, GROUPS) or _groups_with(key, node)
     if any(word.startswith(f"{parent}._target_=") for word in words):
@@ -119,18 +124,16 @@ def _groups_with(key: str, root: DictConfig) -> str:
     return f"; did you mean {' or '.join(places)}?" if places else ""
 
 
-def _belongs_to(group: str, key: str) -> str:
-    """``; it belongs to densify=volumetric`` if other choices have the setting, else ""."""
-    if group not in GROUPS:
-        return ""
-    key_line = re.compile(rf"^{re.escape(key)}:", re.M)
-    files = {
-        name: Path(conf_dir(), group, f"{name}.yaml") for name in options(group) if "/" not in name
-    }
-    choices = [
-        name for name, file in files.items() if key_line.search(file.read_text(encoding="utf-8"))
-    ]
-    return f"; it belongs to {group}={' or '.join(choices[:3])}" if choices else ""
+def _settings_of_choices(group: str) -> dict[str, list[str]]:
+    """The settings that files of a group's choices have, each with the names of these choices."""
+    found: dict[str, list[str]] = {}
+    for name in options(group) if group in GROUPS else ():
+        if "/" not in name:
+            text = Path(conf_dir(), group, f"{name}.yaml").read_text(encoding="utf-8")
+            for key in re.findall(r"^(\w+):", text, re.M):
+                found.setdefault(key, []).append(name)
+    found.pop("defaults", None)
+    return found
 
 
 def _file_that_sets(key: str, words: Sequence[str]) -> str:

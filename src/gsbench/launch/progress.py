@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.quantities import Quantity, asked_quantity
-from gsbench.analysis.results import TrialResult, newest_code, read_experiment
+from gsbench.analysis.results import Experiment, TrialResult, newest_code, read_experiment
 from gsbench.errors import InputError
 from gsbench.launch.states import TrialState, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home
@@ -83,10 +83,11 @@ def progress_of(home: Path) -> Progress:
         cells[names[state.folder]][state.state if state.state in COUNTED else WAITING] += 1
         if state.state == "running":
             speeds[names[state.folder]] += _training(state.folder)[1]
-    trials = [t for t in newest_code(read_experiment(home)).trials if t.path in names]
-    return Progress(
-        cells, dict(speeds), _seconds_left(states, names, trials), _leader(home, names, trials)
-    )
+    experiment = newest_code(read_experiment(home))
+    shown = tuple(trial for trial in experiment.trials if trial.path in names)
+    left = _seconds_left(states, names, shown)
+    leader = _leader(replace(experiment, trials=shown), names)
+    return Progress(cells, dict(speeds), left, leader)
 
 
 def _kinds(name: Name) -> tuple[Name, ...]:
@@ -135,9 +136,9 @@ def _share_done(state: TrialState) -> float:
     return min(1.0, _training(state.folder)[0] / max(1, iterations))
 
 
-def _leader(home: Path, names: dict[Path, Name], trials: Sequence[TrialResult]) -> str:
+def _leader(experiment: Experiment, names: dict[Path, Name]) -> str:
     """The arm with the best mean over those scenes and seeds that all arms have, in words."""
-    declared = active_declaration(home, trials) if trials else None
+    trials, declared = experiment.trials, active_declaration(experiment)
     metric = asked_quantity(declared.metric if declared else "psnr", trials)
     values: dict[str, dict[tuple[str, int], float]] = {arm: {} for arm, _ in names.values()}
     for trial in trials:

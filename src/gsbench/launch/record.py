@@ -27,11 +27,12 @@ from gsbench.runs.experiments import (
     declared_now,
     make_home,
     merge_planned,
+    of_latest_metric,
     open_question,
     read_declarations,
     record_text,
 )
-from gsbench.runs.layout import DECLARED, PLAN, RESULTS, SEED
+from gsbench.runs.layout import CONFIG, DECLARED, FORGOTTEN, PER_VIEW, PLAN, RESULTS, SEED
 from gsbench.settings import ARM_BYTES, is_folder_name
 from gsbench.system.locks import hold
 from gsbench.words import some_of
@@ -97,10 +98,17 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
     """Delete the folders of trials and drop them from the plan of the experiment in ``home``.
 
     The results of stages stay in the store: if the old code comes back, nothing is computed again.
+    What was measured stays in `FORGOTTEN`: it was seen, so verdicts count its code as a version.
     """
     folders = list(folders)
     for folder in folders:
-        require_no_links(home.parent, folder)
+        kept = home / FORGOTTEN / folder.relative_to(home)
+        for place in (folder, kept):
+            require_no_links(home.parent, place, below=True)
+        kept.mkdir(parents=True, exist_ok=True)
+        for name in (CONFIG, PER_VIEW, RESULTS):
+            if (folder / name).exists():
+                shutil.copy2(folder / name, kept / name)
         # first: a half-deleted trial must not look complete
         (folder / RESULTS).unlink(missing_ok=True)
         shutil.rmtree(folder)
@@ -170,9 +178,7 @@ def declare(trials: Sequence[Trial]) -> None:
             if metric is None:
                 continue
             if latest is not None and given is None:
-                sweeps = [one for one in declarations if one.kind == "sweep"]
-                others = [k for k, one in enumerate(sweeps) if one.primary != metric]
-                first = sweeps[max(others, default=-1) + 1]
+                first = of_latest_metric([one for one in declarations if one.kind == "sweep"])[0]
                 log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
             before = {} if latest is None else latest.planned
             together = merge_planned(before, asked)

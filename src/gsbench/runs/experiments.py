@@ -338,6 +338,20 @@ def latest_declaration(declarations: Sequence[Declaration]) -> Declaration:
     return declarations[first]
 
 
+def of_latest_metric(sweeps: Sequence[Declaration]) -> tuple[Declaration, ...]:
+    """The declarations of the latest metric after the last one of another metric.
+
+    ``sweeps`` are declarations of sweeps, in the order of time.
+    """
+    latest = sweeps[-1]
+    others = [one.moment for one in sweeps if one.primary != latest.primary]
+    return tuple(
+        one
+        for one in sweeps
+        if one is latest or (one.primary == latest.primary and one.moment > max(others, default=-1))
+    )
+
+
 def merge_planned(one: Planned, other: Planned) -> Planned:
     """The trials of both plans."""
     return {

@@ -21,6 +21,7 @@ METRICS = "metrics.json"  # of an evaluation
 # in an experiment's folder
 PLAN = "plan.json"  # all trials of the commands so far
 DECLARED = "declared.jsonl"  # declared questions, with their times
+FORGOTTEN = ".forgotten"  # records of removed trials, since what they showed was seen
 LEDGER = "ledger.jsonl"  # ideas, tests and results in their order (`gsbench ledger`)
 TUNING = "tuning.json"  # of a search: its ranges and points
 VOTES = "votes"  # a folder per round of people's votes (`gsbench vote`)

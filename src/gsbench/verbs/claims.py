@@ -42,6 +42,20 @@ HTML = "claims.html"
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 DEFAULT_METRIC = "psnr"
 MOST_QUESTIONS = 10_000
+# what `plan` answers for each command
+PLANNED = {
+    "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
+    "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
+    "check": "Planned for a check of claims: each claim errs in {:.3g} %. It is shown for each, "
+    "not for all at once.",
+    "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
+    "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
+    "of the ideas were tested and none was kept.",
+}
+NEW_TRIALS = (
+    "Train all of them with seeds that the pilot does not have (it has {}), under another name: "
+    "what was seen is not declared beforehand."
+)
 
 
 def check(argv: Sequence[str], runs: Path) -> int:
@@ -176,8 +190,9 @@ def plan(argv: Sequence[str], runs: Path) -> int:
     """Run the verb; raises InputError for bad input."""
     parser = ArgumentParser(
         "plan",
-        "An estimate from an experiment's trials, for 80 % power. The seeds are new ones: those of "
-        "the trials are seen (docs/verdict.md).",
+        "It estimates from an experiment's trials how many scenes and seeds show a difference of "
+        "one arm in 80 of 100 cases. The seeds are new ones: those of the trials are seen "
+        "(docs/verdict.md). How many ideas will be found, it cannot say.",
     )
     parser.add_argument("experiment")
     parser.add_argument(
@@ -241,8 +256,12 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         if purpose.screen:
             lines.append("  an idea that looks better takes as many new seeds, its baseline too")
         plans[-1] |= planned.to_json()
+    seeds = sorted({trial.seed for trial in trials})
+    lines.append(PLANNED[options.command].format(100 * purpose.rate))
+    lines.append(NEW_TRIALS.format(", ".join(map(str, seeds))))
     if options.json:
         asked = {"metric": metric.key, "difference": difference, "for": options.command}
+        asked |= {"error_rate": purpose.rate, "pilot_seeds": seeds}
         found = asked | comparison.to_json() | {"plans": plans}
         lines = [json.dumps(found, indent=1)]
     print("\n".join(lines))

@@ -53,8 +53,8 @@ def status(argv: Sequence[str], runs: Path) -> int:
     parser.flag("--forget", "remove trials from the plan that never started")
     parser.flag(
         "--forget-superseded",
-        "delete the folders of trials that older code made, so that they no longer count as "
-        "versions of it; what their stages computed stays in the store",
+        "delete the folders of trials that older code made; what their stages computed stays in "
+        "the store, and verdicts still count them as versions of the code",
     )
     options = parser.parse_args(argv)
     if options.experiment is None:
