@@ -2,7 +2,7 @@
 
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import pytest
@@ -206,7 +206,6 @@ def test_json_is_read_if_it_is_plain(tmp_path):
     assert read_json(file) == {"a": [1, None]}
 
 
-@dataclass(frozen=True, kw_only=True)
 class Row(Record):
     amount: Amount
     name: Text = "a"

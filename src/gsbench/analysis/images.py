@@ -47,7 +47,6 @@ def absolute_error(render: Pixels, truth: Pixels) -> Array:
     return np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1)
 
 
-@dataclass(frozen=True, kw_only=True)
 class PixelMeasures(Record):
     """Measures of a trial's pictures, which an archive stores in place of the pictures."""
 

@@ -10,7 +10,6 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from typing import Annotated
@@ -41,7 +40,6 @@ log = logging.getLogger(__name__)
 LEVELS = 3  # folders of scene, arm and trial
 
 
-@dataclass(frozen=True, kw_only=True)
 class PlannedTrial(Record):
     """A planned trial: its overrides, the folder of the command, and the Unix time."""
 
@@ -57,7 +55,6 @@ def _checked_folder(name: str) -> str:
     return name
 
 
-@dataclass(frozen=True, kw_only=True)
 class PlanFile(Record):
     """The file ``plan.json``: the trials by their folders within the experiment."""
 

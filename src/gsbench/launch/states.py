@@ -146,7 +146,6 @@ WAITING = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Submission(Record):
     """``.submitted.json``: a trial's Slurm job, its log, and its user."""
 

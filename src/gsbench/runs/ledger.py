@@ -41,7 +41,6 @@ FAILED: Result = "failed"
 Seeds = Annotated[tuple[Count, ...], Field(min_length=2)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Opened(Record):
     """The first line: what decides, on which trials, and how many ideas share the error rate.
 
@@ -63,7 +62,6 @@ class Opened(Record):
     keys: dict[Text, TrialKey]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Started(Record):
     """An idea and the ``level`` of its test, written before its first trial.
 
@@ -81,7 +79,6 @@ class Started(Record):
     keys: dict[Text, TrialKey]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Difference(Record):
     """A mean difference with its interval; for a relative question all three are logarithms."""
 
@@ -90,7 +87,6 @@ class Difference(Record):
     high: Number
 
 
-@dataclass(frozen=True, kw_only=True)
 class Ended(Record):
     """The result of an idea; "failed" if there is none, so that the idea may be tried again.
 
@@ -109,7 +105,6 @@ class Ended(Record):
     seconds: Amount | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Confirming(Record):
     """Captures and seeds that no idea has seen, chosen before their first trial.
 
@@ -122,7 +117,6 @@ class Confirming(Record):
     keys: dict[Text, dict[Text, TrialKey]]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Confirmed(Record):
     """The results of the confirmation ``number`` (from 0): each idea's difference."""
 
@@ -136,7 +130,6 @@ class Confirmed(Record):
 Entry = Opened | Started | Ended | Confirming | Confirmed
 
 
-@dataclass(frozen=True, kw_only=True)
 class Line(Record):
     """An entry with the sha256 of the line before it, "" for the first, and its own."""
 

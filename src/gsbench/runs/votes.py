@@ -5,7 +5,6 @@ import hmac
 import itertools
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,7 +27,6 @@ RoundId = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 PersonId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Showing(Record):
     """One decision of a round: ``left`` and ``right`` name arms, or the sides of a trap.
 
@@ -46,7 +44,6 @@ class Showing(Record):
     of: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RoundKey(Record):
     """The key of a round, which stays in the runs folder until the votes are there.
 
@@ -87,7 +84,6 @@ class RoundKey(Record):
         return self.people * len(self.pairs)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Vote(Record):
     """The answer to a showing, and the seconds that it took."""
 
@@ -96,7 +92,6 @@ class Vote(Record):
     seconds: Amount
 
 
-@dataclass(frozen=True, kw_only=True)
 class Ballot(Record):
     """The file that a person saves at the end of a round.
 
@@ -124,7 +119,6 @@ class Ballot(Record):
         return {vote.showing: vote.answer for vote in self.votes}
 
 
-@dataclass(frozen=True, kw_only=True)
 class StoredBallot(Record):
     """A ballot as the runs folder keeps it.
 

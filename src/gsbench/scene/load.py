@@ -83,7 +83,6 @@ Row = tuple[Number, Number, Number, Number]
 Length = Annotated[float, Field(gt=0, le=MAX_NUMBER)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class PreparedView(Record):
     """A view in `CAMERAS_FILE`: its camera and the ``file`` beside it, "" for the photograph."""
 
@@ -103,14 +102,12 @@ class PreparedView(Record):
         return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
 
 
-@dataclass(frozen=True, kw_only=True)
 class PreparedViews(Record):
     """The content of `CAMERAS_FILE`."""
 
     views: dict[str, PreparedView]
 
 
-@dataclass(frozen=True, kw_only=True)
 class PreparedFiles(Record):
     """The content of `SUMS_FILE`."""
 

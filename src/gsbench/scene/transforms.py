@@ -17,7 +17,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Len
@@ -70,7 +70,6 @@ OTHER_SCALE, SAME_SCALE = 1.5, 0.1
 RATIONAL = "FULL_OPENCV"  # OpenCV's: a polynomial of k1, k2, k3 divided by one of k4, k5, k6
 
 
-@dataclass(frozen=True, kw_only=True)
 class Intrinsics(Record):
     """Intrinsics of one frame, or of all cameras of a file."""
 
@@ -96,7 +95,6 @@ class Intrinsics(Record):
     p2: Optional = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class FrameRecord(Intrinsics):
     """A frame of the file: a photograph with its pose."""
 
@@ -105,7 +103,6 @@ class FrameRecord(Intrinsics):
     mask_path: Text | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class TransformsRecord(Intrinsics):
     """The content of ``transforms.json`` before its conversion."""
 
@@ -274,7 +271,7 @@ def _read_record(path: Path, backdrop: Backdrop) -> TransformsRecord:
     return record
 
 
-def names_of(kind: type[Record]) -> frozenset[str]:
+def names_of(kind: Any) -> frozenset[str]:
     """The keys of a record, which gsbench uses."""
     return frozenset(field.name for field in fields(kind))
 

@@ -19,7 +19,6 @@ from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Run(Record):
     """The run of a trial, and what was sent to it. gsbench keeps it in the trial's folder."""
 

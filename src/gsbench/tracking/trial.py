@@ -242,14 +242,12 @@ class TrackedTrial:
         return pictures
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Planned(Record):
     """The part of a planned trial that is shown: the words of its command."""
 
     overrides: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Plan(Record):
     """The part of an experiment's plan that is shown: its trials by their folders."""
 
