@@ -36,18 +36,14 @@ from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
 from gsbench.runs.store import Output, is_sound, record_files
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
-    WHITE,
-    Mask,
     Resample,
     check_size,
     image_size,
     read_image,
-    read_mask,
     resize_image,
-    resize_mask,
-    write_mask,
     write_png,
 )
+from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
 from gsbench.scene.options import MIN_IMAGES, downscaled_size
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import check_lenses, undistort

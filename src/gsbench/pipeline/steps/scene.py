@@ -27,27 +27,19 @@ from gsbench.runs.store import Store
 from gsbench.runs.user_code import NO_USER_CODE, UserCode
 from gsbench.scene.colmap import normalize_capture, write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import (
-    IMAGES,
-    image_size,
-    png_name,
-    prepare_photograph,
-    prepared_mask,
-    read_image,
-    write_mask,
-)
+from gsbench.scene.images import image_size, png_name, read_image
 from gsbench.scene.load import load_scene
+from gsbench.scene.masks import IMAGES, prepare_photograph, prepared_mask, write_mask
+from gsbench.scene.model_folders import SPARSE_FOLDERS, require_subfolder
 from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
 from gsbench.scene.own_reader import PosedImages, SceneReader, read_posed_images
 from gsbench.scene.readers import (
-    SPARSE_FOLDERS,
     existing_folder,
     fingerprint,
     read_colmap,
     read_photos,
     read_posed,
     read_transforms,
-    require_subfolder,
 )
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
