@@ -17,8 +17,8 @@ from gsbench.launch.batch import (
     run_batch,
 )
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import read_plan
 from gsbench.runs.experiments import read_declarations
+from gsbench.runs.plan import read_plan
 from tests.finished import write_results
 from tests.helpers import refusal
 from tests.launch.test_jobs import LOCAL, SLURM, Mirrored

@@ -10,7 +10,7 @@ from pathlib import Path
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.mirror import mirror_ended
+from gsbench.tracking.tracker_run import mirror_ended
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = 150

@@ -1,8 +1,6 @@
-"""Plan and declarations, which a command writes before its trials run. Loads no torch.
+"""Adding to the plan (`gsbench.runs.plan`) and the declarations (`gsbench.runs.experiments`).
 
-``<runs>/<experiment>/plan.json`` maps the folder of every trial of all commands to the overrides
-that describe it, so that missing trials can be listed. For ``declared.jsonl`` see
-`gsbench.runs.experiments`.
+A command does this before its trials run. Loads no torch.
 """
 
 import logging
@@ -12,14 +10,10 @@ import time
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import AfterValidator
 
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.files import require_no_links, write_json, write_text
-from gsbench.parsing import Amount, DamagedError, Record, read_typed
+from gsbench.files import require_no_links, write_text
 from gsbench.runs.experiments import (
     Declaration,
     Planned,
@@ -30,35 +24,12 @@ from gsbench.runs.experiments import (
     read_declarations,
     record_text,
 )
-from gsbench.runs.layout import DECLARED, PLAN, RESULTS, SEED
-from gsbench.settings import ARM_BYTES, is_folder_name
+from gsbench.runs.layout import DECLARED, RESULTS, SEED
+from gsbench.runs.plan import PlannedTrial, change_plan
 from gsbench.system.locks import hold
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
-
-LEVELS = 3  # folders of scene, arm and trial
-
-
-class PlannedTrial(Record):
-    """A planned trial: its overrides, the folder of the command, and the Unix time."""
-
-    overrides: tuple[str, ...]
-    cwd: str
-    time: Amount
-
-
-def _checked_folder(name: str) -> str:
-    parts = name.split("/")
-    if len(parts) != LEVELS or not all(is_folder_name(part, ARM_BYTES) for part in parts):
-        raise ValueError("it is not a folder of a trial")
-    return name
-
-
-class PlanFile(Record):
-    """The file ``plan.json``: the trials by their folders within the experiment."""
-
-    trials: dict[Annotated[str, AfterValidator(_checked_folder)], PlannedTrial]
 
 
 def add_to_plan(trials: Sequence[Trial]) -> None:
@@ -75,19 +46,7 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
             )
             by_home.setdefault(trial.files.home, {})[trial.folder] = planned
     for home, added in by_home.items():
-        make_home(home)
-        with hold(home / f".{PLAN}.lock", "the plan"):
-            _write_plan(home, read_plan(home) | added)
-
-
-def forget(home: Path, folders: Iterable[Path]) -> None:
-    """Drop trials from the plan of the experiment in ``home``."""
-    dropped = set(folders)
-    with hold(home / f".{PLAN}.lock", "the plan"):
-        _write_plan(
-            home,
-            {folder: trial for folder, trial in read_plan(home).items() if folder not in dropped},
-        )
+        change_plan(home, added)
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
@@ -101,28 +60,7 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
         # first: a half-deleted trial must not look complete
         (folder / RESULTS).unlink(missing_ok=True)
         shutil.rmtree(folder)
-    forget(home, folders)
-
-
-def read_plan(home: Path) -> dict[Path, PlannedTrial]:
-    """The planned trials of the experiment in ``home`` by their folders; {} without a plan.
-
-    A damaged plan gives {} with a warning: trials that have begun are found by their folders
-    anyway.
-    """
-    try:
-        trials = read_typed(home / PLAN, PlanFile).trials
-    except FileNotFoundError:
-        return {}
-    except DamagedError as error:
-        log.warning("left out: %s: to write it again, run the sweep's command", error)
-        return {}
-    return {home / name: trial for name, trial in sorted(trials.items())}
-
-
-def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
-    names = {folder.relative_to(home).as_posix(): trial for folder, trial in trials.items()}
-    write_json(home / PLAN, PlanFile(trials=names).to_json())
+    change_plan(home, dropped=folders)
 
 
 # ---- declarations

@@ -19,7 +19,6 @@ import os
 import secrets
 import shutil
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +47,7 @@ from gsbench.scene.options import MIN_IMAGES, downscaled_size
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import check_lenses, undistort
 from gsbench.system.isolate import CrashError, run_isolated
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import in_threads
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
@@ -132,8 +131,6 @@ def load_scene(
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
     """
-    if principal_point not in ("used", "centred"):
-        raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
     downscaling = Downscaling(downscale, max_size, resample)
     folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
     try:
@@ -166,8 +163,7 @@ def load_scene(
         return View(name, camera, image, mask_of(name))
 
     names = [name for name in capture.image_names if name in entries]
-    with ThreadPoolExecutor(available_threads()) as pool:
-        views = list(pool.map(view, names))
+    views = list(in_threads(view, names))
     held_out = set(capture.test_names)
     return Scene(
         name=capture.name,
@@ -341,8 +337,7 @@ def prepare_all(images: Sequence[ImageToPrepare], progress: Progress) -> list[Ca
 
 def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
     """Prepare some images in this process."""
-    with ThreadPoolExecutor(available_threads()) as pool:
-        return list(pool.map(prepare_image, images))
+    return list(in_threads(prepare_image, images))
 
 
 def prepare_image(image: ImageToPrepare) -> Camera:

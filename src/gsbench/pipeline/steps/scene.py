@@ -4,7 +4,6 @@ Photographs are read from the user's folder, masked, and resized to views; the t
 as PNG.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -46,7 +45,7 @@ from gsbench.scene.transforms import read_transforms as read_transforms_files
 from gsbench.scene.twins import without_copies
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import in_threads
 
 
 class CaptureSource:
@@ -180,17 +179,12 @@ def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
 
     def build(folder: Path) -> None:
         names = capture.image_names
-        with (
-            progress("scene") as report,
-            ThreadPoolExecutor(max_workers=available_threads()) as pool,
-        ):
-            made = pool.map(
-                lambda name: prepare_photograph(
-                    folder, capture.images, capture.masks, name, backdrop
-                ),
-                names,
-            )
-            for done, _ in enumerate(made, 1):
+
+        def prepare(name: str) -> None:
+            prepare_photograph(folder, capture.images, capture.masks, name, backdrop)
+
+        with progress("scene") as report:
+            for done, _ in enumerate(in_threads(prepare, names), 1):
                 report("pixels replaced", done, len(names))
 
     return step_of(CAPTURE, inputs, build)
@@ -323,7 +317,7 @@ def init_step(
 
 def check_readable(capture: Capture, report: Progress) -> None:
     """Decode every photograph once; raises InputError for a damaged one before hours of work."""
-    with ThreadPoolExecutor(max_workers=available_threads()) as pool:
-        made = pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)
-        for done, _ in enumerate(made, 1):
-            report("photographs", done, len(capture.image_names))
+    names = capture.image_names
+    read = in_threads(lambda name: read_image(capture.images / name).shape, names)
+    for done, _ in enumerate(read, 1):
+        report("photographs", done, len(names))

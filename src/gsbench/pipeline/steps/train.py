@@ -38,17 +38,16 @@ from gsbench.external.settings import (
 )
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians, dc_to_rgb
+from gsbench.gaussians.model import Gaussians, dc_to_bytes
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
 from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
 from gsbench.logs import progress
-from gsbench.normalization import Normalization
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, InitialCloud
-from gsbench.scene.types import Capture, Scene
+from gsbench.scene.types import Capture
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
@@ -91,7 +90,8 @@ def train_step(views: Views, parts: Parts) -> Step:
         scene = views.scene
         initial = initial_gaussians(views.store.path(views.init), device)
         _log_normalization(views.capture, densifier)
-        start = check_gaussians(initial, scene, parts, views.capture.normalization)
+        points, colors = initial.means.double().cpu().numpy(), dc_to_bytes(initial.sh_dc)
+        start = check_points(points, colors, views, parts)
         trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
         reset_peak_memory(device)
         with progress("train") as report:
@@ -115,28 +115,13 @@ def train_step(views: Views, parts: Parts) -> Step:
     return step_of(TRAIN, inputs, build, user)
 
 
-def check_gaussians(
-    initial: Gaussians, scene: Scene, parts: Parts, normalization: Normalization
-) -> InitialCloud:
-    """Check the Gaussians that training starts from against the training views (`check_start`)."""
-    colors = (dc_to_rgb(initial.sh_dc).clamp(0, 1) * 255).round().byte()  # [N, 3]
-    return check_points(
-        initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, parts, normalization
-    )
-
-
 def check_points(
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    scene: Scene,
-    parts: Parts,
-    normalization: Normalization,
+    points: NDArray[np.float64], colors: NDArray[np.uint8], views: Views, parts: Parts
 ) -> InitialCloud:
     """Check the points that training starts from against the training views (`check_start`)."""
     # A user's initialiser may lack the attribute.
-    return check_start(
-        points, colors, scene, getattr(parts.initializer, "random_points", False), normalization
-    )
+    is_random = getattr(parts.initializer, "random_points", False)
+    return check_start(points, colors, views.scene, is_random, views.capture.normalization)
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
@@ -222,7 +207,7 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
     def build(folder: Path) -> None:
         cloud = read_cloud(views.store.path(views.init) / MODEL_FOLDER)
         normalization = views.capture.normalization
-        start = check_points(cloud.points, cloud.colors, views.scene, parts, normalization)
+        start = check_points(cloud.points, cloud.colors, views, parts)
         executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
         places = {name: work / name for name in FOLDERS}
         here = {"device": str(device), "threads": parts.threads}

@@ -5,7 +5,6 @@ structure from motion, and a large lawn of faint texture, on which 3DGS grows ov
 Equal seeds give equal images.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from math import cos, pi, radians, sin, tan
 from pathlib import Path
 
@@ -13,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gsbench.errors import InputError
 from gsbench.logs import Progress, no_progress
 from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
-from gsbench.scene.options import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import in_threads
 
 VERSION = 1  # raise it when the images change
 # azimuth between neighbouring views; larger steps gave wrong SfM models of scenes like this one
@@ -40,7 +37,7 @@ def render_courtyard(
     """Write the capture: ``images/*.png`` and the exact COLMAP model ``sparse/0`` without points.
 
     ``width`` and ``height`` are in px. The same arguments give the same bytes. ``progress`` counts
-    views. Raises `InputError` for fewer than 3 views or images below 16 px.
+    views.
     """
     # This module loads pycolmap, which is slow and needed only here.
     from gsbench.scene.colmap import write_model
@@ -54,24 +51,16 @@ def render_courtyard(
         name, camera = item
         Image.fromarray(render_view(layout, camera, seed)).save(images / name, format="PNG")
 
-    with ThreadPoolExecutor(available_threads()) as pool:
-        for done, _ in enumerate(pool.map(work, cameras.items()), start=1):
-            progress("courtyard", done, views)
+    for done, _ in enumerate(in_threads(work, cameras.items()), start=1):
+        progress("courtyard", done, views)
     write_model(output_dir / "sparse" / "0", cameras)
 
 
 def courtyard_cameras(views: int, width: int, height: int) -> dict[str, Camera]:
     """The cameras by file name, on a wavy ring around the courtyard's centre.
 
-    Steps are 7.5 degrees, or less for more than 48 views, which fill the ring. Raises InputError as
-    `render_courtyard` does.
+    Steps are 7.5 degrees, or less for more than 48 views, which fill the ring.
     """
-    if views < MIN_IMAGES:
-        raise InputError(f"scene.views must be at least {MIN_IMAGES}, got {views}")
-    if min(width, height) < MIN_SIZE:
-        raise InputError(
-            f"scene.width and scene.height must be at least {MIN_SIZE} px, got {width}x{height}"
-        )
     step = min(MAX_STEP, 2 * pi / views)
     angles = [index * step - 0.5 * pi for index in range(views)]
     return {f"{k:04d}.png": ring_camera(angle, width, height) for k, angle in enumerate(angles)}
