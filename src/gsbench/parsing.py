@@ -303,7 +303,9 @@ class Record:
         """The JSON object of the file, without optional keys that have their default value."""
         kind: Any = type(self)
         values: dict[str, Any] = adapter(kind).dump_python(self, mode="json")
-        return {one.name: values[one.name] for one in fields(kind) if not self._has_default(one)}
+        return {
+            field.name: values[field.name] for field in fields(kind) if not self._has_default(field)
+        }
 
     def _has_default(self, field: Any) -> bool:
         default = field.default if field.default_factory is MISSING else field.default_factory()

@@ -41,8 +41,8 @@ from gsbench.config.command_words import (
     grid_points,
     is_sweep,
     key_of,
-    own_words,
     parse_word,
+    task_words,
 )
 from gsbench.config.compose import (
     Trial,
@@ -191,7 +191,7 @@ class TrialTask:
     def _launch(self, trials: Sequence[Trial], launcher: Launcher, name: str) -> None:
         """Run trials by another launcher than gsbench's; all are checked before the first."""
         begin_for_another_launcher(trials)
-        jobs = [own_words(trial.overrides) for trial in trials]
+        jobs = [task_words(trial.overrides) for trial in trials]
         try:
             returned = launcher.launch(jobs, initial_job_idx=len(self.ended.trials))
         except GsbenchError:
@@ -221,7 +221,7 @@ class TrialTask:
             own = list(itertools.islice(rest, len(seeds)))
             ended = JobReturn(overrides=job, status=JobStatus.COMPLETED)
             try:
-                ended.return_value = self._report(own, [by_folder[one.folder] for one in own])
+                ended.return_value = self._report(own, [by_folder[trial.folder] for trial in own])
             except GsbenchError as error:
                 ended.return_value, ended.status = error, JobStatus.FAILED
             returned.append(ended)
@@ -320,7 +320,7 @@ def best_line(trials: Sequence[Trial], objective: Objective) -> str:
 
 def _words_without_seed(trial: Trial) -> tuple[str, ...]:
     """The words of a trial's job without the seed and those for Hydra."""
-    return tuple(word for word in own_words(trial.overrides) if key_of(word) != "seed")
+    return tuple(word for word in task_words(trial.overrides) if key_of(word) != "seed")
 
 
 def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:
@@ -357,7 +357,7 @@ def prepare_other_sweeper(sweep: Sweep) -> tuple[list[str], Objective]:
         for key, word in lists.items()
         if "." not in key and key != "seed"
     ]
-    own = own_words(single)
+    own = task_words(single)
     for number, point in enumerate(itertools.product(*choices)):
         if number == MAX_CHOICES:
             raise InputError(

@@ -105,7 +105,7 @@ def missing_folders(trials: Sequence[Trial]) -> list[str]:
     missing: list[tuple[str, Path]] = []
     models: list[str] = []
     scenes = [trial.values["scene"] for trial in trials]
-    known = {(one["name"], one["path"], one["kind"], one.get("sparse")) for one in scenes}
+    known = {(scene["name"], scene["path"], scene["kind"], scene.get("sparse")) for scene in scenes}
     for name, path, kind, sparse in sorted(known, key=str):
         if kind == "courtyard":
             continue

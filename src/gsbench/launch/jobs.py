@@ -275,6 +275,7 @@ def _run(
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
         for job in running.values():
+            # submitit's own `cancel` kills at once; its process is no public attribute
             process = getattr(job, "_process", None)
             if process is not None and process.poll() is None:
                 # submitit's controller passes it on; the trial saves a checkpoint

@@ -100,13 +100,17 @@ def declare(trials: Sequence[Trial]) -> None:
         make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             declarations = read_declarations(home)
-            latest = next((one for one in reversed(declarations) if one.kind == "sweep"), None)
+            latest = next(
+                (declared for declared in reversed(declarations) if declared.kind == "sweep"), None
+            )
             metric = given or (None if latest is None else latest.primary)
             if metric is None:
                 continue
+            # The declared metric stays, since the time of its first declaration decides whether a
+            # verdict was declared before its trials.
             if latest is not None and given is None:
-                sweeps = [one for one in declarations if one.kind == "sweep"]
-                others = [k for k, one in enumerate(sweeps) if one.primary != metric]
+                sweeps = [declared for declared in declarations if declared.kind == "sweep"]
+                others = [k for k, sweep in enumerate(sweeps) if sweep.primary != metric]
                 first = sweeps[max(others, default=-1) + 1]
                 log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
             before = {} if latest is None else latest.planned
@@ -160,12 +164,12 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
     make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         declarations = read_declarations(home)
-        same_kind = [one for one in declarations if one.kind == asked.kind]
+        same_kind = [declared for declared in declarations if declared.kind == asked.kind]
         if same_kind and same_kind[-1].hash == asked.hash:
             return same_kind[-1]
         write_text(home / DECLARED, record_text([*declarations, asked]))
     if same_kind and asked.kind == "sweep":
-        before: Planned = reduce(merge_planned, (one.planned for one in same_kind))
+        before: Planned = reduce(merge_planned, (declared.planned for declared in same_kind))
         _warn_of_added_seeds(home, asked.primary, before, asked.planned)
     if same_kind and asked.kind == "claims":  # votes are judged by their own round alone
         log.warning(

@@ -109,8 +109,8 @@ def _evaluator(truth: ReferenceImages, protocol: str | None, settings: Sequence[
     allow_modules(allowed)
     config: Mapping[str, Any] = truth.config
     if any(word.startswith("eval") for word in settings):
-        own_words = [word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]
-        config = compose_one(own_words).values
+        of_evaluation = [word for word in settings if word.startswith(("eval", f"{PERMISSIONS}="))]
+        config = compose_one(of_evaluation).values
     chosen = dict(config["eval"]) | ({} if protocol is None else {"protocol": protocol})
     own = build_metrics(chosen, list(allowed))
     return make_evaluator(EvalConfig(**chosen), select_device(config.get("device", "auto")), own)

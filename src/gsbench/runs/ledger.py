@@ -268,7 +268,9 @@ def _fault(before: Ledger, entry: Entry) -> str:
     ideas = begun[entry.number][0].keys.keys() - {BASELINE}
     if entry.results.keys() != ideas or not entry.differences.keys() <= ideas:
         return "has results of other ideas than its confirmation"
-    faults = (_fault_of_size(before.opened, one) for one in entry.differences.values())
+    faults = (
+        _fault_of_size(before.opened, difference) for difference in entry.differences.values()
+    )
     return next(filter(None, faults), "")
 
 

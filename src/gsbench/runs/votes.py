@@ -76,7 +76,7 @@ class RoundKey(Record):
     @property
     def pairs(self) -> list[Showing]:
         """The showings that count: pairs of arms, seen for the first time."""
-        return [one for one in self.showings if one.kind == "pair"]
+        return [showing for showing in self.showings if showing.kind == "pair"]
 
     @property
     def votes(self) -> int:
@@ -161,7 +161,9 @@ def read_ballots(folder: Path, key: RoundKey) -> tuple[dict[int, Ballot], dict[s
 def store_ballots(folder: Path, key: RoundKey, ballots: Iterable[Ballot]) -> None:
     """Store new ballots, each in the first free place: by finishing time, after earlier ones."""
     places = set(read_ballots(folder, key)[0])
-    for ballot in sorted(ballots, key=lambda one: (unix_time(one.finished) or 0, one.person)):
+    for ballot in sorted(
+        ballots, key=lambda ballot: (unix_time(ballot.finished) or 0, ballot.person)
+    ):
         place = next(place for place in itertools.count() if place not in places)
         places.add(place)
         stored = StoredBallot.of(key, place, ballot)
@@ -194,7 +196,7 @@ def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
             f"{path} was finished at {ballot.finished}, before its round was made ({key.time}): "
             "a vote with a wrong clock does not count"
         )
-    showings = {one.id for one in key.showings}
+    showings = {showing.id for showing in key.showings}
     if ballot.answers.keys() != showings or len(ballot.votes) != len(showings):
         known = len(ballot.answers.keys() & showings)
         raise InputError(

@@ -68,13 +68,13 @@ def find_model(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
 
 def _where_a_model_is(root: Path) -> str:
     """The setting that finds a model near ``root``; without one, advice to make it."""
-    folders = [root, *(one for pattern in ("*", "*/*", "*/*/*") for one in root.glob(pattern))]
+    folders = [root, *(place for pattern in ("*", "*/*", "*/*/*") for place in root.glob(pattern))]
     folders += [root.parent / name for name in SPARSE_FOLDERS]
-    model = next((one for one in folders if one.is_dir() and _is_model(one)), None)
+    model = next((place for place in folders if place.is_dir() and _is_model(place)), None)
     if model is None:
         why = "a database holds no poses: " if any(root.glob("*.db")) else ""
         return f"{why}make one with COLMAP, or use scene=photos"
-    base = next((one for one in model.parents if (one / "images").is_dir()), root)
+    base = next((place for place in model.parents if (place / "images").is_dir()), root)
     setting = f"path={base}" if base != root else f"sparse={model.relative_to(root)}"
     return f"{model} is one: set scene.{setting}"
 

@@ -80,8 +80,8 @@ def status(argv: Sequence[str], runs: Path) -> int:
         return 0
     if options.json:
         shown = [asdict(replace(trial, planned=None)) for trial in trials]
-        for one in shown:
-            del one["planned"]  # the plan's own entry, for `retry`
+        for entry in shown:
+            del entry["planned"]  # the plan's own entry, for `retry`
         print(json.dumps(shown, indent=1, default=str))  # `default` is for the folder, a Path
     else:
         print("\n".join(lines_of(trials, options.all)))
@@ -202,7 +202,8 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         return 0
     modules = os.getcwd()  # noted now, since `recompose` changes the current folder
     trials = [
-        recompose(one.folder, one.planned, runs, options.changes, modules) for one in unfinished
+        recompose(state.folder, state.planned, runs, options.changes, modules)
+        for state in unfinished
     ]
     # A plan of somebody's must not declare or run anything in an experiment of the user's.
     for old, trial in zip(unfinished, trials, strict=True):

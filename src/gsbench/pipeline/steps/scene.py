@@ -80,16 +80,12 @@ class CaptureSource:
             assert made is not None
             return read_colmap(self.name, made, exact_poses=True, **selection)
         path, selection["masks"] = str(options.path), options.masks
-        if options.kind == "transforms":
-            assert made is not None
-            capture = read_transforms(
-                self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection
-            )
-        elif options.kind == "reader":
-            assert made is not None
-            capture = read_posed(
-                self.name, self._folder, self._posed, made / SPARSE_FOLDERS[0], **selection
-            )
+        if made is not None:
+            model = made / SPARSE_FOLDERS[0]
+            if options.kind == "transforms":
+                capture = read_transforms(self.name, path, self._transforms, model, **selection)
+            else:
+                capture = read_posed(self.name, self._folder, self._posed, model, **selection)
         elif options.kind == "photos":
             capture = read_photos(self.name, path, images=options.images, **selection)
         else:
