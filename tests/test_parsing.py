@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import field
 from pathlib import Path
 
@@ -204,6 +205,13 @@ def test_json_is_read_if_it_is_plain(tmp_path):
             read_json(file)
     file.write_text('{"a": [1, null]}')
     assert read_json(file) == {"a": [1, None]}
+
+
+def test_no_record_has_a_decorator_of_its_own():
+    """`Record` makes the dataclass; a second one would lose the defaults made by factories."""
+    for file in Path(parsing.__file__).parent.rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        assert not re.search(r"^@dataclass.*\nclass \w+\(Record\)", text, re.MULTILINE), file
 
 
 class Row(Record):

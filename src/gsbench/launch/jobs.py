@@ -87,8 +87,7 @@ def labels_of(trials: Sequence[Trial]) -> dict[Path, str]:
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a complete trial."""
-    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
-    return Outcome(folder, "done", metrics)
+    return Outcome(folder, "done", results.metrics_line)
 
 
 def outcome_of_error(folder: Path, error: Exception) -> Outcome:

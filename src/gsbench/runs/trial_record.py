@@ -210,6 +210,11 @@ class TrialRecord(Record):
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
+    def metrics_line(self) -> str:
+        """The metrics to four digits, in one line."""
+        return "  ".join(f"{key} {value:.4g}" for key, value in self.metrics.items())
+
+    @property
     def learnt_nothing(self) -> str:
         """A line that the renders are not better than one colour; "" if they are, or if unknown."""
         psnr, one_color = self.metrics.get("psnr"), self.one_color_psnr
