@@ -131,6 +131,8 @@ def load_scene(
     Raises `InputError` if fewer than three views or no training view have a pose, or an image does
     not fit its camera.
     """
+    if principal_point not in ("used", "centred"):
+        raise InputError(f"scene.principal_point must be used or centred, got {principal_point!r}")
     downscaling = Downscaling(downscale, max_size, resample)
     folder = Path(cache_dir) / _cache_key(capture, Path(model_dir), downscaling, made_by)
     try:

@@ -36,6 +36,10 @@ def downscaled_size(
         >>> downscaled_size(4946, 3286, max_size=1600)
         (1600, 1063)
     """
+    if downscale < 1:
+        raise InputError(f"scene.downscale must be at least 1, got {downscale}")
+    if max_size is not None and max_size < 1:
+        raise InputError(f"scene.max_size must be at least 1 px, got {max_size}")
     longest = max(width, height)
     numerator, denominator = 1, downscale
     if max_size and max_size * downscale < longest:
