@@ -681,10 +681,8 @@ def promises() -> Iterator[Promise]:
         measure = nights_at_once(noise, correlation)
         yield Promise(name, "`in_tests`", 0.1, NIGHTS, found=measure)
     for correlation in (0.7, 0.95):
-        name = (
-            "ledger: false discoveries, one capture, nine of ten retry the most standard errors, "
-        )
-        name += f"by {correlation:g}"
+        name = "ledger: false discoveries, one capture, "
+        name += f"nine of ten retry the most standard errors, by {correlation:g}"
         measure = nights_at_once((1.0,), correlation, most=True)
         yield Promise(name, "`in_tests`", 0.1, NIGHTS, found=measure)
     for command in PURPOSES:

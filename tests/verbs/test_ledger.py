@@ -155,6 +155,8 @@ def test_a_ledger_whose_ideas_share_their_seeds_is_shown_but_gets_no_further_ide
     assert attempt(f"{SPLIT}=0.02") == 0
     assert attempt(f"{SPLIT}=0.03") == 2
     assert "seeds that all of them share: begin another ledger" in capsys.readouterr().err
+    (home / LEDGER).write_text(records.chained(map(records.as_json, old[:2])))
+    assert attempt(f"{SPLIT}=0.02") == 2  # it was begun by the earlier version
 
 
 def test_an_equal_idea_is_neither_trained_nor_entered_twice(home, trainings):

@@ -179,7 +179,8 @@ def _start(
         if same:
             chosen.append(same[0].idea)
             ended = book.ended.get(same[0].idea)
-            if ended is not None and ended.result == FAILED:
+            begun = ended is None and not book.shares_seeds
+            if not begun and not book.is_decided(same[0].idea):
                 rules.check_room(book)  # other ideas may have taken its place
             return None
         rules.check_room(book)
