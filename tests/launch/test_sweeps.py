@@ -334,7 +334,7 @@ def test_a_dry_run_tells_arms_and_their_changes_apart(runs):
 )
 def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missing, download, note):
     def unavailable(options):
-        assert not json.loads(options)["download"]  # a dry run downloads nothing
+        assert not options["download"]  # a dry run downloads nothing
         return missing
 
     monkeypatch.setattr(dry_run, "unavailable_now", unavailable)
