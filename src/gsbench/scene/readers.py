@@ -302,7 +302,7 @@ def _make_capture(
     cameras: CamerasByName | None = None,
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
-    # What the lists name is used first, so that no twin of a listed file takes its place.
+    # Listed files are used first, so that no twin takes their place.
     lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)
     left_out = copies_by_name(names, set(chain.from_iterable(filter(None, lists))))
     report_left_out(folder, left_out, "of the same name")
