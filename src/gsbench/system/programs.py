@@ -58,7 +58,7 @@ def find_program(name: str) -> str | None:
 
 
 def answer_of(command: Sequence[str], seconds: float) -> str | None:
-    """The output of a program that needs no files; None if it fails or is too slow (``seconds``)."""
+    """The output of a program that needs no files; None if it fails or takes too long."""
     try:
         return subprocess.run(
             command,
