@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from gsbench.analysis.addresses import ArmName, trials_of_arm
 from gsbench.analysis.cells import with_variants
-from gsbench.renders.measure import ReferenceImages, find_destination
+from gsbench.renders.imported import find_destination
+from gsbench.renders.truth import ReferenceImages
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.vote import choose_arms

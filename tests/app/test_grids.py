@@ -8,7 +8,8 @@ from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.app.grids import checked_grids, words_of_grids
 from gsbench.config.compose import compose_one
-from gsbench.launch.record import add_to_plan, read_plan
+from gsbench.launch.record import add_to_plan
+from gsbench.runs.plan import read_plan
 from gsbench.runs.trial_folder import TrialFolder
 from tests.helpers import refusal, write
 from tests.trials import write_results

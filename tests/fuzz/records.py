@@ -34,10 +34,10 @@ from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials
-from gsbench.launch.record import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import read_declarations
+from gsbench.runs.plan import read_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.sinks import Run
 from gsbench.tracking.trial import TrackedTrial

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 from torch.testing import assert_close
 
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
+from gsbench.gaussians.model import dc_to_bytes, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from gsbench.init.point_files import read_points
 from gsbench.normalization import Normalization
@@ -141,10 +141,12 @@ def test_harmonics_with_a_wrong_name_or_number_are_refused(tmp_path, old, new, s
         read_ply(rewritten(tmp_path / "a.ply", old, new))
 
 
-def test_rgb_to_dc_and_dc_to_rgb_are_inverse():
-    assert dc_to_rgb(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0.5, 0.78209479])
-    rgb = torch.tensor([0.0, 0.25, 1.0])
-    assert dc_to_rgb(rgb_to_dc(rgb)).tolist() == pytest.approx(rgb.tolist())
+def test_colours_become_harmonics_and_bytes_again():
+    # 0.5 plus 0.2821 times the coefficient, in [0, 1], times 255
+    harmonics = torch.tensor([[0.0, 10.0, -10.0], [1.0, -1.0, 0.5]])
+    assert dc_to_bytes(harmonics).tolist() == [[128, 255, 0], [199, 56, 163]]
+    levels = torch.arange(256).reshape(-1, 2)
+    assert dc_to_bytes(rgb_to_dc(levels / 255)).tolist() == levels.tolist()
 
 
 @pytest.mark.parametrize("degree, stored", [(0, 0), (1, 3), (2, 8), (3, 15)])

@@ -16,8 +16,8 @@ from gsbench.launch.batch import (
     run_batch,
 )
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import read_plan
 from gsbench.runs.experiments import read_declarations
+from gsbench.runs.plan import read_plan
 from tests.helpers import refusal
 from tests.launch.test_jobs import SLURM, Mirrored
 from tests.trials import LOCAL, bare_trial, write_results
@@ -195,8 +195,8 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
 
     parts = SimpleNamespace(make_evaluator=make_evaluator)
     monkeypatch.setitem(sys.modules, "gsbench.pipeline.parts", parts)
-    dry_run.unavailable_now.cache_clear()
-    for options in ('{"flip": false}', '{"flip": true}', '{"flip": false}'):
-        assert dry_run.unavailable_now(options) == {"lpips_vgg"}
+    dry_run._unavailable_now.cache_clear()
+    for flip in (False, True, False):
+        assert dry_run.unavailable_now({"flip": flip}) == ["lpips_vgg"]
     assert [options.flip for options in asked] == [False, True]
-    dry_run.unavailable_now.cache_clear()
+    dry_run._unavailable_now.cache_clear()

@@ -11,7 +11,7 @@ import pytest
 from gsbench.config.compose import Trial
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials, _determining, describe_plan
-from gsbench.launch.record import PlanFile, PlannedTrial, add_to_plan, read_plan, remove
+from gsbench.launch.record import add_to_plan, remove
 from gsbench.launch.states import (
     QueuedJob,
     current_user,
@@ -19,6 +19,7 @@ from gsbench.launch.states import (
     record_submission,
     states_of_experiment,
 )
+from gsbench.runs.plan import PlanFile, PlannedTrial, read_plan
 from gsbench.system.locks import hold
 from tests.helpers import read_json, refusal, write, write_lines
 from tests.tracking.helpers import options

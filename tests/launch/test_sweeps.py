@@ -23,11 +23,12 @@ from gsbench.launch import dry_run, jobs
 from gsbench.launch.batch import run_batch
 from gsbench.launch.dry_run import FinishedTrials, describe_plan
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import add_to_plan, forget, read_plan
+from gsbench.launch.record import add_to_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import TRAIN, Step
+from gsbench.runs.plan import change_plan, read_plan
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
@@ -297,7 +298,7 @@ def test_a_dry_run_tells_arms_and_their_changes_apart(runs):
 )
 def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missing, download, note):
     def unavailable(options):
-        assert not json.loads(options)["download"]  # a dry run downloads nothing
+        assert not options["download"]  # a dry run downloads nothing
         return missing
 
     monkeypatch.setattr(dry_run, "unavailable_now", unavailable)
@@ -332,7 +333,7 @@ def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     assert f"process {os.getpid()}" in states[2][1]
     assert states[3] == ("missing", "never started")
     assert states_of_experiment(runs / "x")[2].state == "partial"
-    forget(runs / "x", [folders[3]])
+    change_plan(runs / "x", dropped=[folders[3]])
     assert len(states_of_experiment(runs / "x")) == 3
 
 
@@ -455,7 +456,7 @@ def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkey
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
     add_to_plan([bare_trial(runs, words=["seed=0"])])
-    monkeypatch.setattr("gsbench.launch.record.write_json", refuse)
+    monkeypatch.setattr("gsbench.runs.plan.write_json", refuse)
     said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
     assert "plan.json" in said

@@ -15,15 +15,10 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.eval.pictures import Matching
-from gsbench.renders import measure
-from gsbench.renders.measure import (
-    Destination,
-    ReferenceImages,
-    _lines,
-    check_destination,
-    find_destination,
-    find_reference_images,
-)
+from gsbench.renders import truth as truths
+from gsbench.renders.imported import Destination, Measured, check_destination, find_destination
+from gsbench.renders.measure import _lines
+from gsbench.renders.truth import ReferenceImages, find_reference_images
 from gsbench.runs.keys import STAGES
 from tests.helpers import read_json, refusal, write
 from tests.trials import write_runs
@@ -194,7 +189,7 @@ def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
         "Store": lambda root: SimpleNamespace(get=get),
         "TrialSteps": lambda config, store: trial,
     }.items():
-        monkeypatch.setattr(measure, name, stand_in)
+        monkeypatch.setattr(truths, name, stand_in)
     place = tmp_path / "ground_truth"
     write(place / "masks" / "a.png", b"")
     truth = find_reference_images("garden", [word], tmp_path)
@@ -260,7 +255,7 @@ def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metr
     )
     matching = Matching({}, "by their order", ("x", "y"))
     views = {"a": {"psnr": 20.0, "ssim": 0.5}, "bcdef": {"psnr": 21.0, "ssim": 0.25}}
-    lines = _lines(FOLDER, evaluator, matching, views, Path("runs/x"))
+    lines = _lines(Measured(FOLDER, [], views, evaluator, {}), matching, Path("runs/x"))
     assert lines[0] == "2 views: the pictures in a folder; protocol paper-1"
     assert lines[1:3] == ["names matched by their order", "left out, without a photograph: x, y"]
     assert lines[3:7] == [

@@ -9,12 +9,13 @@ import pytest
 from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
 from gsbench.files import remove_special_files, require_no_links
-from gsbench.launch.record import declare, forget, remove
+from gsbench.launch.record import declare, remove
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.keys import Step
+from gsbench.runs.plan import change_plan
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import describe_holder, hold, is_held
@@ -53,7 +54,7 @@ def _hold(folder):
 
 
 def _forget(folder):
-    forget(folder.parents[2], [])
+    change_plan(folder.parents[2])
 
 
 def _declare(folder):

@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.pipeline.steps.scene import masking_step
-from gsbench.scene.images import (
+from gsbench.scene.load import load_scene
+from gsbench.scene.masks import (
     fill_ignored,
     find_masks,
     prepare_photograph,
@@ -17,7 +18,6 @@ from gsbench.scene.images import (
     read_mask,
     resize_mask,
 )
-from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture

@@ -13,8 +13,9 @@ from PIL import Image
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.hold_out import select_images, split_names
 from gsbench.scene.images import list_images, match_names
+from gsbench.scene.model_folders import missing_model
 from gsbench.scene.options import SceneConfig, SplitRule
-from gsbench.scene.readers import missing_model, read_colmap, read_photos
+from gsbench.scene.readers import read_colmap, read_photos
 from tests.helpers import refusal, write
 
 

@@ -17,14 +17,13 @@ SRC = Path(programs.__file__).parents[1]
 # relative paths count from there. A Python starts with -P, and imports nothing from there.
 STARTS = {
     ("external/program.py", "watch", "subprocess.Popen"): "own",
-    ("launch/jobs.py", "make_executor", "submitit.SlurmExecutor"): "current",
+    ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
-    ("launch/states.py", "read_queue", "subprocess.run"): "neutral",
     ("pipeline/steps/train.py", "check_version", "subprocess.run"): "own",
     ("system/install.py", "run_git", "subprocess.run"): "neutral",
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
-    ("system/resources.py", "nvidia_smi", "subprocess.run"): "neutral",
+    ("system/programs.py", "answer_of", "subprocess.run"): "neutral",
     ("tracking/mirror.py", "_start", "subprocess.Popen"): "own",
     ("verbs/servers.py", "_announce", "subprocess.run"): "neutral",
     ("verbs/servers.py", "serve", "subprocess.Popen"): "own",

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.mirror import mirror_ended
+from gsbench.tracking.tracker_run import mirror_ended
 from tests.helpers import write, write_lines
 from tests.trials import STEPS, results_of, trial_values
 

@@ -18,7 +18,7 @@ from gsbench.analysis.results import read_experiment
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, publish
 from gsbench.tracking.comparison import MAX_TAG, OWN_NOTE, _set, addresses, description
-from gsbench.tracking.mirror import sync
+from gsbench.tracking.tracker_run import sync
 from gsbench.verbs import servers
 from tests.tracking.helpers import (
     begin_trial,

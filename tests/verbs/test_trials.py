@@ -12,11 +12,12 @@ from rich.console import Console
 from gsbench.config.compose import compose_one
 from gsbench.errors import GsbenchError
 from gsbench.launch.progress import Progress
-from gsbench.launch.record import add_to_plan, read_plan
+from gsbench.launch.record import add_to_plan
 from gsbench.launch.states import TrialState
+from gsbench.runs.plan import read_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.own_modules import allowed_modules
-from gsbench.tracking.mirror import MirrorError
+from gsbench.tracking.tracker_run import MirrorError
 from gsbench.verbs import trials
 from tests.composed import composed
 from tests.helpers import refusal, write

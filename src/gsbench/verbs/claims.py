@@ -179,15 +179,14 @@ def _run(check: Check) -> None:
 
     checked = check.checked(check.asked.answer(run))
     write_text(check.home / HTML, to_html(make_page(checked)))
-    for one in checked.verdicts:
-        print(f"{one.word:<19}  {one.claim.id}: {one.sentence}")
+    for verdict in checked.verdicts:
+        print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.sentence}")
     for note in texts(checked.unused):
         print(note)
     print(check.home / HTML)
 
 
-def plan(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb; raises InputError for bad input."""
+def _plan_parser() -> ArgumentParser:
     parser = ArgumentParser(
         "plan",
         "It estimates from an experiment's trials how many scenes and seeds show a difference of "
@@ -220,7 +219,12 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
     )
     parser.flag("--json", "print JSON")
-    options = parser.parse_args(argv)
+    return parser
+
+
+def plan(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = _plan_parser().parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     comparison = compare(experiment, options.baseline)
     trials = comparison.trials
@@ -326,7 +330,7 @@ def _lines(planned: Plan, metric: Quantity, difference: float) -> list[str]:
 
 
 def _designs_line(group: str, designs: Sequence[Design], difference: float) -> str:
-    shown = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs]
+    shown = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs]
     what = f"  to see {difference:g} on {group}, scenes × seeds"
     return f"{what}: {', '.join(shown) or 'none that can be run'}"
 

@@ -32,7 +32,7 @@ def capture_dir(tmp_path_factory):
 def test_same_arguments_give_the_same_bytes_on_any_number_of_threads(
     capture_dir, tmp_path, monkeypatch, threads
 ):
-    monkeypatch.setattr("gsbench.scene.courtyard.render.available_threads", lambda: threads)
+    monkeypatch.setattr("gsbench.system.resources.available_threads", lambda: threads)
     told = []
     render_courtyard(
         tmp_path, views=4, width=160, height=120, progress=lambda *state: told.append(state)
