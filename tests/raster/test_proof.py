@@ -450,6 +450,11 @@ FAULTS = {
         "tl.minimum(begin + SEGMENT, end)",
         "tl.minimum(begin + SEGMENT - 1, end)",
     ),
+    "a program of a long list that has another's pixels": (
+        COMPOSITE,
+        "steps = step + tl.arange(0, 1)",
+        "steps = tl.arange(0, 1)",
+    ),
     "swapped channels": (
         COMPOSITE,
         "tl.fma(weight, record[7], green)",
