@@ -28,7 +28,7 @@ from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
 from gsbench.claims.stopping import Asked
 from gsbench.runs.experiments import Arm, Declaration, Question, record_text
-from gsbench.runs.ledger import Ledger, Opened, Started
+from gsbench.runs.ledger import Ledger, Opened, Promoted, Started
 from gsbench.tracking.comparison import description
 from gsbench.verbs.results import tables
 from tests.analysis.synthetic import Plan, trial_data, write_trial
@@ -118,12 +118,11 @@ def by_ledger(scenes, seeds, trials):
         keys=baseline,
         seeds=tuple(range(seeds)),
     )
+    started = Started(time=EARLY, idea="mine", against="baseline", identity="", words=(), keys=idea)
     # one side of 2.5 % is an interval of 95 %
-    started = Started(
-        time=EARLY, idea="mine", against="baseline", level=0.025, identity="", words=(), keys=idea
-    )
-    book = Ledger((opened, started), "")
-    asked = rules.ask_idea(rules.declaration_of(book, "mine"), lambda: trials)
+    test = Promoted(time=EARLY, idea="mine", level=0.025, seeds=tuple(range(seeds)))
+    book = Ledger((opened, started, test), "")
+    asked = rules.ask_idea(rules.test_of(book, "mine"), lambda: trials)
     (verdict,) = asked.judged()
     ended = rules.end_of("mine", verdict, EARLY)
     return verdict, {"text": "\n".join([ended.reason, *texts(rules.unused(book, trials))])}

@@ -14,6 +14,7 @@ from gsbench.runs.ledger import (
     Ended,
     Ledger,
     Opened,
+    Promoted,
     Started,
     append,
     as_json,
@@ -42,11 +43,14 @@ def started(idea, against="baseline"):
         time=TIME,
         idea=idea,
         against=against,
-        level=0.03,
         identity=idea,
         words=("densify=x",),
         keys={"garden": f"garden/sfm-{idea}/11111111"},
     )
+
+
+def promoted(idea, *seeds):
+    return Promoted(time=TIME, idea=idea, level=0.03, seeds=seeds)
 
 
 def ended(idea, result):
@@ -58,6 +62,7 @@ def ended(idea, result):
 
 ENTRIES = [
     started("a"),
+    promoted("a", 7, 8, 9),
     ended("a", KEPT),
     started("b", "a"),
     ended("b", FAILED),
@@ -84,7 +89,7 @@ def test_a_ledger_is_read_back_as_it_was_written(home):
     assert (ledger.kept, ledger.tried) == (["a"], 1)  # "b" ended without any result
     assert ledger.words_of("baseline") == ("densify=adc",)
     assert ledger.words_of("b") == ("densify=x",)
-    assert ledger.confirmations == [(ENTRIES[4], ENTRIES[5])]
+    assert ledger.confirmations == [(ENTRIES[5], ENTRIES[6])]
     assert ledger.all_keys() == {
         "garden/sfm-adc/00000000",
         "garden/sfm-a/11111111",
@@ -95,15 +100,16 @@ def test_a_ledger_is_read_back_as_it_was_written(home):
 
 
 def test_an_idea_that_failed_and_was_tried_again_has_its_last_result(home):
+    append(home, lambda ledger: promoted("b", 10, 11))
     ledger = append(home, lambda ledger: ended("b", KEPT))
     assert (ledger.kept, ledger.tried) == (["a", "b"], 2)
 
 
 def test_beginning_again_keeps_the_ledger(home):
-    assert len(begin_ledger(home, OPENED).entries) == 7
+    assert len(begin_ledger(home, OPENED).entries) == 8
 
 
-LAST = 6
+LAST = 7
 CHANGES = ("edit", "drop", "swap", "repeat", "space")
 
 
@@ -159,6 +165,11 @@ AFTER_ALL = {
     "compares with 'b', which was not kept": started("c", "b"),
     "ends 'c', which was not begun": ended("c", KEPT),
     "decides 'a' a second time": ended("a", FAILED),
+    "keeps 'b' without a test": ended("b", KEPT),
+    "tests 'c', which was not begun": promoted("c", 20, 21),
+    "tests with seeds that ideas have seen": promoted("b", 9, 10),
+    "tests with seeds that ideas have": promoted("b", 2, 3),
+    "tests on other seeds than the ideas before": replace(started("c"), level=0.1),
     "has other captures": replace(started("c"), keys={"park": "park/x/1"}),
     "lacks the baseline": Confirming(time=TIME, seeds=(0, 1), keys={}),
     "on none": Confirming(time=TIME, seeds=(0, 1), keys={"baseline": {}, "a": {}}),
@@ -172,27 +183,26 @@ AFTER_ALL = {
 def test_an_entry_that_cannot_follow_is_refused(home, fault):
     entries = [*read_ledger(home).entries, AFTER_ALL[fault]]
     (home / LEDGER).write_text(chained(map(as_json, entries)))
-    with refusal(f"line 8 .*{fault}.*bring back"):
+    with refusal(f"line 9 .*{fault}.*bring back"):
         read_ledger(home)
 
 
 @pytest.mark.parametrize("place", ["ended", "confirmed"])
 def test_a_relative_difference_that_no_number_holds_is_refused(home, place):
     huge = Difference(mean=1e30, low=0.0, high=0.0)
-    entries = [
-        replace(OPENED, relative=True),
-        started("a"),
-        replace(ended("a", KEPT), difference=huge),
-    ]
+    entries = [replace(OPENED, relative=True), *ENTRIES[:2]]
     if place == "confirmed":
-        entries[2:] = [ended("a", KEPT), ENTRIES[4], replace(ENTRIES[5], differences={"a": huge})]
+        confirmed = replace(ENTRIES[6], differences={"a": huge})
+        entries += [ENTRIES[2], ENTRIES[5], confirmed]
+    else:
+        entries.append(replace(ended("a", KEPT), difference=huge))
     (home / LEDGER).write_text(chained(map(as_json, entries)))
     with refusal("difference that cannot be"):
         read_ledger(home)
 
 
 def test_results_of_ideas_that_were_not_asked_are_refused(home):
-    other = replace(ENTRIES[5], results={"a": KEPT, "x": KEPT})
-    (home / LEDGER).write_text(chained(map(as_json, [OPENED, *ENTRIES[:5], other])))
+    other = replace(ENTRIES[6], results={"a": KEPT, "x": KEPT})
+    (home / LEDGER).write_text(chained(map(as_json, [OPENED, *ENTRIES[:6], other])))
     with refusal("results of other ideas"):
         read_ledger(home)

@@ -20,7 +20,8 @@ def describe_ledger(ledger: Ledger) -> list[str]:
         f"{opened.metric} decides: {better} is better, and {least} is the least that matters. "
         f"At most {100 * opened.rate:g} % of the kept ideas are expected to be no better.",
         f"{ledger.tried} of {opened.ideas} planned ideas were tried, and {len(ledger.kept)} kept, "
-        f"on {', '.join(opened.keys)}, with at most {len(opened.seeds)} seeds.",
+        f"on {', '.join(opened.keys)}, with at most {len(opened.seeds)} seeds"
+        f"{'' if ledger.shares_seeds else ', and as many new ones for what looks better'}.",
     ]
 
 
@@ -29,27 +30,34 @@ def ledger_tables(ledger: Ledger) -> list[Table]:
     rows = []
     for number, (idea, started) in enumerate(ledger.started.items(), 1):
         ended = ledger.ended.get(idea)
-        known = ("", "", "", "", "begun", "")
+        known = ("", "", "", "", "in its test" if idea in ledger.tests else "begun", "")
         if ended is not None:
             known = (
-                str(ended.seeds),
+                f"{ended.seeds} new" if idea in ledger.tests else str(ended.seeds),
                 difference_text(ledger.opened, ended.difference),
                 _times(ended.gaussians),
                 _times(ended.seconds),
                 ended.result,
                 why(ended),
             )
-        cells = (started.against, f"{started.level:.2g}", *known)
+        test = ledger.tests.get(idea)
+        level = started.level if test is None else test.level
+        cells = (started.against, "" if level is None else f"{level:.2g}", *known)
         rows.append(Row((f"{number} {idea}",), tuple(map(TableEntry, cells))))
     columns = tuple(Column("", head, ("ledger", head)) for head in HEADS)
-    title = "Ideas in the order of their tests"
-    tables = [Table(title, ("idea",), columns, tuple(rows), (LEVEL,))]
+    notes = (LEVEL,) if ledger.shares_seeds else (LEVEL, UNTESTED)
+    title = "Ideas in their order"
+    tables = [Table(title, ("idea",), columns, tuple(rows), notes)]
     return tables + [_confirmation_table(ledger.opened, *one) for one in ledger.confirmations]
 
 
 LEVEL = (
     "level: the chance that this test keeps an idea that is no better. All levels follow from the "
     "share above; each kept idea raises those after it."
+)
+UNTESTED = (
+    "Tests use new seeds. Ideas without a level did not look better on the seeds of all ideas, so "
+    "they were not tested."
 )
 
 

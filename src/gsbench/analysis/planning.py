@@ -40,17 +40,22 @@ class Purpose:
     """The purpose of the trials.
 
     ``rate`` is the error rate of one question. ``looks`` says whether it is judged in looks, and
-    ``give_up`` is the chance at each look that an idea with just the difference is given up.
+    ``give_up`` is the chance at each look that an idea with just the difference is given up. With
+    ``screen``, equally many other trials come before, which must show it at this rate.
     """
 
     rate: float = ALPHA
     looks: bool = False
     give_up: float = 0.0
+    screen: float = 0.0
 
     def power(self, design: Design, difference: float, deviation: float) -> float:
         """The chance that the command shows ``difference``; pairs differ by ``deviation``."""
         if deviation == 0:
             return 1.0 if difference else 0.0
+        if self.screen:
+            first, then = replace(self, rate=self.screen, screen=0.0), replace(self, screen=0.0)
+            return math.prod(one.power(design, difference, deviation) for one in (first, then))
         if not self.looks:
             return power_of_mean(deviation, design, difference, self.rate)
         shown = np.zeros(DESIGN_DRAWS, dtype=bool)

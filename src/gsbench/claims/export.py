@@ -73,7 +73,7 @@ FILES = {  # media types and descriptions
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
-    LEDGER: ("application/jsonl", "The ideas in the order of their tests (gsbench ledger)"),
+    LEDGER: ("application/jsonl", "The ideas of a ledger and their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
 }
 

@@ -1,14 +1,19 @@
-"""Many ideas under one error rate: the level of each test, and what its trials show.
+"""Many ideas under one error rate: what passes on to a test, the level of the test, its result.
 
-The levels are LOND's (Javanmard and Montanari 2015, arXiv 1502.06197, eq. 3) with equal weights:
-with ``ideas`` planned tests and a false discovery rate ``rate``, the next test has the level
-``rate * (kept + 1) / ideas``, divided by `RETRIES`. LOND controls the false
-discovery rate for p values with positive dependence (Zrnic, Ramdas and Jordan 2021, theorem 4),
-such as those of ideas that share the trainings of one baseline. Tests that run side by side count
-the ideas that were kept before they began, as the same paper does. `scripts/ledger_rates.py`
-simulates it (findings/simulations.md).
+An idea is first compared on the seeds of the ledger, which all ideas share (`screening_of`). This
+cannot keep it: the next idea may follow from the results of all before, so these seeds have been
+looked at, and what looks best on them is partly their luck. An idea that looks better is tested on
+new seeds, on which it and its baseline are trained (`next_test`). Whatever was chosen before, the
+test of an idea that is no better keeps it with at most its level.
+
+The levels are LOND's (Javanmard and Montanari 2015, arXiv 1502.06197, eq. 3): the n-th test has
+``rate * (kept + 1) * w(n)`` with weights that sum to 1. Then the false discovery rate is at most
+``rate``: a false discovery is one of at least ``kept + 1`` in the end, so its expected share is at
+most ``rate * w(n)``. ``kept`` counts what was kept before the test began, so tests may run side by
+side. `scripts/ledger_rates.py` simulates it (findings/simulations.md).
 """
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from gsbench.analysis.comparison import unused_trials
@@ -34,6 +39,7 @@ from gsbench.runs.ledger import (
     Ended,
     Ledger,
     Opened,
+    Promoted,
     Result,
 )
 from gsbench.words import counted, listed
@@ -42,41 +48,91 @@ IDEAS, RATE = 40, 0.1  # the defaults of a ledger
 # The chance, at each look, that an idea as good as the least difference that matters is given up.
 # It costs power and cannot make a false discovery.
 GIVE_UP = 0.05
-# Tries of what looked best share its noise, so they are kept by chance more often than their level
-# says. With equally noisy captures the test is careful enough for that, but nobody knows
-# beforehand that one of them has not all of the noise.
-RETRIES = 3.0
+# The chance that an idea without an effect passes on to its test, over all looks. Half of it or
+# twice as much finds about as many good ideas (findings/simulations.md).
+SCREEN = 0.1
+LOOKS_WORSE = "looks worse"  # by this rate, which is no verdict's
+SEEDS_FROM, SEEDS_TO = 100_000, 1_000_000  # of tests
 
 
-def next_level(ledger: Ledger) -> float:
-    """The level of the next test; raises InputError if all planned ideas were tried."""
-    opened = ledger.opened
-    if ledger.tried >= opened.ideas:
+def check_room(ledger: Ledger) -> None:
+    """Raise InputError unless another idea may be tried."""
+    if ledger.tried >= ledger.opened.ideas:
         raise InputError(
-            f"all {opened.ideas} planned ideas were tried, so the error rate is spent: begin "
-            "another ledger, with another baseline or other captures"
+            f"all {ledger.opened.ideas} planned ideas were tried, so the error rate is spent: "
+            "begin another ledger, with another baseline or other captures"
         )
-    return opened.rate * (len(ledger.kept) + 1) / opened.ideas / RETRIES
+    if ledger.shares_seeds:
+        raise InputError(
+            "an earlier version of gsbench tested the ideas of this ledger on seeds that all of "
+            "them share: begin another ledger"
+        )
 
 
-def declaration_of(ledger: Ledger, idea: str) -> Declaration:
-    """The question of an idea, answered in looks.
+def next_test(ledger: Ledger, idea: str, time: str) -> Promoted:
+    """The test of an idea that looks better."""
+    number = len(ledger.tests) + 1
+    return Promoted(
+        time=time,
+        idea=idea,
+        level=level_of_test(ledger.opened.rate, ledger.opened.ideas, number, len(ledger.kept)),
+        seeds=_new_seeds(ledger, idea),
+    )
 
-    An idea is kept by one side of the interval, and the idea's level is that of this side. So
-    the interval with both sides has twice the level.
+
+def level_of_test(rate: float, ideas: int, number: int, kept: int) -> float:
+    """The level of the test ``number`` (from 1) after ``kept`` ideas were kept.
+
+    The weights ``1 / number`` give the first tests more than equal weights would: few ideas of the
+    planned ones pass on to a test, and each kept one raises the levels after it.
     """
+    return rate * (kept + 1) / number / sum(1 / one for one in range(1, ideas + 1))
+
+
+def _new_seeds(ledger: Ledger, idea: str) -> tuple[int, ...]:
+    """As many seeds as the ledger has, in a row, of which no trial of it has one.
+
+    The row begins where the hash of all lines before says, so another ledger on the same captures
+    has other seeds.
+    """
+    count, text = len(ledger.opened.seeds), f"{ledger.head} {idea}"
+    while True:
+        text = hashlib.sha256(text.encode()).hexdigest()
+        first = SEEDS_FROM + int(text, 16) % (SEEDS_TO - SEEDS_FROM - count)
+        seeds = tuple(range(first, first + count))
+        if not ledger.has_seen(seeds):
+            return seeds
+
+
+def screening_of(ledger: Ledger, idea: str) -> Declaration:
+    """The question whether an idea looks better on the seeds of all ideas, in looks."""
+    started = ledger.started[idea]
+    level = SCREEN if started.level is None else started.level
+    return _in_looks(ledger, idea, started.time, ledger.opened.seeds, level)
+
+
+def test_of(ledger: Ledger, idea: str) -> Declaration:
+    """The question of an idea's test, in looks on its new seeds."""
+    test = ledger.tests[idea]
+    return _in_looks(ledger, idea, test.time, test.seeds, test.level)
+
+
+def _in_looks(
+    ledger: Ledger, idea: str, time: str, seeds: tuple[int, ...], level: float
+) -> Declaration:
+    """An idea passes by one side of the interval, so the interval has twice the level."""
     started = ledger.started[idea]
     question = _question(
         ledger.opened,
         (started.against, ledger.keys_of(started.against)),
         (idea, started.keys),
-        ledger.opened.seeds,
+        seeds,
     )
     return Declaration(
-        time=started.time,
+        time=time,
         questions=(question,),
-        looks=plan_looks(len(question.seeds)),
-        error_rate=min(1.0, 2 * started.level),
+        looks=plan_looks(len(seeds)),
+        error_rate=min(1.0, 2 * level),
     )
 
 
@@ -134,18 +190,21 @@ def _hopeless(verdict: Verdict) -> str:
     return f"a gain of {least_words(verdict)} is unlikely"
 
 
-def end_of(idea: str, verdict: Verdict, time: str) -> Ended:
-    """The ledger's entry for a final verdict."""
+def end_of(idea: str, verdict: Verdict, time: str, tested: bool = True) -> Ended:
+    """The ledger's entry for a final verdict, that of a test or of the comparison before it."""
     baseline, new = verdict.pairs.of_baseline, verdict.pairs.of_arm
     ratios = {}
     for cost in ("gaussians", "train_time"):
         change = relative_change(baseline, new, COSTS[cost][1])
         ratios[cost] = None if change is None else 1 + change.of_totals
+    words = reason(verdict, _hopeless(verdict))
+    if not tested and verdict.outcome == REFUTED:
+        words = LOOKS_WORSE
     return Ended(
         time=time,
         idea=idea,
         result=result_of(verdict),
-        reason=with_notes(reason(verdict, _hopeless(verdict)), verdict),
+        reason=with_notes(words, verdict),
         seeds=verdict.pairs.seeds,
         difference=difference_of(verdict),
         gaussians=ratios["gaussians"],
@@ -173,7 +232,8 @@ def difference_of(verdict: Verdict) -> Difference | None:
 
 def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
     """A note with the reason for the trials that are in no verdict on an idea."""
-    declarations = [declaration_of(ledger, idea) for idea in ledger.started]
+    declarations = [screening_of(ledger, idea) for idea in ledger.started]
+    declarations += [test_of(ledger, idea) for idea in ledger.tests]
     declarations += [confirmation_of(ledger.opened, asked) for asked, _ in ledger.confirmations]
     verdicts = [verdict for one in declarations for verdict in judge(trials, one)]
     return unused_trials(trials, verdicts)
@@ -188,9 +248,10 @@ def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:
     for idea, ended in ledger.ended.items():
         if ended.result == FAILED:
             continue
-        seeds = ledger.opened.seeds[: ended.seeds]
+        declaration = (test_of if idea in ledger.tests else screening_of)(ledger, idea)
+        seeds = declaration.questions[0].seeds[: ended.seeds]
         own = [trial for trial in trials if trial.seed in seeds]
-        (verdict,) = ask_idea(declaration_of(ledger, idea), own.copy).judged()
+        (verdict,) = ask_idea(declaration, own.copy).judged()
         now = result_of(verdict)
         if verdict.pairs.seeds == ended.seeds and now != ended.result:
             lines.append(

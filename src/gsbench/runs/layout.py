@@ -21,7 +21,7 @@ METRICS = "metrics.json"  # of an evaluation
 # in an experiment's folder
 PLAN = "plan.json"  # all trials of the commands so far
 DECLARED = "declared.jsonl"  # declared questions, with their times
-LEDGER = "ledger.jsonl"  # ideas in the order of their tests (`gsbench ledger`)
+LEDGER = "ledger.jsonl"  # ideas, tests and results in their order (`gsbench ledger`)
 TUNING = "tuning.json"  # of a search: its ranges and points
 VOTES = "votes"  # a folder per round of people's votes (`gsbench vote`)
 VOTE_KEY = "key.json"  # of a round: which arm was on which side; beside it a file per person

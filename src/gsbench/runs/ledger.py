@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,6 +40,7 @@ DROPPED: Result = "dropped"
 UNDECIDED: Result = "undecided"
 FAILED: Result = "failed"
 Seeds = Annotated[tuple[Count, ...], Field(min_length=2)]
+Level = Annotated[float, Field(gt=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,20 +67,32 @@ class Opened(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Started(Record):
-    """An idea and the ``level`` of its test, written before its first trial.
+    """An idea, written before its first trial.
 
     ``against`` is the idea that it is compared with. ``identity`` is the hash of its settings and
-    code without names: equal hashes are the same idea.
+    code without names: equal hashes are the same idea. ``level`` stands only in ledgers that are
+    older than `Promoted`: the level of a test on the seeds of all ideas, which kept ideas then.
     """
 
     kind: Literal["started"] = "started"
     time: Text
     idea: Text
     against: Text
-    level: Annotated[float, Field(gt=0, lt=1)]
+    level: Level | None = None
     identity: Text
     words: tuple[str, ...]
     keys: dict[Text, TrialKey]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Promoted(Record):
+    """An idea that looks better: the ``level`` of its test, and seeds that no idea has seen."""
+
+    kind: Literal["promoted"] = "promoted"
+    time: Text
+    idea: Text
+    level: Level
+    seeds: Seeds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +147,7 @@ class Confirmed(Record):
     differences: dict[Text, Difference]
 
 
-Entry = Opened | Started | Ended | Confirming | Confirmed
+Entry = Opened | Started | Promoted | Ended | Confirming | Confirmed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,8 +174,13 @@ class Ledger:
 
     @cached_property
     def started(self) -> dict[str, Started]:
-        """The ideas in the order of their tests."""
+        """The ideas in the order in which they were begun."""
         return {entry.idea: entry for entry in self.entries if isinstance(entry, Started)}
+
+    @cached_property
+    def tests(self) -> dict[str, Promoted]:
+        """The tests on seeds that no idea had seen, in their order."""
+        return {entry.idea: entry for entry in self.entries if isinstance(entry, Promoted)}
 
     @cached_property
     def ended(self) -> dict[str, Ended]:
@@ -169,9 +188,24 @@ class Ledger:
 
     @property
     def tried(self) -> int:
-        """The number of tests that count; ideas that failed do not, since they tell nothing."""
+        """The number of ideas that count; those that failed do not, since they tell nothing."""
         failed = sum(entry.result == FAILED for entry in self.ended.values())
         return len(self.started) - failed
+
+    @property
+    def shares_seeds(self) -> bool:
+        """Return whether it is older than `Promoted`, so that all its tests share their seeds."""
+        return any(started.level is not None for started in self.started.values())
+
+    def is_decided(self, idea: str) -> bool:
+        """Return whether the idea has a result; it has none if its trials failed."""
+        ended = self.ended.get(idea)
+        return ended is not None and ended.result != FAILED
+
+    def has_seen(self, seeds: Iterable[int]) -> bool:
+        """Return whether any idea has trials with one of these seeds, or will have."""
+        seen = [self.opened.seeds, *(test.seeds for test in self.tests.values())]
+        return not set(seeds).isdisjoint(chain.from_iterable(seen))
 
     @property
     def kept(self) -> list[str]:
@@ -249,19 +283,28 @@ def _fault(before: Ledger, entry: Entry) -> str:
     if isinstance(entry, Opened):
         return "" if entry.keys else "has no captures"
     if isinstance(entry, Started):
+        if (entry.level is not None) != before.shares_seeds and before.started:
+            return "tests on other seeds than the ideas before"
         if entry.idea in (*before.started, BASELINE):
             return f"begins {entry.idea!r} a second time"
         if entry.against not in (BASELINE, *before.kept):
             return f"compares with {entry.against!r}, which was not kept"
         same = entry.keys.keys() == before.keys_of(entry.against).keys()
         return "" if same else f"has other captures than {entry.against!r}"
-    if isinstance(entry, Ended):
-        ended = before.ended.get(entry.idea)
+    if isinstance(entry, Promoted | Ended):
+        verb = "ends" if isinstance(entry, Ended) else "tests"
         if entry.idea not in before.started:
-            return f"ends {entry.idea!r}, which was not begun"
-        if ended is not None and ended.result != FAILED:
+            return f"{verb} {entry.idea!r}, which was not begun"
+        if before.is_decided(entry.idea):
             return f"decides {entry.idea!r} a second time"
-        return _fault_of_size(before.opened, entry.difference)
+        if isinstance(entry, Ended):
+            untested = entry.idea not in before.tests and not before.shares_seeds
+            if entry.result == KEPT and untested:
+                return f"keeps {entry.idea!r} without a test"
+            return _fault_of_size(before.opened, entry.difference)
+        if entry.idea in before.tests:
+            return f"tests {entry.idea!r} a second time"
+        return "tests with seeds that ideas have seen" if before.has_seen(entry.seeds) else ""
     if isinstance(entry, Confirming):
         known = {BASELINE, *before.kept}
         if BASELINE not in entry.keys or not entry.keys.keys() <= known:

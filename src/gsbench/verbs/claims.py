@@ -23,7 +23,7 @@ from gsbench.claims import ablation
 from gsbench.claims.check import Check, prepare, recheck
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
-from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, RETRIES
+from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, SCREEN, level_of_test
 from gsbench.claims.stopping import KeyAndSeed
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
@@ -219,7 +219,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         raise InputError(
             f"{options.experiment} has one arm, and planning needs pairs of trials of two"
         )
-    purpose, plans = _purpose(options.command, options.questions), list[dict[str, Any]]()
+    purpose, plans = purpose_of(options.command, options.questions), list[dict[str, Any]]()
     lines = [*comparison.sentences, *texts(comparison.remarks), *experiment.warnings]
     for baseline, arm in comparison.pairs:
         plans.append({"arm": str(arm), "baseline": str(baseline)})
@@ -234,6 +234,8 @@ def plan(argv: Sequence[str], runs: Path) -> int:
             continue
         planned = make_plan(components, difference, purpose, MAX_DESIGNS)
         lines += [f"{arm} against {baseline}", *_lines(planned, metric, difference)]
+        if purpose.screen:
+            lines.append("  an idea that looks better takes as many new seeds, its baseline too")
         plans[-1] |= planned.to_json()
     if options.json:
         asked = {"metric": metric.key, "difference": difference, "for": options.command}
@@ -262,11 +264,16 @@ def _components(trials: Sequence[TrialResult], question: Question, metric: Quant
     return components
 
 
-def _purpose(command: str, questions: int | None) -> Purpose:
-    """The purpose of a command's trials; ideas share a rate of which each takes one side."""
+def purpose_of(command: str, questions: int | None) -> Purpose:
+    """The purpose of a command's trials; each idea takes one side of its level.
+
+    A ledger is planned for the test after a quarter of the ideas were tested and none kept: no more
+    pass on where few are good (findings/simulations.md).
+    """
     if command == "ledger":
-        rate = 2 * RATE / RETRIES / (questions or IDEAS)
-        return Purpose(rate, looks=True, give_up=GIVE_UP)
+        ideas = questions or IDEAS
+        level = level_of_test(RATE, ideas, math.ceil(ideas / 4), 0)
+        return Purpose(2 * level, looks=True, give_up=GIVE_UP, screen=2 * SCREEN)
     return Purpose(ERROR_RATE / (questions or 1), looks=command != "sweep")
 
 

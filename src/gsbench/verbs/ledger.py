@@ -26,7 +26,7 @@ from gsbench.eval.options import EvalConfig
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.runs import ledger as records
 from gsbench.runs.config_hash import config_hash
-from gsbench.runs.experiments import make_home, stamp_now
+from gsbench.runs.experiments import Declaration, make_home, stamp_now
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
 from gsbench.settings import is_folder_name
@@ -70,9 +70,9 @@ def _parser() -> ArgumentParser:
     parser = ArgumentParser(
         "ledger",
         "`new` declares metric, baseline, captures, seeds and error rate. `try` trains one idea, "
-        "seed by seed until it is decided; exit code 0: kept, 1: dropped, or its trials fail, 3: "
-        "undecided, 2: bad input. `confirm` trains what was kept on other captures. `show` lists "
-        "all (docs/night.md).",
+        "seed by seed until it is decided; what looks better is tested on new seeds. Exit code 0: "
+        "kept, 1: dropped, or its trials fail, 3: undecided, 2: bad input. `confirm` trains what "
+        "was kept on other captures. `show` lists all (docs/night.md).",
     )
     parser.add_argument("action", choices=list(ACTIONS))
     parser.add_argument("name", help="the ledger, which is an experiment in the runs folder")
@@ -145,11 +145,16 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
             f"the settings or the code of {against} have changed since its trials ran: bring them "
             "back"
         )
-    own = _compose(home.name, _merged(start, options.settings), options.settings)
+    words = _merged(start, options.settings)
+    own = _compose(home.name, words, options.settings)
     idea, book = _start(home, own, against, options)
-    if (ended := book.ended.get(idea)) is None or ended.result == FAILED:
-        trials |= own
-        book = _run(home, book, idea, trials)
+    if not book.is_decided(idea) and idea not in book.tests:
+        book = _screen(home, book, idea, trials | own)
+    if not book.is_decided(idea) and idea in book.tests:
+        seeds = [f"seed={','.join(map(str, book.tests[idea].seeds))}"]
+        both = [_merged(own_words, seeds) for own_words in (start, words)]
+        baseline, new = (_compose(home.name, one, options.settings) for one in both)
+        book = _test(home, book, idea, baseline | new)
     _print_idea(book, idea, options.json)
     return EXIT_CODES[book.ended[idea].result]
 
@@ -157,7 +162,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
 def _start(
     home: Path, trials: Trials, against: str, options: argparse.Namespace
 ) -> tuple[str, Ledger]:
-    """Enter an idea with its level unless the ledger has it; return its name and the ledger."""
+    """Enter an idea unless the ledger has it; return its name and the ledger."""
     keys, values = _keys(trials, home.name), next(iter(trials.values())).values
     nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
     identity = config_hash(nameless)
@@ -174,10 +179,11 @@ def _start(
         if same:
             chosen.append(same[0].idea)
             ended = book.ended.get(same[0].idea)
-            if ended is not None and ended.result == FAILED:
-                rules.next_level(book)  # raises if other ideas have taken its place
+            begun = ended is None and not book.shares_seeds
+            if not begun and not book.is_decided(same[0].idea):
+                rules.check_room(book)  # other ideas may have taken its place
             return None
-        level = rules.next_level(book)
+        rules.check_room(book)
         name = options.idea or values["densify"]["name"]
         if name in (*book.started, BASELINE):
             if options.idea:
@@ -188,7 +194,6 @@ def _start(
             time=stamp_now(),
             idea=name,
             against=against,
-            level=level,
             identity=identity,
             words=tuple(_merged(book.words_of(against), options.settings)),
             keys=keys,
@@ -198,9 +203,39 @@ def _start(
     return chosen[0], book
 
 
-def _run(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
-    """Train the idea and what it is compared with, look by look, and write its result."""
-    declaration = rules.declaration_of(book, idea)
+def _screen(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
+    """Compare the idea on the seeds of all ideas; write its result, or its test if it passes."""
+    ended = _answer(home, book, idea, rules.screening_of(book, idea), trials)
+
+    def make(now: Ledger) -> records.Entry | None:
+        # A process that ran the same command may have been faster.
+        if idea in now.tests or now.is_decided(idea):
+            return None
+        if ended.result != KEPT:
+            return ended
+        return rules.next_test(now, idea, stamp_now())
+
+    return records.append(home, make)
+
+
+def _test(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
+    """Test the idea on its new seeds, and write its result."""
+    test = book.tests[idea]
+    log.info(
+        "%s looks better, so it is tested on new seeds, %d to %d, with the level %.2g",
+        idea,
+        test.seeds[0],
+        test.seeds[-1],
+        test.level,
+    )
+    ended = _answer(home, book, idea, rules.test_of(book, idea), trials)
+    return records.append(home, lambda now: None if now.is_decided(idea) else ended)
+
+
+def _answer(
+    home: Path, book: Ledger, idea: str, declaration: Declaration, trials: Trials
+) -> records.Ended:
+    """Train the idea and what it is compared with, look by look; the result, not yet written."""
     fails = ""
 
     def run(planned: Sequence[KeyAndSeed]) -> None:
@@ -214,21 +249,17 @@ def _run(home: Path, book: Ledger, idea: str, trials: Trials) -> Ledger:
 
     asked = rules.ask_idea(declaration, lambda: finished_trials(home, trials.values()))
     (verdict,) = asked.answer(run)
-    ended = rules.end_of(idea, verdict, stamp_now())
-    if fails and not verdict.final:
-        own = set(book.keys_of(idea).values())
-        failed = {key for key, trial in trials.items() if trial.files.has_failed()}
-        done = {one.key for one in finished_trials(home, trials.values())}
-        if own & done or not {key for key, _ in failed} <= own:
-            raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
-        reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
-        ended = records.Ended(time=stamp_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
-
-    def make(now: Ledger) -> records.Ended | None:
-        before = now.ended.get(idea)  # by a process that ran the same command
-        return None if before is not None and before.result != FAILED else ended
-
-    return records.append(home, make)
+    tested = idea in book.tests
+    if not fails or verdict.final:
+        return rules.end_of(idea, verdict, stamp_now(), tested)
+    own = set(book.keys_of(idea).values())
+    failed = {key for key, trial in trials.items() if trial.files.has_failed()}
+    measured = {one.key for one in finished_trials(home, trials.values())}
+    # An idea of which something is known cannot be tried anew as if it were not.
+    if tested or own & measured or not {key for key, _ in failed} <= own:
+        raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
+    reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
+    return records.Ended(time=stamp_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
 
 
 def confirm(options: argparse.Namespace, home: Path) -> int:
@@ -418,7 +449,9 @@ def _print_idea(book: Ledger, idea: str, as_json: bool) -> None:
 def _facts(book: Ledger, idea: str) -> dict[str, Any]:
     """The known facts of an idea, for programs."""
     started, ended = book.started[idea], book.ended.get(idea)
-    facts = {"idea": idea, "against": started.against, "level": started.level}
+    facts: dict[str, Any] = {"idea": idea, "against": started.against}
+    if test := book.tests.get(idea):
+        facts |= {"level": test.level, "test_seeds": test.seeds}
     if ended is None:
         return facts | {"result": "begun"}
     return facts | {
