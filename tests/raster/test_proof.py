@@ -429,8 +429,8 @@ def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(monkeypatch, cap
 
 # ---- faults in the kernels: each is planted in a copy of gsbench that Triton's interpreter runs
 
-COMPOSITE, PROJECTION, GEOMETRY = (
-    f"raster/triton/{name}.py" for name in ("composite", "projection", "geometry")
+COMPOSITE, FOOTPRINT, PROJECTION, GEOMETRY = (
+    f"raster/triton/{name}.py" for name in ("composite", "footprint", "projection", "geometry")
 )
 FAULTS = {
     "none": ("raster/triton/layout.py", "SEGMENT = tl.constexpr(256)", "SEGMENT = tl.constexpr(8)"),
@@ -461,7 +461,7 @@ FAULTS = {
         "tl.fma(weight, record[8], green)",
     ),
     "a footprint of one pixel too many": (
-        COMPOSITE,
+        FOOTPRINT,
         "blended = (power >= LOG2_ALPHA_MIN) & (position < seen)",
         "blended = power >= LOG2_ALPHA_MIN",
     ),

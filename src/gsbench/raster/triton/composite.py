@@ -1,4 +1,4 @@
-"""Compositing of blocks, forward and backward, and footprints.
+"""Compositing of blocks, forward and backward.
 
 The formulas are those of 3DGS (Kerbl et al. 2023, eq. 2 to 4; renderCUDA in its code). With the
 density G, the opacity o and the colour c of each Gaussian, front to back,
@@ -419,7 +419,7 @@ def _segment(order, starts, blocks, inner):
 
 
 @triton.jit
-def _store_last_slot(slots, last_slots, block, begin, end, mask):
+def store_last_slot(slots, last_slots, block, begin, end, mask):
     """Write the slot of the entry before ``end``, -1 if none, to ``last_slots`` [blocks]."""
     slot = tl.load(slots + end - 1, mask=mask & (begin < end), other=-1)
     tl.store(last_slots + block, slot, mask=mask)
@@ -456,7 +456,7 @@ def composite_backward(
     derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to front, S is a sum that
     starts with the background and the light behind the segment, so nothing cancels. ``slots``
     [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
-    written: see ``last_slots`` at `_store_last_slot`. ``g_alpha`` is read only if ``HAS_ALPHA``.
+    written: see ``last_slots`` at `store_last_slot`. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
     block, begin = _segment(order, starts, blocks, inner)
     steps = tl.arange(0, STEPS)
@@ -464,7 +464,7 @@ def composite_backward(
     state = block * BLOCK_PIXELS + places
     seen = tl.load(last + state)
     end = tl.max(tl.max(seen, 0), 0)
-    _store_last_slot(slots, last_slots, block, begin, end, tl.program_id(0) >= inner)
+    store_last_slot(slots, last_slots, block, begin, end, tl.program_id(0) >= inner)
     # Compositing did not reach this segment.
     if begin >= end:
         return
@@ -521,92 +521,3 @@ def composite_backward(
                 _sums_over_lanes(_lane_sums(h, weight, t, dy, g, record, ABSOLUTE), lane, ABSOLUTE),
                 mask=stores & (position >= begin),
             )
-
-
-@triton.jit(do_not_specialize=["width", "height", "blocks_x"])
-def cover(
-    starts,
-    entries,
-    slots,
-    records,
-    width,
-    height,
-    blocks_x,
-    last,
-    values,
-    rows_out,
-    last_slots,
-    HAS_VALUES: tl.constexpr,
-):
-    """Write the footprints of the entries of a block that compositing reached to ``rows_out``.
-
-    Each of them has a row of ``rows_out`` [pairs, 16]. A footprint is the number of pixels that the
-    Gaussian was blended into, and the sums over them of ``values`` [H, W], read only if
-    ``HAS_VALUES``, and of the distances to its mean, px. ``last_slots``: see `_store_last_slot`.
-    """
-    block = tl.program_id(0)
-    steps = tl.arange(0, STEPS)
-    inside, pixel, x, y = block_pixels(block, steps, blocks_x, width, height)
-    seen = tl.load(last + block * BLOCK_PIXELS + block_places(steps))
-    begin, end = tl.load(starts + block), tl.max(tl.max(seen, 0), 0)
-    _store_last_slot(slots, last_slots, block, begin, end, True)
-    given = tl.load(values + pixel, mask=inside & HAS_VALUES, other=0.0)
-    columns = x[None, :] + (steps * LANE_COLUMNS).to(tl.float32)[:, None]
-    for position in range(begin, end):
-        record = load_record(records, tl.load(entries + position))
-        power, _, dy = log2_alpha(record, steps, x, y)
-        blended = (power >= LOG2_ALPHA_MIN) & (position < seen)
-        dx = columns - record[0]
-        distance = tl.sqrt(tl.fma(dx, dx, (dy * dy)[None, :]))
-        row = rows_out + tl.load(slots + position) * ROW
-        tl.store(row, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
-        tl.store(row + 1, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
-        tl.store(row + 2, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
-
-
-@triton.jit
-def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
-    """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
-
-    ``own_rows`` is the number of units of each Gaussian. ``sum_units`` has already summed the pairs
-    of each unit into the row of its first pair.
-    """
-    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
-    zero = tl.zeros_like(own_rows).to(tl.float32)
-    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
-    sums = ()
-    for _ in tl.static_range(NUMBERS):
-        sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
-    for k in range(0, tl.max(own_rows, 0)):
-        active = k < own_rows
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
-        grown = ()
-        for n in tl.static_range(NUMBERS):
-            own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
-            grown = grown + (sums[n] + own,)  # type: ignore[assignment]  # noqa: RUF005
-        sums = grown
-    return sums
-
-
-@triton.jit(do_not_specialize=["count"])
-def sum_cover(
-    count,
-    row_counts,
-    first_units,
-    pair_ends,
-    unit_widths,
-    rows,
-    covered,
-    sums,
-    distances,
-    GROUP: tl.constexpr,
-):
-    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows of units."""
-    index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = index < count
-    own_rows = tl.load(row_counts + index, mask=inside, other=0)
-    total, value, distance = sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, 3)
-    tl.store(covered + index, total.to(tl.int32), mask=inside)
-    tl.store(sums + index, value, mask=inside)
-    tl.store(distances + index, distance, mask=inside)

@@ -22,7 +22,8 @@ from gsbench.raster.staged import (
     raise_for_values,
     upload,
 )
-from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
+from gsbench.raster.triton.composite import composite, composite_backward
+from gsbench.raster.triton.footprint import cover, sum_cover
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
