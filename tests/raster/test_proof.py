@@ -450,10 +450,10 @@ FAULTS = {
         "tl.minimum(begin + SEGMENT, end)",
         "tl.minimum(begin + SEGMENT - 1, end)",
     ),
-    "a program of a long list that has another's pixels": (
+    "a program of a long list that looks at another's pixels": (
         COMPOSITE,
-        "steps = step + tl.arange(0, 1)",
-        "steps = tl.arange(0, 1)",
+        "along = (steps * LANE_COLUMNS)",
+        "along = (tl.arange(0, steps.shape[0]) * LANE_COLUMNS)",
     ),
     "swapped channels": (
         COMPOSITE,
