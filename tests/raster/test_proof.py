@@ -442,7 +442,7 @@ FAULTS = {
     ),
     "no state at the border of a segment": (
         COMPOSITE,
-        "light = tl.load(border + TRANSMITTANCE)",
+        "light = tl.load(border + TRANSMITTANCE, mask=crossed, other=light)",
         "pass",
     ),
     "a short segment": (
