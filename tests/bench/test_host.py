@@ -1,12 +1,14 @@
 """The host's part of a training step with Triton: how many launches and operations it makes."""
 
+import json
 from itertools import product
 
 import pytest
 
 pytest.importorskip("triton")
 
-from benchmarks.host import MASKED, TRAININGS, WAYS, count_step, time_host
+from gsbench.bench.host import MASKED, TRAININGS, WAYS, count_step
+from gsbench.verbs.machine import bench
 
 # the most operations of torch in a step of each of ``WAYS``
 LIMITS = {"adc": (119, 87, 15), MASKED: (125, 93, 16), "mcmc": (166, 139, 67)}
@@ -20,7 +22,8 @@ def test_a_step_makes_no_more_launches_and_operations_than_before(training):
         assert 5 < operations <= most
 
 
-def test_all_ways_are_timed():
-    rows = time_host()
+def test_the_bench_shows_all_ways(capsys):
+    assert bench(["--host", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
     assert [(row["training"], row["way"]) for row in rows] == [*product(TRAININGS, WAYS)]
     assert all(row["host_ms"] > 0 for row in rows)

@@ -1,6 +1,4 @@
-"""The host's cost of a training step of ``raster=triton``, measured without a GPU.
-
-    python -m benchmarks.host [--json]
+"""The host's cost of a training step, measured without a GPU.
 
 All kernels are replaced by launches that do nothing, and tensors are tiny, so that only the host's
 work remains: Python, torch's operations, autograd. A recorded graph becomes a call that does
@@ -12,9 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-import json
 import statistics
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,7 +33,6 @@ from gsbench.train.adam_triton import TritonAdam
 from gsbench.train.direct import DirectStep
 from gsbench.train.loss_triton import TritonLoss
 from gsbench.train.trainer import Trainer
-from gsbench.verbs.machine import table
 
 WIDTH, HEIGHT, COUNT = 32, 16, 64  # px, px, Gaussians: so few that their values cost nothing
 MASKED = "adc, masks, visible_adam"
@@ -175,8 +170,3 @@ def time_host() -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-if __name__ == "__main__":
-    found = time_host()
-    print(json.dumps(found, indent=2) if "--json" in sys.argv else table(found))
