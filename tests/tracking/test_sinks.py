@@ -33,7 +33,8 @@ def test_mlflow_shows_a_grid_of_test_pictures(runs):
 def test_the_summary_of_a_trial(tmp_path):
     folder, values = finished(tmp_path)
     words = ["densify=a_densify", "scene.path=/my photos"]
-    plan = {"trials": {folder.relative_to(folder.parents[2]).as_posix(): {"overrides": words}}}
+    planned = {"overrides": words, "cwd": "/", "time": 1.0}
+    plan = {"trials": {folder.relative_to(folder.parents[2]).as_posix(): planned}}
     write(folder.parents[2] / "plan.json", plan)
     trial = TrackedTrial(TrialFolder(folder), values)
     results = trial.folder.sound_record()

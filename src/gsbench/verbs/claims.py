@@ -42,7 +42,7 @@ HTML = "claims.html"
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 DEFAULT_METRIC = "psnr"
 MOST_QUESTIONS = 10_000
-# what `plan` answers for each command
+# the answers of `plan` for each command
 PLANNED = {
     "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
     "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",

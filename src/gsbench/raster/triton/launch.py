@@ -20,7 +20,7 @@ _only_compiled = ContextVar("only_compiled", default=False)
 
 @contextmanager
 def only_compiled() -> Iterator[None]:
-    """Within this context, launches compile their kernels, but do not run them."""
+    """Make launches in this context compile their kernels, but not run them."""
     token = _only_compiled.set(True)
     try:
         yield
