@@ -21,7 +21,7 @@ from typing import Any
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
-from tests.finished import record_of
+from tests.trials import record_of
 
 NAME = "scale"
 VERBS = (["tables", NAME], ["status", NAME], ["report", NAME])

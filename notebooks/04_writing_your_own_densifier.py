@@ -151,6 +151,6 @@ figure.tight_layout()
 
 # %% [markdown]
 # Fewer Gaussians for a similar picture, or a worse picture because there are fewer? One trial cannot tell. Give each
-# arm `seed=0,1,2` with `-m`, and equal counts with `densify.max_gaussians=… densify.cap=hard`. Then read the result
+# arm `seed=0,1,2` with `-m`, and equal counts with `densify.max_gaussians=… densify.cap=governor`. Then read the result
 # as in [Reading a result](03_reading_a_result.ipynb). `docs/densifier.md` has the whole contract, also for densifiers
 # that do not extend ADC.

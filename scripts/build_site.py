@@ -1,9 +1,9 @@
 """Write the pages of the site to build/pages/, from which Zensical builds it (``make docs``).
 
-The pages are docs/, the `PAGES` of the root, the findings, and pages generated from the code
-(`reference.py`). In the repository a page may link to any file. On the site, a link to a file that
-is no page leads to the repository if its address is known (``$GSBENCH_REPOSITORY``); otherwise only
-the file's name stays. A broken link is left as it is, so that Zensical refuses it.
+The pages are docs/, the `PAGES` of the root, the findings, and parts generated from the code
+(`reference.py`, `fidelity.py`). In the repository a page may link to any file. On the site, a link
+to a file that is no page leads to the repository if its address is known (``$GSBENCH_REPOSITORY``);
+otherwise only the file's name stays. A broken link is left as it is, so that Zensical refuses it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = {
+    "README.md": "first_steps.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "CODE_OF_CONDUCT.md": "conduct.md",
@@ -25,9 +26,10 @@ PAGES = {
     "findings/simulations.md": "findings/simulations.md",
 }  # file of the repository: page of the site
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
+PICTURE = re.compile(r"(!\[[^\]]*\]\()docs/")  # the README's, from the root
 FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
-# page: the part that `reference.py` adds to its end
-GENERATED = {"settings.md": "settings", "results.md": "results"}
+# page: the part that `reference.py` or `fidelity.py` adds to its end
+GENERATED = {"settings.md": "settings", "results.md": "results", "fidelity.md": "fidelity"}
 
 
 def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
@@ -59,8 +61,6 @@ def with_site_links(markdown: str, folder: Path, repository: str | None) -> str:
 
 def page_of(name: str) -> str | None:
     """The page of the site that a file of the repository becomes; None for other files."""
-    if name == "README.md":
-        return "index.md"
     if name.startswith("docs/"):
         return name.removeprefix("docs/")
     return name if name.startswith("findings/") and name.endswith(".md") else PAGES.get(name)
@@ -68,8 +68,10 @@ def page_of(name: str) -> str | None:
 
 def write_pages(target: Path, repository: str | None) -> None:
     """Write every page, and the pictures beside them, to the folder ``target``."""
+    import fidelity
     import reference
 
+    parts = reference.PAGES | {"fidelity": fidelity.table}
     shutil.rmtree(target, ignore_errors=True)
     for folder in (DOCS, ROOT / "findings"):
         for path in sorted(folder.rglob("*")) if folder.is_dir() else ():
@@ -92,7 +94,8 @@ def write_pages(target: Path, repository: str | None) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         text = path.read_text(encoding="utf-8")
         if name.removeprefix("docs/") in GENERATED:
-            text += "\n" + reference.PAGES[GENERATED[name.removeprefix("docs/")]]()
+            text += "\n" + parts[GENERATED[name.removeprefix("docs/")]]()
+        text = PICTURE.sub(r"\1", text)
         place.write_text(with_site_links(text, path.parent, repository), encoding="utf-8")
     (target / "api.md").write_text(reference.api_page(), encoding="utf-8")
     (target / "results.schema.json").write_text(reference.schema_text(), encoding="utf-8")

@@ -22,18 +22,34 @@ BROUGHT, STATE, OUT = (Path(os.environ[k]) for k in ("GPU_DAY_BROUGHT", "GPU_DAY
 RESULTS, ARCHIVE = STATE / "results", BROUGHT / "brought.tar.xz"
 PACKAGES = "hydra-core omegaconf pydantic pydantic_core annotated-types typing-inspection"
 PACKAGES += " flip-evaluator plyfile pycolmap gsplat antlr4-python3-runtime"
-NOT_PACKED = "without Faster-GS: no wheel, and CUDA 13 does not compile its source (cub::Max)"
+# CUDA 13 no longer has this functor of the source of Faster-GS.
+OLD_MAXIMUM, MAXIMUM = "cub::Max()", "[](auto a, auto b) { return a < b ? b : a; }"
 WEIGHTS = ("squeezenet1_1*.pth", "lpips_v0.1_squeeze.pth")
 MOST_CARRIED = 45  # MiB
 SQUEEZED = [{"id": lzma.FILTER_X86}, {"id": lzma.FILTER_LZMA2, "preset": 6, "dict_size": 1 << 26}]
 TINY = bool(os.environ.get("GPU_DAY_TINY"))
 COUNTS, PEER = (("3",), "cpu") if TINY else (("100000", "1000000", "3000000"), "gsplat")
 ARMS, SEEDS = ("adc", "volumetric", "volumetric_once"), range(20)
-COMPILATION = "compilation"  # of gsplat, on idle cores; a trial run has nothing to compile
+READINGS = {  # of eq. 7, beside those in `ARMS`: which one gives the paper's counts and gains?
+    "volume_x8": "volumetric densify.volume_threshold=0.24",
+    "of_scales": "volumetric densify.condition_of=scales",
+    "of_nothing": "volumetric densify.condition_of=nothing",
+    "condition_8": "volumetric densify.max_condition=8",
+    "quantile": "volumetric densify.threshold_mode=quantile",
+    "quantile_once": "volumetric_once densify.threshold_mode=quantile",
+}
+# Of gsplat and Faster-GS, on idle cores; a trial run has nothing to compile.
+COMPILATION, OF_FASTER_GS = "compilation", "compilation-faster_gs"
 COMPILE = "0" if TINY else "from gsplat.cuda._backend import _C; assert _C"
-BENCHED = "raster count size forward_ms loss_ms backward_ms adam_ms step_ms steps_per_second fps"
+UNSPLIT = "from gsbench.raster.triton import executor; executor.SPLIT_BLOCKS = 0; "
+UNSPLIT += "from gsbench.cli import main; main()"
+HOST = "training way launches operations host_ms"
+BENCHED = (
+    "part raster count size forward_ms loss_ms backward_ms adam_ms step_ms steps_per_second fps"
+)
 BENCHED += " peak_memory_mb"
-TRAINED = "training iterations num_gaussians train peak_memory_mb psnr ssim lpips_squeeze flip"
+TRAINED = "training iterations num_gaussians times_adc train peak_memory_mb psnr gain_db ssim"
+TRAINED += " lpips_squeeze flip"
 PACK_EVERY, MOST_KEPT = 20.0, 2_000_000  # seconds; bytes of a file
 KEPT = ("results.json", "failed.json", "log.txt", "metrics.jsonl", "events.jsonl", "per_view.csv")
 
@@ -47,8 +63,9 @@ class Part(NamedTuple):
 class Row(NamedTuple):
     parts: list[Part]
     seconds: float  # of the plan; 0: in the background
-    alone: bool = False  # for timing: the compilation pauses
+    alone: bool = False  # for timing: compilations pause
     grace: float = 1.0  # seconds from SIGTERM, when a training writes its checkpoint, to SIGKILL
+    later: bool = False  # only by `rest`
 
 
 def gsbench(name: str, words: str, needs: str = "") -> Part:
@@ -61,12 +78,28 @@ def bench(name: str, raster: str, count: str, needs: str = "") -> Part:
     return gsbench(f"bench-{name}", words, needs)
 
 
+def bench_of_lists(scene: str, *, split: bool) -> Part:
+    """A bench of long lists; without ``split``, one program composites each block."""
+    count, way = COUNTS[1 % len(COUNTS)], "split" if split else "whole"
+    part = bench(f"triton-{scene}-{way}", "triton", count)
+    words = ["bench", "--no-memory", "--scene", scene, *part.command[4:]]
+    how = ["-m", "gsbench.cli"] if split else ["-c", UNSPLIT]
+    return part._replace(command=[PYTHON, *how, *words])
+
+
+def faster_gs(name: str, *words: str) -> Part:
+    script = ["-c", "0"] if TINY else [str(Path(__file__).with_name("faster_gs.py")), *words]
+    needs = OF_FASTER_GS if words[1:] else ""
+    return Part(name, ["env", f"FASTER_GS={STATE}/faster_gs", PYTHON, *script], needs)
+
+
 def training(arm: str, seed: int) -> Part:
     words = f"scene=colmap scene.path={STATE}/bonsai init=dataset train=paper eval.at=[7000]"
     if TINY:
         words = "scene=courtyard scene.views=8 scene.width=32 scene.height=24 init=random"
         words += " init.count=6 train=7k train.iterations=2"
-    words += f" densify={arm} seed={seed} raster=triton tracking=none eval.download=false"
+    words += f" densify={READINGS.get(arm, arm)} seed={seed} raster=triton"
+    words += " tracking=none eval.download=false"
     return gsbench(f"train-{arm}-{seed}", f"name=gpu_day-{arm}-{seed} {words}")
 
 
@@ -80,6 +113,7 @@ def check(name: str, words: str, needs: str = "", tool: str = "") -> Part:
 
 def plan(seed: int = 0) -> list[Row]:
     """All parts, the most telling first; the trainings with ``seed``."""
+    readings = list(READINGS)
     contract, bits = "tests/raster/test_contract.py;-k;", "tests/raster/test_same_bits.py"
     some = " and without_visible" if TINY else ""  # part of the name of one quick test
     of_peer = f"tests/raster/test_gsplat.py;{contract}on_a_gpu or {PEER}{some}"
@@ -88,13 +122,30 @@ def plan(seed: int = 0) -> list[Row]:
     return [
         Row([Part("install", [PYTHON, "-m", "tarfile", "-e", str(ARCHIVE), str(STATE)])], 25),
         Row([Part(COMPILATION, ["nice", "-n", "19", PYTHON, "-c", COMPILE])], 0),
-        Row([gsbench("proof-triton", "doctor --json --prove --raster triton")], 70),
-        Row([check("contract", f"{contract}triton{some}"), check("bits", bits)], 60),
-        *(Row([bench(f"triton-{n}", "triton", n)], 90 / len(COUNTS), True) for n in COUNTS),
-        Row([training(arm, seed) for arm in ARMS], 200, grace=8.0),
-        Row([bench(PEER, PEER, ",".join(COUNTS), COMPILATION)], 35),
-        Row(peer, 25),
+        Row([faster_gs(OF_FASTER_GS, "compile")], 0),
+        Row([gsbench("proof-triton", "doctor --json --prove --raster triton")], 50),
+        Row([check("contract", f"{contract}triton{some}"), check("bits", bits)], 50),
+        Row([gsbench("host", "bench --host --json")], 15, True),
+        *(Row([bench(f"triton-{n}", "triton", n)], 75 / len(COUNTS), True) for n in COUNTS),
+        *(
+            Row([bench_of_lists(scene, split=split)], 10, True)
+            for scene in ("trained", "skewed", "crowded")
+            for split in (True, False)
+        ),
+        Row([faster_gs("bench-faster_gs", "triton", *COUNTS)], 30, True),
+        Row([training(arm, seed) for arm in ARMS], 150, grace=8.0),
+        Row([bench(PEER, PEER, ",".join(COUNTS), COMPILATION)], 30),
+        Row(peer, 20),
         Row([check(tool, f"{bits};-k;tiny", tool=tool) for tool in ("memcheck", "racecheck")], 35),
+        *(
+            Row(
+                [training(reading, seed) for reading in readings[k : k + 3]],
+                270,
+                grace=8.0,
+                later=True,
+            )
+            for k in range(0, len(readings), 3)
+        ),
     ]
 
 
@@ -159,11 +210,10 @@ class Runner:
             for row in rows:
                 until += row.seconds * self.seconds / planned
                 names = [part.name for part in row.parts]
-                if COMPILATION in self.running:
-                    number = signal.SIGSTOP if row.alone else signal.SIGCONT
-                    signal_session(self.running[COMPILATION][0].pid, number)
-                if row.parts[0].needs:
-                    self.wait([COMPILATION], (self.now() + until) / 2)
+                if needed := row.parts[0].needs:
+                    self.signal_compilations(signal.SIGCONT)
+                    self.wait([needed], (self.now() + until) / 2)
+                self.signal_compilations(signal.SIGSTOP if row.alone else signal.SIGCONT)
                 for part in row.parts:
                     self.start(part)
                 if row.seconds:
@@ -173,6 +223,10 @@ class Runner:
             self.end(list(self.running), 1.0)
             (OUT / "table.md").write_text(table(RESULTS))
         return 0 if all(end == 0 for end in self.ends.values()) else 1
+
+    def signal_compilations(self, number: int) -> None:
+        for name in {COMPILATION, OF_FASTER_GS} & self.running.keys():
+            signal_session(self.running[name][0].pid, number)
 
     def pack(self) -> None:
         """Write all results so far to the archive, unless a file vanishes meanwhile."""
@@ -199,11 +253,16 @@ def signal_session(session: int, *signals: int) -> None:
 
 
 def rest(names: tuple[str, ...]) -> list[Row]:
-    """Rows of the named parts; without names, of those that failed before, or of the next seed."""
+    """Rows of the named parts; without names, of the first of these that are not done.
+
+    They are the parts of `all`, the readings of eq. 7, and the trainings with the next seed.
+    """
     done = {name for name, record in read_ends(RESULTS).items() if record["end"] == 0}
     parts = [part for row in plan() for part in row.parts]
     seed = sum(f"train-{ARMS[0]}-{seed}" in done for seed in SEEDS)
-    wanted = set(names) or {x.name for x in parts} - done or {f"train-{arm}-{seed}" for arm in ARMS}
+    first = {part.name for row in plan() if not row.later for part in row.parts}
+    wanted = set(names) or first - done or {part.name for part in parts} - done
+    wanted = wanted or {f"train-{arm}-{seed}" for arm in ARMS}
     wanted |= {part.needs for part in parts if part.name in wanted} - {""}
     wanted |= set() if (STATE / "site").exists() else {"install"}
     rows = []
@@ -246,6 +305,10 @@ def wheels() -> str:
     model.write_binary(new / "bonsai/sparse/0")
     unseen = set(os.listdir(capture.images)) - set(capture.image_names)
     shutil.copytree(capture.images, new / "bonsai/images", ignore=lambda *_: unseen)
+    if source := os.environ.get("GPU_DAY_FASTER_GS"):
+        shutil.copytree(Path(source) / "FasterGSCudaBackend/FasterGSCudaBackend", new / "faster_gs")
+        for file in (new / "faster_gs").rglob("*.cuh"):
+            file.write_text(file.read_text().replace(OLD_MAXIMUM, MAXIMUM))
     (new / "weights").mkdir()
     files = (x for name in WEIGHTS for x in Path(os.environ["GSBENCH_WEIGHTS"]).rglob(name))
     weights = [shutil.copy(file, new / "weights") for file in files]
@@ -254,7 +317,8 @@ def wheels() -> str:
     size = ARCHIVE.stat().st_size / 2**20
     if size > MOST_CARRIED:
         sys.exit(f"{ARCHIVE} has {size:.1f} MiB, more than {MOST_CARRIED}: leave something out")
-    return f"{ARCHIVE}: {size:.1f} MiB, {len(weights)} files of weights; {NOT_PACKED}"
+    without = "" if source else "; without Faster-GS: GPU_DAY_FASTER_GS is not set"
+    return f"{ARCHIVE}: {size:.1f} MiB, {len(weights)} files of weights{without}"
 
 
 def read_ends(results: Path) -> dict[str, dict[str, Any]]:
@@ -288,15 +352,31 @@ def table(results: Path) -> str:
         elif name.startswith(("contract", "bits", "memcheck", "racecheck")):
             facts += text.splitlines()[-1:]
         lines.append("; ".join(facts))
-    rows = [row for file in sorted(results.glob("bench-*.out")) for row in read(file, list)]
-    lines += ["", "For docs/measurements.md:", "", *markdown(BENCHED, rows)]
+    lines += [
+        "",
+        "For docs/measurements.md:",
+        "",
+        *markdown(HOST, read(results / "host.out", list)),
+    ]
+    rows = [
+        {"part": file.stem.removeprefix("bench-")} | row
+        for file in sorted(results.glob("bench-*.out"))
+        for row in read(file, list)
+    ]
+    lines += ["", *markdown(BENCHED, rows)]
     for row in rows:
         profile = json.dumps({key: row.get(key) for key in ("kernels_ms", "waits", "waits_ms")})
-        lines += ["", f"{row['raster']}, {row['count']}: {profile}"]
+        lines += ["", f"{row['part']}, {row['raster']}, {row['count']}: {profile}"]
     rows = []
     for folder in sorted(results.glob("train-*/")):
         record = read(folder / "results.json", dict) | {"training": folder.name}
         rows.append(record | record.get("metrics", {}) | record.get("seconds", {}))
+    for row in rows:
+        baseline = f"train-adc-{row['training'].rpartition('-')[2]}"
+        for adc in (other for other in rows if other["training"] == baseline):
+            with contextlib.suppress(KeyError):  # one of them has not ended
+                row["times_adc"] = row["num_gaussians"] / adc["num_gaussians"]
+                row["gain_db"] = row["psnr"] - adc["psnr"]
     return "\n".join([*lines, "", *markdown(TRAINED, rows)])
 
 
@@ -327,7 +407,8 @@ def main(verb: str, *words: str) -> int:
         return 0
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     seconds = float(words[0]) if words else {"all": 540.0, "rest": 200.0}[verb]
-    return Runner(verb, seconds).run(plan() if verb == "all" else rest(words[1:]))
+    rows = [row for row in plan() if not row.later] if verb == "all" else rest(words[1:])
+    return Runner(verb, seconds).run(rows)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Decided:
-    """What a rule says [N]: ``keep`` and ``test`` are masks.
+    """The answer of a rule [N]: ``keep`` and ``test`` are masks.
 
     ``seeds`` were trained on, and ``tested`` new ones by the idea and the baseline.
     """
@@ -88,7 +88,7 @@ def on_shared_seeds(attempt: Attempt) -> Decided:
 
 
 def in_looks(differences: Array, levels: Array, least: float) -> tuple[Mask, NDArray[np.int64]]:
-    """Which ideas are better in looks at ``levels`` [N] (both sides), and the seeds trained."""
+    """Mask of ideas that are better in looks at ``levels`` [N] (both sides), and seeds trained."""
     count = len(differences)
     undecided, keep = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
     seeds = np.full(count, LOOKS[-1])

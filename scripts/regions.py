@@ -10,8 +10,10 @@ log(1 / largest share) / log(scenes) in 0..1. It is 0 at y = 0, where one scene 
 that the test is Student's. For each number of scenes and seeds and each level, f at the knots of y
 is chosen for the greatest power, while the size is at most the level for every ratio of noise.
 
-Given the variances, a mean is normal. So sizes and powers are means of normal probabilities over
-draws of variances, some of them with small variances by importance sampling.
+Given the variances, a mean is normal. So the size is the mean of 2 Φ(-c √(Σv / Σσ²)) over variances
+v drawn as σ² χ²(K - 1) / (K - 1), with the threshold c for the drawn shares; small variances are
+drawn more often and weighted. K - 1 degrees of freedom are valid for every ratio of noise, since
+P(Z² > c² Σ λ Q) is convex in the shares λ: it is largest if one of them is 1.
 """
 
 from __future__ import annotations

@@ -33,6 +33,18 @@ def write(path, content):
     return path
 
 
+def write_lines(path, rows):
+    """Write JSON values to a file, one a line."""
+    return write(path, "".join(json.dumps(row) + "\n" for row in rows))
+
+
+def change_json(path, **changes):
+    """Change keys of the object in a JSON file; returns the object as it was."""
+    before = read_json(path)
+    write(path, before | changes)
+    return before
+
+
 def words_of(first, *more):
     """The words of a command; the first argument may be a verb or an option with words after it."""
     return [*([first] if "=" in first.partition(" ")[0] else split(first)), *map(str, more)]

@@ -61,8 +61,20 @@ def ask(words, capsys, monkeypatch):
     return line
 
 
-def experiment(settings):
-    """The words that run an experiment from a stranger's file."""
-    folder = Path("conf/experiment")
-    write(folder / "strange.yaml", "# @package _global_\n" + yaml.safe_dump(settings))
+def nested(settings, values=None):
+    """The ``values`` with settings by their dotted keys."""
+    values = {} if values is None else values
+    for key, value in settings.items():
+        *groups, last = key.lstrip("+").split(".")
+        node = values
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[last] = value
+    return values
+
+
+def experiment(settings, group="experiment"):
+    """The words that run an experiment from a stranger's file, which has settings with dots."""
+    text = "# @package _global_\n" + yaml.safe_dump(nested(settings))
+    write(Path(f"conf/{group}/strange.yaml"), text)
     return split("--config-dir conf +experiment=strange")

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.raster.conftest import interpreter_fault
 
@@ -51,6 +52,8 @@ if "doctor" in words:
     raster = words[words.index("--raster") + 1]
     print(json.dumps({{"raster": raster, "passed": True, "device": "a GPU", "versions": {{"triton": "3.6.0"}},
                       "errors": {{"image": 1e-6}}, "seconds": 9.5}}))
+elif "--host" in words:
+    print(json.dumps([{{"training": "adc", "way": "recorded", "launches": 0, "operations": 15, "host_ms": 0.06}}]))
 elif "bench" in words:
     row = {{"raster": words[words.index("--raster") + 1], "size": "16x16", "count": 3, "step_ms": 1.25,
            "kernels_ms": {{"_blend": 0.5}}, "waits": {{"cudaStreamSynchronize": 1.0}}, "waits_ms": {{}}}}
@@ -65,6 +68,9 @@ elif "gsbench.cli" in words:
         json.dump({{"iterations": 30000, "num_gaussians": 12345, "metrics": {{"psnr": 31.54321}},
                    "seconds": {{"train": 99.5}}}}, file)
 """
+
+LISTS = "trained", "skewed", "crowded"  # the scenes in which long lists are split, and are not
+READINGS = "volume_x8", "of_scales", "of_nothing", "condition_8", "quantile", "quantile_once"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs bash, /proc and Triton")
 
@@ -135,7 +141,7 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
     faults = {
         "proof-triton": ("doctor --json --prove --raster triton", "hang"),
         "contract": ("test_contract.py -k triton", "kill"),
-        "bench-triton-3": ("--raster triton --count", "fail"),
+        "bench-triton-3": ("bench --raster triton --count", "fail"),
         "train-volumetric-0": ("densify=volumetric ", "hang"),
     }
     begin = time.monotonic()
@@ -154,11 +160,15 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
         "install",
         "bits",
         "compilation",
+        "compilation-faster_gs",
+        "host",
+        "bench-faster_gs",
         "train-adc-0",
         "train-volumetric_once-0",
         "bench-cpu",
         "proof-cpu",
     }
+    well |= {f"bench-triton-{name}-{way}" for name in LISTS for way in ("split", "whole")}
     assert ends.keys() - faults.keys() == well | {"contract-cpu", "memcheck", "racecheck"}
     assert {
         "results/train-adc-0/results.json",
@@ -173,16 +183,16 @@ def test_parts_that_fail_hang_or_are_killed_do_not_harm_other_parts(day):
     assert "- proof-triton: NO (out of time), " in table
     assert "- contract: NO (-9), " in table
 
-    # The rest is what did not end well; then there is time for another seed.
+    # The rest is what did not end well; then the readings of eq. 7; then another seed.
     code, said = day.run("rest", "60")
     assert code == 0, said
     assert {name for name, end in day.results("rest").items() if end != 0} == {"files"}
     assert "bits" not in said
-    code, said = day.run("rest", "60")
-    assert code == 0, said
-    assert set(re.findall(r"(\S+): 0 after", said)) == {
-        f"train-{arm}-1" for arm in ("adc", "volumetric", "volumetric_once")
-    }
+    for arms, seed in (READINGS, 0), (("adc", "volumetric", "volumetric_once"), 1):
+        code, said = day.run("rest", "60")
+        assert code == 0, said
+        trained = {f"train-{arm}-{seed}" for arm in arms}
+        assert set(re.findall(r"(\S+): 0 after", said)) == trained
 
 
 def test_a_killed_command_leaves_the_results_so_far_and_no_process(day):
@@ -231,7 +241,11 @@ def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
 
     day = Day(tmp_path)
     scene = shared / "data" / "herz_jesus_p25"
+    source = tmp_path / "checkout" / "FasterGSCudaBackend" / "FasterGSCudaBackend"
+    source.mkdir(parents=True)
+    (source / "blend.cuh").write_text("Reduce(used, cub::Max());")
     more = {"GPU_DAY_SCENE": str(scene), "GSBENCH_WEIGHTS": str(shared / "weights")}
+    more["GPU_DAY_FASTER_GS"] = str(tmp_path / "checkout")
     code, said = day.run("wheels", **more)
     assert code == 0, said
     assert re.search(r"brought.tar.xz: \d\.\d MiB, 2 files of weights", said)
@@ -255,6 +269,8 @@ def test_the_archive_has_packages_scene_and_weights(tmp_path, shared):
         image.name for image in before.images.values()
     }
     assert len(list((there / "weights").iterdir())) == 2
+    text = (there / "faster_gs" / "blend.cuh").read_text()
+    assert text == "Reduce(used, [](auto a, auto b) { return a < b ? b : a; });"
 
 
 def test_a_table_of_two_commands(day):
@@ -268,11 +284,15 @@ def test_a_table_of_two_commands(day):
         re.MULTILINE,
     )
     assert re.search(r"^- bits: yes, \d+ s; 3 passed in 1.2s$", said, re.MULTILINE)
-    assert "| triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
+    assert "| triton-3 | triton | 3 | 16x16 | - | - | - | - | 1.25 | - | - | - |" in said
+    assert "| triton-skewed-whole | triton | 3 |" in said
+    assert "| adc | recorded | 0 | 15 | 0.06 |" in said
     assert (
-        'triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}' in said
+        'triton-3, triton, 3: {"kernels_ms": {"_blend": 0.5}, "waits": {"cudaStreamSynchronize": 1.0}'
+        in said
     )
-    assert "| train-volumetric_once-0 | 30000 | 12345 | 99.5 | - | 31.543 | - | - | - |" in said
+    trained = "| train-volumetric_once-0 | 30000 | 12345 | 1 | 99.5 | - | 31.543 | 0 | - | - | - |"
+    assert trained in said
 
 
 def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day):
@@ -281,6 +301,58 @@ def test_a_sanitizer_that_refuses_the_device_is_not_a_failure_of_the_kernels(day
     )
     assert day.run("rest", "60", "memcheck")[0] == 1
     assert "- memcheck: not tried, since" in day.run("table", str(day.out))[1]
+
+
+class FasterGsStandIn:
+    """The functions of Faster-GS's module, with the shapes that its source asks for."""
+
+    def forward(
+        self, means, scales, turns, opacities, base, rest, to_view, center, black, *numbers
+    ):
+        count = len(means)
+        shapes = [tuple(x.shape) for x in (means, scales, turns, opacities, base, rest)]
+        assert shapes == [(count, width) for width in (3, 3, 4, 1)] + [
+            (count, 1, 3),
+            (count, 15, 3),
+        ]
+        assert (to_view.shape, center.shape, black.shape) == ((4, 4), (3,), (3,))
+        bases, self.width, self.height, *_, near, far, antialiased = numbers
+        assert (bases, near, far, antialiased, len(numbers)) == (16, 0.2, 1e4, False, 10)
+        self.view = (to_view, center, black, *numbers)
+        image = torch.zeros(3, self.height, self.width)
+        return (image, *torch.zeros(4, 1), 7, 8, 9)
+
+    def backward(self, seen, g_image, image, means, scales, turns, opacities, rest, *more):
+        assert g_image.shape == image.shape == (3, self.height, self.width)
+        assert g_image.is_contiguous()
+        assert seen.shape == (2, len(means))
+        buffers, view, sizes = more[:4], more[4:-3], more[-3:]
+        assert (len(buffers), view, sizes) == (4, self.view, (7, 8, 9))
+        base = torch.zeros(len(means), 1, 3)
+        return [torch.ones_like(one) for one in (means, scales, turns, opacities, base, rest)]
+
+    def adam_step(self, gradient, value, first, second, step, rate, *constants):
+        assert gradient.shape == value.shape == first.shape == second.shape
+        assert (step > 0, constants) == (True, (0.9, 0.999, 1e-15))
+        self.steps = step
+
+
+def test_faster_gs_takes_turns_with_a_rasterizer(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    import faster_gs
+
+    code = FasterGsStandIn()
+    monkeypatch.setattr(faster_gs, "load_backend", lambda: code)
+    monkeypatch.setattr(faster_gs, "SIZE", (16, 8))
+    faster_gs.main("cpu", "5", "6")
+    rows = json.loads(capsys.readouterr().out)
+    assert [(row["raster"], row["count"]) for row in rows] == [
+        (raster, count) for count in (5, 6) for raster in ("cpu", "faster_gs")
+    ]
+    assert code.steps == faster_gs.STEPS * (faster_gs.TURNS + 1)
+    assert all(row["step_ms"] > 0 and row["fps"] > 0 for row in rows)
+    mean, largest = rows[1]["difference"]
+    assert 0 < mean < largest < 2
 
 
 def test_an_unknown_verb_prints_the_usage(tmp_path):
@@ -303,9 +375,9 @@ def test_the_whole_day_in_the_interpreter(day):
     assert re.search(proof, said, re.MULTILINE)
     assert re.search(r"^- contract: yes, \d+ s; \d+ passed", said, re.MULTILINE)
     assert re.search(r"^- memcheck: yes, \d+ s; 1 passed", said, re.MULTILINE)
-    assert re.search(r"^\| triton \| 3 \| 16x16 \| [\d.]+ \|", said, re.MULTILINE)
+    assert re.search(r"^\| triton-3 \| triton \| 3 \| 16x16 \| [\d.]+ \|", said, re.MULTILINE)
     assert re.search(
-        r"^\| train-volumetric-0 \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \|",
+        r"^\| train-volumetric-0 \| 2 \| \d+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| [\d.]+ \| -?[\d.]+ \|",
         said,
         re.MULTILINE,
     )

@@ -2,7 +2,8 @@
 
 import json
 import os
-from dataclasses import dataclass, field
+import re
+from dataclasses import field
 from pathlib import Path
 
 import pytest
@@ -206,7 +207,13 @@ def test_json_is_read_if_it_is_plain(tmp_path):
     assert read_json(file) == {"a": [1, None]}
 
 
-@dataclass(frozen=True, kw_only=True)
+def test_no_record_has_a_decorator_of_its_own():
+    """`Record` makes the dataclass; a second one would lose the defaults made by factories."""
+    for file in Path(parsing.__file__).parent.rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        assert not re.search(r"^@dataclass.*\nclass \w+\(Record\)", text, re.MULTILINE), file
+
+
 class Row(Record):
     amount: Amount
     name: Text = "a"

@@ -177,7 +177,7 @@ REPOSITORY = "https://example.org/owner/gsbench/"
         ("[a](#here)", "docs", None, "[a](#here)"),
         ("[a](docs/search.md#here)", "", None, "[a](search.md#here)"),
         ("[a](../CONTRIBUTING.md)", "docs", None, "[a](contributing.md)"),
-        ("[a](../README.md)", "docs", None, "[a](index.md)"),
+        ("[a](../README.md)", "docs", None, "[a](first_steps.md)"),
         ("[a](../conf/densify/)", "docs", None, "a (`conf/densify`)"),
         ("[conf/densify](../conf/densify/)", "docs", None, "conf/densify"),
         (

@@ -225,7 +225,7 @@ def checked_runs_folder(name: str) -> Path:
                 f"the name of {strange[0]} is not UTF-8, or has a line break: rename it"
             )
         folder = Path(name).expanduser().resolve()
-        existing = next(place for place in (folder, *folder.parents) if place.exists())
+        existing = _existing(folder)
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{name!r} cannot be the runs folder ({error}): {advice}") from error
     if name.strip() == "":
@@ -297,10 +297,14 @@ def explain_storage(error: BaseException, folder: Path) -> GsbenchError | None:
     )
 
 
+def _existing(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    return next(place for place in (folder, *folder.parents) if place.exists())
+
+
 def _free(folder: Path) -> int:
-    existing = next(place for place in (folder, *folder.parents) if place.exists())
     try:
-        usage = shutil.disk_usage(existing)
+        usage = shutil.disk_usage(_existing(folder))
     except OSError:
         return NEARLY_NOTHING
     # file systems without a size, such as /proc, are never full

@@ -105,6 +105,7 @@ def set_up_logging(verbose: bool | str | Sequence[str] = False, through_root: bo
 
     others = logging.getLogger().handlers if through_root else []
     consoles = [other for other in others if type(other) is logging.StreamHandler]
+    # Their streams were made before this command: `PrintableStream` would escape their colours.
     for console in consoles:
         console.addFilter(_make_printable)  # the lines, not the formatter's colours
         console.setStream(getattr(console.stream, "raw", console.stream))

@@ -15,10 +15,10 @@ import stat
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 
 import yaml
 from annotated_types import MinLen
@@ -287,24 +287,29 @@ Text = Annotated[str, MinLen(1)]
 STRICT = ConfigDict(strict=True, allow_inf_nan=False, extra="ignore")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
 class Record:
-    """Base of records: strict types and finite numbers; unknown keys are ignored."""
+    """Base of records: a subclass is a frozen dataclass of keywords, without a decorator.
+
+    Types are strict and numbers finite; unknown keys are ignored.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
     def to_json(self) -> dict[str, Any]:
         """The JSON object of the file, without optional keys that have their default value."""
         kind: Any = type(self)
         values: dict[str, Any] = adapter(kind).dump_python(self, mode="json")
         return {
-            field.name: values[field.name] for field in fields(self) if not _is_default(self, field)
+            field.name: values[field.name] for field in fields(kind) if not self._has_default(field)
         }
 
-
-def _is_default(record: Record, field: Any) -> bool:
-    default = field.default if field.default_factory is MISSING else field.default_factory()
-    return default is not MISSING and getattr(record, field.name) == default
+    def _has_default(self, field: Any) -> bool:
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        return default is not MISSING and getattr(self, field.name) == default
 
 
 def read_typed(path: Path, kind: type[T]) -> T:

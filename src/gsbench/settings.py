@@ -200,6 +200,8 @@ def _hint(cls: type, name: str) -> Any:
     It is Any if the annotation uses a name that only type checkers import.
     """
     owner = next(base for base in cls.__mro__ if name in inspect.get_annotations(base))
+    # One field at a time, from the class that wrote it: `get_type_hints` of a class fails as a
+    # whole if one of its names is imported for type checkers alone.
     holder = types.SimpleNamespace(__annotations__={name: inspect.get_annotations(owner)[name]})
     scope = vars(sys.modules[owner.__module__]) if owner.__module__ in sys.modules else {}
     try:

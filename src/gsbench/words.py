@@ -92,7 +92,9 @@ def attributes_of(cls: Any) -> list[str]:
 def no_such(owner: str, name: str, names: Sequence[str], inside: str = "") -> str:
     """The message of an AttributeError, with the names that ``owner`` has (``inside`` a field)."""
     guess = did_you_mean(name, names).replace("did you mean ", f"did you mean {inside}")
-    return f"{owner} has no {name!r}; it has {', '.join(f'{inside}{one}' for one in names)}{guess}"
+    return (
+        f"{owner} has no {name!r}; it has {', '.join(f'{inside}{known}' for known in names)}{guess}"
+    )
 
 
 def readable_bytes(count: int | None) -> str:

@@ -3,16 +3,15 @@
 import pytest
 
 from gsbench.analysis.results import load_experiment
-from tests.analysis.synthetic import Plan, write_runs
+from tests.trials import write_runs
 
 
 @pytest.fixture
 def make_experiment(tmp_path):
     """Write the trials of a plan below ``tmp_path`` and load them."""
 
-    def make(**plan):
-        made = Plan(**plan)
-        write_runs(tmp_path, made)
-        return load_experiment(tmp_path, made.experiment)
+    def make(experiment="exp", **plan):
+        write_runs(tmp_path, experiment=experiment, **plan)
+        return load_experiment(tmp_path, experiment)
 
     return make

@@ -3,27 +3,26 @@
 import pytest
 
 from gsbench.analysis.cells import select_trials
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.tables import build_table
-from tests.analysis.test_tables import one_trial
+from tests.analysis.helpers import loaded, page_of, table_of
 from tests.helpers import refusal
+from tests.trials import write_trial
 
 KEY = "eval.extra.mae._target_"
-OWN = {"eval__extra": {"mae": {"_target_": "mine.Mae"}}}
+OWN = {"eval.extra": {"mae": {"_target_": "mine.Mae"}}}
 
 
 @pytest.fixture
 def runs(tmp_path):
     for seed in (0, 1):
         for densify in ("adc", "volumetric"):
-            one_trial(tmp_path, seed, "aaaaaaaa", _densify=densify, psnr=27.0 + seed)
-            one_trial(tmp_path, seed, "bbbbbbbb", OWN, _densify=densify, psnr=27.0 + seed, mae=3.0)
+            write_trial(tmp_path, seed, "aaaaaaaa", densify=densify, psnr=27.0 + seed)
+            write_trial(tmp_path, seed, "bbbbbbbb", OWN, densify=densify, psnr=27.0 + seed, mae=3.0)
     return tmp_path
 
 
 def test_tables_show_trials_with_and_without_the_metric(runs):
-    experiment = load_experiment(runs, "exp")
+    experiment = loaded(runs)
     table = build_table(experiment)
     assert table.row_headings == ("scene", "init", "densify", KEY)
     shown = {(row.labels[2], row.labels[3]) for row in table.rows if row.labels[0] == "garden"}
@@ -33,19 +32,19 @@ def test_tables_show_trials_with_and_without_the_metric(runs):
 
 
 def test_the_report_names_the_added_metric(runs):
-    assert "mine.Mae" in build_report(load_experiment(runs, "exp"))
+    assert "mine.Mae" in page_of(runs)
 
 
 def test_a_null_setting_equals_a_missing_key(tmp_path):
-    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
-    one_trial(tmp_path, 1, "bbbbbbbb", {"eval__extra": None}, psnr=28.0)
-    table = build_table(load_experiment(tmp_path, "exp"), metrics=["psnr"])
+    write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0)
+    write_trial(tmp_path, 1, "bbbbbbbb", {"eval.extra": None}, psnr=28.0)
+    table = table_of(tmp_path, "psnr")
     assert [row.entries[0].text for row in table.rows] == ["27.50 ± 0.71"]
 
 
 @pytest.mark.parametrize("name", ["eval.extra.mea._target_", "densify.volume_treshold", "nothing"])
 def test_a_key_that_no_trial_has_is_refused(runs, name):
-    experiment = load_experiment(runs, "exp")
+    experiment = loaded(runs)
     with refusal(f"no trial has a setting '{name}'"):
         build_table(experiment, rows=["scene", name])
     with refusal(f"no trial has a setting '{name}'"):

@@ -8,14 +8,15 @@ from hypothesis import strategies as st
 
 from gsbench.analysis.addresses import ArmName, trials_of_arm
 from gsbench.analysis.cells import with_variants
-from gsbench.analysis.results import load_experiment
-from gsbench.errors import InputError
-from gsbench.renders.measure import ReferenceImages, find_destination
+from gsbench.renders.imported import find_destination
+from gsbench.renders.truth import ReferenceImages
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.vote import choose_arms
 from gsbench.view.trials import find_trial
-from tests.analysis.synthetic import write_arms
+from tests.analysis.helpers import trials_of
+from tests.helpers import refusal
+from tests.trials import write_arms
 
 NAMES = st.from_regex(r"[a-z][a-z0-9_]{0,8}", fullmatch=True)
 VALUES = st.one_of(
@@ -66,7 +67,7 @@ ARMS = {
 
 @pytest.mark.parametrize("word, count", ARMS.items())
 def test_all_verbs_read_an_arm_alike(runs, word, count):
-    trials = with_variants(load_experiment(runs, "exp").trials)
+    trials = with_variants(trials_of(runs))
     readers = {
         "explain": lambda: explain_cell(f"exp:garden:psnr:{word}", runs),
         "view": lambda: find_trial(f"exp:garden:{word}:1", runs),
@@ -76,14 +77,14 @@ def test_all_verbs_read_an_arm_alike(runs, word, count):
         if count == 1:
             reader()
         else:
-            with pytest.raises(InputError, match=r"momentum\[decay=0.9, kind=\[1, 2\]\]"):
+            with refusal(r"momentum\[decay=0.9, kind=\[1, 2\]\]"):
                 reader()
 
 
 @pytest.mark.parametrize("word", ["momentum[decay=0.9", "[decay=1]", "momentum[0.9]", "a[b=1]c"])
 def test_another_form_is_refused_in_a_line(runs, word):
-    with pytest.raises(InputError, match=re.escape(f"{word!r} is no arm such as")):
-        trials_of_arm(load_experiment(runs, "exp").trials, word)
+    with refusal(re.escape(f"{word!r} is no arm such as")):
+        trials_of_arm(trials_of(runs), word)
 
 
 def test_renders_are_entered_under_an_arm_with_settings(runs):

@@ -19,46 +19,42 @@ from gsbench.analysis.differences import (
     representatives,
 )
 from gsbench.analysis.pairing import choose_pairs, controls_of
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
-from gsbench.analysis.tables import build_table
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Arm
-from tests.analysis.synthetic import write_arms
+from tests.analysis.helpers import loaded, page_of, table_of
 from tests.conftest import ROOT, script
-from tests.helpers import read_json, write
+from tests.helpers import change_json
+from tests.trials import write_arms
 
 shipped_arms = script("fidelity").shipped_arms
 SCHEDULE = {"train.densify_start": 500, "train.densify_stop": 15_000, "train.mcmc_stop": 25_000}
-SCHEDULE |= {
-    "train.densify_interval": 100,
-    "train.opacity_reset_interval": 3000,
-    "train.iterations": 30_000,
-}
-
-
-def config(name, **changes):
-    """The settings of a shipped densifier as a trial records them, with ``changes``."""
-    own = {
-        f"densify.{key}": SCHEDULE.get(str(v).strip("${}"), v)
-        for key, v in shipped_arms()[name].items()
-    }
-    return SCHEDULE | own | {f"densify.{key}": v for key, v in changes.items()}
+SCHEDULE |= {"train.densify_interval": 100, "train.opacity_reset_interval": 3000}
+SCHEDULE |= {"train.iterations": 30_000}
 
 
 def densifier(name, **changes):
-    """The same settings without the prefix ``densify.``."""
-    prefix = "densify."
-    return {
-        key.removeprefix(prefix): v
-        for key, v in config(name, **changes).items()
-        if key.startswith(prefix)
-    }
+    """The settings of a shipped densifier, with ``changes``."""
+    own = {key: SCHEDULE.get(str(v).strip("${}"), v) for key, v in shipped_arms()[name].items()}
+    return own | changes
 
 
-def trials_of(runs, arms, **settings):
-    write_arms(runs, arms, **settings)
-    return with_variants(load_experiment(runs, "exp").trials)
+def config(name, **changes):
+    """The same settings as a trial records them."""
+    return SCHEDULE | {f"densify.{key}": v for key, v in densifier(name, **changes).items()}
+
+
+def write_two(runs, *names):
+    return write_arms(runs, {name: densifier(name) for name in names})
+
+
+def sentences(runs):
+    """What the table says of the differences between arms."""
+    return [note for note in table_of(runs).notes if "differs from" in note]
+
+
+def trials_of(runs, arms, settings=None):
+    write_arms(runs, arms, settings=settings)
+    return with_variants(loaded(runs).trials)
 
 
 def sentence(trials, first, second):
@@ -108,15 +104,9 @@ def test_every_shipped_class_lists_how_it_departs_from_adc():
 
 
 def test_settings_that_only_name_or_place_a_trial_are_no_ingredients():
-    other = config("adc") | {
-        "densify.name": "adc-2",
-        "eval.primary": "psnr",
-        "eval.lpips": [],
-        "train.log_every": 1,
-    }
-    assert (
-        ingredients(config("adc"), other | {"seed": 4, "threads": 2, "launch.name": "slurm"}) == ()
-    )
+    other = config("adc") | {"densify.name": "adc-2", "eval.primary": "psnr", "eval.lpips": []}
+    other |= {"train.log_every": 1, "seed": 4, "threads": 2, "launch.name": "slurm"}
+    assert ingredients(config("adc"), other) == ()
 
 
 @pytest.mark.parametrize(
@@ -128,64 +118,37 @@ def test_a_users_setting_that_begins_like_an_ignored_one_is_an_ingredient(key):
 
 
 def test_changes_outside_the_densifier_are_ingredients():
-    other = config("adc", stop=9000) | {
-        "train.opacity": 0.05,
-        "train.scale": 0.1,
-        "scene.max_size": 160,
-    }
-    assert set(ingredients(config("adc"), other)) == {
-        "schedule",
-        "learning rates",
-        "scene.max_size",
-    }
-    sfm = config("adc") | {
-        "init._target_": "gsbench.init.Sfm",
-        "init.max_num_features": 1,
-        "init.poses": "own",
-    }
-    dim = config("adc") | {
-        "init._target_": "gsbench.init.Dim",
-        "init.extractor": "aliked",
-        "init.poses": "shared",
-    }
-    assert set(ingredients(sfm, dim)) == {"initial cloud", "cameras"}
+    other = config("adc", stop=9000)
+    other |= {"train.opacity": 0.05, "train.scale": 0.1, "scene.max_size": 160}
+    found = ingredients(config("adc"), other)
+    assert {*found} == {"schedule", "learning rates", "scene.max_size"}
+    sfm = config("adc") | {"init._target_": "gsbench.init.Sfm", "init.max_num_features": 1}
+    dim = config("adc") | {"init._target_": "gsbench.init.Dim", "init.extractor": "aliked"}
+    found = ingredients(sfm | {"init.poses": "own"}, dim | {"init.poses": "shared"})
+    assert {*found} == {"initial cloud", "cameras"}
 
 
 def test_a_users_class_with_its_settings_is_one_ingredient():
     """Between two versions of one such class, each setting is an ingredient."""
-    own = config("adc") | {"densify._target_": "mine.Patient", "densify.patience": 3}
-    assert ingredients(config("adc"), own) == ("rule mine.Patient",)
-    assert ingredients(config("adc"), own | {"densify.interval": 50}) == (
-        "rule mine.Patient",
-        "schedule",
-    )
-    assert ingredients(own, own | {"densify.patience": 4, "densify.options.depth": 1}) == (
-        "patience",
-        "options.depth",
-    )
-    assert ingredients(config("longaxis"), own)[0] == "rule mine.Patient"
+    rule = "rule mine.Patient"
+    own = config("adc", _target_="mine.Patient", patience=3)
+    assert ingredients(config("adc"), own) == (rule,)
+    assert ingredients(config("adc"), own | {"densify.interval": 50}) == (rule, "schedule")
+    later = own | {"densify.patience": 4, "densify.options.depth": 1}
+    assert ingredients(own, later) == ("patience", "options.depth")
+    assert ingredients(config("longaxis"), own)[0] == rule
 
 
 def test_a_comparison_of_several_ingredients_is_reported(tmp_path):
-    trials = trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
-    assert sentence(trials, "adc", "longaxis") == (
-        "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
-    )
-    page = build_report(load_experiment(tmp_path, "exp"))
-    assert (
-        "longaxis differs from sfm-adc by split, gradient and threshold"
-        in page.split("</strong>")[0]
-    )
-    notes = build_table(load_experiment(tmp_path, "exp")).notes
-    assert sentence(trials, "adc", "longaxis") in notes
+    write_two(tmp_path, "adc", "longaxis")
+    said = "sfm-longaxis differs from sfm-adc by split, gradient and threshold."
+    assert sentences(tmp_path) == [said]
+    assert said.rstrip(".") in page_of(tmp_path).split("</strong>")[0]
 
 
 def test_a_comparison_that_differs_in_one_ingredient_has_no_note(tmp_path):
-    trials = trials_of(tmp_path, {"adc": densifier("adc"), "volumetric": densifier("volumetric")})
-    assert sentence(trials, "adc", "volumetric") == ""
-    assert not any(
-        "differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes
-    )
+    write_two(tmp_path, "adc", "volumetric")
+    assert sentences(tmp_path) == []
 
 
 def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path):
@@ -197,12 +160,10 @@ def test_a_setting_changed_in_all_arms_is_no_difference(tmp_path):
 
 
 def test_trials_without_recorded_settings_are_reported(tmp_path):
-    for path in write_arms(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")}):
+    for path in write_two(tmp_path, "adc", "longaxis"):
         if "longaxis" in path.parent.name:
             (path / "config.yaml").unlink()
-    assert sentence(list(load_experiment(tmp_path, "exp").trials), "adc", "longaxis").endswith(
-        f"by {NO_RECORD}."
-    )
+    assert sentence(list(loaded(tmp_path).trials), "adc", "longaxis").endswith(f"by {NO_RECORD}.")
 
 
 def test_another_program_counts_as_many_ingredients(tmp_path):
@@ -219,19 +180,16 @@ def test_another_program_counts_as_many_ingredients(tmp_path):
 def test_a_training_elsewhere_has_unknown_ingredients(tmp_path):
     for path in write_arms(tmp_path, {"adc": densifier("adc"), "theirs": densifier("adc")}):
         if path.parent.name == "sfm-theirs":
-            data = read_json(path / "results.json")
-            write(path / "results.json", data | {"evaluated_from": "model"})
-    trials = list(load_experiment(tmp_path, "exp").trials)
+            change_json(path / "results.json", evaluated_from="model")
+    trials = list(loaded(tmp_path).trials)
     assert trials[-1].made_elsewhere
     assert sentence(trials, "adc", "theirs") == f"sfm-theirs differs from sfm-adc by {ELSEWHERE}."
 
 
 def test_points_of_a_search_are_not_compared(tmp_path):
-    trials_of(tmp_path, {"adc": densifier("adc"), "longaxis": densifier("longaxis")})
+    write_two(tmp_path, "adc", "longaxis")
     (tmp_path / "exp" / "tuning.json").write_text("{}")
-    assert not any(
-        "differs from" in note for note in build_table(load_experiment(tmp_path, "exp")).notes
-    )
+    assert sentences(tmp_path) == []
 
 
 # --- controls
@@ -239,13 +197,12 @@ def test_points_of_a_search_are_not_compared(tmp_path):
 
 def test_arms_are_compared_with_their_controls(tmp_path):
     arms = {name: densifier(name) for name in ("adc", "absgrad", "longaxis")}
-    trials = trials_of(
-        tmp_path, arms, eval__controls={"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"}
-    )
+    controls = {"longaxis": "absgrad", "mcmc": "adc", "adc": "adc"}
+    trials = trials_of(tmp_path, arms, {"eval": {"controls": controls}})
     pairs = choose_pairs(sorted({trial.arm for trial in trials}), controls=controls_of(trials))
     against = [(first.densify, second.densify) for first, second in pairs]
     assert against == [("adc", "absgrad"), ("adc", "longaxis"), ("absgrad", "longaxis")]
-    assert "sfm-longaxis against sfm-absgrad" in build_report(load_experiment(tmp_path, "exp"))
+    assert "sfm-longaxis against sfm-absgrad" in page_of(tmp_path)
     varied = [
         Arm("sfm", name, (("cap", str(cap)),))
         for name in ("absgrad", "adc", "longaxis")
@@ -258,13 +215,9 @@ def test_arms_are_compared_with_their_controls(tmp_path):
 
 
 def test_naming_a_control_does_not_change_the_configuration_hash():
-    with_control = {
-        "eval": {"lpips": [], "controls": {"longaxis": "absgrad"}},
-        "densify": {"name": "adc"},
-    }
-    assert config_hash(with_control) == config_hash(
-        {"eval": {"lpips": []}, "densify": {"name": "adc"}}
-    )
+    plain = {"eval": {"lpips": []}, "densify": {"name": "adc"}}
+    named = plain | {"eval": {"lpips": [], "controls": {"longaxis": "absgrad"}}}
+    assert config_hash(named) == config_hash(plain)
 
 
 def test_experiments_list_the_control_of_every_mixed_arm():

@@ -7,16 +7,17 @@ import pytest
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.differences import find_superseded
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment, read_experiment
+from gsbench.analysis.results import read_experiment
 from gsbench.analysis.tables import build_table
 from gsbench.runs import freshness
 from gsbench.runs.user_code import module_digest
 from gsbench.verbs.results import explain_cell
-from tests.analysis.test_tables import one_trial
+from tests.analysis.helpers import loaded, page_of, trials_of
+from tests.trials import write_trial
 
 OLD, NEW = "1" * 64, "2" * 64
 STAGES = {"scene": 1, "init": 1, "train": 1, "evaluate": 1}
-MINE = {"densify___target_": "mine.Patient"}
+MINE = {"densify._target_": "mine.Patient"}
 
 
 def code(digest=None, **stages):
@@ -28,7 +29,7 @@ def of_gsbench(**packages):
 
 
 def table_of(runs):
-    return build_table(load_experiment(runs, "exp"), metrics=["psnr"])
+    return build_table(loaded(runs), metrics=["psnr"])
 
 
 def finished_at(path, seconds):
@@ -38,14 +39,14 @@ def finished_at(path, seconds):
 
 def test_the_newest_code_counts_and_one_line_names_all_earlier_versions(tmp_path):
     for seed in (0, 1):
-        finished_at(one_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
-    finished_at(one_trial(tmp_path, 1, "cccccccc", MINE, psnr=26.0, _code=code("3" * 64)), 1500)
-    finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW)), 2000)
+        finished_at(write_trial(tmp_path, seed, "aaaaaaaa", MINE, psnr=27.0, _code=code(OLD)), 1000)
+    finished_at(write_trial(tmp_path, 1, "cccccccc", MINE, psnr=26.0, _code=code("3" * 64)), 1500)
+    finished_at(write_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=28.0, _code=code(NEW)), 2000)
     words = (
         "exp: 3 trials of sfm-adc made by earlier versions of mine: 11111111 (2), 33333333 (1); "
         "the trials that count have 22222222"
     )
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     assert experiment.warnings == (words,)
     assert [trial.seed for trial in experiment.trials] == [1]
     table = build_table(experiment, metrics=["psnr"])
@@ -54,26 +55,26 @@ def test_the_newest_code_counts_and_one_line_names_all_earlier_versions(tmp_path
     assert words in explain_cell("exp:garden:psnr:adc", tmp_path)
     page = build_report(experiment)
     assert (words in page, "Not in this report: 3 of" in page) == (True, True)
-    one_trial(tmp_path, 0, "dddddddd", psnr=26.0, _densify="other", _code=code())
+    write_trial(tmp_path, 0, "dddddddd", psnr=26.0, densify="other", _code=code())
     assert words not in explain_cell("exp:garden:psnr:other", tmp_path)
 
 
 def test_choices_by_earlier_code_are_counted(tmp_path):
-    one_trial(tmp_path, 0, psnr=26.0, _densify="none", _code=code())
+    write_trial(tmp_path, psnr=26.0, densify="none", _code=code())
     for number, (version, views) in enumerate([(OLD, 5), ("3" * 64, 5), (NEW, 5), (NEW, 8)]):
-        made = MINE | {"densify__views": views}
+        made = MINE | {"densify.views": views}
         finished_at(
-            one_trial(tmp_path, 0, f"{number:08}", made, psnr=27.0, _code=code(version)), number
+            write_trial(tmp_path, 0, f"{number:08}", made, psnr=27.0, _code=code(version)), number
         )
-    page = build_report(load_experiment(tmp_path, "exp"))
+    page = page_of(tmp_path)
     said = "4 choices of settings and code ran here. They differ in densify.views and code of mine,"
     assert said in page
 
 
 def test_older_trials_with_other_settings_still_count(tmp_path):
-    one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify__views": 5}, psnr=27.0, _code=code(OLD))
-    one_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify__views": 8}, psnr=28.0, _code=code(NEW))
-    experiment = load_experiment(tmp_path, "exp")
+    write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"densify.views": 5}, psnr=27.0, _code=code(OLD))
+    write_trial(tmp_path, 0, "bbbbbbbb", MINE | {"densify.views": 8}, psnr=28.0, _code=code(NEW))
+    experiment = loaded(tmp_path)
     assert (len(experiment.trials), experiment.older, experiment.warnings) == (2, (), ())
 
 
@@ -89,9 +90,9 @@ def test_older_trials_with_other_settings_still_count(tmp_path):
     ],
 )
 def test_older_trials_of_gsbench_are_left_out(tmp_path, old, new, part):
-    finished_at(one_trial(tmp_path, 0, psnr=27.0, **old), 1000)
-    finished_at(one_trial(tmp_path, 1, psnr=27.0, **new), 2000)
-    experiment = load_experiment(tmp_path, "exp")
+    finished_at(write_trial(tmp_path, psnr=27.0, **old), 1000)
+    finished_at(write_trial(tmp_path, 1, psnr=27.0, **new), 2000)
+    experiment = loaded(tmp_path)
     assert [trial.seed for trial in experiment.trials] == [1]
     assert f"made by earlier versions of {part}: " in experiment.warnings[0]
 
@@ -101,10 +102,10 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path
     (tmp_path / "patient.py").write_text("x = 1\n")
     here = module_digest("patient", str(tmp_path))
     made = {"sources": {"patient": here}, "stages": STAGES}
-    finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=made), 1000)
+    finished_at(write_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=27.0, _code=made), 1000)
     other = {"sources": {"patient": NEW}, "stages": STAGES}
-    finished_at(one_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _code=other), 2000)
-    assert load_experiment(tmp_path, "exp").trials[0].metrics["psnr"] == 27.0
+    finished_at(write_trial(tmp_path, 0, "bbbbbbbb", MINE, psnr=28.0, _code=other), 2000)
+    assert trials_of(tmp_path)[0].metrics["psnr"] == 27.0
     (tmp_path / "patient.py").write_text("# a comment\nx  =  1\n")
     table = table_of(tmp_path)
     assert table.rows[0].entries[0].text == "27.00"
@@ -117,7 +118,7 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path
         "to run the new one."
     )
     assert line in table.notes
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     comparison = compare(experiment)
     # the sweep's end, plan and site have the remarks
     assert [*map(str, comparison.remarks)] == [line]
@@ -139,8 +140,8 @@ def test_the_code_that_is_here_now_counts_before_what_was_finished_last(tmp_path
     ids=["two versions of a class", "a class of one arm", "a package of one arm"],
 )
 def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, first, second, best):
-    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
-    one_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, _densify="other", **second)
+    write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, **first)
+    write_trial(tmp_path, 0, "bbbbbbbb", psnr=28.0, densify="other", **second)
     table = table_of(tmp_path)
     assert [entry.bold for row in table.rows for entry in row.entries] == [False, best]
     said = "garden: not compared, no best marked: the arms differ in code of mine."
@@ -148,19 +149,21 @@ def test_arms_are_compared_unless_they_share_code_in_two_versions(tmp_path, firs
 
 
 def test_a_scene_in_another_folder_is_no_other_version(tmp_path):
-    one_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene__path": "/here"}, psnr=27.0, _code=code(NEW))
-    one_trial(tmp_path, 1, "bbbbbbbb", MINE | {"scene__path": "/there"}, psnr=28.0, _code=code(NEW))
+    write_trial(tmp_path, 0, "aaaaaaaa", MINE | {"scene.path": "/here"}, psnr=27.0, _code=code(NEW))
+    write_trial(
+        tmp_path, 1, "bbbbbbbb", MINE | {"scene.path": "/there"}, psnr=28.0, _code=code(NEW)
+    )
     assert table_of(tmp_path).rows[0].entries[0].text == "27.50 ± 0.71"
 
 
 def test_explain_names_the_commit_and_the_edited_packages(tmp_path):
     made = of_gsbench(train="released", eval="a" * 16) | {"commit": "0123abcd", "edited": True}
-    one_trial(tmp_path, 0, psnr=27.0, _code=made)
+    write_trial(tmp_path, psnr=27.0, _code=made)
     said = explain_cell("exp:garden:psnr:adc", tmp_path)
     assert "commit    0123abcd, edited" in said
     assert "edited    since the last release: eval" in said
     unreleased = of_gsbench(train="b" * 16, eval="a" * 16) | {"commit": "0123abcd", "edited": False}
-    one_trial(tmp_path / "other", 0, psnr=27.0, _code=unreleased)
+    write_trial(tmp_path / "other", 0, psnr=27.0, _code=unreleased)
     said = explain_cell("exp:garden:psnr:adc", tmp_path / "other")
     assert "commit    0123abcd\n" in said
     assert "since the last release" not in said
@@ -193,8 +196,8 @@ def test_explain_names_the_commit_and_the_edited_packages(tmp_path):
 def test_superseded_trials_are_named_with_the_reason(
     tmp_path, monkeypatch, old, new, here, reasons
 ):
-    first = finished_at(one_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=old), 1000)
-    second = finished_at(one_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=new), 2000)
+    first = finished_at(write_trial(tmp_path, 0, "aaaaaaaa", MINE, psnr=1.0, _code=old), 1000)
+    second = finished_at(write_trial(tmp_path, 1, "bbbbbbbb", MINE, psnr=1.0, _code=new), 2000)
     monkeypatch.setattr(freshness, "module_digest", lambda name, folder: {"there": here}[folder])
     folders = {first: "there", second: "there"} if here else {}
     found = find_superseded(read_experiment(tmp_path / "exp").trials, folders)

@@ -6,10 +6,10 @@ import json
 import os
 import random
 import shutil
-import tempfile
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,10 +23,8 @@ from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.notes import texts
 from gsbench.analysis.quantities import quantity
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_all_trials, load_experiment
+from gsbench.analysis.results import load_all_trials
 from gsbench.analysis.statistics import t_test
-from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import sentence
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
@@ -38,10 +36,12 @@ from gsbench.runs.experiments import Arm, Declaration, Question, open_question, 
 from gsbench.tracking.comparison import description
 from gsbench.verbs.claims import plan
 from gsbench.verbs.results import explain_cell, tables
-from tests.analysis.synthetic import METRICS, Plan, trial_data, write_trial
+from tests.analysis.helpers import loaded, page_of, table_of, write_declared
 from tests.conftest import script
+from tests.helpers import change_json, read_json
+from tests.helpers import write as write_file
+from tests.trials import write_trial
 
-DECLARED_AT = "2026-01-01T00:00:00Z"
 OLD, NEW = "1" * 64, "2" * 64
 EXAMPLES = int(os.environ.get("GSBENCH_EXAMPLES", "0"))  # of random experiments
 
@@ -66,21 +66,35 @@ class Made:
     def key(self):
         return f"{self.scene}/{self.init}-{self.densify}/{self.hash}"
 
+    def results(self, runs):
+        return runs / "exp" / f"{self.key}-seed{self.seed}" / "results.json"
+
 
 def write(runs, trials, experiment="exp"):
     for one in trials:
         rng = random.Random(repr(one))
-        views = {m: np.array([20.0 + rng.gauss(0, 0.1)]) for m in METRICS[:2]}
-        data = trial_data(Plan(experiment), one.scene, one.init, one.densify, one.seed, views)
-        data["measured"] = f"2026-01-{one.day:02d}T00:00:00Z"
-        sources = {"mine": one.code} if one.code else {}
-        data["code"] = {"sources": sources, "stages": {"train": 2}}
-        path = write_trial(runs, data, views, one.hash)
-        config = json.loads((path / "config.yaml").read_text())
-        config["densify"] |= dict(one.options)
-        (path / "config.yaml").write_text(json.dumps(config))
+        path = write_trial(
+            runs,
+            one.seed,
+            one.hash,
+            {f"densify.{name}": value for name, value in one.options},
+            **{"experiment": experiment, "scene": one.scene},
+            **{"init": one.init, "densify": one.densify},
+            **{metric: 20.0 + rng.gauss(0, 0.1) for metric in ("psnr", "ssim")},
+            _measured=midnight(one.day),
+            _code={"sources": {"mine": one.code} if one.code else {}, "stages": {"train": 2}},
+        )
         moment = 1_767_225_600 + 86_400 * one.day
         os.utime(path / "results.json", (moment, moment))
+
+
+def midnight(day):
+    return f"2026-01-{day:02d}T00:00:00Z"
+
+
+def on_day(day, trials, metric="psnr"):
+    """A command's declaration of a metric with these trials {key: seeds}."""
+    return Declaration(time=midnight(day), questions=(open_question(metric),), trials=trials)
 
 
 def declare(runs, *records, metric="psnr"):
@@ -90,9 +104,8 @@ def declare(runs, *records, metric="psnr"):
         for one in made:
             trials.setdefault(one.key, set()).add(one.seed)
         named = {key: tuple(sorted(seeds)) for key, seeds in trials.items()}
-        time = f"2026-01-{day:02d}T00:00:00Z"
-        entries.append(Declaration(time=time, questions=(open_question(metric),), trials=named))
-    (runs / "exp" / "declared.jsonl").write_text(record_text(entries))
+        entries.append(on_day(day, named, metric))
+    write_declared(runs, *entries)
 
 
 def grid(densify, seeds=3, day=2, code="", **options):
@@ -100,8 +113,12 @@ def grid(densify, seeds=3, day=2, code="", **options):
     return [Made(densify, named, seed=seed, day=day, code=code) for seed in range(seeds)]
 
 
-def answer(runs):
-    return compare(load_experiment(runs, "exp"))
+def answer(runs, *baseline):
+    return compare(loaded(runs), *baseline)
+
+
+def remarks(runs):
+    return texts(answer(runs).remarks)
 
 
 def against(comparison):
@@ -122,7 +139,7 @@ def test_an_arm_stays_compared_when_another_is_added(tmp_path):
     ]
     assert against(after) == [("sfm-absgs", "sfm-adc"), *against(before)]
     assert set(before.sentences) < set(after.sentences)
-    rows = [row.labels[3] for row in build_table(after.experiment).rows]
+    rows = [row.labels[3] for row in table_of(tmp_path).rows]
     assert rows == ["–", "–", "0.9", "0.99"]  # adc and absgs have no such setting
     assert "decay=0.9" in explain_cell("exp:a:psnr:momentum[decay=0.9]", tmp_path)
 
@@ -155,11 +172,11 @@ def in_looks(*pairs, scenes="a"):
         )
         for first, second in pairs
     ]
-    return Declaration(time=DECLARED_AT, questions=tuple(questions), looks=(2, 3))
+    return Declaration(time=midnight(1), questions=tuple(questions), looks=(2, 3))
 
 
 def declare_looks(runs, *pairs, **scenes):
-    (runs / "exp" / "declared.jsonl").write_text(record_text([in_looks(*pairs, **scenes)]))
+    write_declared(runs, in_looks(*pairs, **scenes))
 
 
 def test_the_baseline_that_a_sweep_in_looks_declared_stays_it_if_another_arm_ended_first(tmp_path):
@@ -183,6 +200,7 @@ def test_a_sweep_in_looks_gets_no_verdict_that_it_did_not_declare(tmp_path):
 
 
 BOTH_CAPS = ("sfm-adc[cap=2]", "sfm-adc[cap=1]")
+ADC_CAPS = [grid("adc", cap=cap) for cap in (1, 2)]
 
 
 def test_a_sweep_in_looks_keeps_its_verdict_when_a_baseline_is_added(tmp_path):
@@ -218,18 +236,12 @@ def test_a_look_whose_first_seed_failed_says_that_it_waits(tmp_path):
 def test_another_metric_declared_for_a_later_arm_keeps_the_verdict_on_an_earlier_one(tmp_path):
     early, late = [*grid("adc"), *grid("mine")], grid("more", day=6)
     write(tmp_path, early)
-    first, second = (
-        [Declaration(time=time, questions=(open_question(metric),), trials=named)]
-        for time, metric, named in (
-            (DECLARED_AT, "psnr", {one.key: (0, 1, 2) for one in early}),
-            ("2026-01-05T00:00:00Z", "ssim", {one.key: (0, 1, 2) for one in [*early, *late]}),
-        )
-    )
-    file = tmp_path / "exp" / "declared.jsonl"
-    file.write_text(record_text(first))
+    first = on_day(1, {one.key: (0, 1, 2) for one in early})
+    second = on_day(5, {one.key: (0, 1, 2) for one in [*early, *late]}, "ssim")
+    write_declared(tmp_path, first)
     (before,) = answer(tmp_path).sentences
     write(tmp_path, late)
-    file.write_text(record_text(first + second))
+    write_declared(tmp_path, first, second)
     found = answer(tmp_path)
     kept, other = found.sentences
     assert kept == before
@@ -244,13 +256,13 @@ def test_another_metric_declared_for_a_later_arm_keeps_the_verdict_on_an_earlier
 
 @pytest.mark.parametrize("looks", [False, True])
 def test_a_baseline_that_is_chosen_later_declares_no_other_pairs(tmp_path, looks):
-    arms = first, second, third = [grid(name) for name in ("adc", "mine", "more")]
-    trials = [one for arm in arms for one in arm]
+    first, second, third = (grid(name) for name in ("adc", "mine", "more"))
+    trials = [*first, *second, *third]
     write(tmp_path, trials)
     declare(tmp_path, (1, trials))
     if looks:
         declare_looks(tmp_path, (first, second), (first, third))
-    found = compare(load_experiment(tmp_path, "exp"), "mine")
+    found = answer(tmp_path, "mine")
     stated = {(str(one.second), str(one.first)): one for one in found.answers}
     assert not stated["sfm-more", "sfm-mine"].beforehand
     assert "but not for this pair of arms" in sentence(stated["sfm-more", "sfm-mine"])
@@ -261,23 +273,22 @@ def test_a_baseline_that_is_chosen_later_declares_no_other_pairs(tmp_path, looks
 def gain(runs, trials, by=5.0):
     """Raise the PSNR of trials of one view."""
     for one in trials:
-        file = runs / "exp" / f"{one.key}-seed{one.seed}" / "results.json"
-        data = json.loads(file.read_text())
-        old = data["metrics"]["psnr"]
-        data["metrics"]["psnr"] = old + by
-        file.write_text(json.dumps(data))
+        file = one.results(runs)
+        metrics = read_json(file)["metrics"]
+        old = metrics["psnr"]
+        change_json(file, metrics=metrics | {"psnr": old + by})
         views = file.with_name("per_view.csv")
         views.write_text(views.read_text().replace(repr(old), repr(old + by)))
 
 
 def test_seeds_added_to_one_arm_leave_the_others_their_family(tmp_path):
-    arms = [grid(name) for name in ("adc", "mine", "more")]
-    trials = [one for arm in arms for one in arm]
+    adc, mine, third = (grid(name) for name in ("adc", "mine", "more"))
+    trials = [*adc, *mine, *third]
     write(tmp_path, trials)
     declare(tmp_path, (1, trials))
     before = answer(tmp_path).sentences
     assert "adjusted for 2 tests" in before[1]
-    more = [replace(one, seed=3, day=6) for one in (arms[0][0], arms[1][0])]
+    more = [replace(one, seed=3, day=6) for one in (adc[0], mine[0])]
     write(tmp_path, more)
     declare(tmp_path, (1, trials), (5, more))
     after = answer(tmp_path).sentences
@@ -285,13 +296,11 @@ def test_seeds_added_to_one_arm_leave_the_others_their_family(tmp_path):
     assert after[1] == before[1]
 
 
-def drop_value(runs, made, metric="psnr", reason="it is not a number"):
-    file = runs / "exp" / f"{made.key}-seed{made.seed}" / "results.json"
-    data = json.loads(file.read_text())
-    del data["metrics"][metric]
-    data["unavailable"][metric] = reason
-    moment = file.stat().st_mtime
-    file.write_text(json.dumps(data))
+def drop_psnr(runs, made):
+    file = made.results(runs)
+    moment, metrics = file.stat().st_mtime, read_json(file)["metrics"]
+    del metrics["psnr"]
+    change_json(file, metrics=metrics, unavailable={"psnr": "it is not a number"})
     os.utime(file, (moment, moment))
 
 
@@ -304,37 +313,29 @@ def test_an_arm_gains_nothing_by_a_trial_without_a_value(tmp_path, declared):
     if declared:
         declare(tmp_path, (1, [*adc, *mine]))
     assert "better in PSNR" in answer(tmp_path).sentences[0]
-    drop_value(tmp_path, mine[1])
+    drop_psnr(tmp_path, mine[1])
     found = answer(tmp_path)
     (verdict,) = [one for one in found.answers[0].verdicts if one.question.metric == "psnr"]
     assert verdict.favours_lacking
     assert "1 trial of one arm alone failed, stopped or gave no value" in found.sentences[0]
     line = "PSNR (dB): a seed 1 not compared: it is not a number"
-    experiment = found.experiment
-    for told in (
-        texts(found.remarks),
-        found.to_json()["left_out"],
-        build_table(experiment).notes,
-    ):
+    left_out = found.to_json()["left_out"]
+    for told in (remarks(tmp_path), left_out, table_of(tmp_path).notes, page_of(tmp_path)):
         assert line in told
-    assert line in build_report(experiment)
     for one in (mine[0], mine[2], mine[3]):
-        drop_value(tmp_path, one)
-    assert "PSNR (dB): sfm-mine not compared: it is not a number" in texts(answer(tmp_path).remarks)
+        drop_psnr(tmp_path, one)
+    assert "PSNR (dB): sfm-mine not compared: it is not a number" in remarks(tmp_path)
 
 
 def test_a_metric_without_a_direction_is_named(tmp_path):
     trials = [*grid("adc"), *grid("mine")]
     write(tmp_path, trials)
     for one in trials:
-        file = tmp_path / "exp" / f"{one.key}-seed{one.seed}" / "results.json"
-        data = json.loads(file.read_text())
-        data["metrics"]["fancy"] = 1.0
-        file.write_text(json.dumps(data))
+        change_json(one.results(tmp_path), metrics={"psnr": 20.0, "fancy": 1.0})
     line = "fancy: in no verdict, unknown whether higher is better: set `direction` in the metric's"
-    assert line in texts(answer(tmp_path).remarks)[0]
+    assert line in remarks(tmp_path)[0]
     declare(tmp_path, (1, trials), metric="fancy")
-    assert "the declared metric fancy has no direction (unknown" in (answer(tmp_path).sentences[0])
+    assert "the declared metric fancy has no direction (unknown" in answer(tmp_path).sentences[0]
 
 
 def test_settings_of_the_baseline_stay_compared_when_an_arm_is_added(tmp_path):
@@ -358,41 +359,32 @@ def test_initialisers_stay_compared_when_an_arm_is_added(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "arms, pairs, named",
+    "arms, pairs",
     [
         # the settings that both have decide
+        ([*ADC_CAPS, grid("mine", cap=2, lr=3)], [("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS]),
+        ([ADC_CAPS[0], grid("mine", cap=2)], [("sfm-mine", "sfm-adc")]),
         (
-            [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 2, "lr": 3})],
-            [("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
-            "",
-        ),
-        ([("adc", {"cap": 1}), ("mine", {"cap": 2})], [("sfm-mine", "sfm-adc")], ""),
-        (
-            [("adc", {"cap": 1}), ("adc", {"cap": 2}), ("mine", {"cap": 4})],
+            [*ADC_CAPS, grid("mine", cap=4)],
             [("sfm-mine", "sfm-adc[cap=1]"), ("sfm-mine", "sfm-adc[cap=2]"), BOTH_CAPS],
-            "",
         ),
         # without a baseline: an external trainer swept over an option, and no densification
         (
-            [("brush", {"grow": 1}), ("brush", {"grow": 2}), ("none", {})],
+            [grid("brush", grow=1), grid("brush", grow=2), grid("none")],
             [("sfm-brush[grow=2]", "sfm-brush[grow=1]"), ("sfm-none", "sfm-brush[grow=1]")],
-            "",
         ),
     ],
 )
-def test_every_arm_is_compared_by_the_settings_that_both_have(tmp_path, arms, pairs, named):
-    for densify, options in arms:
-        write(tmp_path, grid(densify, **options))
-    found = answer(tmp_path)
-    assert against(found) == pairs
-    assert named in "\n".join(texts(found.unused))
+def test_every_arm_is_compared_by_the_settings_that_both_have(tmp_path, arms, pairs):
+    write(tmp_path, itertools.chain(*arms))
+    assert against(answer(tmp_path)) == pairs
 
 
 def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
     alone = [replace(one, init="random") for one in grid("mine")]
     write(tmp_path, [*grid("adc"), *grid("mine"), *alone])
     reason = "random-mine is not compared: there is no random-adc."
-    experiment = load_experiment(tmp_path, "exp")
+    experiment = loaded(tmp_path)
     assert texts(answer(tmp_path).unused) == [reason]
     plan(["exp"], tmp_path)
     tables(["exp", "--format", "json"], tmp_path)
@@ -400,8 +392,9 @@ def test_an_arm_without_a_baseline_is_named_everywhere(tmp_path, capsys):
     assert said.count(reason) == 2
     write_archive(experiment, tmp_path / "exp.zip")
     write_site([tmp_path / "exp.zip"], tmp_path / "site", "title", tmp_path / "scratch")
-    pages = [build_report(experiment), (tmp_path / "site" / "index.html").read_text()]
-    for text in (*pages, description(experiment), "\n".join(build_table(experiment).notes)):
+    site = (tmp_path / "site" / "index.html").read_text()
+    notes = "\n".join(table_of(tmp_path).notes)
+    for text in (page_of(tmp_path), site, description(experiment), notes):
         assert reason in text
 
 
@@ -444,7 +437,6 @@ def test_a_question_is_declared_if_it_was_fixed_before_the_first_trial_of_its_ar
     )
     found = {one.second.densify: one for one in answer(tmp_path).answers}
     standing = found["mine"].standing
-    assert standing is not None
     assert standing.doubt.startswith(doubt)
     assert standing.beforehand == (not doubt)
     assert sentence(found["mine"]).endswith("The metric was declared beforehand.") == (not doubt)
@@ -459,8 +451,7 @@ def test_repaired_code_leaves_no_declared_trial_missing_for_ever(tmp_path):
     assert "missing" not in "\n".join(texts(found.declared_notes))
     assert "made by earlier versions of mine" in found.experiment.warnings[0]
     # the old code failed before any result: its folder has settings, but no results
-    folder = tmp_path / "exp" / old[0].key
-    (folder.parent / f"{folder.name}-seed0" / "results.json").unlink()
+    old[0].results(tmp_path).unlink()
     assert "missing" not in "\n".join(texts(answer(tmp_path).declared_notes))
 
 
@@ -473,7 +464,7 @@ def test_the_end_of_a_sweep_names_trials_of_earlier_code(tmp_path, caplog):
 
 def forget(runs):
     """Remove the trials of earlier code, as ``status --forget-superseded`` does."""
-    older = load_experiment(runs, "exp").older
+    older = loaded(runs).older
     remove(runs / "exp", [trial.path for trial in older])
     return len(older)
 
@@ -492,7 +483,7 @@ def test_forgotten_trials_of_earlier_code_still_count_as_seen(tmp_path):
     after = answer(tmp_path)
     assert after.experiment.warnings == ()
     assert after.sentences == before.sentences
-    assert "missing" not in "\n".join(build_table(after.experiment).notes)
+    assert "missing" not in "\n".join(table_of(tmp_path).notes)
     write_archive(load_all_trials(tmp_path, "exp"), tmp_path / "exp.zip")
     there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
     assert there.sentences == before.sentences
@@ -523,8 +514,8 @@ def test_other_code_on_the_same_seeds_under_another_name_is_named_everywhere(
     line = "Also measured by other code on these scenes and seeds: sfm-mine, in tried."
     for text in (
         "\n".join(texts(found.remarks)),
-        "\n".join(build_table(found.experiment).notes),
-        build_report(found.experiment),
+        "\n".join(table_of(tmp_path).notes),
+        page_of(tmp_path),
         description(found.experiment),
         found.to_json()["left_out"][0] if named else "",
     ):
@@ -583,10 +574,8 @@ def test_what_old_code_showed_before_the_declaration_was_seen(tmp_path):
 
 def fail(runs, made):
     """Make the folder of a trial that failed."""
-    folder = runs / "exp" / f"{made.key}-seed{made.seed}"
-    folder.mkdir()
     config = {"densify": {"name": made.densify} | dict(made.options)}
-    (folder / "config.yaml").write_text(json.dumps(config))
+    write_file(made.results(runs).with_name("config.yaml"), config)
 
 
 def test_an_archive_gives_the_same_answers(tmp_path):
@@ -601,13 +590,14 @@ def test_an_archive_gives_the_same_answers(tmp_path):
     here = answer(tmp_path)
     assert [one.second.densify for one in here.answers if not one.beforehand] == ["mine"]
     assert "1 trial of one arm alone failed" in here.sentences[1]
-    write_archive(load_all_trials(tmp_path, "exp"), tmp_path / "exp.zip")
-    there = compare(unpack_archive(tmp_path / "exp.zip", tmp_path / "back"))
+    file = tmp_path / "exp.zip"
+    write_archive(load_all_trials(tmp_path, "exp"), file)
+    there = compare(unpack_archive(file, tmp_path / "back"))
     assert there.sentences == here.sentences
     assert texts(there.remarks) == texts(here.remarks)
     assert "made by earlier versions of mine" in there.to_json()["left_out"][-1]
     question = PooledQuestion(("lost",), ("adc",), "psnr")
-    _, notes, _ = read_studies(tmp_path / "exp.zip", question, "ours")
+    _, notes, _ = read_studies(file, question, "ours")
     assert f"ours: left out, exp/{lost[3].key}-seed3: unfinished" in "\n".join(notes)
 
 
@@ -632,10 +622,9 @@ def test_each_version_of_the_code_on_the_same_seeds_has_a_smaller_error_rate(tmp
         "(with other seeds under another name: 5 %)."
     )
     # of seeds that only the newest code was trained on, nothing was seen
-    fresh = [replace(one, seed=one.seed + 7) for one in (*adc, *third)]
     for one in (*adc, *third):
-        shutil.rmtree(tmp_path / "exp" / one.key.rpartition("/")[0] / f"{one.hash}-seed{one.seed}")
-    write(tmp_path, fresh)
+        shutil.rmtree(one.results(tmp_path).parent)
+    write(tmp_path, [replace(one, seed=one.seed + 7) for one in (*adc, *third)])
     assert {one.second.densify: one.versions for one in answer(tmp_path).answers}["mine"] == 1
 
 
@@ -710,7 +699,7 @@ class Experiment:
     def write(self, runs, order=None):
         write(runs, order or self.trials)
         for one in self.without:
-            drop_value(runs, one)
+            drop_psnr(runs, one)
         if self.looks:
             declare_looks(runs, *self.looks, scenes=sorted({one.scene for one in self.trials}))
         elif self.declared:
@@ -792,22 +781,23 @@ def outcomes(comparison):
     }
 
 
+many_examples = settings(max_examples=EXAMPLES or 12, deadline=None)
+
+
 @pytest.mark.parametrize("what", ADDED)
 def test_what_is_added_never_changes_another_verdict(what):
-    @settings(max_examples=EXAMPLES or 12, deadline=None)
+    @many_examples
     @given(experiments(), st.booleans())
     def check(made, other_metric):
-        runs = Path(tempfile.mkdtemp())
-        try:
+        with TemporaryDirectory() as folder:
+            runs = Path(folder)
             made.write(runs)
             before = answer(runs)
             added = set(ADDED[what](made)) - set(made.trials)
             write(runs, sorted(added, key=repr))
             file = runs / "exp" / "declared.jsonl"
             if other_metric and file.exists():
-                named = {one.key: (one.seed,) for one in added}
-                asked = (open_question("ssim"),)
-                later = Declaration(time="2026-02-01T00:00:00Z", questions=asked, trials=named)
+                later = on_day(31, {one.key: (one.seed,) for one in added}, "ssim")
                 file.write_text(file.read_text() + record_text([later]))
             (runs / "exp" / "d" / "sfm-mine" / "deadbeef-seed0").mkdir(parents=True)  # it failed
             after = answer(runs)
@@ -819,8 +809,6 @@ def test_what_is_added_never_changes_another_verdict(what):
                 own = own or (what == OLD_VERSIONS and pair[0] == str(last_arm))
                 assert own or changed[pair] == found
             check_all_is_named(after)
-        finally:
-            shutil.rmtree(runs)
 
     check()
 
@@ -828,14 +816,12 @@ def test_what_is_added_never_changes_another_verdict(what):
 @settings(max_examples=EXAMPLES or 8, deadline=None)
 @given(experiments())
 def test_forgetting_earlier_code_never_changes_a_verdict(made):
-    runs = Path(tempfile.mkdtemp())
-    try:
+    with TemporaryDirectory() as folder:
+        runs = Path(folder)
         made.write(runs)
         before = answer(runs).sentences
         forget(runs)
         assert answer(runs).sentences == before
-    finally:
-        shutil.rmtree(runs)
 
 
 def check_all_is_named(comparison):
@@ -858,12 +844,11 @@ def check_all_is_named(comparison):
 @settings(max_examples=EXAMPLES or 8, deadline=None)
 @given(experiments())
 def test_all_surfaces_state_the_same(made):
-    runs = Path(tempfile.mkdtemp())
-    try:
+    with TemporaryDirectory() as folder:
+        runs = Path(folder)
         made.write(runs)
         comparison = answer(runs)
-        notes = "\n".join(build_table(comparison.experiment).notes)
-        page = html.unescape(build_report(comparison.experiment))
+        notes, page = "\n".join(table_of(runs).notes), html.unescape(page_of(runs))
         told = description(comparison.experiment)
         pairs = comparison.to_json()["pairs"]
         assert [one["sentence"] for one in pairs] == comparison.sentences
@@ -874,19 +859,17 @@ def test_all_surfaces_state_the_same(made):
         for line in texts(comparison.remarks):
             assert line in notes
             assert line in page
-    finally:
-        shutil.rmtree(runs)
 
 
-@settings(max_examples=EXAMPLES or 8, deadline=None)
+@many_examples
 @given(experiments())
 def test_a_metric_where_lower_is_better_gives_the_mirrored_verdict(made):
     scale = quantity("flip", []).worthwhile / quantity("psnr", []).worthwhile
-    runs = Path(tempfile.mkdtemp())
-    try:
+    with TemporaryDirectory() as folder:
+        runs = Path(folder)
         replace(made, declared=[], looks=[]).write(runs)
         for file in runs.glob("exp/*/*/*/results.json"):
-            data, moment = json.loads(file.read_text()), file.stat().st_mtime
+            data, moment = read_json(file), file.stat().st_mtime
             if "psnr" in data["metrics"]:
                 data["metrics"]["flip"] = 1 - scale * data["metrics"]["psnr"]
             file.write_text(json.dumps(data))
@@ -899,21 +882,16 @@ def test_a_metric_where_lower_is_better_gives_the_mirrored_verdict(made):
                 if one.interval is not None:
                     mirrored = [-scale * one.interval.high, -scale * one.interval.low]
                     assert [other.interval.low, other.interval.high] == pytest.approx(mirrored)
-    finally:
-        shutil.rmtree(runs)
 
 
-@settings(max_examples=EXAMPLES or 12, deadline=None)
+@many_examples
 @given(experiments(), st.randoms(use_true_random=False))
 def test_the_order_of_commands_does_not_matter(made, shuffler):
     found = []
     for order in (made.trials, shuffler.sample(made.trials, len(made.trials))):
-        runs = Path(tempfile.mkdtemp())
-        try:
-            made.write(runs, order)
-            found.append(outcomes(answer(runs)))
-        finally:
-            shutil.rmtree(runs)
+        with TemporaryDirectory() as folder:
+            made.write(Path(folder), order)
+            found.append(outcomes(answer(Path(folder))))
     assert found[0] == found[1]
 
 

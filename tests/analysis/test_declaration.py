@@ -1,7 +1,6 @@
 """Declared metrics: which tests are adjusted together, and what is said of late declarations."""
 
 import calendar
-import json
 import os
 import shutil
 import time
@@ -14,37 +13,33 @@ from gsbench.analysis.comparison import compare
 from gsbench.analysis.declaration import active_declaration
 from gsbench.analysis.notes import texts
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import answer_family
 from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import families, in_words, p_text
 from gsbench.runs.experiments import (
     STAMP,
-    Arm,
     Declaration,
     Question,
-    latest_declaration,
     open_question,
     read_declarations,
     record_text,
 )
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import ADC, EARLY, LATE, VOLUMETRIC, loaded, write_declared
+from tests.helpers import change_json, write_lines
+from tests.trials import write_runs
 
-EARLY, LATE = "2020-01-01T00:00:00Z", "2037-01-01T00:00:00Z"
 CLEAR = {"lpips_vgg_raw": -0.05}
 
 
-def declare(runs, *records, experiment="exp"):
-    entries = [
-        Declaration(time=moment, questions=(open_question(metric),)) for metric, moment in records
-    ]
-    (runs / experiment / "declared.jsonl").write_text(record_text(entries))
+def asking(metric, time=EARLY, **more):
+    return Declaration(time=time, questions=(open_question(metric),), **more)
 
 
 def declared_experiment(runs, *records, **plan):
-    write_runs(runs, Plan(**plan))
-    declare(runs, *records)
-    return load_experiment(runs, "exp")
+    """An experiment with a declaration for each (metric, time)."""
+    write_runs(runs, **plan)
+    write_declared(runs, *(asking(*record) for record in records))
+    return loaded(runs)
 
 
 def judged(experiment):
@@ -54,7 +49,6 @@ def judged(experiment):
 def standing(experiment):
     """How the declaration stands to the question about the only compared arm."""
     (one,) = judged(experiment)
-    assert one.standing is not None
     return one.standing
 
 
@@ -71,8 +65,6 @@ def test_a_verdict_in_words_has_its_numbers(tmp_path):
     (one,) = judged(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR))
     first, second = one.verdicts[0], one.verdicts[1]
     for verdict, adjusted in ((first, ""), (second, ", adjusted for 3 tests")):
-        assert verdict.interval is not None
-        assert verdict.p is not None
         p = "below 0.001" if verdict.p < 0.001 else f"{verdict.p:.3f}"
         numbers = (
             f"{verdict.shown(verdict.mean or 0.0)} (interval "
@@ -92,12 +84,8 @@ def test_a_verdict_in_words_has_its_numbers(tmp_path):
 
 def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(tmp_path):
     (one,) = judged(declared_experiment(tmp_path, ("flip", EARLY), effect=CLEAR))
-    assert [verdict.quantity.key for verdict in one.verdicts] == [
-        "flip",
-        "psnr",
-        "ssim",
-        "lpips_vgg_raw",
-    ]
+    order = ["flip", "psnr", "ssim", "lpips_vgg_raw"]
+    assert [verdict.quantity.key for verdict in one.verdicts] == order
     assert [one.role(verdict) for verdict in one.verdicts] == ["declared", *["secondary"] * 3]
     first, *others = one.verdicts
     assert first.family == 1
@@ -114,8 +102,6 @@ def test_the_declared_metric_of_one_pair_is_not_adjusted_and_the_others_are(tmp_
 
 def alone(verdict):
     """The p of a verdict's test by itself."""
-    assert verdict.answer is not None
-    assert verdict.answer.test is not None
     return verdict.answer.test.p
 
 
@@ -139,7 +125,6 @@ def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family():
     (single,) = answer_family([weak])
     assert single.outcome(1, None) == "supported"
     first = answer_family([weak, *noise])[0]
-    assert single.p is not None
     assert first.p == pytest.approx(10 * single.p)
     assert first.outcome(1, None) == "undecided"
 
@@ -148,11 +133,8 @@ def test_a_difference_that_a_single_test_shows_may_be_undecided_in_a_family():
 
 
 def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path):
-    page = build_report(
-        declared_experiment(
-            tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR, views=3, random_seed=1
-        )
-    )
+    plan = {"effect": CLEAR, "views": 3, "random_seed": 1}
+    page = build_report(declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), **plan))
     assert "LPIPS VGG raw was declared beforehand (eval.primary, 2020-01-01 00:00 UTC)." in page
     assert "sfm-volumetric against sfm-adc: better in LPIPS VGG raw on these scenes: −" in page
     assert "The metric was declared beforehand." in page
@@ -161,9 +143,8 @@ def test_the_report_says_what_was_declared_and_what_is_secondary(tmp_path):
     assert "no metric was declared" not in page
 
 
-def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(tmp_path):
-    write_runs(tmp_path, Plan(effect=CLEAR, views=3))
-    experiment = load_experiment(tmp_path, "exp")
+def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so(make_experiment):
+    experiment = make_experiment(effect=CLEAR, views=3)
     page = build_report(experiment)
     assert (
         "Exploratory: no metric was declared (eval.primary), so all metrics count, adjusted for "
@@ -175,21 +156,23 @@ def test_without_a_declaration_all_metrics_are_one_family_and_the_report_says_so
     assert all("4 tests)" in in_words(v) for v in one.verdicts)
     least = min(one.verdicts, key=alone)
     assert least.p == pytest.approx(4 * alone(least))
-    (verdict,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
+    (verdict,) = verdict_notes(experiment)
     assert verdict.removeprefix("Verdict, ") in page
+
+
+def verdict_notes(experiment, trials=None):
+    notes = build_table(experiment, trials).notes
+    return [note for note in notes if note.startswith("Verdict")]
 
 
 def test_tables_have_the_verdict_on_the_declared_metric_whichever_trials_they_show(tmp_path):
     experiment = declared_experiment(tmp_path, ("lpips_vgg_raw", EARLY), effect=CLEAR)
-    whole = [note for note in build_table(experiment).notes if note.startswith("Verdict")]
-    assert len(whole) == 1
-    assert whole[0].startswith(
+    (whole,) = verdict_notes(experiment)
+    assert whole.startswith(
         "Verdict, sfm-volumetric against sfm-adc: better in LPIPS VGG raw on these scenes: −0.05"
     )
-    part = build_table(
-        experiment, [trial for trial in experiment.trials if trial.scene == "garden"]
-    )
-    assert [note for note in part.notes if note.startswith("Verdict")] == whole
+    part = [trial for trial in experiment.trials if trial.scene == "garden"]
+    assert verdict_notes(experiment, part) == [whole]
 
 
 def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_it(tmp_path):
@@ -204,8 +187,7 @@ def test_a_declared_metric_without_weights_has_no_verdict_and_no_other_replaces_
     ]
     reason = "the declared metric LPIPS Alex has no value (weights file alexnet.pth not found)"
     assert f"no verdict, since {reason}" in build_report(experiment)
-    (note,) = (note for note in build_table(experiment).notes if note.startswith("Verdict"))
-    assert f"no verdict, since {reason}" in note
+    assert f"no verdict, since {reason}" in verdict_notes(experiment)[0]
 
 
 # --- when it was declared
@@ -221,17 +203,6 @@ def test_a_declaration_after_results_is_reported_and_all_metrics_are_one_family(
         "LPIPS VGG raw was declared, but only after 6 trials of the arm had been measured" in page
     )
     assert "declared beforehand." not in page
-
-
-def test_a_repeated_declaration_counts_from_its_first_time():
-    psnr, later, flip = (
-        Declaration(time=time, questions=(Question(metric=metric, sign=0),))
-        for metric, time in (("psnr", EARLY), ("psnr", LATE), ("flip", LATE))
-    )
-    assert latest_declaration([psnr]) is psnr
-    assert latest_declaration([psnr, later]) is psnr
-    assert latest_declaration([flip, psnr, later]) is psnr
-    assert latest_declaration([psnr, flip, later]) is later
 
 
 @pytest.mark.parametrize(
@@ -253,27 +224,22 @@ OLDER = (0, 1, 3)  # two trials of the baseline, which do no harm, and one of th
 
 def test_the_time_of_measuring_counts_not_that_of_writing_results(tmp_path):
     """The store gives another experiment the same numbers at once, with their ``measured``."""
-    paths = write_runs(tmp_path, Plan(scenes=("garden",)))
-    declare(tmp_path, ("psnr", "2030-06-01T00:00:00Z"))
+    paths = write_runs(tmp_path, scenes=("garden",))
+    write_declared(tmp_path, asking("psnr", "2030-06-01T00:00:00Z"))
     after = calendar.timegm(time.strptime("2030-06-02T00:00:00Z", STAMP))
     for place, path in enumerate(paths):
-        data = json.loads((path / "results.json").read_text())
         if place in OLDER:
-            data["measured"] = "2030-05-31T00:00:00Z"
-        (path / "results.json").write_text(json.dumps(data))
+            change_json(path / "results.json", measured="2030-05-31T00:00:00Z")
         os.utime(path / "results.json", (after, after))
-    found = standing(load_experiment(tmp_path, "exp"))
+    found = standing(loaded(tmp_path))
     assert {trial.path for trial in found.seen} == {paths[3]}
     assert not found.beforehand
 
 
 def test_a_declaration_is_read_from_trials_if_its_record_is_gone(tmp_path):
-    path = write_runs(tmp_path, Plan())[0]
-    data = json.loads((path / "results.json").read_text())
-    (path / "results.json").write_text(
-        json.dumps(data | {"declared": {"metric": "psnr", "time": EARLY}})
-    )
-    experiment = load_experiment(tmp_path, "exp")
+    path = write_runs(tmp_path)[0]
+    change_json(path / "results.json", declared={"metric": "psnr", "time": EARLY})
+    experiment = loaded(tmp_path)
     repeated = [trial.record.declared for trial in experiment.trials]
     assert [one.primary for one in read_declarations(experiment.folder, repeated)] == ["psnr"]
     assert read_declarations(tmp_path / "nothing") == []
@@ -283,14 +249,8 @@ def test_a_declaration_is_read_from_trials_if_its_record_is_gone(tmp_path):
 
 
 def declare_trials(runs, *records, metric="lpips_vgg_raw"):
-    asked = (open_question(metric),)
-    entries = [
-        Declaration(time=moment, questions=asked).to_json() | {"trials": trials}
-        for moment, trials in records
-    ]
-    (runs / "exp" / "declared.jsonl").write_text(
-        "".join(json.dumps(entry) + "\n" for entry in entries)
-    )
+    entries = [asking(metric, time).to_json() | {"trials": trials} for time, trials in records]
+    write_lines(runs / "exp" / "declared.jsonl", entries)
 
 
 def planned(seeds, arms=("adc", "volumetric")):
@@ -359,15 +319,12 @@ def test_declared_trials_that_are_missing_are_counted(tmp_path):
 
 def test_a_record_that_was_deleted_and_written_anew_does_not_hide_added_trials(tmp_path):
     """Results repeat the declared metric and its time, but not the declared trials."""
-    for path in write_runs(tmp_path, Plan(effect=CLEAR)):
-        data = json.loads((path / "results.json").read_text())
+    declared = {"metric": "lpips_vgg_raw", "time": "2019-01-01T00:00:00Z"}
+    for path in write_runs(tmp_path, effect=CLEAR):
         measured = EARLY if path.name.endswith(("seed0", "seed1")) else "2021-01-01T00:00:00Z"
-        declared = {"metric": "lpips_vgg_raw", "time": "2019-01-01T00:00:00Z"}
-        (path / "results.json").write_text(
-            json.dumps(data | {"measured": measured, "declared": declared})
-        )
+        change_json(path / "results.json", measured=measured, declared=declared)
     declare_trials(tmp_path, ("2020-06-01T00:00:00Z", planned([0, 1, 2])))
-    found = standing(load_experiment(tmp_path, "exp"))
+    found = standing(loaded(tmp_path))
     assert len(found.added) == 4
     assert not found.beforehand
 
@@ -382,60 +339,41 @@ def test_a_record_may_name_no_trials_and_a_damaged_record_declares_nothing(tmp_p
 
 
 def test_declarations_are_read_back_as_they_were_written(tmp_path):
-    arms = Arm("sfm", "adc"), Arm("sfm", "volumetric", (("densify.max_gaussians", "30000"),))
+    arm = replace(VOLUMETRIC, variant=(("densify.max_gaussians", "30000"),))
     keys = ("garden/sfm-adc/3fa9c1d2", "garden/sfm-volumetric/aaaaaaaa")
-    asked = Question(
-        metric="psnr",
-        least=0.1,
-        baseline=arms[0],
-        arm=arms[1],
-        scenes={"garden": keys},
-        seeds=(0, 1, 2),
-    )
-    one = Declaration(time=EARLY, questions=(asked,), looks=(2, 3))
-    two = Declaration(
-        time=LATE, questions=(Question(metric="flip", sign=0),), trials={keys[0]: (0, 1)}
-    )
+    asked = Question(metric="psnr", least=0.1, baseline=ADC, arm=arm, scenes={"garden": keys})
+    one = Declaration(time=EARLY, questions=(replace(asked, seeds=(0, 1, 2)),), looks=(2, 3))
+    two = asking("flip", LATE, trials={keys[0]: (0, 1)})
     (tmp_path / "declared.jsonl").write_text(record_text([two, one]))
     assert read_declarations(tmp_path) == [one, two]
     assert one.planned == dict.fromkeys(keys, (0, 1, 2))
     assert one.kind == "sweep"
-    assert str(arms[1]) == "sfm-volumetric[max_gaussians=30000]"
+    assert str(arm) == "sfm-volumetric[max_gaussians=30000]"
 
 
 def test_the_verdict_on_a_sweep_in_looks_is_that_of_its_looks(tmp_path):
     experiment = declared_experiment(tmp_path, effect=CLEAR)
-    scenes = {
-        scene: (f"{scene}/sfm-adc/c0ffee00", f"{scene}/sfm-volumetric/c0ffee00")
-        for scene in ("courtyard", "garden")
-    }
-    arms = Arm("sfm", "adc"), Arm("sfm", "volumetric")
     asked = Question(
-        metric="lpips_vgg_raw",
-        sign=-1,
-        least=0.005,
-        baseline=arms[0],
-        arm=arms[1],
-        scenes=scenes,
+        **{"metric": "lpips_vgg_raw", "sign": -1, "least": 0.005, "baseline": ADC},
+        arm=VOLUMETRIC,
+        scenes={
+            scene: tuple(f"{scene}/{arm}/c0ffee00" for arm in (ADC, VOLUMETRIC))
+            for scene in ("courtyard", "garden")
+        },
         seeds=(0, 1, 2),
     )
-    declared = Declaration(time=EARLY, questions=(asked,), looks=(2, 3))
-    (tmp_path / "exp" / "declared.jsonl").write_text(record_text([declared]))
+    write_declared(tmp_path, Declaration(time=EARLY, questions=(asked,), looks=(2, 3)))
     (one,) = judged(experiment)
-    assert one.role(one.verdicts[0]) == "declared"
-    assert one.verdicts[0].outcome == "supported"
-    assert one.verdicts[0].p is None
+    first = one.verdicts[0]
+    assert (one.role(first), first.outcome, first.p) == ("declared", "supported", None)
     assert any("look" in line for line in families([one]))
     page = build_report(experiment)
     assert page.count("better in LPIPS VGG raw") == 1
-    seeds = one.verdicts[0].pairs.seeds
-    assert f"with {seeds} of at most 3 seeds. The metric was declared beforehand." in page
+    said = f"with {first.pairs.seeds} of at most 3 seeds. The metric was declared beforehand."
+    assert said in page
     # A look waits for the same seeds of both arms, and without pairs nothing is equal.
-    lost = next((tmp_path / "exp/garden/sfm-adc").glob("*-seed1"))
-    shutil.rmtree(lost)
-    answers = compare(load_experiment(tmp_path, "exp"))
-    assert (
-        "no verdict yet, not all of the first 2 seeds are there in both arms"
-        in (answers.sentences[0])
-    )
+    shutil.rmtree(tmp_path / "exp/garden/sfm-adc/c0ffee00-seed1")
+    answers = compare(loaded(tmp_path))
+    said = "no verdict yet, not all of the first 2 seeds are there in both arms"
+    assert said in answers.sentences[0]
     assert "there are no more of garden" in str(answers.unused[0])

@@ -1,6 +1,5 @@
 """The fairness sheet has everything that records and files say about two arms."""
 
-import json
 import re
 import shutil
 import subprocess
@@ -14,23 +13,19 @@ from gsbench.analysis import fairness
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.fairness import UNLIKE, _shown, fairness_table
 from gsbench.analysis.notes import Note
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import to_latex
 from gsbench.runs.experiments import Arm
 from gsbench.verbs.results import tables
-from tests.analysis.synthetic import write_arms
+from tests.analysis.helpers import page_of, trials_of
 from tests.analysis.test_attribution import densifier
-from tests.finished import search_record
-from tests.helpers import read_json, refusal, write
+from tests.helpers import change_json, refusal, write, write_lines
+from tests.trials import search_record, write_arms
 
 LEFT, RIGHT = Arm("sfm", "adc"), Arm("sfm", "longaxis")
 
 
 def sheet(runs, second="longaxis", first="adc"):
-    return fairness_table(
-        with_variants(load_experiment(runs, "exp").trials), Arm("sfm", first), Arm("sfm", second)
-    )
+    return fairness_table(with_variants(trials_of(runs)), Arm("sfm", first), Arm("sfm", second))
 
 
 def shown(table):
@@ -40,8 +35,7 @@ def shown(table):
 def change(paths, arm, **values):
     for path in paths:
         if path.parent.name == f"sfm-{arm}":
-            data = read_json(path / "results.json")
-            write(path / "results.json", data | values)
+            change_json(path / "results.json", **values)
 
 
 @pytest.fixture
@@ -50,25 +44,13 @@ def paths(tmp_path):
 
 
 def test_the_sheet_has_settings_schedules_and_measurements_side_by_side(tmp_path, paths):
-    change(
-        paths,
-        "longaxis",
-        train_views=40,
-        num_init_points=9000,
-        num_gaussians=31_000,
-        seconds={"train": 80.0},
-    )
-    change(
-        paths,
-        "longaxis",
-        versions={"gsbench": "0.2.0"},
-        hashes={"data": "data-courtyard", "cloud": "abcdef"},
-    )
+    counts = {"train_views": 40, "num_init_points": 9000, "num_gaussians": 31_000}
+    hashes = {"data": "data-courtyard", "cloud": "abcdef"}
+    made = {"versions": {"gsbench": "0.2.0"}, "seconds": {"train": 80.0}, "hashes": hashes}
+    change(paths, "longaxis", **counts, **made)
     for path in paths:
         if path.parent.name == "sfm-longaxis":
-            (path / "events.jsonl").write_text(
-                "".join(json.dumps({"step": 100 * k}) + "\n" for k in range(1, 24))
-            )
+            write_lines(path / "events.jsonl", [{"step": 100 * k} for k in range(1, 24)])
     rows = shown(sheet(tmp_path))
     assert rows["views for training"] == ("42", "40", UNLIKE)
     assert rows["initial points"] == ("3,000", "9,000", UNLIKE)
@@ -85,13 +67,7 @@ def test_the_sheet_has_settings_schedules_and_measurements_side_by_side(tmp_path
 
 def test_only_trials_that_are_compared_count(tmp_path, paths):
     """Seed 2 of the baseline has no partner, so its count is not part of the comparison."""
-    shutil.rmtree(
-        next(
-            path
-            for path in paths
-            if path.parent.name == "sfm-longaxis" and path.name.endswith("seed2")
-        )
-    )
+    shutil.rmtree(paths[-1])
     table = sheet(tmp_path)
     assert shown(table)["Gaussians in the end"][0] == "20,000 to 20,010, mean 20,005"
     assert "Compared: 2 pairs of trials of one scene and seed." in table.notes
@@ -106,12 +82,8 @@ def test_arms_without_a_common_seed_have_a_sheet_of_all_their_trials(tmp_path):
 
 
 def test_long_values_are_cut():
-    assert [_shown("x" * 60), _shown("x" * 61), _shown(3), _shown(None)] == [
-        "x" * 60,
-        "x" * 59 + "…",
-        "3",
-        "null",
-    ]
+    shown = [_shown(value) for value in ("x" * 60, "x" * 61, 3, None)]
+    assert shown == ["x" * 60, "x" * 59 + "…", "3", "null"]
 
 
 def test_the_notes_name_the_ingredients_and_the_tuning(tmp_path, paths):
@@ -123,18 +95,13 @@ def test_the_notes_name_the_ingredients_and_the_tuning(tmp_path, paths):
 def test_a_users_own_arm_has_its_class_and_version(tmp_path):
     own = {"_target_": "largest.SplitLargest", "start": 50, "share": 0.1}
     found = write_arms(tmp_path, {"adc": densifier("adc"), "largest": own})
-    change(
-        found,
-        "largest",
-        code={"sources": {"largest.SplitLargest": "3fa9c1d2aaaaaaaaaaaa"}, "stages": {}},
-    )
+    sources = {"largest.SplitLargest": "3fa9c1d2aaaaaaaaaaaa"}
+    change(found, "largest", code={"sources": sources, "stages": {}})
     table = sheet(tmp_path, "largest")
     assert shown(table)["densify.share"] == ("–", "0.1", UNLIKE)
     assert "largest.SplitLargest 3fa9c1d2" in shown(table)["code"][1]
-    assert (
-        table.notes[0]
-        == "sfm-largest differs from sfm-adc by rule largest.SplitLargest and schedule."
-    )
+    said = "sfm-largest differs from sfm-adc by rule largest.SplitLargest and schedule."
+    assert table.notes[0] == said
 
 
 def test_trials_without_any_record_still_have_a_sheet(tmp_path, paths):
@@ -160,14 +127,11 @@ def test_settings_that_vary_among_the_arms_are_listed_as_tuning(tmp_path):
     notes = sheet(tmp_path, "volumetric-0.01").notes
     two = tmp_path / "two"
     write_arms(two, {"adc": densifier("adc"), **dict([*arms.items()][:2])})
-    assert any(
-        "sfm-volumetric-0.01: 2 choices of settings" in note
-        for note in sheet(two, "volumetric-0.01").notes
-    )
-    (line,) = [note for note in notes if "sfm-volumetric-0.01: 3 choices of settings" in note]
-    assert (
-        "They differ in densify.volume_threshold, and all were measured on the test views" in line
-    )
+    said = "sfm-volumetric-0.01: {} choices of settings"
+    assert any(said.format(2) in note for note in sheet(two, "volumetric-0.01").notes)
+    (line,) = [note for note in notes if said.format(3) in note]
+    words = "They differ in densify.volume_threshold, and all were measured on the test views"
+    assert words in line
 
 
 def test_a_search_that_proposed_the_settings_is_named(tmp_path):
@@ -229,7 +193,7 @@ def test_the_sheet_says_whether_a_search_ended_before_the_trials(searched, said,
 
 
 def test_the_report_shows_the_sheet_before_the_numbers_of_the_verdict(tmp_path, paths):
-    page = build_report(load_experiment(tmp_path, "exp"))
+    page = page_of(tmp_path)
     assert (
         page.index('<h2 id="h-verdict"')
         < page.index("Fairness sheet: sfm-longaxis")
@@ -243,13 +207,8 @@ def test_the_verb_writes_a_sheet_for_each_pair_in_every_format(tmp_path, paths, 
     assert "### Fairness sheet: sfm-longaxis against sfm-adc" in capsys.readouterr().out
     for format_name, suffix in (("latex", "tex"), ("csv", "csv"), ("html", "html")):
         out = tmp_path / "out"
-        assert (
-            tables(
-                ["exp", "--layout", "fairness", "--format", format_name, "--out", str(out)],
-                tmp_path,
-            )
-            == 0
-        )
+        words = [*split("exp --layout fairness --format"), format_name, "--out", str(out)]
+        assert tables(words, tmp_path) == 0
         assert (out / f"exp-fairness-sfm-longaxis-sfm-adc.{suffix}").stat().st_size > 500
     one = tmp_path / "one"
     write_arms(one, {"adc": densifier("adc")})

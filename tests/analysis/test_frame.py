@@ -9,10 +9,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from gsbench.analysis import to_frame
-from gsbench.analysis.results import load_experiment
 from gsbench.verbs.results import tables
-from tests.analysis.test_tables import one_trial
+from tests.analysis.helpers import loaded
 from tests.helpers import read_json, refusal
+from tests.trials import write_trial
 
 
 def test_each_row_has_the_values_of_one_trials_file(make_experiment):
@@ -54,9 +54,9 @@ def test_groups_of_the_frame_average_to_the_cells_of_the_table(make_experiment):
 
 
 def test_a_missing_value_is_na_and_a_swept_setting_has_a_column(tmp_path):
-    one_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, flip=0.1, _num_init_points=None)
-    one_trial(tmp_path, 0, "bbbbbbbb", {"densify__volume_threshold": 0.1}, psnr=28.0, own=3.0)
-    frame = to_frame(load_experiment(tmp_path, "exp"))
+    write_trial(tmp_path, 0, "aaaaaaaa", psnr=27.0, flip=0.1, _num_init_points=None)
+    write_trial(tmp_path, 0, "bbbbbbbb", {"densify.volume_threshold": 0.1}, psnr=28.0, own=3.0)
+    frame = to_frame(loaded(tmp_path))
     assert frame["densify.volume_threshold"].tolist() == [0.03, 0.1]
     assert frame["flip"].isna().tolist() == [False, True]
     assert frame["own"].tolist()[1] == 3.0

@@ -10,7 +10,6 @@ import pytest
 from gsbench.analysis.fairness import counts_note, limit_notes
 from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_notes import doubt_notes, held_out_notes, origin_notes, points_notes
 from gsbench.analysis.tables import build_table
 from gsbench.runs.experiments import Arm
@@ -21,18 +20,18 @@ from gsbench.runs.trial_record import (
     InitialCloud,
     TwinViews,
 )
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import ADC, VOLUMETRIC, loaded, page_of, table_of
 from tests.helpers import read_json, write
+from tests.trials import write_runs, write_trial
 
-ADC, VOLUMETRIC = Arm("sfm", "adc"), Arm("sfm", "volumetric")
 COMPARED = (
     "so this does not compare at equal counts. To do so: give both arms densify.cap=governor "
 )
 
 
 def trials_of(tmp_path, **plan):
-    write_runs(tmp_path, Plan(**plan))
-    return load_experiment(tmp_path, "exp").trials
+    write_runs(tmp_path, **plan)
+    return loaded(tmp_path).trials
 
 
 def with_record(trial, **values):
@@ -54,20 +53,15 @@ def with_record(trial, **values):
 )
 def test_unequal_counts_are_stated_over_the_scenes_that_both_arms_have(tmp_path, counts, said):
     made = trials_of(tmp_path, scenes=list(counts))
-    trials = [
-        with_record(
-            trial,
-            num_gaussians=counts[trial.scene][trial.densify == "volumetric"],
-            num_init_points=50,
-        )
-        for trial in made
-    ]
+    trials = []
+    for trial in made:
+        count = counts[trial.scene][trial.densify == "volumetric"]
+        trials.append(with_record(trial, num_gaussians=count, num_init_points=50))
     note = counts_note(trials, ADC, VOLUMETRIC)
     if said:  # no limit can be below the initial cloud
         larger = [with_record(trial, num_init_points=10_000) for trial in trials]
-        assert "To do so: start both arms with fewer than 10,000 points" in str(
-            counts_note(larger, ADC, VOLUMETRIC)
-        )
+        words = "To do so: start both arms with fewer than 10,000 points"
+        assert words in str(counts_note(larger, ADC, VOLUMETRIC))
     least = min(filter(None, itertools.chain(*counts.values())))
     words = f"densify.max_gaussians={least} and another name."
     expected = f"sfm-volumetric has {said} Gaussians than sfm-adc, {COMPARED}{words}"
@@ -124,18 +118,11 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
         for trial in made
     ]
     words = {"adc": baseline, "volumetric": arm}
-    planned = {
-        trial.path.relative_to(tmp_path / "exp").as_posix(): {
-            "overrides": [
-                *words[trial.densify],
-                f"seed={trial.seed}",
-                "scene=garden",
-                "name=exp",
-                "densify.cap=governor",
-            ]
-        }
-        for trial in trials
-    }
+    planned = {}
+    for trial in trials:
+        own = [*words[trial.densify], f"seed={trial.seed}", "scene=garden", "name=exp"]
+        place = trial.path.relative_to(tmp_path / "exp").as_posix()
+        planned[place] = {"overrides": [*own, "densify.cap=governor"]}
     write(tmp_path / "exp" / "plan.json", {"trials": planned})
     sentence = str(counts_note(trials, ADC, VOLUMETRIC))
     assert f"To do so: {command}" in sentence
@@ -163,12 +150,12 @@ def test_the_advice_on_unequal_counts_is_a_whole_command(tmp_path, baseline, arm
     ],
 )
 def test_a_limit_that_no_arm_reaches_makes_no_counts_equal(tmp_path, budget, counts, events, said):
-    for path in write_runs(tmp_path, Plan(scenes=list(counts), seeds=(0, 1))):
-        data = read_json(path / "results.json")
-        data["num_gaussians"] = counts[data["scene"]][data["densify"] == "volumetric"]
-        limit = {"cap": budget[0], "max_gaussians": budget[1]}
-        write(path / "results.json", data | {"budget": limit, "events": events})
-    experiment = load_experiment(tmp_path, "exp")
+    limit = {"cap": budget[0], "max_gaussians": budget[1]}
+    for scene, own in counts.items():
+        for densify, count in zip(("adc", "volumetric"), own, strict=True):
+            place = {"scene": scene, "densify": densify, "psnr": 20.0}
+            write_trial(tmp_path, **place, _num_gaussians=count, _budget=limit, _events=events)
+    experiment = loaded(tmp_path)
     notes = texts(limit_notes(experiment.trials, [(ADC, VOLUMETRIC)]))
     assert limit_notes(experiment.trials, []) == []
     assert len(notes) == bool(said)
@@ -186,8 +173,8 @@ def test_a_table_warns_of_too_few_rounds(tmp_path, rounds, warns):
     write(trial.path / "config.yaml", config)
     (trial.path / "events.jsonl").write_text('{"step": 100, "cloned": 1}\n' * rounds)
     words = f"sfm-adc: {rounds} round{'s' * (rounds != 1)} of refinement in 2000 iterations"
-    page = build_report(load_experiment(tmp_path, "exp"))
-    notes = build_table(load_experiment(tmp_path, "exp")).notes
+    page = page_of(tmp_path)
+    notes = table_of(tmp_path).notes
     assert any(note.startswith(words) for note in notes) == warns
     assert (words in page) == warns
 
@@ -221,14 +208,14 @@ def test_each_way_of_holding_views_out_is_stated_with_scenes_if_there_are_severa
 
 def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_path):
     for path in write_runs(
-        tmp_path, Plan(inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",))
+        tmp_path, inits=("sfm", "dim", "random"), seeds=(0,), scenes=("garden",)
     ):
         config = read_json(path / "config.yaml")
         config["init"] |= {"sfm": {"points_from": "all"}, "dim": {"points_from": "train"}}.get(
             config["init"]["name"], {}
         )
         write(path / "config.yaml", config)
-    made = load_experiment(tmp_path, "exp").trials
+    made = loaded(tmp_path).trials
     some, every = points_notes(made)
     assert some == Note.of("points of some", init="dim", choice="train")
     assert every == Note.of("points of all", init="sfm", choice="all")
@@ -246,12 +233,12 @@ def test_the_views_behind_initial_points_are_stated_once_per_initialiser(tmp_pat
     ],
 )
 def test_pictures_of_two_filters_are_noted(tmp_path, folders, downscales, noted):
-    paths = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))
+    paths = write_runs(tmp_path, seeds=(0,), scenes=("garden",))
     for path, images, downscale in zip(paths, folders, downscales, strict=True):
         config = read_json(path / "config.yaml")
         config["scene"] |= {"images": images, "downscale": downscale}
         write(path / "config.yaml", config)
-    notes = doubt_notes(load_experiment(tmp_path, "exp").trials)
+    notes = doubt_notes(loaded(tmp_path).trials)
     assert notes == [Note.of("filters")] * noted
 
 
@@ -282,14 +269,10 @@ def test_results_that_are_worth_little_or_may_surprise_are_noted_once(tmp_path):
 
 @pytest.mark.parametrize("lost, rest", [(1, ""), (3, ""), (4, " and 1 more"), (5, " and 2 more")])
 def test_up_to_three_left_out_trials_are_named_and_all_are_counted(tmp_path, lost, rest):
-    paths = write_runs(tmp_path, Plan())
+    paths = write_runs(tmp_path)
     for path in paths[:lost]:
         (path / "results.json").unlink()
-    (note,) = [
-        note
-        for note in build_table(load_experiment(tmp_path, "exp")).notes
-        if note.startswith("Left out")
-    ]
+    (note,) = [note for note in table_of(tmp_path).notes if note.startswith("Left out")]
     assert note.startswith(f"Left out ({lost}): exp/courtyard/")
     assert note.count("unfinished") == min(lost, 3)
     assert note.endswith(f"{rest}.")

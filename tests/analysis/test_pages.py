@@ -2,7 +2,6 @@
 
 import random
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
@@ -10,15 +9,16 @@ from markupsafe import Markup
 
 from gsbench.analysis import table_formats
 from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
 from gsbench.claims.check_page import to_html
 from gsbench.claims.export import write_archive
 from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
 from gsbench.runs.experiments import Arm
 from gsbench.view import page as model_page
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import loaded
 from tests.claims.test_page import made, page_of
+from tests.markup import Page
+from tests.trials import write_runs
 from tests.view.browser import Browser
 
 ROOT = Path(table_formats.__file__).parents[1]
@@ -30,36 +30,16 @@ HOSTILE = (
 LOOK = "[document.title === 'owned', document.scripts.length]"
 
 
-class Parsed(HTMLParser):
-    """The elements of a page with their attributes, in order, and the texts of its scripts."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.elements = []
-        self.scripts = []
-        self.feed(page)
-        self.close()
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        if tag == "script":
-            self.scripts.append("")
-
-    def handle_data(self, data):
-        if self.cdata_elem == "script":
-            self.scripts[-1] += data
-
-    @property
-    def shape(self):
-        return [(tag, tuple(attributes)) for tag, attributes in self.elements]
+def shape(page):
+    return [(tag, tuple(attributes)) for tag, attributes in page.elements]
 
 
 def pages(folder, monkeypatch):
     """Each kind of page by its template, written by the verbs or what they call."""
     runs = folder / "runs"
-    write_runs(runs, Plan(views=7, seeds=(0, 1), pictures=True, effect={"psnr": 1.0}))
+    write_runs(runs, views=7, seeds=(0, 1), pictures=True, effect={"psnr": 1.0})
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    trials = load_experiment(runs, "exp")
+    trials = loaded(runs)
     arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
     make_round(trials.trials, arms, 4, 1, folder / "vote", random.Random(0))
     write_archive(trials, folder / "exp.zip")
@@ -109,8 +89,8 @@ def test_every_page_is_among_those_that_are_tried(both):
 
 def test_no_text_of_a_page_becomes_an_element_or_a_script(both):
     for name, sound in both[0].items():
-        before, after = Parsed(sound), Parsed(both[1][name])
-        assert after.shape == before.shape, name
+        before, after = Page(sound), Page(both[1][name])
+        assert shape(after) == shape(before), name
         assert "&lt;/script&gt;" in both[1][name], name
         assert len(after.scripts) == len(before.scripts)
         for tag, attributes in after.elements:
@@ -122,7 +102,7 @@ def test_no_text_of_a_page_becomes_an_element_or_a_script(both):
 
 def test_every_page_allows_its_own_script_alone(both):
     for name, text in both[0].items():
-        parsed = Parsed(text)
+        parsed = Page(text)
         head = [tag for tag, _ in parsed.elements]
         policy = next(
             attributes["content"] or ""
@@ -144,14 +124,14 @@ def test_no_hostile_text_runs_in_a_browser(both, tmp_path):
         file.write_text(text, encoding="utf-8")
         with Browser(file.as_uri(), tmp_path / f"profile-{name}") as browser:
             found = browser.call("Runtime.evaluate", expression=LOOK, returnByValue=True)
-            assert found["result"]["value"] == [False, len(Parsed(text).scripts)], name
+            assert found["result"]["value"] == [False, len(Page(text).scripts)], name
 
 
 def test_the_name_of_a_photograph_stays_a_text_in_the_page_of_a_model():
     annotation = model_page._annotation(f"0{HOSTILE}.png", {"target": [0, 0, 0]})
     assert not set("<>&") & set(str(annotation))
     page = model_page.with_policy("<!DOCTYPE html><html><head lang='x'><title>t</title></head>")
-    first = Parsed(page).elements[2]
+    first = Page(page).elements[2]
     assert first == (
         "meta",
         {"http-equiv": "Content-Security-Policy", "content": model_page.POLICY},

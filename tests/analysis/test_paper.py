@@ -20,15 +20,15 @@ from gsbench.analysis.paper import (
     published_names,
     published_table,
 )
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.table_formats import to_html_page, to_latex, to_markdown
 from gsbench.analysis.tables import build_table
 from gsbench.eval.facts import find_metric
 from gsbench.system.install import conf_dir
 from gsbench.verbs.results import tables
-from tests.analysis.synthetic import Plan, write_runs
-from tests.analysis.test_tables import one_trial, texts
+from tests.analysis.helpers import trials_of
+from tests.analysis.test_tables import texts
 from tests.helpers import refusal
+from tests.trials import write_runs, write_trial
 
 
 def cell(mean, std=None, count=3):
@@ -198,7 +198,7 @@ def test_an_experiment_without_the_papers_arms_is_refused(make_experiment):
 
 def test_the_tables_verb_prints_and_writes_files(tmp_path, capsys):
     runs = tmp_path / "runs"
-    write_runs(runs, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
+    write_runs(runs, experiment="table1", inits=("dim",), scenes=("garden",))
     assert tables(["table1"], runs) == 0
     out = capsys.readouterr().out
     assert "### Table 1, measured" in out
@@ -212,7 +212,7 @@ def test_the_tables_verb_prints_and_writes_files(tmp_path, capsys):
 
 
 def test_the_verb_names_bad_options_and_left_out_trials(tmp_path, capsys):
-    path = write_runs(tmp_path, Plan())[0]
+    path = write_runs(tmp_path)[0]
     (path / "results.json").write_text("{")
     with refusal("no trial has iterations=7"):
         tables(split("exp --where iterations=7"), tmp_path)
@@ -221,7 +221,7 @@ def test_the_verb_names_bad_options_and_left_out_trials(tmp_path, capsys):
         tables(split("exp --where iterations"), tmp_path)
     with refusal("scene is in --rows and --columns"):
         tables(split("exp --rows scene --columns scene"), tmp_path)
-    assert load_experiment(tmp_path, "exp").trials
+    assert trials_of(tmp_path)
 
 
 def test_the_table_of_differences_quotes_the_papers_setup(make_experiment):
@@ -233,7 +233,7 @@ def test_the_table_of_differences_quotes_the_papers_setup(make_experiment):
 
 
 def test_an_experiment_with_the_suffix_own_has_the_papers_layout(tmp_path, capsys):
-    write_runs(tmp_path, Plan(experiment="table1_own", inits=("dim_paper",), scenes=("garden",)))
+    write_runs(tmp_path, experiment="table1_own", inits=("dim_paper",), scenes=("garden",))
     assert tables(["table1_own"], tmp_path) == 0
     out = capsys.readouterr().out
     assert "### Table 1, measured (experiment table1_own)" in out
@@ -269,9 +269,9 @@ def test_scenes_and_methods_of_papers_have_the_names_of_gsbench(name):
 
 def test_measured_values_are_shown_beside_the_printed_numbers(tmp_path, capsys):
     for seed, psnr in enumerate((27.41, 27.41, 27.41)):
-        one_trial(tmp_path, seed, psnr=psnr, ssim=0.9, lpips_vgg_raw=0.2)
-    one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
-    table = published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
+        write_trial(tmp_path, seed, psnr=psnr, ssim=0.9, lpips_vgg_raw=0.2)
+    write_trial(tmp_path, psnr=1.0, scene="nowhere")
+    table = published_table(trials_of(tmp_path), "3dgs")
     assert texts(table) == [
         ["garden", "sfm", "adc", "27.410", "+0.000 =", "0.868", "+0.032 ≠", "0.103", "+0.097 ≠"]
     ]
@@ -285,12 +285,12 @@ def test_measured_values_are_shown_beside_the_printed_numbers(tmp_path, capsys):
 
 
 def test_trials_that_cannot_be_compared_with_a_paper_are_refused(tmp_path):
-    one_trial(tmp_path, 0, psnr=1.0, _scene="nowhere")
+    write_trial(tmp_path, psnr=1.0, scene="nowhere")
     with refusal("no trial here is of one of them"):
-        published_table(load_experiment(tmp_path, "exp").trials, "3dgs-mcmc")
-    one_trial(tmp_path, 0, psnr=1.0)
-    one_trial(tmp_path, 1, psnr=1.0, _iterations=7)
+        published_table(trials_of(tmp_path), "3dgs-mcmc")
+    write_trial(tmp_path, psnr=1.0)
+    write_trial(tmp_path, 1, psnr=1.0, _iterations=7)
     with refusal(r"scene=garden init=sfm densify=adc would average trials that differ in iter"):
-        published_table(load_experiment(tmp_path, "exp").trials, "3dgs")
+        published_table(trials_of(tmp_path), "3dgs")
     with refusal(r"no published numbers '3dsg'.*did you mean 3dgs"):
         load_published("3dsg")

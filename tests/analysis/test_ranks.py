@@ -42,7 +42,6 @@ def test_the_critical_values_are_those_of_demsar(arms, q):
 @pytest.mark.parametrize("metric", ["psnr", "lpips_vgg_raw"])
 def test_the_best_arm_has_rank_one(seven, metric):
     ranking = rank_arms(seven.trials, quantity(metric, seven.trials))
-    assert ranking is not None
     assert (ranking.arms[0], ranking.ranks[0]) == (Arm("sfm", "volumetric"), 1.0)
     means = {
         arm: [
@@ -56,21 +55,14 @@ def test_the_best_arm_has_rank_one(seven, metric):
 
 
 def test_groups_are_the_largest_that_do_not_differ():
-    made = Ranking(
-        quantity("psnr", []),
-        tuple(Arm("sfm", c) for c in "abcde"),
-        (1.0, 1.8, 2.7, 4.0, 5.5),
-        SCENES,
-        1.2,
-        0.01,
-    )
-    assert made.groups == [(0, 1), (1, 2)]
-    assert Ranking(
-        made.quantity, made.arms, (1.0, 1.1, 1.2, 1.3, 5.0), SCENES, 1.2, 0.01
-    ).groups == [(0, 3)]
-    assert (
-        Ranking(made.quantity, made.arms, (1.0, 2.0, 3.0, 4.0, 5.0), SCENES, 0.9, 0.01).groups == []
-    )
+    assert ranked((1.0, 1.8, 2.7, 4.0, 5.5)).groups == [(0, 1), (1, 2)]
+    assert ranked((1.0, 1.1, 1.2, 1.3, 5.0)).groups == [(0, 3)]
+    assert ranked((1.0, 2.0, 3.0, 4.0, 5.0), critical=0.9).groups == []
+
+
+def ranked(ranks, names="abcde", critical=1.2):
+    arms = tuple(Arm("sfm", name) for name in names)
+    return Ranking(quantity("psnr", []), arms, ranks, SCENES, critical, None)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +79,6 @@ def test_few_scenes_or_arms_have_no_ranking(make_experiment, plan):
 def test_two_arms_have_a_ranking_without_friedmans_test(make_experiment):
     experiment = make_experiment(scenes=SCENES, effect={"psnr": 9.0})
     ranking = rank_arms(experiment.trials, quantity("psnr", experiment.trials))
-    assert ranking is not None
     assert (ranking.ranks, ranking.p) == ((1.0, 2.0), None)
     assert ranking.critical == critical_difference(2, 7)
 
@@ -95,23 +86,16 @@ def test_two_arms_have_a_ranking_without_friedmans_test(make_experiment):
 def test_a_scene_that_lacks_an_arm_is_left_out(seven):
     trials = [trial for trial in seven.trials if (trial.scene, trial.densify) != ("c", "mcmc")]
     ranking = rank_arms(trials, quantity("psnr", trials))
-    assert ranking is not None
     assert ranking.scenes == ("a", "b", "d", "e", "f", "g")
     two = [trial for trial in trials if (trial.scene, trial.densify) != ("d", "adc")]
     assert rank_arms(two, quantity("psnr", two)) is None
 
 
 def test_equal_arms_do_not_differ(make_experiment):
-    experiment = make_experiment(
-        scenes=SCENES,
-        densifiers=ARMS,
-        trial_noise=0.0,
-        residual_noise=0.0,
-        effect_noise=0.0,
-        scene_noise=0.0,
-    )
+    noises = ("trial_noise", "residual_noise", "effect_noise", "scene_noise")
+    plan = {"scenes": SCENES, "densifiers": ARMS} | dict.fromkeys(noises, 0.0)
+    experiment = make_experiment(**plan)
     ranking = rank_arms(experiment.trials, quantity("psnr", experiment.trials))
-    assert ranking is not None
     assert set(ranking.ranks) == {2.0}
     assert ranking.p == 1.0
     assert ranking.groups == [(0, 2)]
@@ -123,7 +107,6 @@ def test_report_and_site_have_the_plot_of_ranks(seven, tmp_path):
     for page in (build_report(seven), (tmp_path / "site" / "index.html").read_text()):
         assert page.count("ranks over 7 scenes</figcaption>") == 4  # PSNR, SSIM, LPIPS, FLIP
     ranking = rank_arms(seven.trials, quantity("psnr", seven.trials))
-    assert ranking is not None
     svg = rank_plot(ranking)
     assert f"CD {critical_difference(3, 7):.2f}" in svg
     assert f"that no arm differs: p {p_text(ranking.p)}.</p>" in svg
@@ -136,9 +119,8 @@ def numbers(pattern, text):
 
 def test_a_rank_plot_puts_arms_ranks_and_groups_where_they_belong():
     """Five arms with names of five letters: the scale is from 20 + 5 x 6.6 px to 380 - 30 px."""
-    arms = tuple(Arm("sfm", c) for c in "abcde")
     ranks = (1.0, 1.8, 2.7, 4.0, 4.5)
-    svg = rank_plot(Ranking(quantity("psnr", []), arms, ranks, SCENES, 1.2, None))
+    svg = rank_plot(ranked(ranks))
     assert 'viewBox="0 0 401.0 204.0"' in svg
     step, rows = 297 / 4, [57, 83, 109, 135, 161]
     assert numbers("<circle cx=# cy=#", svg) == [
@@ -162,7 +144,6 @@ def test_a_rank_plot_puts_arms_ranks_and_groups_where_they_belong():
     assert "Not different: sfm-a to sfm-b; sfm-b to sfm-c; sfm-d to sfm-e." in svg
     assert "Friedman" not in svg
     # Long names leave at least 160 px to the scale.
-    long = (Arm("sfm", "x" * 50), Arm("sfm", "y" * 49))
-    svg = rank_plot(Ranking(quantity("psnr", []), long, (1.0, 2.0), SCENES, 0.5, None))
+    svg = rank_plot(ranked((1.0, 2.0), ("x" * 50, "y" * 49), 0.5))
     assert [x for x, _ in numbers("<circle cx=# cy=#", svg)] == pytest.approx([376.4, 536.4])
     assert "Not different: none." in svg

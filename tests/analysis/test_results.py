@@ -8,18 +8,14 @@ import pytest
 from gsbench.analysis.results import load_experiment, read_views
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.trial_record import read_rows
-from tests.analysis.synthetic import Plan, write_arms, write_runs
-from tests.helpers import read_json, refusal, write
-
-
-def rewrite(path, **changes):
-    data = read_json(path / "results.json")
-    write(path / "results.json", data | changes)
+from tests.analysis.helpers import loaded, trials_of
+from tests.helpers import change_json, refusal, write
+from tests.trials import write_arms, write_runs
 
 
 def test_every_complete_trial_is_read(tmp_path):
-    paths = write_runs(tmp_path, Plan())
-    experiment = load_experiment(tmp_path, "exp")
+    paths = write_runs(tmp_path)
+    experiment = loaded(tmp_path)
     assert {trial.path for trial in experiment.trials} == set(paths)
     assert experiment.warnings == ()
     assert experiment.seeds == (0, 1, 2)
@@ -28,7 +24,7 @@ def test_every_complete_trial_is_read(tmp_path):
 def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
     for cap in (1, 2):
         write_arms(tmp_path, {"adc": {"cap": cap}}, seeds=(1, 0))
-    trials = load_experiment(tmp_path, "exp").trials
+    trials = trials_of(tmp_path)
     assert [trial.seed for trial in trials] == [0, 0, 1, 1]
     assert [trial.config_hash for trial in trials] == sorted(
         {trial.config_hash for trial in trials}
@@ -36,36 +32,27 @@ def test_trials_are_in_the_order_of_seeds_then_of_configurations(tmp_path):
 
 
 def test_hydra_and_report_files_beside_the_trials_are_ignored(tmp_path):
-    write_runs(tmp_path, Plan())
+    write_runs(tmp_path)
     (tmp_path / "exp" / ".hydra").mkdir()
     (tmp_path / "exp" / "report.html").write_text("")
     (tmp_path / "exp" / "multirun.yaml").write_text("")
-    assert load_experiment(tmp_path, "exp").warnings == ()
+    assert loaded(tmp_path).warnings == ()
 
 
-DAMAGES = {
-    "half a file": (
-        lambda path: (path / "results.json").write_text('{"status": "comp'),
-        "not JSON",
-    ),
-    "binary": (lambda path: (path / "results.json").write_bytes(b"\xff\xfe\x00"), "not JSON"),
-    "a list": (lambda path: (path / "results.json").write_text("[]"), "should be an object"),
-    "nan": (lambda path: rewrite(path, metrics={"psnr": float("nan")}), "metrics.psnr is nan"),
-    "text for a number": (
-        lambda path: rewrite(path, metrics={"psnr": "27"}),
-        "metrics.psnr is '27'",
-    ),
-    "no seconds": (lambda path: rewrite(path, seconds=None), "seconds is None"),
-    "no count": (lambda path: rewrite(path, num_gaussians=None), "num_gaussians"),
-    "no protocol": (lambda path: rewrite(path, protocol=None), "protocol is None"),
-    "still running": (lambda path: rewrite(path, status="running"), "unfinished"),
-    "another scene": (
-        lambda path: rewrite(path, scene="kitchen"),
-        "foreign, its results.json is of scene 'kitchen'",
-    ),
-    "another experiment": (lambda path: rewrite(path, experiment="other"), "of experiment 'other'"),
-    "another arm": (lambda path: rewrite(path, densify="none"), "of arm 'sfm-none'"),
-    "another seed": (lambda path: rewrite(path, seed=7), "of seed '7'"),
+DAMAGES = {  # keys of results.json, its new content, or a change of the folder
+    "half a file": ('{"status": "comp', "not JSON"),
+    "binary": (b"\xff\xfe\x00", "not JSON"),
+    "a list": ("[]", "should be an object"),
+    "nan": ({"metrics": {"psnr": float("nan")}}, "metrics.psnr is nan"),
+    "text for a number": ({"metrics": {"psnr": "27"}}, "metrics.psnr is '27'"),
+    "no seconds": ({"seconds": None}, "seconds is None"),
+    "no count": ({"num_gaussians": None}, "num_gaussians"),
+    "no protocol": ({"protocol": None}, "protocol is None"),
+    "still running": ({"status": "running"}, "unfinished"),
+    "another scene": ({"scene": "kitchen"}, "foreign, its results.json is of scene 'kitchen'"),
+    "another experiment": ({"experiment": "other"}, "of experiment 'other'"),
+    "another arm": ({"densify": "none"}, "of arm 'sfm-none'"),
+    "another seed": ({"seed": 7}, "of seed '7'"),
     "a copy under another name": (
         lambda path: path.rename(path.with_name("copy of run")),
         "not named",
@@ -80,10 +67,15 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", list(DAMAGES))
 def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path, damage):
-    paths = write_runs(tmp_path, Plan())
+    paths = write_runs(tmp_path)
     spoil, words = DAMAGES[damage]
-    spoil(paths[4])
-    experiment = load_experiment(tmp_path, "exp")
+    if callable(spoil):
+        spoil(paths[4])
+    elif isinstance(spoil, dict):
+        change_json(paths[4] / "results.json", **spoil)
+    else:
+        write(paths[4] / "results.json", spoil)
+    experiment = loaded(tmp_path)
     assert len(experiment.trials) == len(paths) - 1
     assert len(experiment.warnings) == 1
     assert words in experiment.warnings[0]
@@ -91,18 +83,18 @@ def test_a_trial_that_cannot_be_used_is_named_and_left_out(tmp_path, damage):
 
 
 def test_a_failed_trial_says_why(tmp_path):
-    path = write_runs(tmp_path, Plan())[0]
+    path = write_runs(tmp_path)[0]
     (path / "results.json").unlink()
     write(
         path / "failed.json", {"error": "TrainingError", "message": "the loss is not finite at 812"}
     )
-    assert load_experiment(tmp_path, "exp").warnings == (
+    assert loaded(tmp_path).warnings == (
         "exp/courtyard/sfm-adc/c0ffee00-seed0: failed, the loss is not finite at 812",
     )
 
 
 def test_an_unknown_experiment_names_the_known_ones(tmp_path):
-    write_runs(tmp_path, Plan())
+    write_runs(tmp_path)
     (tmp_path / "store").mkdir()
     assert list_experiments(tmp_path) == ["exp"]
     with refusal("there: exp"):
@@ -112,15 +104,15 @@ def test_an_unknown_experiment_names_the_known_ones(tmp_path):
 
 
 def test_an_experiment_without_a_usable_trial_is_an_error(tmp_path):
-    for path in write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,))):
+    for path in write_runs(tmp_path, scenes=("garden",), seeds=(0,)):
         (path / "results.json").unlink()
     with refusal("no complete trial among 2 folders"):
-        load_experiment(tmp_path, "exp")
+        loaded(tmp_path)
 
 
 def test_views_must_average_to_the_metrics_of_their_trial(tmp_path):
-    path = write_runs(tmp_path, Plan(seeds=(0,), scenes=("garden",)))[0]
-    trial = next(trial for trial in load_experiment(tmp_path, "exp").trials if trial.path == path)
+    path = write_runs(tmp_path, seeds=(0,), scenes=("garden",))[0]
+    trial = next(trial for trial in trials_of(tmp_path) if trial.path == path)
     views = read_views(trial)
     assert len(views) == 6
     assert set(views["view000"]) == {"psnr", "ssim", "lpips_vgg_raw", "flip"}

@@ -5,10 +5,10 @@ import pytest
 from PIL import Image
 
 from gsbench.analysis.images import textured_error
-from gsbench.analysis.results import load_experiment
 from gsbench.runs.layout import FROM_PIXELS, MASKS
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import trials_of
 from tests.helpers import refusal, write
+from tests.trials import write_runs
 
 
 def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
@@ -17,9 +17,9 @@ def test_textured_error_is_the_mean_error_in_the_most_textured_fifth(tmp_path):
     The render is off by a tenth of the column's number.
     """
     write_runs(
-        tmp_path, Plan(scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True)
+        tmp_path, scenes=("garden",), densifiers=("adc",), seeds=(0,), views=1, pictures=True
     )
-    (trial,) = load_experiment(tmp_path, "exp").trials
+    (trial,) = trials_of(tmp_path)
     column = np.arange(100)
     truth = np.repeat((9 + column**2 // 50)[None], 20, axis=0)
     render = truth - column // 10

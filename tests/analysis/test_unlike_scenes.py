@@ -2,49 +2,44 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from gsbench.analysis.differences import between_scenes_notes, ingredients_between
 from gsbench.analysis.fairness import caveats, fairness_table
 from gsbench.analysis.judgement import judge
 from gsbench.analysis.notes import texts
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
-from gsbench.analysis.tables import build_table
-from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, Declaration, Question
-from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.analysis.helpers import EARLY, page_of, rows_of, table_of, trials_of
+from tests.helpers import refusal
+from tests.trials import write_trial
 
-STAGES = {"scene": 1, "init": 1, "train": 1, "evaluate": 1}
 NO_MEAN = "No mean over the scenes is shown, since they differ in conditions or code."
 
 
+def code(version):
+    stages = {"scene": 1, "init": 1, "evaluate": 1, "train": version}
+    return {"sources": {}, "stages": stages}
+
+
 def write(runs, scene, config_hash="c0ffee00", densify="adc", settings=None, **results):
-    """Two trials of a scene; ``settings`` are settings, ``results`` keys of results.json."""
+    """Two trials of a scene; ``results`` are keys of results.json with ``_`` before them."""
     for seed in (0, 1):
-        views = {"psnr": 20.0 + (densify == "mcmc") + np.zeros(2) + seed}
-        data = trial_data(Plan(), scene, "sfm", densify, seed, views) | results
-        write_trial(runs, data, views, config_hash, **(settings or {}))
+        psnr = 20.0 + (densify == "mcmc") + seed
+        place = {"scene": scene, "densify": densify}
+        write_trial(runs, seed, config_hash, settings, **place, psnr=psnr, **results)
 
 
-def table(runs, **how):
-    """The table of the experiment, and whether it has a mean over scenes."""
-    made = build_table(load_experiment(runs, "exp"), metrics=["psnr"], **how)
-    return made, any(row.labels[0].startswith("mean of") for row in made.rows)
-
-
-def lines(made):
+def lines(runs, has_mean=True):
+    """The notes on scenes; the table has a mean over them or not."""
+    made = table_of(runs, "psnr")
+    assert any(row.labels[0].startswith("mean of") for row in made.rows) == has_mean
     return [note for note in made.notes if "more than the scene" in note or "No mean" in note]
 
 
 def test_settings_of_an_arm_that_differ_between_scenes_are_stated(tmp_path):
-    write(tmp_path, "park", "a" * 8, settings={"densify__start": 500, "init__count": 5})
-    write(tmp_path, "room", "b" * 8, settings={"densify__start": 900, "init__count": 5})
-    write(tmp_path, "yard", "a" * 8, settings={"densify__start": 500, "init__count": 5})
-    made, has_mean = table(tmp_path)
-    assert has_mean
-    assert lines(made) == [
+    for scene, start in (("park", 500), ("room", 900), ("yard", 500)):
+        write(tmp_path, scene, f"{start:08}", settings={"densify.start": start, "init.count": 5})
+    assert lines(tmp_path) == [
         "Scenes of sfm-adc differ in more than the scene: densify.start (500 on park, yard, 900 on "
         "room)."
     ]
@@ -53,24 +48,22 @@ def test_settings_of_an_arm_that_differ_between_scenes_are_stated(tmp_path):
 def test_arms_with_the_same_differences_share_a_line(tmp_path):
     for densify in ("adc", "mcmc"):
         for scene, most in (("park", 1000), ("room", 2000)):
-            settings = {"densify__max_gaussians": most}
+            settings = {"densify.max_gaussians": most}
             budget = {"max_gaussians": most, "cap": "hard"}
-            write(tmp_path, scene, f"{most:08d}", densify, settings, budget=budget)
-    made, has_mean = table(tmp_path)
-    assert has_mean  # each scene has its own budget, as in many papers
-    assert lines(made) == [
+            write(tmp_path, scene, f"{most:08d}", densify, settings, _budget=budget)
+    assert lines(tmp_path) == [  # and a mean: each scene has its own budget, as in many papers
         "Scenes of sfm-adc and sfm-mcmc differ in more than the scene: densify.max_gaussians (1000 "
         "on park, 2000 on room)."
     ]
-    table(tmp_path, rows=("densify",))  # is not refused
+    table_of(tmp_path, "psnr", rows=("densify",))  # is not refused
 
 
 def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path):
     for scene, starts in (("park", (500, 900)), ("room", (900,))):
         for start in starts:
-            own = {"densify__start": start, "scene__path": scene, "scene__views": len(scene) + 1}
+            own = {"densify.start": start, "scene.path": scene, "scene.views": len(scene) + 1}
             write(tmp_path, scene, f"{start:08d}", settings=own)
-    assert lines(table(tmp_path)[0]) == []
+    assert lines(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -84,36 +77,30 @@ def test_what_is_swept_on_a_scene_or_belongs_to_the_scene_is_not_stated(tmp_path
 )
 def test_no_mean_is_shown_over_scenes_under_different_conditions(tmp_path, key, values):
     for scene, value in zip(("park", "room"), values, strict=True):
-        write(tmp_path, scene, **{key: value})
-    made, has_mean = table(tmp_path)
-    assert not has_mean
-    first, second = lines(made)
-    assert first == NO_MEAN
-    assert second == (
+        write(tmp_path, scene, **{f"_{key}": value})
+    assert lines(tmp_path, has_mean=False) == [
+        NO_MEAN,
         f"Scenes of sfm-adc differ in more than the scene: {key} ({values[0]} on park, {values[1]} "
-        "on room)."
-    )
-    with pytest.raises(InputError, match=key):
-        table(tmp_path, rows=("densify",))
+        "on room).",
+    ]
+    with refusal(key):
+        table_of(tmp_path, "psnr", rows=("densify",))
 
 
 def test_variants_made_by_other_code_keep_their_means(tmp_path):
     """Each of them has one version of the code on all scenes."""
     for start, version in ((500, 1), (900, 2)):
         for scene in ("park", "room"):
-            code = {"sources": {}, "stages": STAGES | {"train": version}}
-            write(tmp_path, scene, f"{start:08d}", settings={"densify__start": start}, code=code)
-    made, has_mean = table(tmp_path)
-    assert has_mean
-    assert lines(made) == []
+            settings = {"densify.start": start}
+            write(tmp_path, scene, f"{start:08d}", settings=settings, _code=code(version))
+    assert lines(tmp_path) == []
 
 
 def test_versions_that_a_gate_compares_are_no_difference_between_scenes(tmp_path):
     for version in (1, 2):
-        code = {"sources": {}, "stages": STAGES | {"train": version}}
         for scene in ("park", "room"):
-            write(tmp_path / str(version), scene, code=code)
-    old, new = (load_experiment(tmp_path / str(version), "exp").trials for version in (1, 2))
+            write(tmp_path / str(version), scene, _code=code(version))
+    old, new = (trials_of(tmp_path / str(version)) for version in (1, 2))
     assert between_scenes_notes(old, new) == []
     assert texts(between_scenes_notes([*old[:2], *new[2:]])) == [
         "Scenes of sfm-adc differ in more than the scene: the version of stage train."
@@ -122,55 +109,46 @@ def test_versions_that_a_gate_compares_are_no_difference_between_scenes(tmp_path
 
 def test_no_mean_is_shown_over_versions_of_the_code(tmp_path):
     for scene, version in (("park", 1), ("room", 2)):
-        write(tmp_path, scene, code={"sources": {}, "stages": STAGES | {"train": version}})
-    made, has_mean = table(tmp_path)
-    assert not has_mean
-    assert lines(made) == [
+        write(tmp_path, scene, _code=code(version))
+    assert lines(tmp_path, has_mean=False) == [
         NO_MEAN,
         "Scenes of sfm-adc differ in more than the scene: the version of stage train.",
     ]
 
 
 def test_resolution_and_data_are_those_of_a_scene(tmp_path):
-    write(tmp_path, "park", resolution=[400, 300])
-    write(tmp_path, "room", resolution=[300, 200])
-    made, has_mean = table(tmp_path)
-    assert has_mean
-    assert lines(made) == []
+    write(tmp_path, "park", _resolution=[400, 300])
+    write(tmp_path, "room", _resolution=[300, 200])
+    assert lines(tmp_path) == []
 
 
 def test_a_verdict_on_named_trials_says_how_the_scenes_differ(tmp_path):
-    for densify in ("adc", "mcmc"):
-        write(tmp_path, "park", "a" * 8, densify, iterations=2000)
-        write(tmp_path, "room", "a" * 8, densify, iterations=7000)
-    scenes = {
-        scene: tuple(f"{scene}/sfm-{arm}/{'a' * 8}" for arm in ("adc", "mcmc"))
-        for scene in ("park", "room")
-    }
-    asked = Question(
-        metric="psnr", sign=1, baseline=Arm("", "a"), arm=Arm("", "b"), scenes=scenes, seeds=(0, 1)
+    arms, scenes = ("adc", "mcmc"), {}
+    for scene, iterations in (("park", 2000), ("room", 7000)):
+        for densify in arms:
+            write(tmp_path, scene, densify=densify, _iterations=iterations)
+        scenes[scene] = tuple(f"{scene}/sfm-{arm}/c0ffee00" for arm in arms)
+    asked = Question(metric="psnr", sign=1, scenes=scenes, seeds=(0, 1))
+    alone = replace(asked, scenes={"park": scenes["park"]})
+    both, one = (
+        judge(trials_of(tmp_path), Declaration(time=EARLY, questions=(question,)))[0]
+        for question in (asked, alone)
     )
-    trials = load_experiment(tmp_path, "exp").trials
-    declaration = Declaration(time="2020-01-01T00:00:00Z", questions=(asked,))
-    (verdict,) = judge(trials, declaration)
-    assert tuple(texts(verdict.notes)) == (
+    assert texts(both.notes) == [
         "Scenes of sfm-adc and sfm-mcmc differ in more than the scene: iterations (2000 on park, "
-        "7000 on room).",
-    )
-    (alone,) = judge(
-        trials, replace(declaration, questions=(replace(asked, scenes={"park": scenes["park"]}),))
-    )
-    assert alone.notes == ()
+        "7000 on room)."
+    ]
+    assert one.notes == ()
 
 
 @pytest.fixture
 def tuned_on_room(tmp_path):
     """Arms that differ in one setting on one scene, and in a second one on another scene."""
     for densify, start in (("adc", 500), ("mcmc", 900)):
-        own = {"densify___target_": "mine.Own", "densify__grow": 1 + (densify == "mcmc")}
-        write(tmp_path, "park", "a" * 8, densify, own | {"densify__split_size": 500})
-        write(tmp_path, "room", "b" * 8, densify, own | {"densify__split_size": start})
-    return load_experiment(tmp_path, "exp").trials
+        own = {"densify._target_": "mine.Own", "densify.grow": 1 + (densify == "mcmc")}
+        write(tmp_path, "park", "a" * 8, densify, own | {"densify.split_size": 500})
+        write(tmp_path, "room", "b" * 8, densify, own | {"densify.split_size": start})
+    return trials_of(tmp_path)
 
 
 FIRST, SECOND = Arm("sfm", "adc"), Arm("sfm", "mcmc")
@@ -186,7 +164,7 @@ def test_arms_differ_by_one_setting_alone_only_if_they_do_on_every_scene(tuned_o
 
 def test_a_fairness_sheet_has_the_values_of_all_scenes(tuned_on_room):
     sheet = fairness_table(tuned_on_room, FIRST, SECOND)
-    rows = {row.labels[0]: [entry.text for entry in row.entries] for row in sheet.rows}
+    rows = rows_of(sheet)
     assert rows["densify.grow"] == ["1", "2", "≠"]
     assert rows["densify.split_size"] == ["500", "500, 900", "≠"]
     assert sheet.notes[1] == (
@@ -203,8 +181,7 @@ def test_arms_without_a_common_scene_are_described_by_one_trial_each(tuned_on_ro
 
 
 def test_the_report_says_it_beside_the_verdict(tuned_on_room, tmp_path):
-    page = build_report(load_experiment(tmp_path, "exp"))
-    verdict = page.partition('<div class="verdict">')[2].partition("</div>")[0]
+    verdict = page_of(tmp_path).partition('<div class="verdict">')[2].partition("</div>")[0]
     assert (
         "Scenes of sfm-mcmc differ in more than the scene: densify.split_size (500 on " in verdict
     )

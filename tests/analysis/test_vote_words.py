@@ -3,13 +3,13 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, LikeThese
 from gsbench.analysis.vote_words import describe_round, load_rounds, people_words, vote_table
 from gsbench.analysis.votes import PairVotes, RoundVerdict
 from gsbench.runs.experiments import Arm
 from gsbench.runs.votes import RoundKey, Showing
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import trials_of
+from tests.trials import write_runs
 
 ADC, MCMC = Arm("sfm", "adc"), Arm("sfm", "mcmc")
 
@@ -110,8 +110,8 @@ def test_a_linked_round_of_votes_is_left_out(tmp_path, caplog):
 
 
 def test_the_table_has_the_verdicts_of_people_and_scenes(tmp_path):
-    write_runs(tmp_path, Plan(scenes=("yard",), densifiers=("adc", "mcmc"), effect={}))
-    trials = load_experiment(tmp_path, "exp").trials
+    write_runs(tmp_path, scenes=("yard",), densifiers=("adc", "mcmc"), effect={})
+    trials = trials_of(tmp_path)
     pair = replace(PAIR, scenes=replace(PEOPLE, outcome="undecided"), views=())
     table = vote_table(pair, True, trials, ())
     rows = {row.labels[0]: [entry.text for entry in row.entries] for row in table.rows}

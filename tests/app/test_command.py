@@ -24,32 +24,18 @@ OWN_FILES = {
 }
 
 
+OF_A_TRIAL = (
+    "hydra.output_subdir=.hydra hydra/job_logging=default hydra.job_logging.root.handlers=[file]"
+)
+OF_JOBS = "hydra.run.dir=${runs}/.hydra hydra.sweep.subdir=${hydra.job.num} hydra/launcher=basic"
+
+
 @pytest.mark.parametrize(
     "changes, typed, multirun, launch, added",
     [
         ({}, [], True, "serial", []),
-        (
-            {"run": {"dir": "here"}},
-            [],
-            False,
-            "serial",
-            [
-                "hydra.output_subdir=.hydra",
-                "hydra/job_logging=default",
-                "hydra.job_logging.root.handlers=[file]",
-            ],
-        ),
-        (
-            {"output_subdir": "x", "job_logging": {"root": 1}},
-            [],
-            True,
-            "serial",
-            [
-                "hydra.run.dir=${runs}/.hydra",
-                "hydra.sweep.subdir=${hydra.job.num}",
-                "hydra/launcher=basic",
-            ],
-        ),
+        ({"run": {"dir": "here"}}, [], False, "serial", OF_A_TRIAL.split()),
+        ({"output_subdir": "x", "job_logging": {"root": 1}}, [], True, "serial", OF_JOBS.split()),
         (
             {"sweep": {"dir": "a", "subdir": "b"}, "run": {"dir": "here"}},
             ["hydra.output_subdir=null", "hydra/job_logging=none"],
@@ -113,23 +99,14 @@ def test_another_launchers_jobs_get_a_folder_that_nobody_could_prepare(tmp_path)
     ],
 )
 def test_settings_of_a_sweep_need_a_sweep(changes, multirun, said):
-    config = OmegaConf.create(
-        {
-            "hydra": {
-                "sweeper": {"params": None, "grids": []},
-                "mode": None,
-                "runtime": {"choices": {"hydra/launcher": "gsbench"}},
-            },
-            "launch": {"stop_when_decided": False, "name": "serial"},
-        }
-    )
+    runtime = {"choices": {"hydra/launcher": "gsbench"}}
+    hydra = {"sweeper": {"params": None, "grids": []}, "mode": None, "runtime": runtime}
+    launch = {"stop_when_decided": False, "name": "serial"}
+    config = OmegaConf.create({"hydra": hydra, "launch": launch})
     for key, value in changes.items():
         OmegaConf.update(config, key, value, merge=False)
-    if said is None:
+    with refusal(said):
         check_sweep_settings(config, multirun)
-    else:
-        with pytest.raises(InputError, match=said):
-            check_sweep_settings(config, multirun)
 
 
 # ---- the end of a command
@@ -193,21 +170,21 @@ def test_a_comparison_of_versions_has_a_trial_of_each_scene(tmp_path, monkeypatc
         (["seed=1"], "seed follows from the other words"),
         (["+eval.primary=psnr"], r"eval\.primary follows from"),
     ):
-        with pytest.raises(InputError, match=f"gate: {said}"):
+        with refusal(f"gate: {said}"):
             one_trial_per_scene("gate", words, "psnr")
-    with pytest.raises(InputError, match="primary=nosuch"):
+    with refusal("primary=nosuch"):
         one_trial_per_scene("gate", [], "nosuch")
     made.append(trial(tmp_path, 1, scene={"name": "a"}))
-    with pytest.raises(InputError, match="gate is about one arm"):
+    with refusal("gate is about one arm"):
         one_trial_per_scene("gate", [], "train_time")
     made[:] = [trial(tmp_path)]
     made[0].values["launch"]["wait"] = False
-    with pytest.raises(InputError, match="gate waits for its trials"):
+    with refusal("gate waits for its trials"):
         one_trial_per_scene("gate", [], "train_time")
 
 
 def test_a_dry_run_explains_a_reference_to_nothing(runs):
-    with pytest.raises(InputError, match=r"^hydra\.run\.dir: Interpolation key 'nope' not found"):
+    with refusal(r"^hydra\.run\.dir: Interpolation key 'nope' not found"):
         command.compose_trials(["hydra.run.dir=${nope}"])
 
 

@@ -23,11 +23,9 @@ def test_a_sweep_may_set_what_all_its_choices_have_and_the_default_lacks():
 
 def test_now_is_the_same_in_all_trials_of_a_sweep():
     """Microseconds never agree by chance; each densifier is composed by itself."""
-    trials = compose_trials(
-        [*SWEEP, "name=x-${now:%H%M%S%f}", "scene.name=y-${now:%f}"], multirun=True
-    )
-    assert len({trial.values["name"] for trial in trials}) == 1
-    assert len({trial.values["scene"]["name"] for trial in trials}) == 1
+    words = [*SWEEP, "name=x-${now:%H%M%S%f}", "scene.name=y-${now:%f}"]
+    trials = compose_trials(words, multirun=True)
+    assert len({(one.values["name"], one.values["scene"]["name"]) for one in trials}) == 1
 
 
 @pytest.mark.parametrize(
@@ -80,27 +78,18 @@ def test_hydras_own_settings_are_accepted_and_a_dry_run_writes_nothing(words, ru
 
 def test_settings_can_read_hydras_node():
     """Each job gets its own number, although trials that differ in the seed share a composition."""
-    words = [
-        "name=x-${hydra:runtime.choices.densify}-${hydra:job.num}",
-        "init=random",
-        "densify=adc,none",
-        "seed=0,1",
-    ]
-    trials = compose_trials(words, multirun=True)
-    assert [trial.values["name"] for trial in trials] == [
-        "x-adc-0",
-        "x-adc-1",
-        "x-none-2",
-        "x-none-3",
-    ]
-    (trial,) = compose_trials(["name=x-${hydra:runtime.choices.densify}"])
-    assert trial.values["name"] == "x-volumetric"
-    words = ["+hydra.job.config.override_dirname.exclude_keys=[name]", "init=random", "seed=0,1"]
-    trials = compose_trials([*words, "name='${hydra:job.override_dirname}'"], multirun=True)
-    assert [trial.values["name"] for trial in trials] == [
-        "init=random,seed=0",
-        "init=random,seed=1",
-    ]
+
+    def names(*words):
+        trials = compose_trials(["init=random", *words], multirun=True)
+        return [trial.values["name"] for trial in trials]
+
+    choice = "name=x-${hydra:runtime.choices.densify}"
+    jobs = names(f"{choice}-${{hydra:job.num}}", "densify=adc,none", "seed=0,1")
+    assert jobs == ["x-adc-0", "x-adc-1", "x-none-2", "x-none-3"]
+    assert names(choice) == ["x-volumetric"]
+    without_name = "+hydra.job.config.override_dirname.exclude_keys=[name]"
+    found = names(without_name, "seed=0,1", "name='${hydra:job.override_dirname}'")
+    assert found == ["init=random,seed=0", "init=random,seed=1"]
 
 
 @pytest.mark.parametrize("value", ["x-${seed}", "x-${oc.select:seed,5}", "x-${${scene.name}}"])

@@ -12,10 +12,11 @@ from gsbench.analysis.results import read_experiment
 from gsbench.launch.jobs import Outcome, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.runs.experiments import read_declarations
-from gsbench.runs.layout import CONFIG, RESULTS
+from gsbench.runs.layout import RESULTS
 from gsbench.runs.trial_record import record_from
-from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.helpers import change_json
 from tests.launch.test_declare import TINY
+from tests.trials import write_as
 
 BASE = [
     "-m",
@@ -52,10 +53,7 @@ class Fake:
                 raise KeyboardInterrupt
             results = trial.folder / RESULTS
             if not results.exists():
-                views = {"psnr": self.psnr(arm, seed) + np.arange(3.0)}
-                data = trial_data(Plan(experiment="stop"), "courtyard", "random", arm, seed, views)
-                write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
-                (trial.folder / CONFIG).write_text(trial.yaml)
+                write_as(trial, psnr=self.psnr(arm, seed) + np.arange(3.0))
             outcomes.append(
                 outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
             )
@@ -114,24 +112,21 @@ def test_noise_gets_all_seeds_and_each_trial_is_launched_once(sweep, runs):
 @pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
 def test_all_seeds_of_planned_looks_are_declared_beforehand(sweep, runs, psnr):
     assert sweep(Fake(psnr)) == 0
-    experiment = read_experiment(runs / "stop")
-    comparison = compare(experiment)
+    comparison = compare(read_experiment(runs / "stop"))
     (answer,) = comparison.answers
     assert answer.beforehand
     # the sweep's last look and every other surface have the verdict of one function
-    assert answer.primary[0].outcome == verdicts_of(runs)[0].outcome
-    assert answer.primary[0].interval == verdicts_of(runs)[0].interval
-    assert ("Not there yet: 4 of the 8 declared trials" in str(comparison.notes()[-1])) == (
-        psnr is clear
-    )
+    (verdict,), shown = verdicts_of(runs), answer.primary[0]
+    assert (shown.outcome, shown.interval) == (verdict.outcome, verdict.interval)
+    missing = "Not there yet: 4 of the 8 declared trials" in str(comparison.notes()[-1])
+    assert missing == (psnr is clear)
 
 
 @pytest.mark.parametrize("psnr", [noise, clear], ids=lambda function: function.__name__)
 def test_looks_over_a_baseline_that_existed_give_one_verdict(sweep, runs, psnr, said, caplog):
     assert sweep(Fake(psnr)) == 0
     for file in (runs / "stop").glob("*/random-adc/*/results.json"):
-        text = file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
-        file.write_text(text)
+        change_json(file, measured="2020-01-01T00:00:00Z")
     caplog.clear()
     with caplog.at_level(logging.INFO):
         assert sweep(Fake(psnr)) == 0
@@ -176,9 +171,7 @@ def test_a_failed_seed_ends_the_looks_and_repeating_it_decides(sweep, runs):
 def test_more_seeds_after_looking_are_a_new_plan_whose_verdict_is_late(sweep, runs):
     assert sweep(Fake(noise)) == 0
     for file in (runs / "stop").glob("*/*/*/results.json"):  # measured long before the second plan
-        file.write_text(
-            file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
-        )
+        change_json(file, measured="2020-01-01T00:00:00Z")
     assert sweep(Fake(noise), "seed=0,1,2,3,4,5") == 0
     assert len(read_declarations(runs / "stop")) == 2
     (verdict,) = verdicts_of(runs)
@@ -193,31 +186,20 @@ def test_another_hydra_launcher_gets_one_look_at_a_time(sweep):
     assert [seed for ((_, seed),) in fake.batches] == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
-def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, capsys, said):
+def test_settings_make_arms_and_the_report_opens_with_the_looks(sweep, runs, said):
     """Arms that differ in one setting only have names of their own, as in the report."""
-    fake = Fake(clear)
-    assert (
-        sweep(
-            fake,
-            "densify=adc,volumetric",
-            "densify.max_gaussians=1000,2000",
-            "launch.least_difference=0.5",
-        )
-        == 0
-    )
-    verdicts = verdicts_of(runs)
-    assert [
-        (str(v.question.baseline), str(v.question.arm), v.question.least) for v in verdicts
-    ] == [
+    words = ["densify.max_gaussians=1000,2000", "launch.least_difference=0.5"]
+    assert sweep(Fake(clear), *words) == 0
+    asked = [verdict.question for verdict in verdicts_of(runs)]
+    assert [(str(one.baseline), str(one.arm), one.least) for one in asked] == [
         (f"random-adc[max_gaussians={count}]", f"random-volumetric[max_gaussians={count}]", 0.5)
         for count in (1000, 2000)
     ]
-    assert cli.run(["report", "stop"]) == 0
+    said("report stop")
     text = (runs / "stop" / "report.html").read_text()
     pair = "random-volumetric[max_gaussians=1000] against random-adc[max_gaussians=1000]"
     assert f"{pair}: better in PSNR (dB) on this scene" in text
     assert "launch.stop_when_decided" in text
-    capsys.readouterr()
     assert "Seeds come in planned looks" in said("tables", "stop")
 
 

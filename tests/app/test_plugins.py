@@ -16,7 +16,8 @@ from gsbench.app.sweep import Ended
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.jobs import Outcome
 from tests.app.stand_ins import done, trial
-from tests.finished import write_results
+from tests.helpers import refusal
+from tests.trials import write_results
 
 # ---- the value of a job
 
@@ -51,7 +52,7 @@ def test_the_value_of_a_job_is_the_mean_of_its_seeds_towards_the_wanted_end(tmp_
     with pytest.raises(GsbenchError, match="has no lpips_vgg"):
         Objective(1).value([*trials, third])
     monkeypatch.setattr(sweep, "facts_for", lambda metric, values: SimpleNamespace(direction=0))
-    with pytest.raises(InputError, match="whether more or less of it is better is not known"):
+    with refusal("whether more or less of it is better is not known"):
         metric_of(third.values)
 
 
@@ -65,13 +66,9 @@ def job(tmp_path, monkeypatch):
 
     def instance():
         overrides = OmegaConf.create({"hydra": ["hydra.mode=RUN", "hydra.x=1"], "task": ["a=1"]})
-        node = {
-            "job_logging": state.log,
-            "verbose": "x",
-            "overrides": overrides,
-            "mode": state.mode,
-        }
-        return SimpleNamespace(cfg=SimpleNamespace(hydra=SimpleNamespace(**node)))
+        own = {"job_logging": state.log, "verbose": "x", "mode": state.mode}
+        node = SimpleNamespace(overrides=overrides, **own)
+        return SimpleNamespace(cfg=SimpleNamespace(hydra=node))
 
     def resolve(config, allowed, words):
         state.did.append(("composed", allowed))
@@ -212,12 +209,12 @@ def test_another_sweeper_gets_a_value_for_each_job(tmp_path):
 
     def compose_jobs(jobs):
         composed.extend(jobs)
-        seeds = [int(dict(word.split("=") for word in job).get("seed", "7")) for job in jobs]
-        name = lambda job: {"name": job[0].replace("=", "")}  # noqa: E731
-        return [
-            trial(tmp_path / "runs", seed, job, scene=name(job))
-            for seed, job in zip(seeds, jobs, strict=True)
-        ]
+        made = []
+        for job in jobs:
+            seed = int(dict(word.split("=") for word in job).get("seed", "7"))
+            name = job[0].replace("=", "")
+            made.append(trial(tmp_path / "runs", seed, job, scene={"name": name}))
+        return made
 
     own = SimpleNamespace(composer=SimpleNamespace(trials=compose_jobs))
 

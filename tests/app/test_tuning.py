@@ -1,6 +1,5 @@
 """Tuning parity, with trials that take no time: what is declared, searched and chosen for arms."""
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +18,11 @@ from gsbench.launch.jobs import outcome_of_error, outcome_of_results
 from gsbench.launch.record import add_to_plan, declare
 from gsbench.parsing import read_typed
 from gsbench.runs.experiments import Arm, TuningRecord
-from gsbench.runs.layout import CONFIG, RESULTS, TUNING
+from gsbench.runs.layout import RESULTS, TUNING
 from gsbench.runs.trial_record import record_from
-from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.helpers import change_json, read_json, write
 from tests.launch.test_declare import TINY
+from tests.trials import write_as
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna (extra search)")
 
@@ -46,6 +46,7 @@ WORDS = [
     *(word for word in TINY if not word.startswith(("densify=", "seed=", "name="))),
     "+experiment=fair",
 ]
+INTERVAL, TUNE = "tag(log, interval(1e-3, 1e-1))", "hydra.sweeper.tune"
 KEYS = {"adc": "gradient_threshold", "volumetric": "volume_threshold"}
 BEST = {"adc": 3e-4, "volumetric": 0.01}
 
@@ -80,11 +81,7 @@ class Fake:
             views = {"psnr": 26.0 - error + 0.01 * values["seed"] + np.arange(3.0)}
             if self.own_metric:
                 views["mine"] = views["psnr"]
-            data = trial_data(
-                Plan(experiment=values["name"]), "courtyard", "random", arm, values["seed"], views
-            )
-            write_trial(trial.files.runs, data, views, trial.folder.name.partition("-")[0])
-            (trial.folder / CONFIG).write_text(trial.yaml)
+            write_as(trial, **views)
         return outcome_of_results(trial.folder, record_from(results.read_bytes(), results))
 
     def tuning(self, arm):
@@ -102,9 +99,7 @@ Sweep = Callable[..., int]
 @pytest.fixture
 def sweep(runs, tmp_path, monkeypatch):
     def run(fake, *words, file=FILE):
-        conf = tmp_path / "conf" / "experiment"
-        conf.mkdir(parents=True, exist_ok=True)
-        (conf / "fair.yaml").write_text(file)
+        write(tmp_path / "conf/experiment/fair.yaml", file)
         monkeypatch.setattr("gsbench.app.command.run_batch", fake)
         return cli.run(["--config-dir", str(tmp_path / "conf"), *WORDS, *words])
 
@@ -116,9 +111,7 @@ def tuning(runs, arm):
 
 
 def chosen(runs, arm):
-    best = tuning(runs, arm).best
-    assert best is not None
-    return dict(best.settings)
+    return dict(tuning(runs, arm).best.settings)
 
 
 @pytest.mark.slow
@@ -175,10 +168,10 @@ def test_a_killed_tuning_continues_and_chooses_the_same_values(
 def test_settings_added_to_a_record_are_ignored(strange, sweep, runs):
     assert sweep(Fake()) == 0
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
-    record = json.loads(file.read_text())
+    record = read_json(file)
     for point in record["points"]:
         point["settings"] |= strange
-    file.write_text(json.dumps(record))
+    write(file, record)
     again = Fake()
     assert sweep(again) == 0
     assert all(trial.values["tracking"]["uri"] is None for trial in again.trained)
@@ -198,19 +191,12 @@ def test_seeds_may_be_added_to_a_tuned_sweep_and_it_may_stop_when_decided(sweep,
 @pytest.mark.slow
 def test_a_point_is_judged_on_all_scenes_and_seeds_of_the_tuning(sweep, runs):
     fake = Fake()
-    words = [
-        "scene.sector=0,1",
-        "scene.split=sector",
-        "hydra.sweeper.tune.seed='7,8'",
-        "hydra.sweeper.tune.points=2",
-    ]
+    words = ["scene.sector=0,1", "scene.split=sector", f"{TUNE}.seed='7,8'", f"{TUNE}.points=2"]
     assert sweep(fake, *words) == 0
-    assert [(one.values["scene"]["sector"], one.values["seed"]) for one in fake.tuning("adc")] == [
-        (sector, seed) for _ in range(2) for sector in (0, 1) for seed in (7, 8)
-    ]
-    assert tuning(runs, "adc").points[0].value == pytest.approx(
-        26 - np.log(1.5) + 0.075 + 1, abs=1e-4
-    )
+    trained = [(one.values["scene"]["sector"], one.values["seed"]) for one in fake.tuning("adc")]
+    assert trained == 2 * [(0, 7), (0, 8), (1, 7), (1, 8)]
+    value = 26 - np.log(1.5) + 0.075 + 1
+    assert tuning(runs, "adc").points[0].value == pytest.approx(value, abs=1e-4)
 
 
 @pytest.mark.slow
@@ -218,49 +204,42 @@ def test_failed_points_count_in_the_budget_and_an_arm_without_a_judged_point_end
     sweep, runs, capsys
 ):
     assert sweep(Fake(fails=[0])) == 1
-    assert [point.value is None for point in tuning(runs, "adc").points] == [
-        True,
-        False,
-        False,
-        False,
-    ]
+    first, *rest = (point.value is None for point in tuning(runs, "adc").points)
+    assert (first, rest) == (True, 3 * [False])
     mended = Fake()
     assert sweep(mended) == 0
     # it is tried again
     assert mended.tuning("adc")[0].values["densify"]["gradient_threshold"] == 0.0002
     assert all(point.value is not None for point in tuning(runs, "adc").points)
-    capsys.readouterr()
     assert sweep(Fake(fails=[0, 2, 4, 6]), "name=none") == 1
-    assert (
-        "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)"
-        in capsys.readouterr().err
-    )
+    words = "no point of random-adc has a psnr (gsbench status none-tune-random-adc says why)"
+    assert words in capsys.readouterr().err
 
 
 def test_a_typed_value_replaces_an_interval(sweep, runs):
     fake = Fake()
-    assert sweep(fake, "densify.stop=200", "hydra.sweeper.tune.points=1") == 0
+    assert sweep(fake, "densify.stop=200", f"{TUNE}.points=1") == 0
     assert {one.values["densify"]["stop"] for one in fake.tuning("volumetric")} == {200}
     assert chosen(runs, "volumetric").keys() == {"densify.volume_threshold"}
 
 
 def test_zero_points_tune_nothing(sweep, runs):
     fake = Fake()
-    assert sweep(fake, "hydra.sweeper.tune.points=0") == 0
+    assert sweep(fake, f"{TUNE}.points=0") == 0
     assert fake.batches == [4]
     assert not list(runs.glob("*/tuning.json"))
 
 
 def test_a_dry_run_says_what_will_be_tuned_and_trains_nothing(sweep, runs, capsys):
-    look = ["--dry-run"]
-    assert sweep(Fake(), *look) == 0
+    assert sweep(Fake(), "--dry-run") == 0
     said = capsys.readouterr().out
-    assert (
+    for words in (
         "tunes first: 4 points each for random-adc and random-volumetric, by psnr of validation "
-        "views" in said
-    )
-    assert "8 trainings" in said
-    assert "with the values found, which are not known yet" in said
+        "views",
+        "8 trainings",
+        "with the values found, which are not known yet",
+    ):
+        assert words in said
     assert not runs.exists()
 
 
@@ -275,24 +254,13 @@ def test_an_interval_searches_one_arm(runs, monkeypatch):
 
     monkeypatch.setattr(optuna.samplers, "TPESampler", make_sampler)
     monkeypatch.setattr("gsbench.app.command.run_batch", fake)
-    words = [
-        "-m",
-        *WORDS[:-1],
-        "densify=volumetric",
-        "name=fair",
-        "seed=0,1",
-        "hydra.sweeper.tune.at_once=2",
-    ]
-    searched = [
-        "densify.volume_threshold=tag(log, interval(1e-3, 1e-1))",
-        "hydra.sweeper.tune.points=3",
-    ]
+    words = ["-m", *WORDS[:-1], "densify=volumetric", "name=fair", "seed=0,1"]
+    searched = [f"densify.volume_threshold={INTERVAL}", f"{TUNE}.points=3", f"{TUNE}.at_once=2"]
     assert cli.run([*words, *searched]) == 0
     assert fake.batches == [2, 1, 2]
     # Points that run together must know of each other, or the sampler may choose one twice.
     assert sampler_settings == {"seed": 0, "constant_liar": True}
     part = search_summary(runs / "fair-tune-random-volumetric")
-    assert part is not None
     assert "no test view was looked at" in part[0]
     assert "failed" not in part[0]
     assert "<svg" in part[1]
@@ -303,15 +271,11 @@ def test_an_interval_searches_one_arm(runs, monkeypatch):
 @pytest.mark.slow
 def test_a_users_metric_is_optimised_in_the_direction_of_its_class(sweep, runs, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
-    Path("own.py").write_text(
-        "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
-    )
-    words = [
-        "hydra.sweeper.tune.metric=mine",
-        "eval.extra.mine._target_=own.Mine",
-        "allow_targets=[own]",
-    ]
-    assert sweep(Fake(own_metric=True), *words, "hydra.sweeper.tune.points=2") == 0
+    text = "class Mine:\n    direction = -1\n    def measure(self, *given): ...\n"
+    Path("own.py").write_text(text)
+    own = ["eval.extra.mine._target_=own.Mine", "allow_targets=[own]"]
+    words = [*own, f"{TUNE}.metric=mine", f"{TUNE}.points=2"]
+    assert sweep(Fake(own_metric=True), *words) == 0
     search = tuning(runs, "adc")
     assert search.direction == -1
     assert search.best == min(search.points, key=lambda point: point.value or 0.0)
@@ -355,48 +319,42 @@ def test_unequal_tuning_is_stated_in_headline_and_tables(sweep, runs):
     assert sweep(Fake(), file=UNEVEN) == 0
     lines = notes(runs)
     assert f"Tuning. {SENTENCE}" in lines
-    page = build_report(load_experiment(runs, "fair"))
-    assert (
-        page.index("<strong>random-volumetric against")
-        < page.index(SENTENCE)
-        < page.index("<summary>Fairness")
-    )
-    assert any(SENTENCE in note for note in build_table(load_experiment(runs, "fair")).notes)
+    experiment = load_experiment(runs, "fair")
+    page = build_report(experiment)
+    order = "<strong>random-volumetric against", SENTENCE, "<summary>Fairness"
+    places = [page.index(part) for part in order]
+    assert places == sorted(places)
+    assert any(SENTENCE in note for note in build_table(experiment).notes)
 
 
 @pytest.mark.slow
 def test_trials_from_before_the_tuning_and_with_other_values_are_named(sweep, runs):
     assert sweep(Fake()) == 0
     for file in (runs / "fair").glob("*/random-volumetric/*/results.json"):
-        file.write_text(
-            file.read_text().replace('"raster"', '"measured": "2020-01-01T00:00:00Z", "raster"')
-        )
+        change_json(file, measured="2020-01-01T00:00:00Z")
     (line,) = [note for note in notes(runs) if "random-volumetric: " in note]
     assert "when 2 of these 2 trials had been measured" in line
     file = runs / "fair-tune-random-volumetric" / "tuning.json"
-    record = json.loads(file.read_text())
+    record = read_json(file)
     for point in record["points"]:
         point["settings"]["densify.volume_threshold"] = 0.5
-    file.write_text(json.dumps(record))
+    write(file, record)
     lines = notes(runs)
-    assert any("These trials have other values." in line for line in lines)
-    assert any(
-        "random-adc 4 points of 1 seed on validation views and random-volumetric none" in line
-        for line in lines
-    )
+    unequal = "random-adc 4 points of 1 seed on validation views and random-volumetric none"
+    for words in ("These trials have other values.", unequal):
+        assert any(words in line for line in lines)
     file.write_text("{")
     assert notes(runs)  # a damaged record does not hide the others
 
 
 # --- bad input
 
-INTERVAL = "tag(log, interval(1e-3, 1e-1))"
 MISTAKES = [
-    (FILE, "hydra.sweeper.tune.point=3", "did you mean points?"),
-    (FILE, "hydra.sweeper.tune.metric=psnrr", "did you mean psnr?"),
-    (FILE, "hydra.sweeper.tune.metric=mine", "there is no such metric"),
-    (FILE, "hydra.sweeper.tune.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
-    (FILE, "hydra.sweeper.tune.seed=one", "must list whole numbers"),
+    (FILE, f"{TUNE}.point=3", "did you mean points?"),
+    (FILE, f"{TUNE}.metric=psnrr", "did you mean psnr?"),
+    (FILE, f"{TUNE}.metric=mine", "there is no such metric"),
+    (FILE, f"{TUNE}.seed='1,2'", "tune.seed: 1 is a seed of the sweep, too"),
+    (FILE, f"{TUNE}.seed=one", "must list whole numbers"),
     (FILE, "scene.validation=true", "leave scene.validation out"),
     (FILE, "launch.wait=false", "launch.wait must be true"),
     (FILE, "hydra/sweeper=basic", "gsbench's own sweeper alone"),

@@ -176,16 +176,14 @@ def test_kernels_are_recorded_on_the_device_and_divided_by_the_steps(paced, monk
         assert measure.time.perf_counter() - before == (192 if on_gpu else 48)
 
     monkeypatch.setattr(measure, "profile", profile)
-    kernels = stepper.profiled_steps()["kernels_ms"]
-    assert kernels == {"sort": 0.5 if on_gpu else 7, "all others": 0}
+    assert stepper.profiled_steps()["kernels_ms"] == {"sort": 0.5 if on_gpu else 7, "all others": 0}
     assert len(waits) == on_gpu
 
 
 @pytest.mark.parametrize("device, resets", [("cpu", 0), ("cuda", 1)])
 def test_peak_memory_is_that_of_three_steps(device, resets, monkeypatch):
     done = []
-    stepper = SimpleNamespace(device=torch.device(device), step=lambda: done.append("step"))
-    made = {"x": stepper}
+    made = {"x": SimpleNamespace(device=torch.device(device), step=lambda: done.append("step"))}
     monkeypatch.setattr(measure, "Stepper", lambda raster, setting: made[raster])
     monkeypatch.setattr(measure, "reset_peak_memory", lambda device: done.append("reset"))
     monkeypatch.setattr(measure, "peak_memory_mb", lambda device: float(len(done)))
@@ -207,8 +205,7 @@ def test_a_gpu_is_for_rasterizers_that_need_one_and_for_a_users_own(monkeypatch)
     monkeypatch.setattr(measure, "make_scene", lambda *_: disabled[0] / 0)
     with pytest.raises(ZeroDivisionError):  # not an IndexError: it was called before
         Stepper("gsplat", Setting("trained", 40, 30, 50))
-    made = make_rasterizer("reference", torch.device("cpu"), 1)
-    assert isinstance(made, ReferenceRasterizer)
+    assert isinstance(make_rasterizer("reference", torch.device("cpu"), 1), ReferenceRasterizer)
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from dataclasses import MISSING, fields
 import numpy as np
 import pytest
 
-from gsbench.analysis.results import load_experiment
 from gsbench.claims.ablation import (
     choose_switches,
     declared_switches,
@@ -19,11 +18,12 @@ from gsbench.config.build import build
 from gsbench.config.compose import compose_one
 from gsbench.config.groups import options
 from gsbench.densify.volumetric import Volumetric
-from gsbench.errors import InputError
 from gsbench.runs.config_hash import config_hash
 from gsbench.settings import Switch
-from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.analysis.helpers import trials_of
+from tests.helpers import refusal
 from tests.launch.test_declare import TINY
+from tests.trials import write_trial
 
 NESTED = {
     "rule": Switch({"stop": 0}),
@@ -54,7 +54,7 @@ def test_a_switch_within_another_is_trained_only_where_the_other_is_on():
 
 def test_switches_that_depend_on_each_other_are_refused():
     circle = {"a": Switch({"x": 1}, within="b"), "b": Switch({"y": 1}, within="a")}
-    with pytest.raises(InputError, match="circle"):
+    with refusal("circle"):
         runs_to_train(circle)
     chain = {
         "a": Switch({"x": 1}),
@@ -108,14 +108,14 @@ def test_switches_in_a_yaml_file_do_not_change_the_configuration_hash():
     assert config_hash(named) == config_hash(plain)
     assert build("densify", named["densify"], []).split_shrink == 1.6
     for wrong in ({"a": {}}, {"a": 1}, [1], {"a": {"off": 3}}, {"a": {"off": {"x": 1}, "of": 2}}):
-        with pytest.raises(InputError, match=r"densify\.switches"):
+        with refusal(r"densify\.switches"):
             declared_switches({}, {"switches": wrong})
 
 
 def test_an_unknown_switch_is_refused_with_the_nearest_name():
-    with pytest.raises(InputError, match="did you mean shrink"):
+    with refusal("did you mean shrink"):
         choose_switches(NESTED, ["shrnk"], "x")
-    with pytest.raises(InputError, match="declares no switch"):
+    with refusal("declares no switch"):
         choose_switches({}, [], "x")
     assert list(choose_switches(NESTED, ["once"], "x")) == ["once"]
 
@@ -129,20 +129,16 @@ def write_ablation(runs, gains, seeds=3):
     for number, chosen in enumerate(runs_to_train(NESTED)):
         for seed in range(seeds):
             noise = 0.001 * np.random.default_rng([number, seed]).normal()
-            views = {"psnr": 26 + sum(gains[name] for name in chosen) + noise + np.zeros(3)}
-            write_trial(
-                runs,
-                trial_data(Plan(), "courtyard", "sfm", "volumetric", seed, views),
-                views,
-                f"{number:08x}",
-            )
+            psnr = 26 + sum(gains[name] for name in chosen) + noise
+            place = {"scene": "courtyard", "densify": "volumetric"}
+            write_trial(runs, seed, f"{number:08x}", **place, psnr=psnr)
         keys[chosen] = {"courtyard": f"courtyard/sfm-volumetric/{number:08x}"}
     return keys
 
 
 def test_each_combination_is_judged_against_the_run_with_all_parts(tmp_path):
     keys = write_ablation(tmp_path, {"rule": 1.0, "shrink": 0.4, "once": 0.0})
-    verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
+    verdicts = judge_runs(trials_of(tmp_path), keys, "psnr")
     found = {str(one.question.arm): (round(one.mean or 0.0, 2), one.outcome) for one in verdicts}
     assert found == {
         "without shrink": (-0.4, "refuted"),
@@ -163,7 +159,7 @@ def test_a_combination_whose_trials_are_missing_has_no_verdict(tmp_path):
     last = list(keys)[-1]
     for path in (tmp_path / "exp").glob(f"{keys[last]['courtyard']}-seed*/results.json"):
         path.unlink()
-    verdicts = judge_runs(load_experiment(tmp_path, "exp").trials, keys, "psnr")
+    verdicts = judge_runs(trials_of(tmp_path), keys, "psnr")
     assert verdicts[-1].answer is None
     assert markdown_table(verdicts)[-1].endswith("| – | – | courtyard: seed 0 has no partner |")
     assert len(markdown_table(verdicts[-1:])) == 3

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 import zipfile
 from shlex import split
@@ -12,24 +13,30 @@ import yaml
 
 from gsbench.analysis.comparison import compare
 from gsbench.analysis.images import textured_error
-from gsbench.analysis.results import load_experiment, read_views
+from gsbench.analysis.results import read_views
 from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.errors import InputError
-from tests.analysis.synthetic import Plan, write_runs
+from gsbench.runs.experiments import Declaration, Question
+from tests.analysis.helpers import loaded, write_declared
 from tests.helpers import read_json, refusal, write
+from tests.trials import write_runs
 
 # as many trials as Table 1 has
-MANY = Plan(scenes=[f"scene{k}" for k in range(9)], seeds=range(3), views=25)
+UNSIGNED = ("archive.json", "ro-crate-metadata.json")
+MANY = {"scenes": [f"scene{k}" for k in range(9)], "seeds": range(3), "views": 25}
 
 
-def export(tmp_path, plan=Plan()):  # noqa: B008 - never changed
+def declare(runs, metric="psnr"):
+    asked = Question(metric=metric, sign=0)
+    write_declared(runs, Declaration(time="2026-01-01T00:00:00Z", questions=(asked,)))
+
+
+def export(tmp_path, **plan):
     runs = tmp_path / "runs"
-    write_runs(runs, plan)
-    (runs / "exp" / "declared.jsonl").write_text(
-        '{"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-01-01T00:00:00Z"}\n'
-    )
-    write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    write_runs(runs, **plan)
+    declare(runs)
+    write_archive(loaded(runs), tmp_path / "exp.zip")
     return tmp_path / "exp.zip"
 
 
@@ -38,9 +45,18 @@ def members(file):
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def rewrite(file, change):
+def rewrite(file, change, resigned=False):
+    """Change the members of an archive; somebody who knows how also updates their checksums."""
     content = members(file)
     change(content)
+    if resigned:
+        manifest = json.loads(content["archive.json"])
+        manifest["sha256"] = {
+            name: hashlib.sha256(data).hexdigest()
+            for name, data in content.items()
+            if name not in UNSIGNED
+        }
+        content["archive.json"] = json.dumps(manifest).encode()
     with zipfile.ZipFile(file, "w") as archive:
         for name, data in content.items():
             archive.writestr(name, data)
@@ -48,7 +64,7 @@ def rewrite(file, change):
 
 def test_results_settings_and_views_are_read_back(tmp_path):
     file = export(tmp_path)
-    there = load_experiment(tmp_path / "runs", "exp")
+    there = loaded(tmp_path / "runs")
     back = unpack_archive(file, tmp_path / "other")
     assert [one.label for one in back.trials] == [one.label for one in there.trials]
     for one, other in zip(there.trials, back.trials, strict=True):
@@ -61,16 +77,16 @@ def test_results_settings_and_views_are_read_back(tmp_path):
 
 
 def test_an_archive_is_small_and_equal_results_give_equal_archives(tmp_path):
-    file = export(tmp_path, MANY)
+    file = export(tmp_path, **MANY)
     assert file.stat().st_size < 300_000
     before = file.read_bytes()
-    write_archive(load_experiment(tmp_path / "runs", "exp"), file)
+    write_archive(loaded(tmp_path / "runs"), file)
     assert file.read_bytes() == before
 
 
 def test_an_archive_has_no_pixels_no_paths_and_no_passwords(tmp_path):
     runs = tmp_path / "runs"
-    (path, *_) = write_runs(runs, Plan(pictures=True, views=2))
+    (path, *_) = write_runs(runs, pictures=True, views=2)
     config = yaml.safe_load((path / "config.yaml").read_text())
     config["runs"], config["scene"]["path"] = "/home/alice/runs", "/home/alice/photos/garden"
     config["tracking"] = {"uri": "http://alice:secret@there.org"}
@@ -87,7 +103,7 @@ def test_an_archive_has_no_pixels_no_paths_and_no_passwords(tmp_path):
     )
     results["unavailable"] = {"lpips_alex": looked, "where": "/home/alice/weights/a.pth"}
     write(path / "results.json", results)
-    write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    write_archive(loaded(runs), tmp_path / "exp.zip")
     content = members(tmp_path / "exp.zip")
     assert not any(name.endswith((".png", ".ply")) for name in content)
     assert b"alice" not in b"".join(content.values())
@@ -132,12 +148,12 @@ def cut(file):
     file.write_bytes(file.read_bytes()[:-600])
 
 
-def edit(name, old, new):
+def edit(name, old, new, resigned=False):
     def change(content):
         assert old in content[name]
         content[name] = content[name].replace(old, new)
 
-    return lambda file: rewrite(file, change)
+    return lambda file: rewrite(file, change, resigned)
 
 
 def drop(name):
@@ -145,29 +161,14 @@ def drop(name):
 
 
 def resigned(name, old, new):
-    """An edit by somebody who also updates the checksum."""
-
-    def change(content):
-        assert old in content[name]
-        content[name] = content[name].replace(old, new)
-        manifest = json.loads(content["archive.json"])
-        manifest["sha256"][name] = hashlib.sha256(content[name]).hexdigest()
-        content["archive.json"] = json.dumps(manifest).encode()
-
-    return lambda file: rewrite(file, change)
+    return edit(name, old, new, resigned=True)
 
 
 def with_unfinished(folder):
     """An archive by somebody who names this trial as failed."""
     line = json.dumps({"folder": folder, "configuration": {}}).encode()
-
-    def change(content):
-        content["unfinished.jsonl"] = line
-        manifest = json.loads(content["archive.json"])
-        manifest["sha256"]["unfinished.jsonl"] = hashlib.sha256(line).hexdigest()
-        content["archive.json"] = json.dumps(manifest).encode()
-
-    return lambda file: rewrite(file, change)
+    added = {"unfinished.jsonl": line}
+    return lambda file: rewrite(file, lambda content: content.update(added), resigned=True)
 
 
 def flip_a_bit(file):
@@ -226,11 +227,9 @@ def flip_a_bit(file):
 def test_every_kind_of_damage_is_refused_in_one_line_and_leaves_no_files(tmp_path, damage, message):
     file = export(tmp_path)
     damage(file)
-    with pytest.raises(InputError) as raised:
+    with refusal(re.escape(message)) as raised:
         unpack_archive(file, tmp_path / "other")
-    assert message in str(raised.value)
     assert str(raised.value).startswith(str(file))
-    assert "\n" not in str(raised.value)
     assert {path.name for path in tmp_path.iterdir()} <= {"runs", "exp.zip", "other"}
 
 
@@ -244,7 +243,7 @@ def test_a_file_too_large_is_not_unpacked(tmp_path, monkeypatch):
 def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
     runs, tmp_path, caplog, said, refused
 ):
-    first, second, *_ = write_runs(runs, Plan())
+    first, second, *_ = write_runs(runs)
     (first / "per_view.csv").write_text("view,psnr\nview000,1.0\n")
     (second / "results.json").write_text("{")
     assert said("export --results exp --out", tmp_path / "out" / "a.zip").startswith(
@@ -269,15 +268,13 @@ def test_a_damaged_trial_is_left_out_by_name_and_the_rest_is_exported(
 @pytest.mark.parametrize("config", ["kept", "unreadable"])
 def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, config):
     runs = tmp_path / "runs"
-    *_, failed = write_runs(runs, Plan(effect={"psnr": 3.0}))
-    (runs / "exp" / "declared.jsonl").write_text(
-        '{"questions": [{"metric": "psnr", "sign": 0}], "time": "2026-01-01T00:00:00Z"}\n'
-    )
+    *_, failed = write_runs(runs, effect={"psnr": 3.0})
+    declare(runs)
     (failed / "results.json").unlink()
     (failed / "failed.json").write_text('{"reason": "out of memory in /home/me/x"}')
     if config == "unreadable":
         (failed / "config.yaml").write_text("[1")
-    there = load_experiment(runs, "exp")
+    there = loaded(runs)
     write_archive(there, tmp_path / "exp.zip")
     back = unpack_archive(tmp_path / "exp.zip", tmp_path / "other")
     assert compare(back).sentences == compare(there).sentences
@@ -289,14 +286,12 @@ def test_a_trial_that_failed_forbids_the_same_verdict_in_the_archive(tmp_path, c
 def test_what_a_question_asks_of_pictures_comes_with_the_results(tmp_path, monkeypatch):
     """Pictures themselves stay out; a trial whose pictures are gone has no such number."""
     runs = tmp_path / "runs"
-    first, *_ = write_runs(runs, Plan(scenes=("yard",), seeds=(0,), pictures=True))
-    (runs / "exp" / "declared.jsonl").write_text(
-        '{"questions": [{"metric": "error_textured", "sign": 0}], "time": "2026-01-01T00:00:00Z"}\n'
-    )
-    there = {one.key: textured_error(one) for one in load_experiment(runs, "exp").trials}
+    first, *_ = write_runs(runs, scenes=("yard",), seeds=(0,), pictures=True)
+    declare(runs, "error_textured")
+    there = {one.key: textured_error(one) for one in loaded(runs).trials}
     (first / "from_pixels.json").unlink(missing_ok=True)
     shutil.rmtree(first / "renders")
-    write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    write_archive(loaded(runs), tmp_path / "exp.zip")
     lost, kept = unpack_archive(tmp_path / "exp.zip", tmp_path / "other").trials
     assert textured_error(kept) == there[kept.key]
     with pytest.raises(InputError):
@@ -305,10 +300,10 @@ def test_what_a_question_asks_of_pictures_comes_with_the_results(tmp_path, monke
 
 def test_trials_without_a_sound_configuration_are_left_out(tmp_path):
     runs = tmp_path / "runs"
-    first, second, *others = write_runs(runs, Plan(scenes=("yard",)))
+    first, second, *others = write_runs(runs, scenes=("yard",))
     (first / "config.yaml").unlink()
     (second / "config.yaml").write_text("[1]")
-    left_out = write_archive(load_experiment(runs, "exp"), tmp_path / "exp.zip")
+    left_out = write_archive(loaded(runs), tmp_path / "exp.zip")
     assert len(unpack_archive(tmp_path / "exp.zip", tmp_path / "other").trials) == len(others)
     assert len(left_out) == 2
 

@@ -1,9 +1,9 @@
 """A check from its file to its page: questions, runs at each look, and repeated checks."""
 
-import json
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import yaml
 
@@ -21,13 +21,13 @@ from gsbench.claims.check_page import _number, make_page, to_html
 from gsbench.claims.file import parse_claims
 from gsbench.cli import run
 from gsbench.config.compose import with_seed
-from gsbench.errors import InputError
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs.claims import describe
-from tests.analysis.synthetic import Plan, trial_data, write_trial
-from tests.claims.test_file import GOOD, changed, without
+from tests.claims.test_file import CLAIM, changed
+from tests.helpers import read_json, refusal, write
 from tests.launch.test_declare import TINY
+from tests.trials import write_as
 
 SENTENCE = (
     "volumetric against adc: better in PSNR (dB) on this scene: +1.000 (interval +0.996 to +1.004), "
@@ -37,8 +37,11 @@ EFFECT = 1.0  # dB, of "volumetric" in the made-up trials
 
 
 def content(**changes):
-    claims = [GOOD["claims"][0] | {"metric": "psnr", "direction": "higher", "least": 0.3} | changes]
-    return without("settings", "eval.lpips") | {"scenes": {"courtyard": None}, "claims": claims}
+    claims = [CLAIM | {"metric": "psnr", "direction": "higher", "least": 0.3} | changes]
+    return changed("settings", {"scene.max_size": 160}) | {
+        "scenes": {"courtyard": None},
+        "claims": claims,
+    }
 
 
 def check_of(tmp_path, **changes):
@@ -53,8 +56,6 @@ class FakeRunner:
         self.batches = []
 
     def __call__(self, trials):
-        import numpy as np
-
         self.batches.append(len(trials))
         for trial in trials:
             folder, values = TrialFolder.of(trial.values), trial.values
@@ -66,11 +67,7 @@ class FakeRunner:
                 continue
             arm = values["densify"]["name"]
             rng = np.random.default_rng([values["seed"], arm == "adc"])
-            views = {"psnr": 26 + EFFECT * (arm != "adc") + rng.normal(0, self.noise) + np.zeros(3)}
-            data = trial_data(
-                Plan(experiment="check_it"), "courtyard", "sfm", arm, values["seed"], views
-            )
-            write_trial(folder.runs, data, views, folder.path.name.partition("-")[0])
+            write_as(trial, psnr=26 + EFFECT * (arm != "adc") + rng.normal(0, self.noise))
 
 
 def looked(check, runner):
@@ -136,15 +133,15 @@ def test_scenes_that_cannot_be_tested_are_named_and_not_run(tmp_path):
 def test_settings_that_do_not_compose_are_refused_with_claim_scene_and_arm(tmp_path):
     for bad, message in (
         (
-            changed("arms", "adc", to={"densify": "adcc"}),
+            changed("arms.adc", {"densify": "adcc"}),
             "claim lpips, scene courtyard, arm adc: .*did you mean adc",
         ),
-        (changed("settings", to={"scene.max_siz": 160}), "did you mean max_size"),
-        (changed("arms", "volumetric", to={"densify": "adc"}), "the same trial on courtyard"),
-        (changed("arms", "adc", to={"densify.cap": "soft,hard"}), "several values"),
+        (changed("settings", {"scene.max_siz": 160}), "did you mean max_size"),
+        (changed("arms.volumetric", {"densify": "adc"}), "the same trial on courtyard"),
+        (changed("arms.adc", {"densify.cap": "soft,hard"}), "several values"),
     ):
         bad["scenes"] = {"courtyard": None}
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             prepare(parse_claims(bad), tmp_path, lambda trials: [])
 
 
@@ -165,18 +162,12 @@ def test_the_page_has_verdicts_looks_and_declarations(tmp_path):
     older = replace(check.declaration, time="2019-01-01T00:00:00Z", error_rate=0.1)
     declared = check.declaration
     page = make_page(Checked(check.file, verdicts, declared, [older, declared]))
-    for part in (
-        "supported",
-        "PSNR",
-        "courtyard",
-        "Earlier declarations under this name: 1.",
-        "looks planned at 2, 3, 4 seeds",
-        "abstract",
-    ):
-        assert part in to_html(page)
-    assert "<better>" not in to_html(page)
-    assert "<svg" in to_html(page)
-    alone = to_html(page).replace("http://www.w3.org", "").replace("http-equiv", "")
+    text = to_html(page)
+    words = "Earlier declarations under this name: 1.", "looks planned at 2, 3, 4 seeds"
+    for part in (*words, *["supported", "PSNR", "courtyard", "abstract", "<svg"]):
+        assert part in text
+    assert "<better>" not in text
+    alone = text.replace("http://www.w3.org", "").replace("http-equiv", "")
     assert "http" not in alone  # one file, no network
 
 
@@ -235,45 +226,33 @@ def test_what_cannot_be_tested_says_why():
 
 
 def test_the_page_shows_short_numbers_and_late_trials():
-    assert [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)] == [
-        "1,000",
-        "-1,000",
-        "999.9",
-        "0.5",
-    ]
+    shown = [_number(value) for value in (1000.0, -1000.0, 999.94, 0.5)]
+    assert shown == ["1,000", "-1,000", "999.9", "0.5"]
     two = Note.of("seen", trials=2)
     assert str(two).startswith("2 trials had been measured before this was declared")
 
 
 def test_check_judges_made_up_trials_and_their_archive_alike(
-    runs, tmp_path, monkeypatch, capsys, said, refused
+    runs, tmp_path, monkeypatch, said, refused
 ):
     runner = FakeRunner(noise=0.001)
     monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
     path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
-    path.write_text(json.dumps(content()))
+    write(path, content())
     out = said("check", path, "--dry-run")
     assert "1 claim to be tested" in out
-    assert (
-        "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps" in out
-    )
-    assert run(["check", str(path)]) == 0
+    words = "4 trials until the first look, 8 at most; each test may err in 5 % of such sweeps"
+    assert words in out
+    own = runs / "check_it" / "claims.html"
+    assert said("check", path) == f"supported            lpips: {SENTENCE}\n{own}\n"
     assert runner.batches == [4]
-    home = runs / "check_it"
-    assert (
-        capsys.readouterr().out
-        == f"supported            lpips: {SENTENCE}\n{home / 'claims.html'}\n"
-    )
-    assert "supported" in (home / "claims.html").read_text()
-    assert run(["export", "--results", "check_it", "--out", str(archive)]) == 0
-    capsys.readouterr()
+    assert "supported" in own.read_text()
+    said("export --results check_it --out", archive)
     out = said("check", path, "--from", archive)
     assert f"supported            lpips: {SENTENCE}" in out
     assert "judged on 4 trials: 1 scene, 2 seeds, two arms; looks planned at 2, 3, 4 seeds" in out
-    assert run(["check", str(path), "--from", str(archive), "--out", str(page)]) == 0
-    assert page.read_text().count("supported") == (home / "claims.html").read_text().count(
-        "supported"
-    )
+    said("check", path, "--from", archive, "--out", page)
+    assert page.read_text().count("supported") == own.read_text().count("supported")
     for changes, message in (
         ({"least": 0.2}, "its least was 0.3 when it was declared"),
         ({"direction": "lower"}, "its sign was 1"),
@@ -281,7 +260,7 @@ def test_check_judges_made_up_trials_and_their_archive_alike(
         ({"baseline": "volumetric", "arm": "adc"}, "other arms were declared"),
         ({"id": "other"}, "the file lacks claims that were declared: lpips"),
     ):
-        path.write_text(json.dumps(content(**changes)))
+        write(path, content(**changes))
         assert message in refused("check", path, "--from", archive)
     for words, message in (
         (["--from", str(archive), "--dry-run"], "runs nothing"),
@@ -303,14 +282,10 @@ def test_check_declares_before_it_runs_trials_and_repeats_its_page(
     claims = [
         claim | {"id": "points"},
         claim | {"id": "size", "not_testable": "too large", "metric": "ssim"},
+        claim | {"id": "texture", "metric": "error_textured", "direction": "lower", "least": "2%"},
     ]
-    claims.append(
-        claim | {"id": "texture", "metric": "error_textured", "direction": "lower", "least": "2%"}
-    )
     path = tmp_path / "claims.yaml"
-    path.write_text(
-        json.dumps(content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2})
-    )
+    write(path, content() | {"settings": settings, "arms": arms, "claims": claims, "seeds": 2})
     assert "4 trials until the first look" in said("check", path, "--dry-run")
     assert not (runs / "check_it").exists()
     out = said("check", path)
@@ -318,9 +293,7 @@ def test_check_declares_before_it_runs_trials_and_repeats_its_page(
     assert "not testable here    size: too large" in out
     home = runs / "check_it"
     (declared,) = read_declarations(home)
-    measured = [
-        json.loads(file.read_text())["measured"] for file in home.glob("*/*/*/results.json")
-    ]
+    measured = [read_json(file)["measured"] for file in home.glob("*/*/*/results.json")]
     assert len(measured) == 4
     assert min(measured) >= declared.time
     first = (home / "claims.html").read_text()
@@ -355,20 +328,11 @@ def test_a_file_of_claims_allows_no_code(tmp_path, key, monkeypatch):
     (tmp_path / "stranger.py").write_text(
         "from gsbench.densify import ADC\n\n\nclass Mine(ADC):\n    pass\n"
     )
-    with pytest.raises(
-        InputError, match=r"no file can allow code to run: type allow_targets=\[…\]"
-    ):
+    with refusal(r"no file can allow code to run: type allow_targets=\[…\]"):
         parse_claims(content() | {"settings": {key: ["stranger"]}})
-    arms = {
-        "adc": None,
-        "volumetric": {
-            "densify": "adc",
-            "densify._target_": "stranger.Mine",
-            "densify.name": "mine",
-        },
-    }
-    file = parse_claims(content() | {"arms": arms})
-    with pytest.raises(InputError, match=r"stranger\.Mine is not gsbench's own"):
+    mine = {"densify": "adc", "densify._target_": "stranger.Mine", "densify.name": "mine"}
+    file = parse_claims(content() | {"arms": {"adc": None, "volumetric": mine}})
+    with refusal(r"stranger\.Mine is not gsbench's own"):
         prepare(file, tmp_path, lambda trials: [])
     check = prepare(file, tmp_path, lambda trials: [], ["allow_targets=[stranger]"])
     assert check.trials(2)[1].values["densify"]["_target_"] == "stranger.Mine"

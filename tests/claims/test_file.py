@@ -12,6 +12,17 @@ from tests.conftest import ROOT
 from tests.helpers import refusal
 
 SHIPPED = sorted((ROOT / "conf" / "claims").glob("*.yaml"))
+CLAIM = {
+    "id": "lpips",
+    "says": "it is better",
+    "where": "abstract",
+    "baseline": "adc",
+    "arm": "volumetric",
+    "metric": "lpips_squeeze",
+    "direction": "lower",
+    "least": 0.005,
+    "refuted_if": "it is not",
+}
 GOOD = {
     "name": "check_it",
     "paper": "A paper",
@@ -19,44 +30,24 @@ GOOD = {
     "settings": {"scene.max_size": 160, "eval.lpips": ["squeeze"]},
     "scenes": {"courtyard": None, "own": {"scene": "photos", "scene.path": "${oc.env:HOME}/own"}},
     "arms": {"adc": {}, "volumetric": {"densify": "volumetric"}},
-    "claims": [
-        {
-            "id": "lpips",
-            "says": "it is better",
-            "where": "abstract",
-            "baseline": "adc",
-            "arm": "volumetric",
-            "metric": "lpips_squeeze",
-            "direction": "lower",
-            "least": 0.005,
-            "refuted_if": "it is not",
-        }
-    ],
+    "claims": [CLAIM],
 }
 
 
-def changed(*path, to):
-    """The good file with one value changed."""
-    content = copy.deepcopy(GOOD)
-    place = content
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = to
-    return content
+GONE = object()
 
 
-def without(*path):
-    content = copy.deepcopy(GOOD)
-    place = content
-    for key in path[:-1]:
-        place = place[key]
-    del place[path[-1]]
-    return content
-
-
-def second_claim(**changes):
-    content = copy.deepcopy(GOOD)
-    content["claims"].append(content["claims"][0] | {"id": "other"} | changes)
+def changed(place, to):
+    """The good file with another value at a place such as ``claims.0.arm``, or without it."""
+    content = inner = copy.deepcopy(GOOD)
+    *keys, last = place.split(".", 2)
+    for key in keys:
+        inner = inner[int(key) if key.isdecimal() else key]
+    last = int(last) if last.isdecimal() else last
+    if to is GONE:
+        del inner[last]
+    else:
+        inner[last] = to
     return content
 
 
@@ -70,7 +61,7 @@ def test_the_files_that_ship_are_sound(path):
 
 def test_settings_of_a_trial_are_words_of_a_command_line():
     file = parse_claims(
-        changed("claims", 0, "budget", to={"densify.max_gaussians": 15000, "densify.cap": None})
+        changed("claims.0.budget", {"densify.max_gaussians": 15000, "densify.cap": None})
     )
     assert file.words(file.claims[0], "own", "adc") == [
         "scene.max_size=160",
@@ -85,7 +76,7 @@ def test_settings_of_a_trial_are_words_of_a_command_line():
 
 
 def test_settings_of_a_claim_override_those_of_arms_and_of_the_file():
-    content = changed("settings", to={"densify.max_gaussians": 1, "scene.max_size": 160})
+    content = changed("settings", {"densify.max_gaussians": 1, "scene.max_size": 160})
     content["arms"]["adc"] = {"densify": "adc", "densify.max_gaussians": 2}
     content["claims"][0]["budget"] = {"densify.max_gaussians": 3}
     words = (file := parse_claims(content)).words(file.claims[0], "courtyard", "adc")
@@ -94,7 +85,7 @@ def test_settings_of_a_claim_override_those_of_arms_and_of_the_file():
 
 def test_the_direction_of_a_claim_is_the_sign_of_its_question():
     def sign(direction):
-        file = parse_claims(changed("claims", 0, "direction", to=direction))
+        file = parse_claims(changed("claims.0.direction", direction))
         return file.question(
             file.claims[0], {"courtyard": ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")}
         ).sign
@@ -106,135 +97,74 @@ def test_the_question_does_not_depend_on_the_wording_of_the_claim():
     file = parse_claims(GOOD)
     keys = ("garden/sfm-adc/0a", "garden/sfm-volumetric/0b")
     question = file.question(file.claims[0], {"courtyard": keys})
-    assert (question.metric, question.sign, question.least, question.relative) == (
-        "lpips_squeeze",
-        -1,
-        0.005,
-        False,
-    )
-    assert (str(question.baseline), question.seeds) == (
-        "adc[densify=adc]",
-        tuple(range(file.seeds)),
-    )
+    asked = question.metric, question.sign, question.least, question.relative
+    assert asked == ("lpips_squeeze", -1, 0.005, False)
+    assert (str(question.baseline), question.seeds) == ("adc[densify=adc]", (0, 1, 2, 3))
     assert question.planned == dict.fromkeys(keys, question.seeds)
-    other = parse_claims(changed("claims", 0, "says", to="in other words"))
+    other = parse_claims(changed("claims.0.says", "in other words"))
     assert other.question(other.claims[0], {"courtyard": keys}) == question
 
 
 def test_the_least_effect_is_a_difference_or_a_percentage():
     absolute = parse_claims(GOOD).claims[0].effect
-    relative = parse_claims(changed("claims", 0, "least", to="10%")).claims[0].effect
+    relative = parse_claims(changed("claims.0.least", "10%")).claims[0].effect
     assert (absolute.size, str(absolute)) == (0.005, "0.005")
     assert (relative.size, str(relative)) == (pytest.approx(0.1), "10 %")
 
 
 BAD = [
-    (
-        "an unknown arm",
-        lambda: changed("claims", 0, "arm", to="volumetrik"),
-        "did you mean volumetric",
-    ),
-    (
-        "an unknown baseline",
-        lambda: changed("claims", 0, "baseline", to="adcc"),
-        "baseline 'adcc'.*did you mean adc",
-    ),
-    (
-        "an unknown metric",
-        lambda: changed("claims", 0, "metric", to="lpips_squeze"),
-        "did you mean lpips_squeeze",
-    ),
-    (
-        "an unknown scene",
-        lambda: changed("claims", 0, "scenes", to=["courtyrad"]),
-        "did you mean courtyard",
-    ),
-    ("a scene twice", lambda: changed("claims", 0, "scenes", to=["own", "own"]), "is listed twice"),
-    (
-        "an arm against itself",
-        lambda: changed("claims", 0, "arm", to="adc"),
-        "compared with itself",
-    ),
-    ("zero width", lambda: changed("claims", 0, "least", to=0), "above 0"),
-    ("zero percent", lambda: changed("claims", 0, "least", to="0%"), "above 0"),
-    ("a negative width", lambda: changed("claims", 0, "least", to=-0.1), "above 0"),
-    ("no number", lambda: changed("claims", 0, "least", to="much"), "above 0"),
-    ("an infinite width", lambda: changed("claims", 0, "least", to="inf"), "above 0"),
-    (
-        "a count without percent",
-        lambda: changed("claims", 0, "metric", to="gaussians"),
-        "such as 10%",
-    ),
-    (
-        "a width above the metric's range",
-        lambda: changed("claims", 0, to=GOOD["claims"][0] | {"metric": "ssim", "least": 1}),
-        "more than ssim can differ by",
-    ),
-    (
-        "an unknown direction",
-        lambda: changed("claims", 0, "direction", to="lowre"),
-        "'higher', 'lower' or 'same'",
-    ),
-    ("an unknown key", lambda: changed("claims", 0, "metrics", to="psnr"), "did you mean metric"),
-    ("an unknown key at the top", lambda: changed("clams", to=[]), "did you mean claims"),
-    (
-        "a key that is missing",
-        lambda: without("claims", 0, "refuted_if"),
-        "claims.1..refuted_if is not given",
-    ),
-    ("no seeds", lambda: without("seeds"), "seeds is not given"),
-    ("one seed", lambda: changed("seeds", to=1), r"in \[2, 1000\]"),
-    ("endless seeds", lambda: changed("seeds", to=10**9), r"in \[2, 1000\]"),
-    ("no claims", lambda: changed("claims", to=[]), "at least one claim"),
-    (
-        "claims that are missing",
-        lambda: without("claims"),
-        "at least one claim|claims is not given",
-    ),
-    ("a claim that is text", lambda: changed("claims", 0, to="it is better"), "must be a mapping"),
-    (
-        "an empty sentence",
-        lambda: changed("claims", 0, "says", to="  "),
-        "says must be a text that is not empty",
-    ),
-    ("no scenes", lambda: changed("scenes", to={}), "at least one"),
-    (
-        "a scene that is text",
-        lambda: changed("scenes", "own", to="photos"),
-        "must be a mapping of settings",
-    ),
-    ("nested settings", lambda: changed("settings", to={"scene": {"max_size": 160}}), "with dots"),
-    (
-        "a nested budget",
-        lambda: changed("claims", 0, "budget", to={"densify": {"cap": "hard"}}),
-        "with dots",
-    ),
-    ("a seed of its own", lambda: changed("settings", to={"seed": 3}), "set by the plan"),
-    ("a name of its own", lambda: changed("arms", "adc", to={"name": "x"}), "set by the plan"),
-    (
-        "a primary metric",
-        lambda: changed("settings", to={"eval.primary": "psnr"}),
-        "set by the plan",
-    ),
-    ("no setting", lambda: changed("settings", to={"scene max": 160}), "is not a setting"),
-    ("an error rate of 1", lambda: changed("error_rate", to=1.0), "error_rate"),
-    ("a list", lambda: [], "must be a mapping"),
-    ("nothing", lambda: None, "must be a mapping"),
-    ("a name that is a path", lambda: changed("name", to="../other"), "letters, digits"),
-    ("one id twice", lambda: second_claim(id="lpips", metric="psnr"), "each its own"),
+    ("claims.0.refuted_if", GONE, "claims.1..refuted_if is not given"),
+    ("seeds", GONE, "seeds is not given"),
+    ("claims", GONE, "at least one claim|claims is not given"),
+    ("claims", [CLAIM, CLAIM | {"metric": "psnr"}], "each its own"),
+    ("claims.0.arm", "volumetrik", "did you mean volumetric"),
+    ("claims.0.baseline", "adcc", "baseline 'adcc'.*did you mean adc"),
+    ("claims.0.metric", "lpips_squeze", "did you mean lpips_squeeze"),
+    ("claims.0.scenes", ["courtyrad"], "did you mean courtyard"),
+    ("claims.0.scenes", ["own", "own"], "is listed twice"),
+    ("claims.0.arm", "adc", "compared with itself"),
+    ("claims.0.least", 0, "above 0"),
+    ("claims.0.least", "0%", "above 0"),
+    ("claims.0.least", -0.1, "above 0"),
+    ("claims.0.least", "much", "above 0"),
+    ("claims.0.least", "inf", "above 0"),
+    ("claims.0.metric", "gaussians", "such as 10%"),
+    ("claims.0", CLAIM | {"metric": "ssim", "least": 1}, "more than ssim can differ by"),
+    ("claims.0.direction", "lowre", "'higher', 'lower' or 'same'"),
+    ("claims.0.metrics", "psnr", "did you mean metric"),
+    ("clams", [], "did you mean claims"),
+    ("seeds", 1, r"in \[2, 1000\]"),
+    ("seeds", 10**9, r"in \[2, 1000\]"),
+    ("claims", [], "at least one claim"),
+    ("claims.0", "it is better", "must be a mapping"),
+    ("claims.0.says", "  ", "says must be a text that is not empty"),
+    ("scenes", {}, "at least one"),
+    ("scenes.own", "photos", "must be a mapping of settings"),
+    ("settings", {"scene": {"max_size": 160}}, "with dots"),
+    ("claims.0.budget", {"densify": {"cap": "hard"}}, "with dots"),
+    ("settings", {"seed": 3}, "set by the plan"),
+    ("arms.adc", {"name": "x"}, "set by the plan"),
+    ("settings", {"eval.primary": "psnr"}, "set by the plan"),
+    ("settings", {"scene max": 160}, "is not a setting"),
+    ("error_rate", 1.0, "error_rate"),
+    ("name", "../other", "letters, digits"),
 ]
 
 
-@pytest.mark.parametrize(
-    "content, message", [case[1:] for case in BAD], ids=[case[0] for case in BAD]
-)
-def test_bad_input_is_refused_in_one_line(content, message):
+@pytest.mark.parametrize("place, value, message", BAD)
+def test_bad_input_is_refused_in_one_line(place, value, message):
     with refusal(message):
-        parse_claims(content())
+        parse_claims(changed(place, value))
+
+
+@pytest.mark.parametrize("content", [[], None])
+def test_what_is_no_mapping_is_refused(content):
+    with refusal("must be a mapping"):
+        parse_claims(content)
 
 
 def test_a_users_own_metric_needs_its_class():
-    content = changed("claims", 0, "metric", to="sharpness")
+    content = changed("claims.0.metric", "sharpness")
     with refusal(r"eval\.extra\.sharpness"):
         parse_claims(content)
     content["settings"]["eval.extra.sharpness._target_"] = "mine.Sharpness"
@@ -251,10 +181,10 @@ def test_the_file_that_the_document_shows_is_sound():
 
 
 def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
-    with refusal("cannot be read"):
-        read_claims(tmp_path / "none.yaml")
-    with refusal("cannot be read"):
-        read_claims(tmp_path)
+    path = tmp_path / "bad.yaml"
+    for place in (path, tmp_path):
+        with refusal("cannot be read"):
+            read_claims(place)
     for text, message in (
         ("a: [", "not YAML"),
         ("name: a\nname: b\n", "is in it twice"),
@@ -266,7 +196,6 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path):
         ("a: &a {b: 1}\nc: {<<: *a}", "merge key"),
         ("a: !!python/name:os.system x", "tag"),
     ):
-        path = tmp_path / "bad.yaml"
         path.write_text(text)
         with refusal(message):
             read_claims(path)

@@ -29,9 +29,10 @@ from gsbench.claims.gate import (
     too_small_to_place,
 )
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.runs.trial_record import Code
-from tests.analysis.synthetic import Plan, trial_data, write_runs, write_trial
+from tests.analysis.helpers import loaded
+from tests.helpers import refusal
+from tests.trials import write_as, write_runs, write_trial
 
 VALUES = {"eval": {"extra": {}}}
 SCENES = dict.fromkeys(("courtyard", "garden"), ("sfm-adc", "sfm-adc"))
@@ -49,13 +50,8 @@ def trials(runs, effect, noise, seeds=4, scenes=tuple(SCENES)):
     for scene in scenes:
         for seed in range(seeds):
             rng = np.random.default_rng([seed, len(scene), int(1000 * abs(effect))])
-            views = {
-                "psnr": 26 + effect + rng.normal(0, noise) + np.zeros(3),
-                "flip": 0.1 + np.zeros(3),
-            }
-            write_trial(
-                runs, trial_data(Plan(experiment="gate"), scene, "sfm", "adc", seed, views), views
-            )
+            psnr = 26 + effect + rng.normal(0, noise)
+            write_trial(runs, seed, experiment="gate", scene=scene, psnr=psnr, flip=0.1)
     return load_experiment(runs, "gate").trials
 
 
@@ -119,28 +115,25 @@ def test_an_interval_that_reaches_the_least_loss_that_matters_does_not_pass(sign
 
 def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
     old = trials(tmp_path, 0, 0.1)
-    (verdict,) = ask_gate(
-        asked(), lambda: old, lambda: [one for one in old if one.scene == "garden"]
-    ).judged()
+    garden = [one for one in old if one.scene == "garden"]
+    (verdict,) = ask_gate(asked(), lambda: old, lambda: garden).judged()
     assert not verdict.final
     assert result_of(verdict) == NOT_DECIDED
     assert "trials are missing" in describe(verdict)
 
 
 def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
-    def made_by(own, state, measured):
-        code = Code(rooms={"densify": state})
-        return [
-            replace(one, record=replace(one.record, code=code, measured=measured)) for one in own
-        ]
+    def made_by(own, state, year):
+        made = {"code": Code(rooms={"densify": state}), "measured": f"{year}-01-01T00:00:00Z"}
+        return [replace(one, record=replace(one.record, **made)) for one in own]
 
-    old = made_by(trials(tmp_path / "a", 0, 0.01), "one", "2019-01-01T00:00:00Z")
-    new = made_by(trials(tmp_path / "b", -1, 0.01), "two", "2021-01-01T00:00:00Z")
+    old = made_by(trials(tmp_path / "a", 0, 0.01), "one", 2019)
+    new = made_by(trials(tmp_path / "b", -1, 0.01), "two", 2021)
     (verdict,) = ask_gate(asked(), lambda: old, lambda: new).judged()
     assert (result_of(verdict), verdict.seen) == (WORSE, ())
     (other,) = ask_gate(asked(), lambda: new, lambda: old).judged()
     assert len(other.seen) == 8
-    mixed = [*new[:1], *made_by(new[1:], "three", "2021-01-01T00:00:00Z")]
+    mixed = [*new[:1], *made_by(new[1:], "three", 2021)]
     (refused,) = ask_gate(asked(), lambda: old, lambda: mixed).judged()
     assert "different versions" in str(refused.notes[0])
     assert result_of(refused) == NOT_DECIDED
@@ -170,9 +163,9 @@ def test_questions_that_cannot_be_judged_are_refused():
         (("psnr", "0"), "above 0"),
         (("psnr", "much"), "above 0"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refusal(message):
             asked(*words)
-    with pytest.raises(InputError, match="needs at least 2 seeds, and there is 1"):
+    with refusal("needs at least 2 seeds, and there is 1"):
         asked(seeds=1)
     assert asked("gaussians", "10%").questions[0].sign == -1
     assert asked(least=None).questions[0].least == 0.1
@@ -197,8 +190,8 @@ def test_questions_that_cannot_be_judged_are_refused():
 def test_bad_input_of_gate_is_refused(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("GSBENCH_RUNS", raising=False)
-    write_runs(tmp_path / "made", Plan(densifiers=("adc", "volumetric")))
-    write_archive(load_experiment(tmp_path / "made", "exp"), tmp_path / "exp.zip")
+    write_runs(tmp_path / "made", densifiers=("adc", "volumetric"))
+    write_archive(loaded(tmp_path / "made"), tmp_path / "exp.zip")
     given = any(word.startswith(("scene=", "densify=")) for word in words)
     assert run(["gate", *words, *([] if given or not words else ["densify=adc", "init=sfm"])]) == 2
     assert message in capsys.readouterr().err
@@ -212,11 +205,8 @@ def test_the_exit_code_of_gate_is_its_result(tmp_path, monkeypatch, capsys, effe
 
     def train(planned):
         for trial in planned:
-            seed, folder = trial.values["seed"], trial.folder
-            trained.append(seed)
-            views = {"psnr": 26 + effect + 0.001 * seed + np.zeros(3)}
-            data = trial_data(Plan(experiment="gate"), "courtyard", "sfm", "adc", seed, views)
-            write_trial(trial.files.runs, data, views, folder.name.partition("-")[0])
+            trained.append(trial.values["seed"])
+            write_as(trial, psnr=26 + effect + 0.001 * trained[-1])
         return 0
 
     monkeypatch.chdir(tmp_path)
@@ -251,12 +241,12 @@ def test_bisecting_finds_any_commit_within_the_largest_number_of_steps(worse):
 def test_bisecting_skips_commits_that_are_undecided_or_do_not_train():
     assert first_worse(12, lambda commit: PASSED) is None
     answers = {6: NOT_DECIDED, 7: None}
-    assert first_worse(
-        12, lambda commit: answers.get(commit, WORSE if commit >= 9 else PASSED)
-    ) == (8, 9)
-    assert first_worse(
-        12, lambda commit: answers.get(commit, WORSE if commit >= 8 else PASSED)
-    ) == (5, 8)
+    for worse, found in ((9, (8, 9)), (8, (5, 8))):
+
+        def result(commit, worse=worse):
+            return answers.get(commit, WORSE if commit >= worse else PASSED)
+
+        assert first_worse(12, result) == found
     asked_for = []
 
     def never(commit):

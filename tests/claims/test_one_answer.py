@@ -1,8 +1,6 @@
 """The same trials give the same answer by a sweep, a check, a gate and a ledger, on each surface."""
 
 import html
-import json
-import logging
 import os
 import tempfile
 from pathlib import Path
@@ -16,9 +14,6 @@ from hypothesis import strategies as st
 from gsbench.analysis.comparison import compare, unused_trials
 from gsbench.analysis.looks import plan_looks
 from gsbench.analysis.notes import texts
-from gsbench.analysis.report.build import build_report
-from gsbench.analysis.results import load_experiment
-from gsbench.analysis.tables import build_table
 from gsbench.analysis.verdict_words import in_words, numbers
 from gsbench.claims import gate as gates
 from gsbench.claims import ledger as rules
@@ -27,14 +22,16 @@ from gsbench.claims.check import Checked, claim_verdicts
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
 from gsbench.claims.stopping import Asked
-from gsbench.runs.experiments import Arm, Declaration, Question, record_text
+from gsbench.runs.experiments import Arm, Declaration, Question
 from gsbench.runs.ledger import Ledger, Opened, Promoted, Started
 from gsbench.tracking.comparison import description
 from gsbench.verbs.results import tables
-from tests.analysis.synthetic import Plan, trial_data, write_trial
+from tests.analysis.helpers import EARLY, loaded, page_of, table_of, trials_of, write_declared
 from tests.claims.test_check import content
+from tests.helpers import read_json
+from tests.trials import write_trial
 
-EARLY, LEAST = "2020-01-01T00:00:00Z", 0.1
+LEAST = 0.1
 EXAMPLES = int(os.environ.get("GSBENCH_EXAMPLES", "12"))
 
 
@@ -56,11 +53,8 @@ def experiments(draw):
 def write(runs, seeds, scenes, values):
     """Write the trials, and their declaration as a sweep that stops when decided."""
     for (arm, scene, seed), psnr in values.items():
-        views = {"psnr": np.array([psnr])}
-        data = trial_data(Plan(), scene, "sfm", arm, seed, views) | {
-            "measured": "2021-01-01T00:00:00Z"
-        }
-        write_trial(runs, data, views)
+        measured = "2021-01-01T00:00:00Z"
+        write_trial(runs, seed, scene=scene, densify=arm, psnr=psnr, _measured=measured)
     question = Question(
         metric="psnr",
         least=LEAST,
@@ -70,7 +64,7 @@ def write(runs, seeds, scenes, values):
         seeds=tuple(range(seeds)),
     )
     declared = Declaration(time=EARLY, questions=(question,), looks=plan_looks(seeds))
-    (runs / "exp" / "declared.jsonl").write_text(record_text([declared]))
+    write_declared(runs, declared)
 
 
 def keys(scene):
@@ -108,15 +102,8 @@ def by_gate(scenes, seeds, trials):
 def by_ledger(scenes, seeds, trials):
     baseline, idea = ({scene: keys(scene)[side] for scene in scenes} for side in (0, 1))
     opened = Opened(
-        time=EARLY,
-        metric="psnr",
-        sign=1,
-        least=LEAST,
-        ideas=4,
-        rate=0.1,
-        words=(),
-        keys=baseline,
-        seeds=tuple(range(seeds)),
+        **{"time": EARLY, "metric": "psnr", "sign": 1, "least": LEAST, "ideas": 4, "rate": 0.1},
+        **{"words": (), "keys": baseline, "seeds": tuple(range(seeds))},
     )
     started = Started(time=EARLY, idea="mine", against="baseline", identity="", words=(), keys=idea)
     # one side of 2.5 % is an interval of 95 %
@@ -141,7 +128,7 @@ def test_each_verb_gives_the_same_answer_and_names_each_trial(made):
         runs = Path(folder)
         (runs / "exp").mkdir()
         write(runs, seeds, scenes, values)
-        experiment = load_experiment(runs, "exp")
+        experiment = loaded(runs)
         trials = list(experiment.trials)
         comparison = compare(experiment)
         found = {
@@ -169,24 +156,17 @@ def test_each_verb_gives_the_same_answer_and_names_each_trial(made):
 def surfaces(runs, experiment, comparison, words):
     """Check that each surface of the sweep states a verdict in these words."""
     assert words in comparison.sentences[0]
-    assert words in "\n".join(map(str, build_table(experiment).notes))
-    assert words in html.unescape(build_report(experiment))
+    assert words in "\n".join(table_of(runs).notes)
+    assert words in html.unescape(page_of(runs))
     assert words in description(experiment)
-    lines = []
-    handler = logging.Handler()
-    handler.emit = lambda record: lines.append(record.getMessage())
-    stopping.log.addHandler(handler)
-    level, stopping.log.level = stopping.log.level, logging.INFO
-    try:
-        home = runs / "exp"
-        stopping.log_verdicts([SimpleNamespace(files=SimpleNamespace(home=home))])
-    finally:
-        stopping.log.removeHandler(handler)
-        stopping.log.level = level
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        lines = []
+        monkeypatch.setattr(stopping.log, "info", lambda form, *facts: lines.append(form % facts))
+        stopping.log_verdicts([SimpleNamespace(files=SimpleNamespace(home=runs / "exp"))])
     assert words in next(line for line in lines if " against " in line)
     assert tables(["exp", "--format", "json", "--out", str(runs / "verdicts")], runs) == 0
     (file,) = (runs / "verdicts").glob("*.json")
-    (pair,) = json.loads(file.read_text())["pairs"]
+    (pair,) = read_json(file)["pairs"]
     assert words in pair["sentence"]
 
 
@@ -199,7 +179,7 @@ def test_a_trial_after_the_look_that_decided_is_named_with_the_reason(tmp_path, 
     }
     (tmp_path / "exp").mkdir()
     write(tmp_path, 4, "a", values)
-    trials = list(load_experiment(tmp_path, "exp").trials)
+    trials = list(trials_of(tmp_path))
     verdict, said = verb("a", 4, trials)
     assert verdict.pairs.seeds == 2
     assert "(the question was decided with 2 seeds)" in said["text"]

@@ -5,27 +5,26 @@ from dataclasses import replace
 import pytest
 
 from gsbench.analysis.judgement import judge
-from gsbench.analysis.results import read_experiment
 from gsbench.claims.check import Checked, claim_verdicts
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import parse_claims
 from gsbench.runs.experiments import Declaration
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import trials_of
 from tests.claims.test_check import content
+from tests.trials import write_runs
 
 EARLY = "2020-01-01T00:00:00Z"
 SIZE = "nine scenes, 30,000 iterations"
 
 
-def made(runs, scenes, seeds=4, **plan):
-    write_runs(
-        runs, Plan(scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0}, **plan)
-    )
-    return list(read_experiment(runs / "exp").trials)
+def made(runs, scenes, seeds=4):
+    write_runs(runs, scenes=scenes, seeds=range(seeds), scene_noise=0.0, effect={"psnr": 1.0})
+    return list(trials_of(runs))
 
 
 def page_of(trials):
     """The page of one claim about all scenes of the trials."""
+    trials = list(trials)
     names = list(dict.fromkeys(trial.scene for trial in trials))
     file = parse_claims(
         content() | {"size": SIZE, "scenes": {name: {"scene": "courtyard"} for name in names}}
@@ -55,17 +54,10 @@ def test_the_page_notes_different_machines_and_clouds(tmp_path):
         found = []
         for trial in trials:
             cpu = cpus[trial.seed]
-            machine = {
-                "cpu": cpu,
-                "architecture": "x86_64",
-                "kernels": "znver4",
-                "torch": "AVX512",
-                "device": "cpu",
-            }
+            machine = {"cpu": cpu, "kernels": "znver4", "torch": "AVX512", "device": "cpu"}
             hashes = trial.record.hashes | {"cloud": 64 * cpu[0]}
-            found.append(
-                replace(trial, record=replace(trial.record, machine=machine, hashes=hashes))
-            )
+            record = replace(trial.record, machine=machine, hashes=hashes)
+            found.append(replace(trial, record=record))
         return page_of(found).lines
 
     mixed, plain = lines(("Abacus", "Brain")), lines(("Abacus", "Abacus"))
@@ -75,14 +67,13 @@ def test_the_page_notes_different_machines_and_clouds(tmp_path):
 
 
 def test_each_initialiser_has_a_fairness_sheet_of_its_own(tmp_path):
-    trials = [
-        replace(
-            one,
-            record=replace(one.record, init="dataset" if one.scene != "courtyard" else one.init),
-        )
-        for one in made(tmp_path, ("courtyard", "room", "yard"), seeds=2)
-    ]
-    page = page_of(trials)
+    trials = made(tmp_path, ("courtyard", "room", "yard"), seeds=2)
+    page = page_of(
+        one
+        if one.scene == "courtyard"
+        else replace(one, record=replace(one.record, init="dataset"))
+        for one in trials
+    )
     (section,) = page.sections
     counts = [
         line for sheet in section.fairness for line in sheet.notes if line.startswith("Compared")

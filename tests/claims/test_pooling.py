@@ -1,6 +1,5 @@
 """The mean of many studies by Student's t, refusals, and archives as studies."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gsbench.analysis.results import load_experiment
 from gsbench.analysis.statistics import Interval, t_test
 from gsbench.claims.export import write_archive
 from gsbench.claims.pooling import (
@@ -23,11 +21,13 @@ from gsbench.claims.pooling import (
     read_studies,
 )
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import loaded, trials_of
+from tests.helpers import change_json, refusal
+from tests.trials import BUDGET, write_runs
 
 WANTED = PooledQuestion(("volumetric", "new"), ("adc", "gaussian-splatting"), "psnr")
+POOL = ("pool", "--arm", "volumetric")
 EFFECTS = (0.5, 0.9, 0.4, 0.7)
 STUDIES = [
     Study(f"trial {k}", effect, Interval(effect - 0.1, effect + 0.1))
@@ -38,7 +38,6 @@ STUDIES = [
 def test_the_mean_is_tested_with_studies_as_units():
     found, expected = pool(STUDIES), stats.ttest_1samp(EFFECTS, 0)
     interval = expected.confidence_interval()
-    assert found.test is not None
     assert found.test.mean == pytest.approx(np.mean(EFFECTS))
     assert found.test.p == pytest.approx(expected.pvalue)
     own = found.test.interval()
@@ -53,7 +52,6 @@ def test_intervals_contain_the_truth_as_often_as_they_claim():
     for _ in range(600):
         effects = rng.normal(1.0, 0.3, 5) + rng.normal(0, rng.uniform(0.1, 0.5, 5))
         found = pool([Study(str(k), float(effect)) for k, effect in enumerate(effects)])
-        assert found.test is not None
         held += found.test.interval().low <= 1.0 <= found.test.interval().high
     assert held / 600 > 0.95 - 3 * (0.05 * 0.95 / 600) ** 0.5
 
@@ -67,14 +65,13 @@ def test_studies_of_different_protocols_have_no_mean():
     unknown = pool([studies[0], Study("c", 1.0)])
     assert "c: unknown" in unknown.refusal
     alike = pool([studies[0], Study("c", 1.0, None, "paper-1")]).test
-    assert alike is not None
     assert alike.mean == pytest.approx(1.0)
 
 
 def test_one_study_has_no_mean_and_a_study_given_twice_is_refused():
     assert pool(STUDIES[:1]).test is None
     assert pool([]).test is None
-    with pytest.raises(InputError, match="twice"):
+    with refusal("twice"):
         pool([STUDIES[0], STUDIES[0]])
 
 
@@ -101,25 +98,22 @@ def test_studies_are_rows_of_a_table():
 def archive(tmp_path, name, seed=0, protocol="paper-1", budget=None, **plan):
     """Write the archive of a laboratory in which "volumetric" gains 1 dB."""
     runs = tmp_path / f"runs_{name}_{seed}"
-    paths = write_runs(runs, Plan(effect={"psnr": 1.0}, random_seed=seed, **plan))
+    paths = write_runs(runs, effect={"psnr": 1.0}, random_seed=seed, **plan)
     for number, path in enumerate(paths):
-        results = json.loads((path / "results.json").read_text())
-        results["protocol"] = (
-            protocol if protocol != "both" else ("paper-1", "standard-1")["garden" in str(path)]
-        )
-        results["budget"] = budget or results["budget"]
+        own = ("paper-1", "standard-1")["garden" in str(path)] if protocol == "both" else protocol
         # no two trainings take exactly the same time
-        results["seconds"]["train"] += seed + number / 1000
-        (path / "results.json").write_text(json.dumps(results))
+        took = {"init": 5.0, "train": 60 + seed + number / 1000, "evaluate": 2.0}
+        changes = {"protocol": own, "seconds": took, "budget": budget or BUDGET}
+        change_json(path / "results.json", **changes)
     file = tmp_path / f"{name}.zip"
-    write_archive(load_experiment(runs, "exp"), file)
+    write_archive(loaded(runs), file)
     return file
 
 
 def test_an_archive_is_a_study_of_its_paired_differences(tmp_path):
     file = archive(tmp_path, "lab")
     ((study,), _, _) = read_studies(file, WANTED, "lab")
-    trials = load_experiment(tmp_path / "runs_lab_0", "exp").trials
+    trials = trials_of(tmp_path / "runs_lab_0")
     by_arm = {(one.densify, one.scene, one.seed): one.metrics["psnr"] for one in trials}
     pairs = np.array(
         [
@@ -128,14 +122,10 @@ def test_an_archive_is_a_study_of_its_paired_differences(tmp_path):
         ]
     )
     assert study.effect == pytest.approx(pairs.mean())
-    test = t_test(pairs)
-    assert test is not None
-    assert study.interval is not None
-    assert (study.interval.low, study.interval.high) == pytest.approx(
-        (test.interval().low, test.interval().high)
-    )
-    assert study.protocol == "paper-1"
-    assert study.name == "lab"
+    expected = t_test(pairs).interval()
+    assert study.interval.low == pytest.approx(expected.low)
+    assert study.interval.high == pytest.approx(expected.high)
+    assert (study.protocol, study.name) == ("paper-1", "lab")
 
 
 def test_initialisers_on_different_scenes_are_one_study(tmp_path):
@@ -144,7 +134,7 @@ def test_initialisers_on_different_scenes_are_one_study(tmp_path):
         "both (dataset)",
         "both (sfm)",
     ]
-    trials = load_experiment(tmp_path / "runs_both_0", "exp")
+    trials = loaded(tmp_path / "runs_both_0")
     kept = [trial for trial in trials.trials if (trial.init == "sfm") == (trial.scene == "garden")]
     write_archive(replace(trials, trials=tuple(kept)), tmp_path / "one.zip")
     (study,), notes, _ = read_studies(tmp_path / "one.zip", WANTED, "one")
@@ -157,47 +147,40 @@ def test_initialisers_on_different_scenes_are_one_study(tmp_path):
     assert [("sfm" in note, "dataset" in note) for note in notes] == [(False, True), (True, False)]
 
 
-def test_trials_of_archives_can_be_chosen(tmp_path, said):
+def test_trials_of_archives_can_be_chosen(tmp_path, said, refused):
     """One archive may have two initialisers, or two splits, under one name."""
     files = [
-        str(archive(tmp_path, name, seed, inits=("sfm", "random")))
-        for seed, name in enumerate("ab")
+        archive(tmp_path, name, seed, inits=("sfm", "random")) for seed, name in enumerate("ab")
     ]
-    out = said("pool", *files, "--arm", "volumetric", "--where", "init=sfm")
+    out = said(*POOL, *files, "--where", "init=sfm")
     assert "of 2 studies" in out
     assert "| a |" in out
     assert out.startswith("volumetric against adc, difference in PSNR (dB), more is better\n")
     assert "caution" not in out
-    assert run(["pool", *files, "--arm", "volumetric", "--where", "init=none"]) == 2
+    refused(*POOL, *files, "--where", "init=none")
 
 
-def test_different_budgets_are_named(tmp_path, capsys):
+def test_different_budgets_are_named(tmp_path, said):
     steered = archive(tmp_path, "steered", budget={"max_gaussians": 20_000, "cap": "governor"})
     growing = archive(tmp_path, "growing", seed=1, budget={"max_gaussians": None, "cap": None})
-    assert run(["pool", str(steered), str(growing), "--arm", "volumetric"]) == 0
     sentence = "caution: the budgets differ (steered: 20,000 Gaussians (governor); growing: none)"
-    assert sentence in capsys.readouterr().out
+    assert sentence in said(*POOL, steered, growing)
 
 
 def test_three_archives_have_a_mean(tmp_path, said):
-    files = [str(archive(tmp_path, f"lab{k}", k)) for k in range(3)]
-    out = said("pool", *files, "--arm", "volumetric")
-    assert "| lab0 | +" in out
-    assert "of 3 studies" in out
-    assert "a further one would lie between" in out
+    out = said(*POOL, *(archive(tmp_path, f"lab{k}", k) for k in range(3)))
+    for words in ("| lab0 | +", "of 3 studies", "a further one would lie between"):
+        assert words in out
 
 
 def test_two_protocols_have_no_mean_and_one_can_be_chosen(tmp_path, said):
     """The protocols differ between archives or within one; every study is shown."""
-    files = [
-        str(archive(tmp_path, "a", 0)),
-        str(archive(tmp_path, "b", 1, "both")),
-        str(archive(tmp_path, "c", 2)),
-    ]
-    out = said("pool", *files, "--arm", "volumetric")
+    protocols = {"a": "paper-1", "b": "both", "c": "paper-1"}
+    files = [archive(tmp_path, name, k, own) for k, (name, own) in enumerate(protocols.items())]
+    out = said(*POOL, *files)
     assert all(name in out for name in ("| a |", "| b (paper-1) |", "| b (standard-1) |", "| c |"))
     assert "no mean: the studies differ in protocol" in out
-    out = said("pool", *files, "--arm", "volumetric", "--protocol", "paper-1")
+    out = said(*POOL, *files, "--protocol", "paper-1")
     assert "of 3 studies" in out
     assert "b (standard-1): not asked for" in out
 
@@ -228,24 +211,23 @@ def test_each_bad_source_has_one_line_and_the_others_are_pooled(tmp_path, capsys
         (line,) = [line for line in lines if name in line]
         assert reason in line
     assert len(lines) == 6
-    refused("pool", cut, "--arm", "volumetric")
+    refused(*POOL, cut)
 
 
 def test_archives_with_the_same_file_name_are_distinguished(tmp_path, said):
     for lab, seed in (("one", 0), ("two", 1)):
         (tmp_path / lab).mkdir()
         archive(tmp_path / lab, "results", seed)
-    sources = [str(tmp_path / lab / "results.zip") for lab in ("one", "two")]
-    assert f"| {sources[1]} |" in said("pool", *sources, "--arm", "volumetric")
+    sources = [tmp_path / lab / "results.zip" for lab in ("one", "two")]
+    assert f"| {sources[1]} |" in said(*POOL, *sources)
 
 
 def test_scenes_of_an_archive_under_other_conditions_are_noted(tmp_path):
     file = archive(tmp_path, "lab")
     runs = tmp_path / "runs_lab_0"
-    for path in (runs / "exp" / "garden").glob("*/*"):
-        results = json.loads((path / "results.json").read_text()) | {"iterations": 7000}
-        (path / "results.json").write_text(json.dumps(results))
-    write_archive(load_experiment(runs, "exp"), file)
+    for path in (runs / "exp" / "garden").glob("*/*/results.json"):
+        change_json(path, iterations=7000)
+    write_archive(loaded(runs), file)
     _, notes, _ = read_studies(file, WANTED, "lab")
     assert notes[1:] == [
         "lab: Scenes of sfm-adc and sfm-volumetric differ in more than the scene: iterations (2000 "
@@ -272,14 +254,11 @@ def test_a_name_of_an_arm_must_fit_one_arm_of_each_initialiser():
         assert pairs(adc, once, twice, arm=name) == [(adc, twice)]
         assert pairs(adc, once, twice, arm="adc", baseline=name) == [(twice, adc)]
     for names in ({}, {"arm": "adc", "baseline": "volumetric"}):
-        with pytest.raises(
-            InputError, match=re.escape(f"the name fits {once} and {twice}: choose")
-        ):
+        with refusal(re.escape(f"the name fits {once} and {twice}: choose")):
             pairs(adc, once, twice, **names)
 
 
 def test_a_metric_that_a_source_lacks_is_named(tmp_path, refused):
-    assert "can be paired in lpips_alex" in refused(
-        "pool", archive(tmp_path, "lab"), "--arm", "volumetric", "--metric", "lpips_alex"
-    )
+    line = refused(*POOL, archive(tmp_path, "lab"), "--metric", "lpips_alex")
+    assert "can be paired in lpips_alex" in line
     assert "--arm" in refused("pool", tmp_path / "lab.zip")

@@ -2,7 +2,7 @@
 
 import json
 import re
-from html.parser import HTMLParser
+from shlex import split
 
 import pytest
 
@@ -12,26 +12,26 @@ from gsbench.claims.archive import unpack_archive
 from gsbench.claims.export import write_archive
 from gsbench.claims.site import _by_quantity, _unique_key
 from gsbench.cli import run
-from gsbench.runs.experiments import Question, declared_now, record_text
-from tests.analysis.synthetic import Plan, write_runs
+from gsbench.runs.experiments import Question, declared_now
+from tests.analysis.helpers import loaded, trials_of, write_declared
 from tests.claims.test_archive import rewrite
 from tests.helpers import refusal
+from tests.markup import Page
+from tests.trials import write_runs
 from tests.view.browser import Browser
 
 HOSTILE = "<img src=x onerror=alert(1)>&\"'"
 CLAIM = {"courtyard": ("courtyard/sfm-adc/c0ffee00", "courtyard/sfm-volumetric/c0ffee00")}
 
 
-def archive(tmp_path, plan, pictures=False, claim=""):
+def archive(tmp_path, experiment="exp", claim="", **plan):
     """The archive of made-up trials, with a declared claim of that name."""
-    runs, file = tmp_path / f"runs-{plan.experiment}", tmp_path / f"{plan.experiment}.zip"
-    write_runs(runs, plan)
+    runs, file = tmp_path / f"runs-{experiment}", tmp_path / f"{experiment}.zip"
+    write_runs(runs, experiment=experiment, **plan)
     if claim:
         question = Question(metric="psnr", least=0.1, scenes=CLAIM, seeds=(0, 1, 2), name=claim)
-        (runs / plan.experiment / "declared.jsonl").write_text(
-            record_text([declared_now(questions=(question,))])
-        )
-    write_archive(load_experiment(runs, plan.experiment), file, pictures)
+        write_declared(runs, declared_now(questions=(question,)), experiment=experiment)
+    write_archive(load_experiment(runs, experiment), file, plan.get("pictures", False))
     return file
 
 
@@ -40,38 +40,14 @@ def site(tmp_path, *archives):
     return (tmp_path / "site" / "index.html").read_text()
 
 
-class Elements(HTMLParser):
-    """The names of all elements with their attributes, and all text."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.elements = []
-        self.text = ""
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-
-    def handle_data(self, data):
-        self.text += data
-
-
 def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
-    files = [
-        archive(tmp_path, Plan(), claim="sharper"),
-        archive(tmp_path, Plan(experiment="other", effect={"psnr": 2})),
-    ]
+    files = archive(tmp_path, claim="sharper"), archive(tmp_path, "other", effect={"psnr": 2})
     page = site(tmp_path, *files)
-    found = Elements(page)
+    found = Page(page)
     for words in (
-        "courtyard",
-        "garden",
-        "sfm",
-        "volumetric",
         "PSNR (dB)",
-        "sharper",
         "better in",
-        "paper-1",
+        *split("courtyard garden sfm volumetric sharper paper-1"),
     ):
         assert words in found.text
     for _, attributes in found.elements:
@@ -86,10 +62,8 @@ def test_the_first_page_has_arms_scenes_claims_and_working_links(tmp_path):
 
 
 def test_a_table_of_many_metrics_is_split_into_one_for_each(tmp_path):
-    write_runs(tmp_path, Plan())
-    table = build_table(
-        load_experiment(tmp_path, "exp"), columns=("scene",), metrics=("psnr", "ssim", "flip")
-    )
+    write_runs(tmp_path)
+    table = build_table(loaded(tmp_path), columns=("scene",), metrics=("psnr", "ssim", "flip"))
     parts = list(_by_quantity(table))
     assert [part.title for part in parts] == [name for name, _ in table.groups]
     for place, part in enumerate(parts):
@@ -113,15 +87,15 @@ def test_the_key_of_an_experiment_is_plain_and_not_taken(name, taken, key):
 
 
 def test_the_report_has_pictures_if_the_archive_has_them(tmp_path):
-    file = archive(tmp_path, Plan(seeds=(0,), scenes=("courtyard",), pictures=True), pictures=True)
+    file = archive(tmp_path, seeds=(0,), scenes=("courtyard",), pictures=True)
     site(tmp_path, file)
     # whole views
     assert "data:image/jpeg" in (tmp_path / "site" / "reports" / "exp.html").read_text()
     without = tmp_path / "without.zip"
-    write_archive(load_experiment(tmp_path / "runs-exp", "exp"), without)
+    write_archive(loaded(tmp_path / "runs-exp"), without)
     assert without.stat().st_size < file.stat().st_size / 2
     back = unpack_archive(file, tmp_path / "back").trials[0]
-    there = load_experiment(tmp_path / "runs-exp", "exp").trials[0]
+    there = trials_of(tmp_path / "runs-exp")[0]
     for kind in ("renders", "ground_truth"):
         assert [one.read_bytes() for one in back.folder.pictures(kind)] == [
             one.read_bytes() for one in there.folder.pictures(kind)
@@ -129,12 +103,12 @@ def test_the_report_has_pictures_if_the_archive_has_them(tmp_path):
 
 
 def test_an_archive_of_too_many_bytes_is_neither_written_nor_read(tmp_path, monkeypatch):
-    file = archive(tmp_path, Plan())
+    file = archive(tmp_path)
     monkeypatch.setattr("gsbench.claims.archive.MAX_TOTAL_BYTES", 1000)
     with refusal("more than the limit of 1 kB"):
         unpack_archive(file, tmp_path / "back")
     with refusal("more than the limit of 1 kB"):
-        write_archive(load_experiment(tmp_path / "runs-exp", "exp"), tmp_path / "again.zip")
+        write_archive(loaded(tmp_path / "runs-exp"), tmp_path / "again.zip")
 
 
 def test_html_in_texts_of_a_stranger_is_escaped(tmp_path):
@@ -149,33 +123,21 @@ def test_html_in_texts_of_a_stranger_is_escaped(tmp_path):
                 if "configuration" in line:
                     line["configuration"]["densify"][HOSTILE] = HOSTILE
             content[name] = "".join(json.dumps(line) + "\n" for line in lines).encode()
-        repack(content)
 
-    def repack(content):
-        import hashlib
-
-        manifest = json.loads(content["archive.json"])
-        manifest["sha256"] = {
-            name: hashlib.sha256(content[name]).hexdigest() for name in manifest["sha256"]
-        }
-        content["archive.json"] = json.dumps(manifest).encode()
-
-    file = archive(tmp_path, Plan(), claim=HOSTILE)
-    rewrite(file, spoil)
+    file = archive(tmp_path, claim=HOSTILE)
+    rewrite(file, spoil, resigned=True)
     page = site(tmp_path, file)
     pages = [page, (tmp_path / "site" / "reports" / "exp.html").read_text()]
     for text in pages:
-        found = Elements(text)
-        assert not [
-            tag for tag, attributes in found.elements if "onerror" in attributes or tag == "img"
-        ]
-    assert HOSTILE in Elements(page).text
+        elements = Page(text).elements
+        assert not [tag for tag, named in elements if "onerror" in named or tag == "img"]
+    assert HOSTILE in Page(page).text
     assert page.count("<script>") == 1
 
 
 @pytest.mark.parametrize("name", ["index", "Con Trol%20#x", "é<>".replace("<>", "")])
 def test_names_of_experiments_become_plain_names_of_files(tmp_path, name):
-    one, other = archive(tmp_path, Plan(experiment=name)), tmp_path / "again.zip"
+    one, other = archive(tmp_path, name), tmp_path / "again.zip"
     other.write_bytes(one.read_bytes())
     site(tmp_path, one, other)
     reports = sorted(path.name for path in (tmp_path / "site" / "reports").glob("*.html"))
@@ -184,7 +146,7 @@ def test_names_of_experiments_become_plain_names_of_files(tmp_path, name):
 
 
 def test_damaged_archives_are_left_out_and_a_site_without_any_is_refused(tmp_path, capsys, refused):
-    good, bad = archive(tmp_path, Plan()), tmp_path / "bad.zip"
+    good, bad = archive(tmp_path), tmp_path / "bad.zip"
     bad.write_bytes(good.read_bytes()[:100])
     out = str(tmp_path / "site")
     assert run(["site", str(bad), str(good), "--out", out]) == 1
@@ -207,16 +169,8 @@ def test_damaged_archives_are_left_out_and_a_site_without_any_is_refused(tmp_pat
     ],
 )
 def test_a_picture_with_a_path_outside_its_trial_is_refused(tmp_path, name):
-    import hashlib
-
-    def add(content):
-        manifest = json.loads(content["archive.json"])
-        content[name] = b"x"
-        manifest["sha256"][name] = hashlib.sha256(b"x").hexdigest()
-        content["archive.json"] = json.dumps(manifest).encode()
-
-    file = archive(tmp_path, Plan())
-    rewrite(file, add)
+    file = archive(tmp_path)
+    rewrite(file, lambda content: content.update({name: b"x"}), resigned=True)
     before = {path for path in tmp_path.rglob("*") if "inside" not in path.parts}
     with refusal(
         r"cannot be a picture of a trial|cannot be the folder of a trial|not that of an "
@@ -228,9 +182,7 @@ def test_a_picture_with_a_path_outside_its_trial_is_refused(tmp_path, name):
 
 @pytest.mark.slow
 def test_a_click_on_a_heading_sorts_the_table(tmp_path):
-    archives = [
-        archive(tmp_path, Plan(experiment=name, seeds=range(k + 1))) for k, name in enumerate("cab")
-    ]
+    archives = [archive(tmp_path, name, seeds=range(k + 1)) for k, name in enumerate("cab")]
     site(tmp_path, *archives)
 
     def evaluated(browser, script):

@@ -4,7 +4,6 @@ import itertools
 import json
 import random
 import re
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -14,21 +13,20 @@ from PIL import Image
 from scipy.optimize import minimize
 from scipy.stats import binomtest
 
-from gsbench.analysis.report.build import build_report
 from gsbench.analysis.results import load_experiment
 from gsbench.analysis.votes import bradley_terry, judge_round
 from gsbench.claims.vote_page import make_round
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.runs.experiments import Arm, read_declarations
 from gsbench.runs.votes import Ballot, RoundKey, Showing, Vote, read_key
 from gsbench.verbs.vote import choose_arms
-from tests.analysis.synthetic import Plan, write_runs
+from tests.analysis.helpers import page_of, trials_of
 from tests.conftest import script
+from tests.helpers import read_json, refusal, write
+from tests.trials import write_runs
 from tests.view.browser import Browser
 
 ADC, VOLUMETRIC = "sfm-adc", "sfm-volumetric"
-Chooser = Callable[[Showing], str]
 SHARP = {"left": "right", "right": "left"}
 
 
@@ -38,7 +36,11 @@ def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("votes")
     write_runs(
         folder,
-        Plan(views=7, seeds=(0, 1), pictures=True, effect={"lpips_vgg_raw": 0.1}, view_noise=0.1),
+        views=7,
+        seeds=(0, 1),
+        pictures=True,
+        effect={"lpips_vgg_raw": 0.1},
+        view_noise=0.1,
     )
     return folder
 
@@ -55,10 +57,8 @@ def made(runs, tmp_path):
 
     def make(*words, pairs="12", out="page"):
         before = set((runs / "exp" / "votes").glob("*"))
-        assert (
-            run(["vote", "make", "exp", "--out", str(tmp_path / out), "--pairs", pairs, *words])
-            == 0
-        )
+        made = ["vote", "make", "exp", "--out", str(tmp_path / out), "--pairs", pairs]
+        assert run([*made, *words]) == 0
         (folder,) = set((runs / "exp" / "votes").glob("*")) - before
         return read_key(folder)
 
@@ -82,21 +82,23 @@ def ballot(key, person, choose, minute=0, name=""):
 
 def saved(folder, one):
     file = folder / f"votes-{one.person}.json"
-    file.write_text(json.dumps(one.to_json()))
+    write(file, one.to_json())
     return str(file)
+
+
+@pytest.fixture
+def judge(said, tmp_path):
+    """A function that judges ballots, or the stored ones, and returns what is printed."""
+    return lambda *ballots: said("vote judge exp", *(saved(tmp_path, one) for one in ballots))
 
 
 def made_up(arms, scenes, views, people=9, traps=4):
     """A key without pictures: every two arms on each view."""
+    pair = {"kind": "pair", "seed": 0}
     showings = [
         Showing(
-            id=f"{scene}{view}{one}{two}",
-            kind="pair",
-            scene=str(scene),
-            view=str(view),
-            seed=0,
-            left=one,
-            right=two,
+            **{"id": f"{scene}{view}{one}{two}", "scene": str(scene), "view": str(view)},
+            **pair | {"left": one, "right": two},
         )
         for scene in range(scenes)
         for view in range(views)
@@ -106,19 +108,11 @@ def made_up(arms, scenes, views, people=9, traps=4):
     showings.append(
         replace(first, id="again", kind="again", left=first.right, right=first.left, of=first.id)
     )
-    trap = Showing(
-        id="", kind="trap", scene="0", view="0", seed=0, left="photograph", right="blurred"
-    )
+    trap = replace(first, kind="trap", left="photograph", right="blurred")
     showings += [replace(trap, id=f"trap{number}") for number in range(traps)]
     named = tuple(Arm(*arm.split("-")) for arm in arms)
-    return RoundKey(
-        salt="s",
-        time="2026-11-27T00:00:00Z",
-        arms=named,
-        people=people,
-        traps_allowed=0,
-        showings=tuple(showings),
-    )
+    more = {"salt": "s", "time": "2026-11-27T00:00:00Z", "traps_allowed": 0}
+    return RoundKey(arms=named, people=people, showings=tuple(showings), **more)
 
 
 # ---- the page
@@ -146,24 +140,23 @@ def test_each_showing_has_the_pictures_that_its_key_names(made, runs, tmp_path):
     key = made()
     text = (page / "index.html").read_text()
     entries = json.loads(text.partition('id="data">')[2].partition("</script>")[0])["showings"]
-    trials = {(t.scene, str(t.arm), t.seed): t.path for t in load_experiment(runs, "exp").trials}
+    trials = {(t.scene, str(t.arm), t.seed): t.path for t in trials_of(runs)}
     for entry, showing in zip(entries, key.showings, strict=True):
-        photo, left, right = (
-            np.asarray(Image.open(page / entry[what])) for what in ("photo", "left", "right")
-        )
+        photo, left, right = (pixels(page / entry[what]) for what in ("photo", "left", "right"))
+        name = f"{showing.view}.png"
         folder = trials[showing.scene, ADC, showing.seed]
-        np.testing.assert_array_equal(
-            photo, np.asarray(Image.open(folder / "ground_truth" / f"{showing.view}.png"))
-        )
+        np.testing.assert_array_equal(photo, pixels(folder / "ground_truth" / name))
         for side, shown in (("left", left), ("right", right)):
             what = getattr(showing, side)
             if showing.kind == "trap":
                 assert np.array_equal(shown, photo) == (what == "photograph")
             else:
-                render = (
-                    trials[showing.scene, what, showing.seed] / "renders" / f"{showing.view}.png"
-                )
-                np.testing.assert_array_equal(shown, np.asarray(Image.open(render)))
+                folder = trials[showing.scene, what, showing.seed]
+                np.testing.assert_array_equal(shown, pixels(folder / "renders" / name))
+
+
+def pixels(file):
+    return np.asarray(Image.open(file))
 
 
 def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
@@ -183,8 +176,8 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
         differences = {}
         for place in range(7):
             both = [
-                np.asarray(Image.open(t.path / "renders" / f"view{place:03}.png")).astype(float)
-                for t in load_experiment(runs, "exp").trials
+                pixels(t.path / "renders" / f"view{place:03}.png").astype(float)
+                for t in trials_of(runs)
                 if t.scene == scene and t.seed == place % 2
             ]
             differences[f"view{place:03}"] = np.abs(both[0] - both[1]).mean()
@@ -192,25 +185,22 @@ def test_views_sides_repeats_and_traps_follow_the_rules(made, runs):
     for showing in key.showings:
         if showing.kind == "again":
             first = next(one for one in key.pairs if one.id == showing.of)
-            assert (showing.left, showing.right, showing.view) == (
-                first.right,
-                first.left,
-                first.view,
-            )
+            swapped = replace(first, left=first.right, right=first.left)
+            assert (showing.left, showing.right) == (swapped.left, swapped.right)
+            assert showing.view == first.view
             assert key.showings.index(showing) > key.showings.index(first)
 
 
 def test_a_repeated_pair_does_not_follow_its_first_showing_soon(runs, tmp_path):
-    trials = load_experiment(runs, "exp").trials
+    trials = trials_of(runs)
     for seed in range(8):
         arms = [Arm("sfm", "adc"), Arm("sfm", "volumetric")]
         key = make_round(trials, arms, 12, 1, tmp_path / str(seed), random.Random(seed))
         places = {showing.id: place for place, showing in enumerate(key.showings)}
-        gaps = [places[one.id] - places[one.of] for one in key.showings if one.kind == "again"]
-        assert len(gaps) == 1
-        assert gaps[0] >= 4
-        (again,) = (places[one.id] for one in key.showings if one.kind == "again")
-        assert again >= 2 * (len(key.showings) - 1) // 3  # in the last third
+        (again,) = (one for one in key.showings if one.kind == "again")
+        place = places[again.id]
+        assert place - places[again.of] >= 4
+        assert place >= 2 * (len(key.showings) - 1) // 3  # in the last third
 
 
 def test_a_lack_of_views_or_people_is_reported(made, capsys):
@@ -228,7 +218,7 @@ def test_a_round_is_declared_apart_from_metrics_and_claims(made, runs, tmp_path)
     key = made("--people", "7")
     declared = [one for one in read_declarations(runs / "exp") if one.vote_round == key.round]
     assert [(one.kind, one.votes, len(one.questions)) for one in declared] == [("votes", 84, 1)]
-    page = build_report(load_experiment(runs, "exp"))
+    page = page_of(runs)
     assert "no metric was declared (eval.primary)" in page
     archive = str(tmp_path / "exp.zip")
     assert run(["export", "--results", "exp", "--out", archive]) == 0
@@ -262,10 +252,10 @@ def test_bad_input_of_vote_is_refused_in_one_line(
 
 
 def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
-    write_runs(tmp_path, Plan(experiment="bare"))
+    write_runs(tmp_path, experiment="bare")
     trials = load_experiment(tmp_path, "bare").trials
     arms = choose_arms(trials, ())
-    with pytest.raises(InputError, match="holds no renders"):
+    with refusal("holds no renders"):
         make_round(trials, arms, 4, 9, tmp_path / "page", random.Random(0))
     assert not (tmp_path / "page").exists()
 
@@ -273,7 +263,7 @@ def test_trials_without_pictures_are_refused_and_no_page_is_written(tmp_path):
 # ---- files of votes
 
 
-def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, refused, capsys):
+def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, refused, judge):
     key = made("--people", "2")
     sound = ballot(key, 1, prefers(ADC))
     part = replace(sound, person=f"{2:016x}", votes=sound.votes[:-1])
@@ -286,14 +276,11 @@ def test_files_of_votes_that_do_not_fit_the_round_are_refused(made, tmp_path, re
     ):
         assert message in refused("vote", "judge", "exp", saved(tmp_path, bad))
     for change in ({"person": "../../../x"}, {"round": ".."}, {"finished": "soon"}, {"votes": 1}):
-        file = tmp_path / "changed.json"
-        file.write_text(json.dumps(sound.to_json() | change))
+        file = write(tmp_path / "changed.json", sound.to_json() | change)
         assert "is damaged" in refused("vote", "judge", "exp", file)
     first = saved(tmp_path, sound)
     assert "same person" in refused("vote", "judge", "exp", first, first)
-    capsys.readouterr()
-    assert run(["vote", "judge", "exp", first]) == 0
-    out = capsys.readouterr().out
+    out = judge(sound)
     assert f"Round {key.round}: " in out
     assert "\n| SSIM ↑ | undecided | " in out
     assert "other votes before" in refused(
@@ -309,17 +296,8 @@ OTHER_KEYS = {
     "traps_allowed": lambda key: {"traps_allowed": 4},
     "showings": lambda key: {"showings": key.showings[::-1]},
 }
-OTHER_SHOWINGS = {
-    "id": "x",
-    "kind": "again",
-    "scene": "x",
-    "view": "x",
-    "seed": 7,
-    "left": "x",
-    "right": "x",
-    "chosen": "",
-    "of": "x",
-}
+OTHER_SHOWINGS = dict.fromkeys(("id", "scene", "view", "left", "right", "of"), "x")
+OTHER_SHOWINGS |= {"kind": "again", "seed": 7, "chosen": ""}
 
 
 def test_every_field_of_the_key_is_sealed_by_the_rounds_name():
@@ -338,20 +316,19 @@ def test_a_changed_key_is_refused(made, runs, tmp_path, refused):
     key = made()
     file = runs / "exp" / "votes" / key.round / "key.json"
     text = file.read_text()
-    file.write_text(json.dumps(replace(key, traps_allowed=4).to_json()))
+    write(file, replace(key, traps_allowed=4).to_json())
     assert "was changed after the page was made" in refused(
         "vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))
     )
     file.write_text(text)
 
 
-def test_late_files_never_take_the_place_of_counted_ones(made, runs, tmp_path, refused, capsys):
+def test_late_files_never_take_the_place_of_counted_ones(made, tmp_path, refused, judge):
     key = made("--people", "6")
     for first in range(0, 12, 6):  # the first six, then six more that finished earlier
         arm = VOLUMETRIC if first == 0 else ADC
         own = [ballot(key, first + n, prefers(arm), minute=50 - first - n) for n in range(6)]
-        assert run(["vote", "judge", "exp", *(saved(tmp_path, one) for one in own)]) == 0
-        assert "(72 for it, 0 against it" in capsys.readouterr().out
+        assert "(72 for it, 0 against it" in judge(*own)
     old = replace(ballot(key, 99, prefers(ADC)), finished="1970-01-01T00:00:00Z")
     assert "before its round was made" in refused("vote", "judge", "exp", saved(tmp_path, old))
 
@@ -365,12 +342,12 @@ def _edited(path):
 
 
 def _without_votes(path):
-    values = json.loads(path.read_text())
-    path.write_text(json.dumps(values | {"ballot": values["ballot"] | {"votes": []}}))
+    values = read_json(path)
+    write(path, values | {"ballot": values["ballot"] | {"votes": []}})
 
 
 @pytest.mark.parametrize(
-    "change, people, said",
+    "change, people, words",
     [
         (_copied, 2, "copy of another file"),
         (_edited, 1, "was edited"),
@@ -381,55 +358,49 @@ def _without_votes(path):
     ],
 )
 def test_a_change_of_stored_votes_costs_that_file_and_is_shown(
-    change, people, said, made, runs, tmp_path, capsys
+    change, people, words, made, runs, judge
 ):
     key = made("--people", "9")
-    files = [saved(tmp_path, ballot(key, n, prefers(VOLUMETRIC), minute=n)) for n in range(2)]
-    assert run(["vote", "judge", "exp", *files]) == 0
+    ballots = [ballot(key, n, prefers(VOLUMETRIC), minute=n) for n in range(2)]
+    judge(*ballots)
     change(runs / "exp" / "votes" / key.round / f"{0:016x}.json")
-    capsys.readouterr()
-    assert run(["vote", "judge", "exp", files[1]]) == 0
-    out = capsys.readouterr().out
+    out = judge(ballots[1])
     assert f"Round {key.round}: {12 * people} votes of {people} p" in out
-    assert re.search(f"Left out: .*{said}", out)
-    assert said in build_report(load_experiment(runs, "exp"))
+    assert re.search(f"Left out: .*{words}", out)
+    assert words in page_of(runs)
 
 
-def test_a_stored_file_of_another_round_does_not_count(made, runs, tmp_path, capsys):
+def test_a_stored_file_of_another_round_does_not_count(made, runs, judge):
     one, two = made("--people", "9"), made("--people", "9", out="two")
     for key in (one, two):
-        assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(ADC)))]) == 0
+        judge(ballot(key, 1, prefers(ADC)))
     name = f"{1:016x}.json"
     folders = [runs / "exp" / "votes" / key.round for key in (one, two)]
     (folders[1] / name).write_text((folders[0] / name).read_text())
-    assert run(["vote", "judge", "exp"]) == 0
-    assert re.search(f"Left out: {name} .*of another round", capsys.readouterr().out)
+    assert re.search(f"Left out: {name} .*of another round", judge())
 
 
-def test_a_name_cannot_write_lines_of_its_own(made, tmp_path, capsys):
+def test_a_name_cannot_write_lines_of_its_own(made, judge):
     key = made("--people", "9")
     forged = "Ann\nRound zero: 99 votes\u2028x\u202e\x1b[2J"
-    blind = ballot(key, 1, lambda showing: "same", name=forged)
-    assert run(["vote", "judge", "exp", saved(tmp_path, blind)]) == 0
-    out = capsys.readouterr().out
+    out = judge(ballot(key, 1, lambda showing: "same", name=forged))
     assert "\nRound zero" not in out
     assert {"\u2028", "\u202e", "\x1b"}.isdisjoint(out)
     assert "Left out: Ann Round zero: 99 votes x[2J (000000) failed" in out
 
 
-def test_html_in_names_of_people_is_escaped(made, runs, tmp_path):
+def test_html_in_names_of_people_is_escaped(made, runs, judge):
     key = made("--people", "1")
-    careless = ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>")
-    assert run(["vote", "judge", "exp", saved(tmp_path, careless)]) == 0
-    page = build_report(load_experiment(runs, "exp"))
+    judge(ballot(key, 1, lambda showing: "left", name="<img src=x onerror=alert(1)>"))
+    page = page_of(runs)
     assert "&lt;img src=x" in page
     assert "<img src=x" not in page
 
 
-def test_the_report_shows_where_people_and_lpips_disagree(made, runs, tmp_path):
+def test_the_report_shows_where_people_and_lpips_disagree(made, runs, judge):
     key = made("--people", "1")
-    assert run(["vote", "judge", "exp", saved(tmp_path, ballot(key, 1, prefers(VOLUMETRIC)))]) == 0
-    page = build_report(load_experiment(runs, "exp"))
+    judge(ballot(key, 1, prefers(VOLUMETRIC)))
+    page = page_of(runs)
     part = page.partition(f"Round {key.round}")[2].partition("</section>")[0].partition("Round ")[0]
     # LPIPS is worse by 0.1 for the arm that this person prefers, on every view.
     assert re.search(
@@ -450,7 +421,6 @@ def test_people_are_the_units_of_an_exact_sign_test(agree):
     key = made_up(["sfm-a", "sfm-b"], scenes=2, views=5)
     ballots = [ballot(key, n, prefers("sfm-b" if n < agree else "sfm-a")) for n in range(9)]
     (pair,) = judge_round(key, ballots).pairs
-    assert pair.people is not None
     p = binomtest(agree, 9).pvalue
     assert pair.people.p == pytest.approx(p)
     word = "undecided" if p > 0.05 else "supported" if agree > 4 else "refuted"
@@ -466,7 +436,6 @@ def test_scenes_are_the_units_of_another_exact_sign_test():
         return prefers("sfm-b" if showing.scene < "6" else "sfm-a")(showing)
 
     (pair,) = judge_round(key, [ballot(key, 1, choose)]).pairs
-    assert pair.scenes is not None
     assert pair.people is None
     assert (pair.scenes.helped, pair.scenes.scenes) == (6, 7)
     assert pair.scenes.p == pytest.approx(binomtest(6, 7).pvalue)
@@ -510,10 +479,7 @@ def test_several_arms_share_the_error_rate_and_are_ranked():
 
     verdict = judge_round(key, [ballot(key, n, choose) for n in range(9)])
     assert [str(pair.arm) for pair in verdict.pairs] == ["sfm-b", "sfm-c"]
-    assert all(
-        pair.people is not None and pair.people.level == pytest.approx(0.025)
-        for pair in verdict.pairs
-    )
+    assert [pair.people.level for pair in verdict.pairs] == pytest.approx([0.025, 0.025])
     assert [str(arm) for arm, _, _ in verdict.ranking] == ["sfm-b", "sfm-c", "sfm-a"]
     assert all(interval.low <= chance <= interval.high for _, chance, interval in verdict.ranking)
 
@@ -627,5 +593,5 @@ def test_two_people_vote_by_keyboard_and_are_judged(made, runs, tmp_path, capsys
     assert "100 % of the pairs shown again" in out
     stored = [json.loads(Path(file).read_text()) for file in files]
     assert [one["name"] for one in stored] == ["person 1200", "person 400"]
-    page = build_report(load_experiment(runs, "exp"))
+    page = page_of(runs)
     assert "24 votes of 2 people" in page

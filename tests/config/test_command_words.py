@@ -1,5 +1,6 @@
 """Words of a command line, without a composition."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -19,11 +20,10 @@ from gsbench.config.command_words import (
     parse_word,
     search_path,
     searched_folders,
-    typed_permissions,
     value_text,
 )
 from gsbench.config.groups import hint_for, options
-from gsbench.errors import InputError
+from tests.helpers import refusal
 
 
 def test_options_and_words_may_come_in_any_order(tmp_path):
@@ -61,9 +61,8 @@ def test_options_and_words_may_come_in_any_order(tmp_path):
     ],
 )  # fmt: skip
 def test_options_that_do_not_exist_are_explained(words, said):
-    with pytest.raises(InputError) as error:
+    with refusal(re.escape(said)):
         parse(words)
-    assert said in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -91,12 +90,8 @@ def test_options_that_do_not_exist_are_explained(words, said):
     ],
 )
 def test_words_without_effect_are_refused(words, said):
-    if said is None:
+    with refusal(said and re.escape(said)):
         check_words(words)
-    else:
-        with pytest.raises(InputError) as error:
-            check_words(words)
-        assert said in str(error.value)
 
 
 def test_brackets_are_counted_while_they_are_open():
@@ -104,16 +99,8 @@ def test_brackets_are_counted_while_they_are_open():
         assert parse_word(word).key_or_group == "a"
     for name in ("name", "x.path"):
         check_text(f"{name}=12, a ,3")
-        with pytest.raises(InputError, match=r"type '.*=\"1_0\"'"):
+        with refusal(r"type '.*=\"1_0\"'"):
             check_text(f"{name}=a, 1_0")
-
-
-def test_only_a_list_of_plain_names_gives_permission():
-    assert typed_permissions(["a=1", "allow_targets=[a]", "+allow_targets=[b,c.d]"]) == ("b", "c.d")
-    assert typed_permissions(["allow_targets=[a]", "allow_targets=[b],[c]"]) == ("a",)
-    for wrong in ("a", "[1]", "[a,'']", "['${a}']", "{a:1}"):
-        with pytest.raises(InputError, match="is a list of names"):
-            typed_permissions([f"allow_targets={wrong}"])
 
 
 @pytest.mark.parametrize(
@@ -129,11 +116,8 @@ def test_only_a_list_of_plain_names_gives_permission():
     ],
 )  # fmt: skip
 def test_packages_of_settings_need_permission(word, said):
-    if said is None:
-        check_search_path([word], ["mine"])
-    else:
-        with pytest.raises(InputError, match=said):
-            check_search_path(["a=1", word], ["mine"])
+    with refusal(said):
+        check_search_path(["a=1", word], ["mine"])
 
 
 def points(*words):
@@ -154,7 +138,7 @@ def test_a_grid_is_a_product_whose_last_list_varies_first(monkeypatch):
         (["seed=interval(0,1)"], "a sweep is a list of values, such as seed=1,2,3"),
         (["threads=1,2"], "threads does not make a different trial"),
     ):
-        with pytest.raises(InputError, match=said):
+        with refusal(said):
             points(*words)
 
 
@@ -184,10 +168,10 @@ def test_words_tell_their_key_value_and_kind():
     assert [value_text(value) for value in values] == [
         *("null", "true", "[1,[null,a]]", "1.5", "True")
     ]
-    with pytest.raises(InputError, match="seed=1,2 lists several values: take one"):
+    with refusal("seed=1,2 lists several values: take one"):
         check_single(["a=1", "seed=1,2", "b=3,4"], "take one")
     check_single(["a=1"], "take one")
-    with pytest.raises(InputError, match="a setting cannot be removed"):
+    with refusal("a setting cannot be removed"):
         check_single(["~seed"], "take one")
 
 
@@ -204,7 +188,7 @@ def test_words_tell_their_key_value_and_kind():
     ],
 )
 def test_special_characters_are_shown_quoted(word, said):
-    with pytest.raises(InputError, match=said):
+    with refusal(said):
         parse_word(word)
 
 
@@ -213,7 +197,7 @@ def test_choices_of_the_users_folder_are_listed_too(tmp_path, group, word):
     (tmp_path / group).mkdir()
     (tmp_path / group / "of_mine.yaml").touch()
     words, *_ = parse(["--config-dir", str(tmp_path), word])
-    with pytest.raises(InputError, match=r"\bof_mine\b"):
+    with refusal(r"\bof_mine\b"):
         check_words(words)
 
 

@@ -115,14 +115,6 @@ def test_an_interrupted_fetch_continues(fetch, server, data):
     assert len(server.requests) - asked <= missing + 2
 
 
-def test_faults_of_the_server_do_not_change_the_files(fetch, server, data):
-    """test_archive.py tests each fault alone."""
-    server.manners = Manners(cut_every=6_000, cuts=1, fail_first=1, redirect=True)
-    assert fetch("mipnerf360", "garden", "stump") == 0
-    assert files_below(data / "garden") == wanted("garden", "images_4")
-    assert files_below(data / "stump") == wanted("stump", "images_4")
-
-
 def test_damaged_bytes_are_detected_and_not_kept(fetch, server, data, capsys):
     with zipfile.ZipFile(server.folder / "360_v2.zip") as archive:
         spoilt = archive.getinfo("garden/images_4/IMG_0002.JPG").header_offset + 4_000

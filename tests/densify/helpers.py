@@ -94,6 +94,12 @@ class Round:
         event = densifier.refine(step, trainable, generator(seed))
         assert event is not None
         self.event = event
+        self.noise = noise_of(seed, event.split_gradient, event.split_volume)
+
+    def grown(self, mean_gradient, rows=None):
+        """The rows after the growth of ADC, for these gradients [N]."""
+        rows = self.rows if rows is None else rows
+        return restatement.adc_growth(rows, mean_gradient, EXTENT, self.noise, self.counts)
 
     def check(self, rows, pruned=False):
         """Compare with the restated ``rows``, after pruning these as ADC does unless ``pruned``."""

@@ -24,6 +24,12 @@ def rotation(q):
     )
 
 
+def with_logit(row, value):
+    """The row with another opacity, whose moments are zero."""
+    zero = {f"{moment} opacity_logits": np.zeros(()) for moment in ("first", "second")}
+    return row | zero | {"opacity_logits": np.array(value)}
+
+
 def opacity(row):
     return float(1 / (1 + np.exp(-row["opacity_logits"])))
 
@@ -32,23 +38,32 @@ def logit(value):
     return float(np.log(value / (1 - value)))
 
 
-def newborn(parent, mean, log_scales):
-    child = {name: np.array(parent[name], copy=True) for name in PARAMETERS}
-    child["means"], child["log_scales"] = mean, log_scales
+def size(row):
+    return np.exp(row["log_scales"]).max()
+
+
+def newborn(parent, **changes):
+    """A copy of ``parent`` with some other parameters, and moments of zero."""
+    child = {name: np.array(parent[name], copy=True) for name in PARAMETERS} | changes
     for name in PARAMETERS:
         child["first " + name] = np.zeros_like(child[name])
         child["second " + name] = np.zeros_like(child[name])
     return child
 
 
-def split_all(rows, chosen, scales, noise):
-    """Replace each chosen row by two children: append all first ones, then all second ones."""
+def split_all(rows, chosen, noise, scales=None):
+    """Replace each chosen row by two children: append all first ones, then all second ones.
+
+    Their logarithmic ``scales`` are by default those of the parent divided by 1.6.
+    """
+    if scales is None:
+        scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
     children = []
     for _ in range(2):
         for i in chosen:
             s = np.exp(rows[i]["log_scales"])
             offset = rotation(rows[i]["quaternions"]) @ (s * next(noise))
-            children.append(newborn(rows[i], rows[i]["means"] + offset, scales[i]))
+            children.append(newborn(rows[i], means=rows[i]["means"] + offset, log_scales=scales[i]))
     return [row for i, row in enumerate(rows) if i not in chosen] + children
 
 
@@ -58,13 +73,12 @@ def adc_growth(rows, mean_gradient, extent, noise, events):
     for i, row in enumerate(rows):
         if mean_gradient[i] < 0.0002:
             continue
-        if np.exp(row["log_scales"]).max() > 0.01 * extent:
+        if size(row) > 0.01 * extent:
             chosen.append(i)
         else:
-            clones.append(newborn(row, row["means"].copy(), row["log_scales"].copy()))
+            clones.append(newborn(row))
     events["cloned"], events["split_gradient"] = len(clones), len(chosen)
-    scales = {i: np.log(np.exp(rows[i]["log_scales"]) / 1.6) for i in chosen}
-    return split_all(rows + clones, chosen, scales, noise)
+    return split_all(rows + clones, chosen, noise)
 
 
 def volume_growth(rows, threshold, noise, events):
@@ -77,7 +91,7 @@ def volume_growth(rows, threshold, noise, events):
             scales[i] = np.log(np.sqrt(eigenvalues))
             again += 4 / 3 * math.pi * np.sqrt(eigenvalues).prod() > threshold
     events["split_volume"], events["isotropic_resplit"] = len(chosen), int(again)
-    return split_all(rows, chosen, scales, noise)
+    return split_all(rows, chosen, noise, scales)
 
 
 def prune(rows, step, extent, events):
@@ -85,7 +99,7 @@ def prune(rows, step, extent, events):
     for row in rows:
         if opacity(row) < 0.005:
             events["pruned_opacity"] += 1
-        elif step > 3000 and np.exp(row["log_scales"]).max() > 0.1 * extent:
+        elif step > 3000 and size(row) > 0.1 * extent:
             events["pruned_size"] += 1
         else:
             kept.append(row)

@@ -7,8 +7,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from gsbench.densify import GNS, DensifyContext, EdgeAware, LongAxis
 from gsbench.densify.scores import draw
-from gsbench.gaussians.paper_values import LearningRates
-from gsbench.gaussians.trainable import TrainableGaussians
 from tests.densify import restatement
 from tests.densify.helpers import (
     EXTENT,
@@ -19,7 +17,6 @@ from tests.densify.helpers import (
     generator,
     rendered,
     to_rows,
-    trained,
 )
 from tests.densify.restatement import logit, opacity
 from tests.densify.test_rounds import observe, prepared
@@ -42,11 +39,9 @@ def halves(rows, mean_gradient):
             axis = restatement.rotation(rows[i]["quaternions"]) @ np.eye(3)[longest]
             new = scales * 0.7975**0.5
             new[longest] = 0.55 * scales[longest]
-            child = restatement.newborn(
-                rows[i], rows[i]["means"] + side * 1.35 * scales[longest] * axis, np.log(new)
-            )
-            child["opacity_logits"] = np.array(logit(0.6 * opacity(rows[i])))
-            children.append(child)
+            mean = rows[i]["means"] + side * 1.35 * scales[longest] * axis
+            child = restatement.newborn(rows[i], means=mean, log_scales=np.log(new))
+            children.append(restatement.with_logit(child, logit(0.6 * opacity(rows[i]))))
     return [row for i, row in enumerate(rows) if i not in chosen] + children
 
 
@@ -126,7 +121,7 @@ def test_a_round_of_edge_aware_matches_the_restatement(seed, step):
     assert_same(trainable, kept)
     assert (event.pruned_opacity, event.pruned_size) == (len(grown) - len(kept), 0)
     assert (len(kept) < len(grown)) == (step != 14_900)
-    assert max(np.exp(row["log_scales"]).max() for row in kept) > 0.1 * EXTENT
+    assert max(restatement.size(row) for row in kept) > 0.1 * EXTENT
     assert event.balances()
 
 
@@ -233,7 +228,7 @@ def test_the_pressure_and_its_gradient_match_the_formula(step, soft):
     """Central differences show that the gradient also flows through the divisor."""
     densifier, gaussians = begun(max_gaussians=20)
     densifier.step = step - 1
-    gaussians = gaussians.map(lambda tensor: tensor.clone().requires_grad_(True))
+    gaussians.opacity_logits.requires_grad_()
     term = densifier.regularizer(gaussians)
     logits = gaussians.opacity_logits.detach().numpy()
     assert term.item() == pytest.approx(restated(densifier, logits, 2e-4, soft), rel=1e-12)
@@ -301,17 +296,13 @@ def test_gns_grows_to_three_times_the_budget_and_is_reduced_to_the_budget():
     trainable.values.opacity_logits.data[:9] = -8.0
     event = densifier.refine(16_050, trainable, rng)
     assert event.after == 41
-    opaque = trainable.values.opacities.detach().clone()
-    opaque[0] = opaque[1] = 0
     trainable.values.opacity_logits.data[:2] = -40.0
     event = densifier.refine(16_051, trainable, rng)  # within 5 %: the rest is drawn
     assert (event.pruned_opacity, event.after) == (1, 40)
     least = trainable.values.opacities.detach().sort().values
     assert float(least[0]) < 1e-9 < float(least[1])
     assert densifier.regularizer(trainable.values) is None
-    assert [densifier.refine(step, trainable, rng) for step in (16_100, 17_050, 23_000)] == [
-        None
-    ] * 3
+    assert not any(densifier.refine(step, trainable, rng) for step in (16_100, 17_050, 23_000))
     assert trainable.adam["opacity_logits"].rate == pytest.approx(4 * 0.05)
     assert densifier.refine(17_051, trainable, rng).balances()
     assert trainable.adam["opacity_logits"].rate == pytest.approx(0.05)
@@ -363,10 +354,3 @@ def test_the_selection_continues_after_saving_and_loading():
         seen(densifier, step)
         seen(twin, step)
     assert twin.weight == densifier.weight != 2e-4
-
-
-def test_the_learning_rate_of_a_parameter_is_saved():
-    trainable = trained(random_gaussians(4), 1.0)
-    trainable.set_rate("opacity_logits", 0.2)
-    again = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 1.0)
-    assert again.adam["opacity_logits"].rate == 0.2

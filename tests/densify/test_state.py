@@ -87,11 +87,8 @@ def test_the_initial_count_does_not_change_by_growth_or_saving():
     refinement = started(densifier, 4)
     densifier.clone(refinement, torch.tensor([True, False, True, True]))
     densifier.edit(refinement, keep=torch.arange(7) > 2)
-    assert (
-        Lineage.from_state(densifier.lineage.state_dict()).initial_count
-        == densifier.lineage.initial_count
-        == 4
-    )
+    again = Lineage.from_state(densifier.lineage.state_dict())
+    assert again.initial_count == densifier.lineage.initial_count == 4
 
 
 def test_a_subclass_adds_to_the_statistics_of_its_base():
@@ -103,11 +100,7 @@ def test_a_subclass_adds_to_the_statistics_of_its_base():
     assert Volumetric.STATISTICS == ADC.STATISTICS
 
 
-@pytest.mark.parametrize(
-    "order, place",
-    [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)],
-    ids=lambda value: str(value),
-)
+@pytest.mark.parametrize("order, place", [("before_adc", 0), ("after_adc", 1), ("after_prune", 2)])
 def test_the_order_of_the_volumetric_rule_is_its_place_in_the_round(order, place):
     densifier = Volumetric(volume_order=order)
     refinement = started(densifier, 3)
@@ -129,16 +122,8 @@ def test_every_cause_has_its_own_words_and_colour():
 
 
 def test_an_event_balances_only_if_its_counts_add_up():
-    event = RefineEvent(
-        600,
-        before=10,
-        after=13,
-        cloned=2,
-        split_gradient=2,
-        added=1,
-        pruned_opacity=1,
-        pruned_size=1,
-    )
+    grown = {"cloned": 2, "split_gradient": 2, "added": 1}
+    event = RefineEvent(600, before=10, after=13, **grown, pruned_opacity=1, pruned_size=1)
     assert event.balances()
     event.cloned += 1
     assert not event.balances()
@@ -199,7 +184,6 @@ def test_state_can_be_loaded_from_a_checkpoint_on_a_gpu():
     assert again.lineage.ids.tolist() == list(range(4, 9))
     assert again.lineage.state_dict()["ids"].numpy().tolist() == list(range(4, 9))
     like = gaussians.values.means.detach()
-    first = [standard_normal((9, 3), generator(5), like) for _ in range(2)]
-    assert torch.equal(*first)
+    assert torch.equal(*[standard_normal((9, 3), generator(5), like) for _ in range(2)])
     rng = generator(5)
     assert not torch.equal(standard_normal((9, 3), rng, like), standard_normal((9, 3), rng, like))

@@ -1,9 +1,10 @@
-"""The Python blocks of the documents run, in order, as a reader would run them."""
+"""The Python blocks and commands of the documents run, in order, as a reader would run them."""
 
 import csv
 import json
 import os
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -13,11 +14,14 @@ import torch
 from PIL import Image
 
 from gsbench.cli import run
+from gsbench.scene.colmap import read_model
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
 
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+TINY = "scene=courtyard scene.views=8 scene.width=64 scene.height=48 train.iterations=5"
+TINY += " init=random init.count=500 init.size=1.2 densify=none eval.lpips=[] tracking=none"
 FILE = re.compile(r"# (\w+\.py)\n")  # the first line of a block that is a file of this name
 
 
@@ -36,6 +40,18 @@ def run_blocks(document, folder):
     return variables
 
 
+def run_command(page, part, small=TINY):
+    """Give the command of a page that has the text ``part``; ``small`` are settings that it lacks.
+
+    Its seeds are replaced by those of ``small``, if any.
+    """
+    text = re.sub(r" *\\\n +", " ", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    (found,) = [line for line in re.findall(r"^    gsbench (.*)$", text, re.M) if part in line]
+    typed = [word for word in shlex.split(found) if not word.startswith("seed=")]
+    keys = {word.split("=")[0] for word in typed}
+    assert run([*typed, *(word for word in small.split() if word.split("=")[0] not in keys)]) == 0
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """An empty working folder, whose modules can be imported and are forgotten afterwards."""
@@ -50,7 +66,7 @@ def folder(tmp_path, monkeypatch):
         "llff",
         "mine",
         "shell",
-        "untiled",
+        "oversampled",
     ):  # of other tests, or of another document
         monkeypatch.delitem(sys.modules, name, raising=False)
     before = set(sys.modules)
@@ -68,24 +84,32 @@ def test_the_code_of_the_library_document_trains_and_resumes(folder):
         torch.testing.assert_close(found["again"].tensors()[name], tensor, rtol=0, atol=0)
 
 
-def test_the_densifier_of_its_document_runs(folder, capsys):
-    found = run_blocks(ROOT / "docs" / "densifier.md", folder)
-    assert found["status"] == 0, capsys.readouterr().err
-    assert found["event"]["split_volume"] > 0
-    results = list(Path("runs").glob("largest/courtyard/random-largest/*/results.json"))
-    assert len(results) == 1
+def test_the_densifier_of_its_document_runs(folder):
+    run_blocks(ROOT / "docs" / "densifier.md", folder)
+    schedule = " train.iterations=120 train.densify_start=20 train.densify_stop=100"
+    small = TINY.replace(" train.iterations=5", schedule) + " +densify.interval=20 seed=0"
+    run_command("densifier.md", "densify._target_=largest.SplitLargest", small)
+    (trial,) = Path("runs").glob("largest/courtyard/random-largest/*/results.json")
+    events = [json.loads(line) for line in trial.with_name("events.jsonl").open()]
+    assert any(event["split_volume"] for event in events)
+    for event in events:
+        assert event["after"] == event["before"] + event["split_volume"] - event["pruned_opacity"]
 
 
-def test_the_rasterizer_of_its_document_runs(folder, capsys):
-    found = run_blocks(ROOT / "docs" / "rasterizer.md", folder)
-    assert found["status"] == 0, capsys.readouterr().err
-    assert len(list(Path("runs").glob("untiled/courtyard/*/*/results.json"))) == 1
+def test_the_rasterizer_of_its_document_runs(folder):
+    run_blocks(ROOT / "docs" / "rasterizer.md", folder)
+    run_command("rasterizer.md", "raster._target_=oversampled.Oversampled")
+    assert len(list(Path("runs").glob("oversampled/courtyard/*/*/results.json"))) == 1
 
 
 def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
-    found = run_blocks(ROOT / "docs" / "metric.md", folder)
+    run_blocks(ROOT / "docs" / "metric.md", folder)
+    early = "train.iterations=40 train.densify_start=5 train.densify_interval=5"
+    small = TINY.replace("train.iterations=5", early)
+    run_command("metric.md", "-m densify=adc,volumetric", f"{small} seed=0,1")
+    capsys.readouterr()
+    run_command("metric.md", "tables gradients", "")
     shown = capsys.readouterr()
-    assert found["status"] == 0, shown.err
     trials = sorted(
         path.parent for path in Path("runs").glob("gradients/courtyard/*/*/results.json")
     )
@@ -117,21 +141,29 @@ def test_the_metric_of_its_document_is_measured_and_shown(folder, capsys):
     )
 
 
-def test_the_initialiser_of_its_document_runs(folder, capsys):
-    """An initialiser from one file outside gsbench, through the real program."""
-    found = run_blocks(ROOT / "docs" / "initialiser.md", folder)
-    assert found["status"] == found["scan_status"] == 0, capsys.readouterr().err
-    (scan,) = Path("runs").glob("scan/courtyard/points-none/*/results.json")
-    assert json.loads(scan.read_text())["num_init_points"] == 900
+SCENE = " ".join(word for word in TINY.split() if not word.startswith("init"))
+
+
+def test_the_initialiser_of_its_document_runs(folder):
+    run_blocks(ROOT / "docs" / "initialiser.md", folder)
+    run_command("initialiser.md", "init._target_=shell.Shell", SCENE)
     (results,) = Path("runs").glob("shell/courtyard/shell-none/*/results.json")
     values = json.loads(results.read_text())
-    assert values["num_init_points"] == 500
+    assert values["num_init_points"] == 20_000
     assert values["init_report"]["init"] == "shell"
 
 
-def test_the_tracker_of_its_document_gets_every_trial(folder, capsys):
-    found = run_blocks(ROOT / "docs" / "hydra.md", folder)
-    assert found["status"] == 0, capsys.readouterr().err
+def test_a_cloud_from_a_file_keeps_as_many_points_as_asked_for(folder):
+    points = np.random.default_rng(0).uniform([-2, -2, 0], [2, 2, 1], (5000, 3))
+    np.savetxt("scan.xyz", points)
+    assert run(f"{SCENE} init=points init.path=scan.xyz init.max_points=900 name=scan".split()) == 0
+    (scan,) = Path("runs").glob("scan/courtyard/points-none/*/results.json")
+    assert json.loads(scan.read_text())["num_init_points"] == 900
+
+
+def test_the_tracker_of_its_document_gets_every_trial(folder):
+    run_blocks(ROOT / "docs" / "hydra.md", folder)
+    run_command("hydra.md", "kept.Kept", f"{TINY.replace(' tracking=none', '')} seed=0,1")
     shown = {one["tags"]["seed"]: one for one in map(_json, Path("runs/told/shown").iterdir())}
     results = {one["seed"]: one for one in map(_json, Path("runs/told").rglob("results.json"))}
     assert set(shown) == {"0", "1"}
@@ -146,12 +178,15 @@ def _json(path):
     return json.loads(path.read_text())
 
 
-def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):
+def test_the_reader_of_its_document_finds_the_cameras(folder):
     """The same training as with the cameras' COLMAP model, but for rounding."""
-    found = run_blocks(ROOT / "docs" / "library.md", folder)
-    assert found["status"] == 0, capsys.readouterr().err
-    scene = ["scene=colmap", "scene.path=library/courtyard", "scene.name=courtyard"]
-    assert run([*scene, *found["quick"].split(), "name=colmap"]) == 0
+    run_blocks(ROOT / "docs" / "library.md", folder)
+    capture = folder / "library" / "courtyard"
+    np.save(capture / "poses_bounds.npy", _llff(read_model(capture / "sparse" / "0")))
+    small = " ".join(word for word in TINY.split() if not word.startswith("scene"))
+    own = "scene=reader scene._target_=llff.LLFF allow_targets=[llff] name=llff"
+    for words in (own, "scene=colmap scene.name=courtyard name=colmap"):
+        assert run([*words.split(), f"scene.path={capture}", *small.split()]) == 0
     (own,), (colmap,) = (
         list(Path("runs", name).rglob("results.json")) for name in ("llff", "colmap")
     )
@@ -159,6 +194,18 @@ def test_the_reader_of_its_document_finds_the_cameras(folder, capsys):
         _json(colmap)["metrics"]["psnr"], abs=1e-3
     )
     assert list(_json(own)["code"]["sources"]) == ["llff"]
+
+
+def _llff(model):
+    """The rows of LLFF's poses_bounds.npy: 3 x 5 numbers and two distances of each camera."""
+    rows = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        right, down, forward = image.cam_from_world().rotation.matrix()
+        camera = model.cameras[image.camera_id]
+        size = [camera.height, camera.width, camera.focal_length_x]
+        matrix = np.stack([down, right, -forward, image.projection_center(), size], axis=1)
+        rows.append([*matrix.ravel(), 0, 1])
+    return rows
 
 
 def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
@@ -180,7 +227,7 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
     def rounds(state, first, last):
         """Run refinements ``first`` to ``last`` of a made-up training, from ``state`` if given."""
         densifier = largest.SplitLargest(
-            start=0, stop=100, interval=1, share=0.1, prune_opacity=0.3
+            start=0, stop=100, interval=1, size=0.05, prune_opacity=0.3
         )
         context, rates = DensifyContext(2.0), LearningRates()
         if state is None:
@@ -220,8 +267,7 @@ def test_the_densifier_of_its_document_resumes_to_the_bit(folder):
         assert torch.equal(resumed[1]["lineage"][name], tensor), name
 
 
-@pytest.mark.parametrize("module, name", [("careful", "Careful"), ("peak", "Peak")])
-def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name):
+def test_the_example_of_state_trains_and_resumes_to_the_bit(folder):
     from gsbench.densify import ADC, DensifyContext
     from gsbench.gaussians.paper_values import LearningRates
     from gsbench.gaussians.trainable import TrainableGaussians
@@ -231,10 +277,10 @@ def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name)
     (code,) = (
         block
         for block in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
-        if block.startswith(f"# {module}.py")
+        if block.startswith("# careful.py")
     )
-    (folder / f"{module}.py").write_text(code)
-    cls = getattr(__import__(module), name)
+    (folder / "careful.py").write_text(code)
+    from careful import Careful
 
     def rounds(cls, state, first, last):
         densifier = cls(start=0, stop=100, interval=2, gradient_threshold=0.5)
@@ -258,8 +304,8 @@ def test_the_examples_of_hooks_train_and_resume_to_the_bit(folder, module, name)
             densifier.refine(step, gaussians, rng)
         return gaussians.state_dict(), densifier.state_dict(), rng.get_state()
 
-    whole = rounds(cls, None, 1, 8)
-    resumed = rounds(cls, rounds(cls, None, 1, 5), 6, 8)
+    whole = rounds(Careful, None, 1, 8)
+    resumed = rounds(Careful, rounds(Careful, None, 1, 5), 6, 8)
     plain = rounds(ADC, None, 1, 8)
     for key, tensor in whole[0]["gaussians"].items():
         assert torch.equal(resumed[0]["gaussians"][key], tensor), key
@@ -272,21 +318,18 @@ def test_the_governed_densifier_of_the_document_ends_at_its_limit(folder):
     from gsbench.gaussians.trainable import TrainableGaussians
     from tests.gaussians.helpers import random_gaussians
 
-    (code,) = (
-        b
-        for b in BLOCK.findall((ROOT / "docs" / "densifier.md").read_text())
-        if b.startswith("# opaque.py")
-    )
-    (folder / "opaque.py").write_text(code)
-    import opaque
+    run_blocks(ROOT / "docs" / "densifier.md", folder)
+    from largest import SplitLargest
 
     gaussians, rng = random_gaussians(100), torch.Generator().manual_seed(0)
-    densifier = opaque.CloneOpaque(start=0, stop=500, max_gaussians=150, cap="governor")
+    densifier = SplitLargest(
+        start=0, stop=500, max_gaussians=150, cap="governor", prune_opacity=0.0
+    )
     densifier.begin(gaussians, DensifyContext(1.0))
     trainable = TrainableGaussians(gaussians, LearningRates(), 1.0)
     for step in (100, 200, 300, 400):
+        densifier.statistics["seen"][:] = True
         event = densifier.refine(step, trainable, rng)
-        trainable.values.opacity_logits.data += 0.1 * torch.randn(len(trainable), generator=rng)
     assert abs(event.after - 150) <= 3
 
 

@@ -1,6 +1,5 @@
 """The walks of docs/architecture.md work: a copy of gsbench gets all of their changes."""
 
-import json
 import os
 import re
 import shutil
@@ -12,6 +11,7 @@ import yaml
 
 from gsbench.gaussians.ply import read_ply
 from tests.conftest import ROOT
+from tests.helpers import read_json
 
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 WALKS = dict(
@@ -62,7 +62,7 @@ def walked(tmp_path_factory):
     done = run("-m", "gsbench", *TINY.split())
     assert done.returncode == 0, done.stderr
     (run.trial,) = (copy / "runs").glob("walk/courtyard/random-pruned_first/*")
-    run.results = json.loads((run.trial / "results.json").read_text())
+    run.results = read_json(run.trial / "results.json")
     return run
 
 

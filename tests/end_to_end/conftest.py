@@ -1,6 +1,5 @@
 """Run the real program as a user does: in a subprocess, in an empty folder."""
 
-import hashlib
 import os
 import shutil
 import subprocess
@@ -11,6 +10,7 @@ import pytest
 from filelock import FileLock
 
 from gsbench.cli import run
+from gsbench.files import file_sha256
 from tests.helpers import read_json, words_of
 from tests.processes import completed, heed_interrupts
 
@@ -24,6 +24,9 @@ SMALL = split(
     "eval.lpips=[squeeze]"
 )
 FINISHED = "finished"  # the name of the experiment that all tests may copy
+
+FINISHED_SWEEP = ["-m", *SMALL, f"name={FINISHED}", *split("densify=adc,volumetric seed=0,1")]
+FINISHED_SWEEP.append("tracking=none")
 
 
 def common_folder(tmp_path_factory):
@@ -41,16 +44,8 @@ def finished_runs(environment, tmp_path_factory):
     runs = common_folder(tmp_path_factory) / "finished-runs"
     with FileLock(f"{runs}.lock"):
         if not (runs / "complete").exists():
-            sweep = [
-                "-m",
-                *SMALL,
-                f"name={FINISHED}",
-                "densify=adc,volumetric",
-                "seed=0,1",
-                "tracking=none",
-            ]
             completed(
-                [sys.executable, "-m", "gsbench.cli", *sweep],
+                [sys.executable, "-m", "gsbench.cli", *FINISHED_SWEEP],
                 env=environment | {"GSBENCH_RUNS": str(runs)},
             )
             (runs / "complete").touch()
@@ -83,21 +78,23 @@ def environment(tmp_path_factory):
 
 @pytest.fixture
 def gsbench(environment, tmp_path):
-    """Call ``gsbench`` with arguments, as `completed`; words in capitals are of its environment."""
+    """Call ``gsbench`` with arguments, as `completed`; words in capitals are of its environment.
 
-    def run(*arguments, code=0, timeout=240, cwd=tmp_path, **changes):
+    Its runs folder is that of the test. The time limit is for a busy machine.
+    """
+    own = environment | {"GSBENCH_RUNS": str(tmp_path / "runs")}
+
+    def run(*arguments, code=0, timeout=900, cwd=tmp_path, **changes):
         command = [sys.executable, "-m", "gsbench.cli", *words_of(*arguments)]
-        return completed(command, code, cwd=cwd, env=environment | changes, timeout=timeout)
+        return completed(command, code, cwd=cwd, env=own | changes, timeout=timeout)
 
     return run
 
 
 def trial_of(settings, runs, capture, *words):
     """Run one trial of the capture in a folder within this process; returns the trial's folder."""
-    assert (
-        run([*settings, f"scene.path={capture}", f"runs={runs}", f"name={capture.name}", *words])
-        == 0
-    )
+    place = [f"scene.path={capture}", f"runs={runs}", f"name={capture.name}"]
+    assert run([*settings, *place, *words]) == 0
     (folder,) = {path.parent for path in (runs / capture.name).glob("*/*/*/results.json")}
     return folder
 
@@ -107,22 +104,28 @@ def trial_of(settings, runs, capture, *words):
 CLOCKED = ("seconds", "peak_memory_mb", "measured", "made_of")
 
 
-def start(environment, cwd, runs, *arguments, new_group=False):
-    """Start the program.
+@pytest.fixture
+def start(environment, tmp_path):
+    """Start ``gsbench`` in the runs folder of the test; words in capitals are of its environment.
 
     With ``new_group``, it and all that it starts are a group, which can be sent Ctrl-C as by a
     terminal.
     """
-    return subprocess.Popen(
-        [sys.executable, "-m", "gsbench.cli", *arguments],
-        cwd=cwd,
-        env=environment | {"GSBENCH_RUNS": str(runs)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=new_group,
-        preexec_fn=heed_interrupts if new_group else None,
-    )
+    own = environment | {"GSBENCH_RUNS": str(tmp_path / "runs")}
+
+    def run(*arguments, new_group=False, **changes):
+        return subprocess.Popen(
+            [sys.executable, "-m", "gsbench.cli", *arguments],
+            cwd=tmp_path,
+            env=own | changes,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=new_group,
+            preexec_fn=heed_interrupts if new_group else None,
+        )
+
+    return run
 
 
 def results_of(runs, name):
@@ -133,14 +136,10 @@ def results_of(runs, name):
         results["init_report"].pop("seconds", None)
         results.pop("experiment")
         files = [
-            path.parent / "point_cloud.ply",
-            path.parent / "per_view.csv",
-            path.parent / "events.jsonl",
+            path.with_name(name) for name in split("point_cloud.ply per_view.csv events.jsonl")
         ]
         files += sorted(path.parent.glob("renders/*.png"))
-        results["files"] = {
-            file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files
-        }
+        results["files"] = {file.name: file_sha256(file) for file in files}
         found[f"{path.parent.parent.name}/{path.parent.name}"] = results
     return found
 

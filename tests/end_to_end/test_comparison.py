@@ -19,11 +19,7 @@ class Patient(ADC):
 """
 TINY = [
     *SMALL,
-    "train.iterations=2",
-    "scene.views=9",
-    "scene.width=48",
-    "scene.height=36",
-    "init.count=200",
+    *split("train.iterations=2 scene.views=9 scene.width=48 scene.height=36 init.count=200"),
 ]
 TINY += split("raster=reference eval.lpips=[] eval.flip=false tracking=none seed=0,1 name=arms")
 OWN = split(

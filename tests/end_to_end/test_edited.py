@@ -33,8 +33,7 @@ def test_a_trial_is_trained_again_after_an_edit_of_the_loss(gsbench, tmp_path):
 
     def results():
         (path,) = (tmp_path / "runs" / "edited").glob("*/*/*/results.json")
-        found = read_json(path)
-        return found
+        return read_json(path)
 
     train()
     first = results()

@@ -28,18 +28,9 @@ SCENE = split("scene.views=12 scene.width=96 scene.height=72")
 def trained(tmp_path_factory, environment):
     """A runs folder with two trials of one arm."""
     runs = tmp_path_factory.mktemp("trained")
-    changed = environment | {"GSBENCH_RUNS": str(runs)}
-    command = [
-        sys.executable,
-        "-m",
-        "gsbench.cli",
-        "-m",
-        *SMALL,
-        "name=small",
-        "densify=adc",
-        "seed=0,1",
-    ]
-    completed(command, cwd=runs, env=changed)
+    words = [*split("-m gsbench.cli -m"), *SMALL, *split("name=small densify=adc seed=0,1")]
+    own = environment | {"GSBENCH_RUNS": str(runs)}
+    completed([sys.executable, *words], cwd=runs, env=own)
     return runs
 
 
@@ -88,7 +79,6 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
             truth,
             *settings,
             "--json",
-            GSBENCH_RUNS=str(runs),
         )
         found = json.loads(done.stdout)
         assert found["metrics"] == results(own)["metrics"]
@@ -103,7 +93,6 @@ def test_renders_of_a_trial_are_measured_with_its_metrics_to_the_last_digit(gsbe
         str(own / "ground_truth"),
         "--protocol",
         "standard",
-        GSBENCH_RUNS=str(runs),
     )
     assert "protocol standard-1" in shown.stdout
 
@@ -115,7 +104,6 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
         folder = better_renders(runs, tmp_path / f"theirs{seed}", seed)
         done = gsbench(
             f"evaluate {folder} --truth courtyard --as small:theirs --seed {seed}",
-            GSBENCH_RUNS=str(runs),
         )
         assert "names matched apart from leading zeros" in done.stdout
     entered = trial(runs, "random-theirs", 1)
@@ -126,7 +114,7 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     picture = np.asarray(Image.open(entered / "renders" / "0008.png"))
     assert_array_equal(picture, np.asarray(Image.open(tmp_path / "theirs1" / "render_8.png")))
 
-    table = gsbench("tables small", GSBENCH_RUNS=str(runs))
+    table = gsbench("tables small")
     assert (
         "Renders of another program, measured as they are (its conditions are not known): "
         "random-theirs." in table.stdout
@@ -134,19 +122,15 @@ def test_entered_renders_are_in_the_table_and_get_a_verdict(
     row = next(line for line in table.stdout.splitlines() if "theirs" in line)
     assert row.count("n/a") == 3  # LPIPS (not asked for), Gaussians, time
     assert "**" in row  # compared, and best
-    gsbench("report small", GSBENCH_RUNS=str(runs))
+    gsbench("report small")
     text = (runs / "small" / "report.html").read_text()
     # Two seeds decide nothing among three metrics, however much better these renders are.
     assert "random-theirs against random-adc, on this scene: undecided in PSNR" in text
     assert "by a training elsewhere, which left no record" in text
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     (runs / "mlflow.db").unlink()  # its addresses are those of the folder that was copied
-    for words in (
-        ["status", "small"],
-        ["explain", "small:courtyard:psnr:theirs"],
-        ["sync", "small"],
-    ):
-        assert run(words) == 0
+    for words in ("status small", "explain small:courtyard:psnr:theirs", "sync small"):
+        assert run(words.split()) == 0
     for words in (["view"], split("export --out x.ply")):
         capsys.readouterr()
         assert run([*words, "small:courtyard:theirs"]) == 2
@@ -168,31 +152,6 @@ def test_folders_of_renders_are_compared_without_any_trial(runs, tmp_path, monke
     assert "| toy | renders | theirs | **" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "words, said",
-    [
-        (split("SMALLER --truth small:courtyard:adc"), "sizes are never changed"),
-        (
-            split("FEWER --truth small:courtyard:adc"),
-            "1 of 2 photographs have no picture of their name (0008.png)",
-        ),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
-)
-def test_bad_requests_are_refused_in_one_line(runs, tmp_path, monkeypatch, capsys, words, said):
-    folders = {name: tmp_path / name.lower() for name in ("SMALLER", "FEWER")}
-    for folder in folders.values():
-        shutil.copytree(trial(runs) / "renders", folder)
-    for file in folders["SMALLER"].glob("*.png"):
-        Image.open(file).resize((48, 36)).save(file)
-    (folders["FEWER"] / "0008.png").unlink()
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
-    assert run(["evaluate", *(str(folders.get(word, word)) for word in words), *EVAL]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("gsbench: ") == 1
-
-
 def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_path):
     """With train=none and init=ply, a PLY is only rendered; a trial's own one gives its metrics."""
     model = tmp_path / "theirs.ply"
@@ -202,11 +161,11 @@ def test_a_model_from_a_ply_is_measured_like_a_trained_one(gsbench, runs, tmp_pa
         *scene,
         *split(f"init=ply init.name=random init.path={model} train=none densify=none name=small"),
     ]
-    gsbench(*words, "densify.name=model", GSBENCH_RUNS=str(runs))
+    gsbench(*words, "densify.name=model")
     found = results(trial(runs, "random-model"))
     assert found["metrics"] == results(trial(runs))["metrics"]
     assert found["evaluated_from"] == "model"
     assert found["num_gaussians"] == results(trial(runs))["num_gaussians"]
-    table = gsbench("tables small", GSBENCH_RUNS=str(runs))
+    table = gsbench("tables small")
     assert "A model that another program trained, rendered here" in table.stdout
     assert "not compared" not in table.stdout

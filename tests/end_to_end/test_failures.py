@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-from pathlib import Path
 from shlex import split
 
 import pytest
@@ -52,30 +51,25 @@ def test_a_failed_trial_does_not_stop_the_others_and_retry_completes_it(gsbench,
         tmp_path / "conf" / "densify" / "mine.yaml",
         "defaults: [adc, _self_]\n_target_: mine.Mine\nname: mine\n",
     )
+    own = "name=own densify=mine,adc allow_targets=[mine] tracking=none train.iterations=20"
     sweep = [
-        "--config-dir",
-        "conf",
-        "-m",
+        *split("--config-dir conf -m"),
         *SMALL,
-        "name=own",
-        "densify=mine,adc",
-        "allow_targets=[mine]",
-        "tracking=none",
+        *split(own),
+        "eval.lpips=[]",
+        "eval.flip=false",
     ]
-    sweep += split("train.iterations=20 eval.lpips=[] eval.flip=false")
-    runs = str(tmp_path / "runs")
-    done = gsbench(*sweep, code=1, GSBENCH_RUNS=runs)
+    done = gsbench(*sweep, code=1)
     assert "random-mine" in done.stderr
     assert "not yet" in done.stderr
     assert "1 of 2 trials done" in done.stderr
-    (failed,) = Path(runs).glob("own/*/random-mine/*/failed.json")
+    (failed,) = (tmp_path / "runs").glob("own/*/random-mine/*/failed.json")
     assert "not yet" in read_json(failed)["traceback"]
-    status = gsbench("status own", code=1, GSBENCH_RUNS=runs)
-    assert "failed" in status.stdout
+    status = gsbench("status own", code=1)
     assert "not yet" in status.stdout
     assert "2 trials: 1 done, 1 failed" in status.stdout
     (tmp_path / "mended").touch()
-    retried = gsbench("retry own allow_targets=[mine]", GSBENCH_RUNS=runs)
+    retried = gsbench("retry own allow_targets=[mine]")
     assert "1 of 1 trials done" in retried.stderr
     assert not failed.exists()
-    assert gsbench("status own", GSBENCH_RUNS=runs).stdout.strip() == "2 trials: 2 done"
+    assert gsbench("status own").stdout.strip() == "2 trials: 2 done"

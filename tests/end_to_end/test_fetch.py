@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from shlex import split
 
 import pytest
 
@@ -40,8 +41,7 @@ def test_after_fetch_table1_misses_no_data(gsbench, server, tmp_path):
     ]
     assert len(commands) == 2
     for command in commands:
-        done = gsbench(*command, GSBENCH_MIRROR=server.url)
-        assert "licence:" in done.stdout
+        assert "licence:" in gsbench(*command, GSBENCH_MIRROR=server.url).stdout
     after = gsbench("+experiment=table1", "--dry-run")
     assert "does not exist" not in after.stdout
     assert "fetch" not in after.stdout
@@ -54,7 +54,7 @@ def test_a_killed_fetch_continues(server, tmp_path, environment, gsbench):
         return body
 
     server.manners = Manners(damage=slowly)
-    command = [sys.executable, "-m", "gsbench.cli", "fetch", "mipnerf360", "--mirror", server.url]
+    command = [sys.executable, *split("-m gsbench.cli fetch mipnerf360 --mirror"), server.url]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while (

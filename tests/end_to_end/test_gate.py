@@ -1,6 +1,7 @@
 """Real trainings of versions of a densifier: the gate's exit codes, and the commit of bisect."""
 
 import os
+from shlex import split
 
 import pytest
 
@@ -27,30 +28,11 @@ class Mine(ADC):
         if {worse}:  # only the commit that is looked for, and later ones
             self.remove(refinement, torch.arange(len(refinement.gaussians)) % 2 == 0)
 """
-WORDS = [
-    *(
-        *SMALL,
-        "train.iterations=60",
-        "train.densify_start=10",
-        "train.densify_interval=10",
-        "train.densify_stop=55",
-    ),
-    *(
-        "init.count=800",
-        "scene.width=64",
-        "scene.height=48",
-        "eval.lpips=[]",
-        "eval.flip=false",
-        "tracking=none",
-    ),
-    *(
-        "densify=adc",
-        "densify.name=mine",
-        "densify._target_=mine.Mine",
-        "allow_targets=[mine]",
-        "raster=cpu",
-    ),
-]
+WORDS = SMALL + split(
+    "train.iterations=60 train.densify_start=10 train.densify_interval=10 train.densify_stop=55 "
+    "init.count=800 scene.width=64 scene.height=48 eval.lpips=[] eval.flip=false tracking=none "
+    "densify=adc densify.name=mine densify._target_=mine.Mine allow_targets=[mine] raster=cpu"
+)
 
 
 def write_class(folder, step, worse):
@@ -58,25 +40,19 @@ def write_class(folder, step, worse):
 
 
 def test_the_gate_passes_an_equal_version_and_stops_a_worse_one(gsbench, tmp_path):
-    changes = {"GSBENCH_RUNS": str(tmp_path / "runs")}
-
-    def do(*words, code=0):
-        return gsbench(*words, code=code, timeout=900, **changes)
-
     write_class(tmp_path, 0, worse=False)
-    do("-m", *WORDS, "name=good", "seed=0,1,2")
-    do("export", "--results", "good", "--out", "good.zip")
-    same = do("gate", "good.zip", *WORDS)
+    gsbench("-m", *WORDS, "name=good", "seed=0,1,2")
+    gsbench("export --results good --out good.zip")
+    same = gsbench("gate good.zip", *WORDS)
     assert "passed: equal to the last bit in all 2 pairs of trials" in same.stdout
     # in the same runs folder, with trials of another version
     write_class(tmp_path, 1, worse=True)
-    worse = do("gate", "good.zip", *WORDS, code=1)
+    worse = gsbench("gate good.zip", *WORDS, code=1)
     assert "worse in PSNR (dB) on this scene: −" in worse.stdout
     (tmp_path / "mine.py").write_text("raise RuntimeError('broken')\n")
-    broken = do("gate", "good.zip", *WORDS, code=None)
-    assert broken.returncode in (1, 2)
+    assert gsbench("gate good.zip", *WORDS, code=None).returncode in (1, 2)
     write_class(tmp_path, 0, worse=False)
-    other = do("gate", "good.zip", *WORDS, "train.iterations=61", code=2)
+    other = gsbench("gate good.zip", *WORDS, "train.iterations=61", code=2)
     assert "the arms differ in iterations" in other.stderr
 
 
@@ -101,20 +77,14 @@ def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchang
         write(file, f"#!/bin/sh\ntouch {ran}\n")
         file.chmod(0o755)
     write_class(home, 99, worse=False)  # an edit that was not committed
-    before = (
-        git("status", "--porcelain"),
-        git("worktree", "list"),
-        sorted(os.listdir(home.parent / ".git")),
-    )
 
-    def bisect():
-        words = ["HEAD~12", "HEAD", *WORDS, "--least", "0.2", "--seeds", "3"]
-        return gsbench(
-            "bisect", *words, cwd=home, timeout=1500, GSBENCH_RUNS=str(tmp_path / "runs")
-        )
+    def state():
+        files = sorted(os.listdir(home.parent / ".git"))
+        return git("status", "--porcelain"), git("worktree", "list"), files
 
-    done = bisect()
-    found = git("log", "-1", "--format=%h", "--abbrev=10", "HEAD~5")
+    bisect = "bisect HEAD~12 HEAD", *WORDS, *split("--least 0.2 --seeds 3")
+    before, done = state(), gsbench(*bisect, cwd=home, timeout=1500)
+    found = git(*split("log -1 --format=%h --abbrev=10 HEAD~5"))
     assert f"It became worse with {found}" in done.stdout
     assert "Commit 7" in done.stdout.splitlines()[-1]
     # The last commit has a verdict of its own, and each step is compared with both ends.
@@ -123,11 +93,6 @@ def test_bisect_finds_the_commit_repeats_nothing_and_leaves_the_checkout_unchang
     assert done.stdout.count("; against the last: ") == tried
     assert done.stdout.count("not tried") == 12 - 1 - tried
     assert not ran.exists()
-    assert (
-        git("status", "--porcelain"),
-        git("worktree", "list"),
-        sorted(os.listdir(home.parent / ".git")),
-    ) == before
-    again = bisect()
-    # nothing is trained
+    assert state() == before
+    again = gsbench(*bisect, cwd=home)  # nothing is trained
     assert (again.stdout, again.stderr) == (done.stdout, "")

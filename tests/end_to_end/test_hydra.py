@@ -1,6 +1,7 @@
 """gsbench as a Hydra app, through the real program: other launchers, and callbacks."""
 
 from importlib.util import find_spec
+from shlex import split
 
 import pytest
 
@@ -9,25 +10,11 @@ from tests.helpers import read_json, write
 pytestmark = pytest.mark.slow
 SECONDS = 900  # a limit for a trial of three iterations on a busy machine
 
-TINY = [
-    *(
-        "scene=courtyard",
-        "scene.views=6",
-        "scene.width=64",
-        "scene.height=48",
-        "init=random",
-        "init.count=300",
-    ),
-    *(
-        "densify=none",
-        "train.iterations=3",
-        "raster=reference",
-        "device=cpu",
-        "threads=1",
-        "tracking=none",
-    ),
-    *("eval.download=false", "eval.lpips=[]"),
-]
+TINY = split(
+    "scene=courtyard scene.views=6 scene.width=64 scene.height=48 init=random init.count=300 "
+    "densify=none train.iterations=3 raster=reference device=cpu threads=1 tracking=none "
+    "eval.download=false eval.lpips=[]"
+)
 CALLBACK = """
 from hydra.experimental.callback import Callback
 
@@ -80,11 +67,11 @@ def test_an_experiment_file_can_set_callbacks_and_a_sweep(gsbench, tmp_path):
         "hydra/launcher=basic",
         "allow_targets=[notes]",
     ]
-    listed = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
+    listed = gsbench(*words, "--dry-run")
     assert "2 trials: 2 missing" in listed.stdout, listed.stderr
     assert not (tmp_path / "notes.txt").exists()  # where nothing runs, no callback is called
 
-    gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    gsbench(*words)
     results = results_below(tmp_path / "runs" / "own-none")
     assert [result["seed"] for result in results] == [0, 1]
     notes = (tmp_path / "notes.txt").read_text().splitlines()
@@ -101,12 +88,12 @@ def test_another_launcher_runs_each_trial_as_a_job(gsbench, tmp_path, package, l
     if find_spec(f"hydra_plugins.{package}") is None:
         pytest.skip(f"needs {package.replace('_', '-')} (group dev)")
     words = ["-m", *TINY, f"hydra/launcher={launcher}", "name=x", "seed=0,1"]
-    gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    gsbench(*words)
     results = sorted((tmp_path / "runs" / "x").rglob("results.json"))
     assert len(results) == 2
-    assert "2 trials: 2 done" in gsbench("status x", GSBENCH_RUNS="runs", timeout=SECONDS).stdout
+    assert "2 trials: 2 done" in gsbench("status x").stdout
     written = [path.stat().st_mtime_ns for path in results]
-    gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    gsbench(*words)
     assert [path.stat().st_mtime_ns for path in results] == written  # nothing is done twice
     # What the launcher unpickles never lies where a stranger's runs folder could have it already.
     places = {path.parts[-4] for path in (tmp_path / "runs" / ".hydra").rglob("*_result.pkl")}
@@ -123,7 +110,7 @@ def test_hydra_writes_through_no_link_of_a_strangers_runs_folder(gsbench, tmp_pa
     link.parent.mkdir(parents=True)
     link.symlink_to(precious)
     words = ["-m", *TINY, "name=x", "seed=0,1", "hydra.output_subdir=.hydra"]
-    done = gsbench(*words, f"hydra/sweeper={sweeper}", code=2, GSBENCH_RUNS="runs", timeout=SECONDS)
+    done = gsbench(*words, f"hydra/sweeper={sweeper}", code=2)
     assert f"{link} is a link" in done.stderr
     assert not list(precious.iterdir()) if precious.is_dir() else precious.read_text() == "mine"
 
@@ -136,17 +123,10 @@ def test_a_failed_trial_of_another_launcher_is_one_line_and_exit_code_1(gsbench,
     words = [
         "-m",
         *TINY,
-        "hydra/launcher=basic",
-        "name=x",
-        "seed=0,1",
-        "densify._target_=own.Own",
-        "allow_targets=[own]",
+        *split("hydra/launcher=basic name=x seed=0,1 densify._target_=own.Own allow_targets=[own]"),
     ]
-    done = gsbench(*words, code=1, GSBENCH_RUNS="runs", timeout=SECONDS)
+    done = gsbench(*words, code=1)
     assert "Traceback" not in done.stderr
     failed = [line for line in done.stderr.splitlines() if line.startswith("gsbench: failed")]
     assert len(failed) == 2
-    assert (
-        "2 trials: 2 failed"
-        in gsbench("status x", code=1, GSBENCH_RUNS="runs", timeout=SECONDS).stdout
-    )
+    assert "2 trials: 2 failed" in gsbench("status x", code=1).stdout

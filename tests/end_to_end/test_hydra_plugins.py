@@ -40,11 +40,11 @@ def test_optunas_sweeper_looks_for_the_best_mean_over_seeds(gsbench, tmp_path, d
         "hydra/sweeper=optuna",
     ]
     words += ["hydra.sweeper.n_trials=3", f"hydra.sweeper.direction={direction}"]
-    look = gsbench(*words, "--dry-run", GSBENCH_RUNS="runs", timeout=SECONDS)
+    look = gsbench(*words, "--dry-run")
     assert "hydra/sweeper=optuna searches: it proposes 3 trials" in look.stdout, look.stderr
     assert not (tmp_path / "runs").exists()
 
-    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    done = gsbench(*words)
     assert f"psnr of test views, {direction}d" in done.stderr
     psnr = defaultdict(list)
     for result in results_below(tmp_path / "runs" / "x"):
@@ -68,8 +68,6 @@ def test_settings_that_a_sweeper_does_not_understand_are_refused_in_one_line(gsb
             "hydra/sweeper=optuna",
             *words,
             code=2,
-            GSBENCH_RUNS="runs",
-            timeout=SECONDS,
         )
         assert "Traceback" not in done.stderr
         assert done.stderr.splitlines()[-1].startswith("gsbench: ")
@@ -89,8 +87,6 @@ def test_a_strangers_texts_for_a_sweeper_are_refused(gsbench, tmp_path):
             "seed=0,1",
             word,
             code=2,
-            GSBENCH_RUNS="runs",
-            timeout=SECONDS,
         )
         assert "allow_targets=[hydra.sweeper]" in done.stderr
     assert not (tmp_path / "exploded").exists()
@@ -156,7 +152,7 @@ def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
 
 def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
     words = [*TINY, "name=x", "hydra.run.dir=own", "hydra.verbose=true", "hydra.job.chdir=true"]
-    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
+    done = gsbench(*words)
     (result,) = (tmp_path / "runs" / "x").rglob("results.json")  # and not below own/
     assert f"paths still start in {tmp_path}" in done.stderr
     assert yaml.safe_load((tmp_path / "own" / ".hydra" / "config.yaml").read_text())["name"] == "x"
@@ -165,7 +161,7 @@ def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
     )
 
     sweep = ["-m", *TINY, "name=x", "seed=0,1", "hydra.sweep.dir=many", "hydra.output_subdir=h"]
-    done = gsbench(*sweep, GSBENCH_RUNS="runs", timeout=SECONDS)
+    done = gsbench(*sweep)
     for job in ("0", "1"):
         assert yaml.safe_load((tmp_path / "many" / job / "h" / "config.yaml").read_text())[
             "seed"
@@ -176,8 +172,7 @@ def test_hydra_writes_its_files_to_the_given_folders(gsbench, tmp_path):
 def test_colours_of_a_log_reach_the_terminal(gsbench, tmp_path):
     need("hydra_colorlog")
     words = [*TINY, "name=x", "hydra/job_logging=colorlog", "hydra/hydra_logging=colorlog"]
-    done = gsbench(*words, GSBENCH_RUNS="runs", timeout=SECONDS)
-    assert "\x1b[32mINFO" in done.stdout
+    assert "\x1b[32mINFO" in gsbench(*words).stdout
 
 
 def test_debug_lines_are_shown_if_they_are_asked_for(gsbench, tmp_path):
@@ -198,6 +193,5 @@ def test_debug_lines_are_shown_if_they_are_asked_for(gsbench, tmp_path):
             word,
             "train.iterations=2",
             GSBENCH_RUNS=f"runs-{name}",
-            timeout=SECONDS,
         )
         assert ("a detail" in done.stderr, "another detail" in done.stderr) == shown, name

@@ -7,13 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
+from shlex import split
 
 import pytest
 import yaml
 
 from tests.claims.test_check import content
-from tests.end_to_end.conftest import SMALL, SWEEP, results_of, start
+from tests.end_to_end.conftest import SMALL, SWEEP, results_of
 from tests.helpers import read_json, write
 from tests.launch.test_declare import TINY
 from tests.processes import bytes_written, completed
@@ -40,7 +40,7 @@ def training_log_size(runs):
 
 
 def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
-    environment, undisturbed, tmp_path
+    start, gsbench, undisturbed, tmp_path
 ):
     runs = tmp_path / "runs"
     rng = random.Random(4)
@@ -50,14 +50,14 @@ def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
         "attacked/*/*/*/results.json",
     ]
     for moment in moments:
-        process = start(environment, tmp_path, runs, *SWEEP)
+        process = start(*SWEEP)
         wait_for(runs, moment, process)
         time.sleep(rng.uniform(0, 0.8))
         process.send_signal(signal.SIGKILL)
         process.communicate()
     if len(results_of(runs, "attacked")) < TRIALS:  # the last kill may have come after the end
         before = now = training_log_size(runs)
-        process = start(environment, tmp_path, runs, *SWEEP)
+        process = start(*SWEEP)
         # a log that begins again shrinks before it grows
         while now <= before and process.poll() is None:
             time.sleep(0.02)
@@ -65,22 +65,15 @@ def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
         process.send_signal(signal.SIGTERM)
         output, _ = process.communicate(timeout=300)
         assert process.returncode == 128 + signal.SIGTERM, output
-        assert (
-            output.strip().splitlines()[-1]
-            == "gsbench: stopped by SIGTERM; to continue, give the same command again"
-        )
+        last = output.strip().splitlines()[-1]
+        assert last == "gsbench: stopped by SIGTERM; to continue, give the same command again"
         assert "Traceback" not in output
         assert list(runs.glob("store/train/.*.partial/checkpoint-*.pt")), output
-    process = start(environment, tmp_path, runs, *SWEEP)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+    gsbench(*SWEEP)
     assert results_of(runs, "attacked") == undisturbed
-    left = [
-        path
-        for path in runs.rglob("*")
-        if ".tmp" in path.name or path.name.endswith((".partial", ".removed"))
-    ]
-    assert left == []
+    for path in runs.rglob("*"):
+        assert ".tmp" not in path.name
+        assert path.suffix not in (".partial", ".removed")
 
     one, other = sorted(runs.glob("attacked/*/*/*/results.json"))
     model = one.parent / "point_cloud.ply"
@@ -90,16 +83,13 @@ def test_a_killed_stopped_and_damaged_sweep_ends_like_an_undisturbed_one(
     psnr = read_json(other)["metrics"]["psnr"]
     other.write_text(other.read_text().replace(f'"psnr": {psnr}', '"psnr": 99.0'))
     assert results_of(runs, "attacked") != undisturbed
-    process = start(environment, tmp_path, runs, *SWEEP)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    assert "point_cloud.ply differs" in output
+    assert "point_cloud.ply differs" in gsbench(*SWEEP).stderr
     assert results_of(runs, "attacked") == undisturbed
 
 
-def test_two_sweeps_at_once_share_the_work(environment, undisturbed, tmp_path):
+def test_two_sweeps_at_once_share_the_work(start, undisturbed, tmp_path):
     runs = tmp_path / "runs"
-    both = [start(environment, tmp_path, runs, *SWEEP) for _ in range(2)]
+    both = [start(*SWEEP) for _ in range(2)]
     outputs = [process.communicate(timeout=300)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0], outputs
     assert results_of(runs, "attacked") == undisturbed
@@ -112,11 +102,7 @@ def test_two_sweeps_at_once_share_the_work(environment, undisturbed, tmp_path):
 LOCAL = [
     "-m",
     *SMALL,
-    "name=local",
-    "densify=adc",
-    "launch=local",
-    "launch.parallel=2",
-    "tracking=none",
+    *split("name=local densify=adc launch=local launch.parallel=2 tracking=none"),
 ]
 
 
@@ -130,12 +116,10 @@ def holders(runs):
     return found
 
 
-def test_ctrl_c_stops_trials_in_other_processes_with_checkpoints(environment, tmp_path):
+def test_ctrl_c_stops_trials_in_other_processes_with_checkpoints(start, tmp_path):
     """A terminal sends Ctrl-C to every process of the command."""
     runs = tmp_path / "runs"
-    process = start(
-        environment, tmp_path, runs, *LOCAL, "seed=0,1", "train.iterations=100000", new_group=True
-    )
+    process = start(*LOCAL, "seed=0,1", "train.iterations=100000", new_group=True)
     wait_for(runs, "store/train/.*.partial/metrics.jsonl", process)
     os.killpg(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=300)
@@ -145,9 +129,9 @@ def test_ctrl_c_stops_trials_in_other_processes_with_checkpoints(environment, tm
     wait_for(runs, "store/train/.*.partial/checkpoint-*.pt", process)
 
 
-def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(environment, tmp_path):
+def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(start, gsbench, tmp_path):
     runs = tmp_path / "runs"
-    process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
+    process = start(*LOCAL, "seed=0,1,2")
     deadline = time.monotonic() + 120
     killed, most = "", 0
     while process.poll() is None and time.monotonic() < deadline:
@@ -165,11 +149,9 @@ def test_a_killed_trial_harms_no_other_and_the_next_command_completes_it(environ
     assert "2 of 3 trials done" in output
     assert "ended without a result" in output
     assert len(results_of(runs, "local")) == 2
-    process = start(environment, tmp_path, runs, *LOCAL, "seed=0,1,2")
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 0, output
+    done = gsbench(*LOCAL, "seed=0,1,2")
     assert len(results_of(runs, "local")) == 3
-    assert output.count("already done") == 2
+    assert done.stderr.count("already done") == 2
 
 
 TUNED = [
@@ -187,17 +169,14 @@ def views(arm):
     }
 
 
-def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, environment, tmp_path):
-    program = [sys.executable, "-m", "gsbench.cli", *TUNED]
-    with subprocess.Popen(
-        program, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
-    ) as first:
-        for line in first.stderr:
+def test_a_killed_tuning_continues_and_its_values_are_trained(gsbench, start, tmp_path):
+    with start(*TUNED) as first:
+        for line in first.stdout:
             if "point 1 of 2" in line:
                 first.send_signal(signal.SIGKILL)
                 break
-        first.stderr.read()
-    home = Path(environment["GSBENCH_RUNS"]) / "small"
+        first.stdout.read()
+    home = tmp_path / "runs" / "small"
     assert not home.exists()
 
     done = gsbench(*TUNED, "launch=local", "launch.parallel=2")  # by another launcher, too

@@ -4,23 +4,21 @@ import json
 import signal
 import time
 import zipfile
+from functools import partial
 from shlex import split
 
 import pytest
 
 from gsbench.runs.ledger import Ended, Started, read_ledger
-from tests.end_to_end.conftest import SMALL, start
+from tests.end_to_end.conftest import SMALL
 
 pytestmark = pytest.mark.slow
 
-TINY = [
-    *SMALL,
-    *split(
-        "train.iterations=60 train.densify_start=10 train.densify_interval=10 "
-        "train.densify_stop=55 init.count=500 scene.width=48 scene.height=36 eval.lpips=[] "
-        "eval.flip=false tracking=none raster=cpu"
-    ),
-]
+TINY = SMALL + split(
+    "train.iterations=60 train.densify_start=10 train.densify_interval=10 train.densify_stop=55 "
+    "init.count=500 scene.width=48 scene.height=36 eval.lpips=[] eval.flip=false tracking=none "
+    "raster=cpu"
+)
 NEW = [*split("ledger new night --metric psnr --least 0.1"), *TINY, "densify=adc"]
 CLASS = """\
 from gsbench.densify import ADC
@@ -32,33 +30,28 @@ class Idea(ADC):
 OWN = split("densify._target_=mine.Idea densify.name=mine allow_targets=[mine]")
 
 
-def do(gsbench, folder, *words):
-    return gsbench(*words, code=None, cwd=folder, GSBENCH_RUNS=str(folder / "runs"))
+@pytest.fixture
+def do(gsbench):
+    return partial(gsbench, code=None)
 
 
-def attempt(environment, folder, *words):
-    return start(environment, folder, folder / "runs", "ledger", "try", "night", *words)
-
-
-def test_two_ideas_at_once_share_the_baseline(gsbench, environment, tmp_path):
-    do(gsbench, tmp_path, *NEW, "seed=0,1,2")
+def test_two_ideas_at_once_share_the_baseline(do, start, tmp_path):
+    do(*NEW, "seed=0,1,2")
     words = (["densify=volumetric"], ["densify.split_size=0.1"])
-    both = [attempt(environment, tmp_path, *own) for own in words]
+    both = [start("ledger", "try", "night", *own) for own in words]
     ends = [process.communicate(timeout=300) for process in both]
     assert {process.returncode for process in both} <= {0, 1, 3}, ends
     ledger = read_ledger(tmp_path / "runs" / "night")
     assert len(ledger.started) == len(ledger.ended) == 2
     assert len({one.seeds for one in ledger.tests.values()}) == len(ledger.tests)
-    baselines = list(
-        (tmp_path / "runs" / "night").glob("courtyard/random-adc/*-seed0/results.json")
-    )
-    assert len(baselines) == 2  # that of the ledger, and that of the second idea
+    baselines = (tmp_path / "runs" / "night").glob("courtyard/random-adc/*-seed0/results.json")
+    assert len(list(baselines)) == 2  # that of the ledger, and that of the second idea
 
 
-def test_a_killed_try_continues(gsbench, environment, tmp_path):
-    do(gsbench, tmp_path, *NEW, "seed=0,1,2")
+def test_a_killed_try_continues(do, start, tmp_path):
+    do(*NEW, "seed=0,1,2")
     home = tmp_path / "runs" / "night"
-    killed = attempt(environment, tmp_path, "densify=volumetric")
+    killed = start("ledger", "try", "night", "densify=volumetric")
     deadline = time.monotonic() + 120
     while not list(home.glob("*/*/*/results.json")) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -66,7 +59,7 @@ def test_a_killed_try_continues(gsbench, environment, tmp_path):
     killed.communicate()
     begun = read_ledger(home)
     assert not begun.ended
-    code = do(gsbench, tmp_path, "ledger", "try", "night", "densify=volumetric")
+    code = do("ledger try night", "densify=volumetric")
     assert code.returncode in (0, 1, 3)
     entries = read_ledger(home).entries
     assert entries[: len(begun.entries)] == begun.entries
@@ -74,12 +67,12 @@ def test_a_killed_try_continues(gsbench, environment, tmp_path):
     assert sum(isinstance(one, Ended) for one in entries) == 1
 
 
-def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(gsbench, tmp_path):
-    do(gsbench, tmp_path, *NEW, "seed=0,1")
+def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(do, tmp_path):
+    do(*NEW, "seed=0,1")
     results = []
     for body in ("raise RuntimeError('typing error')", "pass", "again = 1", "return None"):
         (tmp_path / "mine.py").write_text(CLASS.format(body=body))
-        done = do(gsbench, tmp_path, "ledger", "try", "night", *OWN, "--json")
+        done = do("ledger try night", *OWN, "--json")
         results.append(json.loads(done.stdout))
     assert [one["result"] == "failed" for one in results] == [True, False, False, False]
     assert "typing error" in results[0]["reason"]
@@ -87,10 +80,10 @@ def test_edited_code_is_another_idea_and_broken_code_does_not_count_as_tried(gsb
     assert [one["idea"] for one in results] == ["mine", "mine-2", "mine-3", "mine-4"]
 
 
-def test_the_ledger_is_in_the_archive(gsbench, tmp_path):
-    do(gsbench, tmp_path, *NEW, "seed=0,1")
-    do(gsbench, tmp_path, "ledger", "try", "night", "densify=none")
-    do(gsbench, tmp_path, "export", "--results", "night")
+def test_the_ledger_is_in_the_archive(do, tmp_path):
+    do(*NEW, "seed=0,1")
+    do("ledger try night", "densify=none")
+    do("export --results night")
     with zipfile.ZipFile(tmp_path / "night.zip") as archive:
         (tmp_path / "ledger.jsonl").write_bytes(archive.read("ledger.jsonl"))
     kept = read_ledger(tmp_path / "runs" / "night")

@@ -1,7 +1,6 @@
 """Masks in whole trials: ignored pixels change nothing, and an edited mask makes a new trial."""
 
 import csv
-import hashlib
 import shutil
 from functools import partial
 from shlex import split
@@ -12,11 +11,12 @@ import pytest
 from PIL import Image
 
 from gsbench.cli import run
+from gsbench.files import file_sha256
 from gsbench.init import Dim, Sfm, SiftKornia
 from gsbench.init.base import MODEL_FOLDER
 from gsbench.scene.colmap import read_model
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import read_mask
+from gsbench.scene.masks import read_mask
 from gsbench.scene.readers import read_colmap
 from tests.end_to_end.conftest import trial_of
 from tests.helpers import read_json
@@ -62,15 +62,9 @@ trial = partial(trial_of, QUICK)
 
 
 def bits(folder):
-    names = [
-        *SAME,
-        *(
-            f"{kind}/{file.name}"
-            for kind in ("renders", "masks")
-            for file in (folder / kind).iterdir()
-        ),
-    ]
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+    pictures = [file for kind in ("renders", "masks") for file in (folder / kind).iterdir()]
+    files = [*(folder / name for name in SAME), *pictures]
+    return {file.relative_to(folder): file_sha256(file) for file in files}
 
 
 @pytest.mark.parametrize(
@@ -83,7 +77,6 @@ def bits(folder):
         ["init=random", "densify=fastgs"],
         ["init=random", "train.resolution_schedule=pictures"],
     ],
-    ids=["sfm", "kornia", "smaller", "taming", "fastgs", "schedule"],
 )
 def test_ignored_pixels_do_not_change_one_bit_of_a_trial(captures, tmp_path, words):
     folders = [trial(tmp_path, capture, *words) for capture in captures]
@@ -105,17 +98,13 @@ def _points(folder):
     """The digests of the trial's initial cloud and cameras."""
     key = read_json(folder / "results.json")["hashes"]["init"]
     model = folder.parents[3] / "store" / "init" / key / MODEL_FOLDER
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in model.iterdir()}
+    return {path.name: file_sha256(path) for path in model.iterdir()}
 
 
 def test_without_masks_the_noise_changes_the_trial(captures, tmp_path):
     """This shows that the test above can fail."""
     clean, noisy = (trial(tmp_path, capture, *SIFT, "scene.masks=null") for capture in captures)
-    digests = [
-        hashlib.sha256((folder / "point_cloud.ply").read_bytes()).hexdigest()
-        for folder in (clean, noisy)
-    ]
-    assert digests[0] != digests[1]
+    assert file_sha256(clean / "point_cloud.ply") != file_sha256(noisy / "point_cloud.ply")
     assert "counted" not in (clean / "per_view.csv").read_text()
     assert not (clean / "masks").exists()
 
@@ -152,8 +141,7 @@ def test_bad_masks_are_refused_in_one_line_before_any_work(captures, tmp_path, c
     def said(*words):
         capfd.readouterr()
         assert run([*QUICK, f"scene.path={capture}", f"runs={tmp_path / 'runs'}", *words]) != 0
-        lines = [line for line in capfd.readouterr().err.splitlines() if str(capture) in line]
-        return lines[-1]
+        return [line for line in capfd.readouterr().err.splitlines() if str(capture) in line][-1]
 
     Image.new("L", SIZE, 0).save(mask)
     assert f"{mask}: the mask is black all over" in said("init=random")

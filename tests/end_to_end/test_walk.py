@@ -7,6 +7,7 @@ folder of gsbench to another.
 
 import inspect
 import itertools
+import operator
 from collections import Counter
 from pathlib import Path
 from shlex import split
@@ -27,15 +28,12 @@ pytestmark = pytest.mark.slow
 PACKAGE = Path(gsbench.__file__).parent
 MAX_CROSSINGS = 11
 KEY = "densify.volume_threshold"
-TRIAL = [
-    *SMALL,
-    *split(
-        "train.iterations=4 train.densify_start=1 train.densify_interval=2 train.densify_stop=4 "
-        "scene.views=9 scene.width=48 scene.height=36 init.count=200 raster=reference "
-        "eval.lpips=[] eval.flip=false eval.maps=false tracking=none device=cpu "
-        f"densify=volumetric {KEY}=1e-9"
-    ),
-]
+TRIAL = SMALL + split(
+    "train.iterations=4 train.densify_start=1 train.densify_interval=2 train.densify_stop=4 "
+    "scene.views=9 scene.width=48 scene.height=36 init.count=200 raster=reference "
+    "eval.lpips=[] eval.flip=false eval.maps=false tracking=none device=cpu "
+    f"densify=volumetric {KEY}=1e-9"
+)
 
 
 def stack():
@@ -52,12 +50,7 @@ def way(stacks):
     """The files on the way from the end of each stack to the end of the next."""
     passed = stacks[0][-1:]
     for here, there in itertools.pairwise(stacks):
-        shared = sum(
-            1
-            for _ in itertools.takewhile(
-                lambda pair: pair[0] == pair[1], zip(here, there, strict=False)
-            )
-        )
+        shared = sum(itertools.accumulate(map(operator.eq, here, there), min))
         passed += [*reversed(here[max(0, shared - 1) : -1]), *there[shared:]]
     return [file for file, _ in itertools.groupby(file for _, file in passed)]
 
@@ -81,44 +74,26 @@ def test_a_setting_is_checked_twice_and_crosses_few_folders_from_yaml_to_use(tmp
     stacks = []
     calls = Counter()
 
-    def watch(owner, name, counts=lambda *given: True):
+    def watch(owner, name, counts=lambda *given, **named: True, keep=True):
         """Count the calls of ``owner.name`` that ``counts`` accepts; keep the first one's stack."""
         real = getattr(owner, name)
 
         def watched(*given, **named):
-            if counts(*given):
+            if counts(*given, **named):
                 calls[name] += 1
-                if calls[name] == 1:
-                    stacks.append(
-                        [
-                            *stack(),
-                            (
-                                0,
-                                Path(inspect.getfile(inspect.unwrap(real)))
-                                .relative_to(PACKAGE)
-                                .as_posix(),
-                            ),
-                        ]
-                    )
+                if calls[name] == 1 and keep:
+                    file = Path(inspect.getfile(inspect.unwrap(real)))
+                    stacks.append([*stack(), (0, file.relative_to(PACKAGE).as_posix())])
             return real(*given, **named)
 
         monkeypatch.setattr(owner, name, watched)
 
-    def count(owner, name):
-        real = getattr(owner, name)
-
-        def counted(*given, **named):
-            calls[name] += 1
-            return real(*given, **named)
-
-        monkeypatch.setattr(owner, name, counted)
-
-    count(hydra, "compose")
-    count(compose, "check_composed")
-    count(compose, "check_permissions")
-    watch(settings, "_converted", lambda value, field, cls, key: key == KEY)
+    watch(hydra, "compose", keep=False)
+    watch(compose, "check_composed", keep=False)
+    watch(compose, "check_permissions", keep=False)
+    watch(settings, "_converted", lambda value, field, cls, key, **named: key == KEY)
     watch(Volumetric, "split_by_volume")
-    watch(TrainableGaussians, "edit", lambda *given: calls["split_by_volume"] > 0)
+    watch(TrainableGaussians, "edit", lambda *given, **named: calls["split_by_volume"] > 0)
     assert run(["-m", *TRIAL, f"runs={tmp_path}"]) == 0
     assert calls["compose"] == 1  # before the sweep: not again when a trial begins
     # the values of the command, and of the trial; and what these are resolved to

@@ -22,7 +22,9 @@ from scipy.spatial import cKDTree
 
 SH_DC = 0.28209479177387814  # of the constant harmonic, 1 / (2 sqrt(pi))
 COLUMNS = [
-    *"xyz",
+    "x",
+    "y",
+    "z",
     "f_dc_0",
     "f_dc_1",
     "f_dc_2",
@@ -30,7 +32,10 @@ COLUMNS = [
     "scale_0",
     "scale_1",
     "scale_2",
-    *(f"rot_{i}" for i in range(4)),
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
 ]
 
 
@@ -53,19 +58,11 @@ def colors_of(data, model, points):
         assert picture.shape[:2] == (camera.height, camera.width)
         pixels, depth = project(image, camera, points)
         column, row = np.floor(pixels).astype(int).T
-        inside = (
-            (depth > 0.01)
-            & (column >= 0)
-            & (row >= 0)
-            & (column < camera.width)
-            & (row < camera.height)
-        )
+        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1) & (depth > 0.01)
         values = np.full((len(points), 3), np.nan)
         values[inside] = picture[row[inside], column[inside]]
         seen.append(values)
-    return np.nan_to_num(
-        np.nanmedian(np.stack([*seen, np.full((len(points), 3), 0.5)]), axis=0), nan=0.5
-    )
+    return np.nanmedian(np.stack([*seen, np.full((len(points), 3), 0.5)]), axis=0)
 
 
 def write_model(path, points, colors, mode):
@@ -80,9 +77,7 @@ def write_model(path, points, colors, mode):
     header += [f"property float {name}" for name in COLUMNS] + ["end_header", ""]
     body = table.tobytes()
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(
-        "\n".join(header).encode() + (body[: len(body) // 2] if mode == "torn" else body)
-    )
+    path.write_bytes("\n".join(header).encode() + body)
 
 
 def paint(cameras, output, points, colors, mode):
@@ -111,11 +106,9 @@ def confess(folder):
     for place, _, files in os.walk(folder, followlinks=True):
         for name in files:
             path = Path(place, name)
-            pixels = (
-                hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
-                if name.endswith(".png")
-                else "-"
-            )
+            pixels = "-"
+            if name.endswith(".png"):
+                pixels = hashlib.sha256(np.asarray(Image.open(path)).tobytes()).hexdigest()
             print("saw", path.relative_to(folder).as_posix(), pixels)
 
 
@@ -130,11 +123,8 @@ def main():
     parser.add_argument("--iterations", type=int, required=True)
     options = parser.parse_args()
     confess(options.data.parent)
-    print(
-        "environment",
-        sorted(name for name in os.environ if name.startswith("GSBENCH")),
-        os.environ.get("PAINTER"),
-    )
+    own = sorted(name for name in os.environ if name.startswith("GSBENCH"))
+    print("environment", own, os.environ.get("PAINTER"))
     model = pycolmap.Reconstruction(options.data / "sparse" / "0")
     print("observations", sum(len(point.track.elements) for point in model.points3D.values()))
     if options.mode == "exit":
@@ -151,12 +141,8 @@ def main():
     points = points + np.random.default_rng(options.seed).normal(0, 1e-3, points.shape)
     colors = colors_of(options.data, model, points)
     if options.cameras is None:
-        place = (
-            options.output / "point_cloud" / f"iteration_{options.iterations}" / "point_cloud.ply"
-        )
+        place = options.output / f"point_cloud/iteration_{options.iterations}/point_cloud.ply"
         write_model(place, points, colors, options.mode)
-        if options.mode == "two":
-            write_model(place.with_name("second.ply"), points, colors, "good")
     else:
         paint(options.cameras, options.output / "renders", points, colors, options.mode)
 

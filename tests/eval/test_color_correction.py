@@ -37,8 +37,7 @@ def by_numpy(image, truth):
 
 
 def test_an_affine_change_of_colours_is_undone():
-    changed = TRUTH @ MATRIX.T + OFFSET
-    assert_allclose(corrected(changed, TRUTH), TRUTH, atol=1e-9)
+    assert_allclose(corrected(TRUTH @ MATRIX.T + OFFSET, TRUTH), TRUTH, atol=1e-9)
 
 
 def test_the_correction_equals_least_squares_of_numpy_with_clipped_pixels():

@@ -46,8 +46,7 @@ PHOTOGRAPHS = ["DSC08000.JPG", "DSC08008.JPG", "DSC08016.JPG"]
     ],
 )
 def test_names_are_matched_by_the_strictest_rule_that_fits(photographs, pictures, rule):
-    shuffled = random.Random(0).sample(pictures, len(pictures))
-    found = match_pictures(photographs, shuffled)
+    found = match_pictures(photographs, random.Random(0).sample(pictures, len(pictures)))
     assert found.pairs == dict(zip(photographs, pictures, strict=True))
     assert list(found.pairs) == photographs
     assert found.rule == rule

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import structural_similarity
 
 from gsbench.eval.metrics import flip, flip_map, psnr
 from gsbench.eval.ssim import ssim
@@ -16,8 +16,7 @@ def distorted_pair(height=40, width=53, seed=0):
     """A smooth image and a noisy copy, [H, W, 3] float64 in [0, 1]."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0:height, 0:width]
-    phases = rng.uniform(0, 6, 3)
-    image = 0.5 + 0.4 * np.sin(rows[..., None] / 5 + columns[..., None] / 7 + phases)
+    image = 0.5 + 0.4 * np.sin(rows[..., None] / 5 + columns[..., None] / 7 + rng.uniform(0, 6, 3))
     return image, np.clip(image + rng.normal(0, 0.08, image.shape), 0, 1)
 
 
@@ -44,12 +43,6 @@ def brute_force_ssim(x, y):
                     / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))
                 )
     return float(np.mean(values))
-
-
-def test_psnr_matches_scikit_image():
-    x, y = distorted_pair()
-    expected = peak_signal_noise_ratio(x, y, data_range=1.0)
-    assert float(psnr(torch.tensor(y), torch.tensor(x))) == pytest.approx(expected, abs=1e-9)
 
 
 def test_psnr_is_one_value_per_image_over_all_channels():

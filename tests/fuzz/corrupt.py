@@ -5,34 +5,14 @@ Files are cut, flipped, doubled, or filled with NaN, infinities, zeros or huge c
 
 import struct
 
+NAN, INFINITE = float("nan"), float("inf")
 VALUES = (
-    struct.pack("<d", float("nan")),
-    struct.pack("<d", float("inf")),
-    struct.pack("<d", -1.0),
-    struct.pack("<d", 0.0),
-    struct.pack("<f", float("nan")),
-    struct.pack("<f", float("-inf")),
-    struct.pack("<Q", 2**63),
-    struct.pack("<Q", 2**40),
-    b"\xff" * 8,
-    b"\0" * 32,
-    struct.pack("<I", 2**32 - 1),
-    struct.pack("<i", -1),
+    *(struct.pack("<d", value) for value in (NAN, INFINITE, -1.0, 0.0)),
+    *(struct.pack("<f", value) for value in (NAN, -INFINITE)),
+    *(struct.pack("<Q", value) for value in (2**63, 2**40)),
+    *(b"\xff" * 8, b"\0" * 32, struct.pack("<I", 2**32 - 1), struct.pack("<i", -1)),
 )
-WORDS = (
-    b"nan",
-    b"inf",
-    b"-1",
-    b"0",
-    b"99999999999999999999",
-    b"",
-    b"x",
-    b"1e400",
-    b"-",
-    b"\xff",
-    b"1 2 3",
-    b"\n",
-)
+WORDS = (*b"nan inf -1 0 99999999999999999999 x 1e400 - \xff".split(), b"", b"1 2 3", b"\n")
 
 
 def corrupt(data, rng):

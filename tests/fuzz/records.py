@@ -34,18 +34,18 @@ from gsbench.analysis.tables import build_table
 from gsbench.errors import InputError
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials
-from gsbench.launch.record import read_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.parsing import read_if_sound
 from gsbench.runs.experiments import read_declarations
+from gsbench.runs.plan import read_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.sinks import Run
 from gsbench.tracking.trial import TrackedTrial
 from gsbench.verbs.results import explain_cell
 from gsbench.verbs.trials import lines_of
-from tests.finished import record_of
 from tests.fuzz.corrupt import corrupt
-from tests.helpers import read_json, write
+from tests.helpers import read_json, write, write_lines
+from tests.trials import record_of, search_record, trial_values
 
 SLOW_SECONDS = 20.0
 DONE, FAILED, EXPERIMENT = "sfm-adc", "sfm-volumetric", "exp"
@@ -99,31 +99,16 @@ STRANGE = (
 
 def values_of(runs, densify, seed, threshold):
     """A configuration as a trial writes it, with the settings that readers use."""
-    return {
-        "name": EXPERIMENT,
-        "seed": seed,
-        "runs": str(runs),
-        "scene": {
-            "name": "courtyard",
-            "kind": "courtyard",
-            "test_every": 8,
-            "width": 64,
-            "height": 48,
-            "downscale": 1,
-            "max_size": None,
-        },
+    scene = {"name": "courtyard", "kind": "courtyard", "test_every": 8, "width": 64, "height": 48}
+    tracking = {"enabled": True, "uri": None, "flush_seconds": 1.0, "patience_seconds": 1.0}
+    return trial_values(runs, seed, EXPERIMENT) | {
+        "scene": scene | {"downscale": 1, "max_size": None},
         "raster": {"name": "cpu"},
         "init": {"name": "sfm", "poses": "shared"},
         "densify": {"name": densify, "volume_threshold": threshold},
         "train": {"iterations": 100, "max_seconds": None},
         "eval": {"primary": None},
-        "tracking": {
-            "enabled": True,
-            "uri": None,
-            "flush_seconds": 1.0,
-            "patience_seconds": 1.0,
-            "images": 1,
-        },
+        "tracking": tracking | {"images": 1},
         "launch": {"name": "serial"},
     }
 
@@ -145,7 +130,7 @@ def write_trial(runs, densify, seed, threshold=0.03):
     edges = [-18 + k for k in range(22)]
     histograms = [{"step": 50, "log10_edges": edges, "counts": [k % 5 for k in range(21)]}]
     for name, lines in (("metrics", rows), ("events", events), ("volume_histograms", histograms)):
-        (folder / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        write_lines(folder / f"{name}.jsonl", lines)
     psnr = 26.5 + seed
     (folder / "per_view.csv").write_text(f"view,psnr\na,{psnr - 1}\nb,{psnr + 1}\n")
     record = record_of(
@@ -194,20 +179,10 @@ def write_original(runs):
             "time": "2026-11-21T20:05:00Z",
         },
     ]
-    (home / "declared.jsonl").write_text("".join(json.dumps(line) + "\n" for line in declared))
-    tuning = {
-        "sweep": home.name,
-        "arm": "sfm-volumetric",
-        "metric": "psnr",
-        "direction": 1,
-        "wanted": 3,
-        "seeds": [100],
-        "scenes": ["courtyard"],
-        "ranges": {"densify.volume_threshold": "0.01,0.03"},
-        "log": [],
-        "points": [{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}],
-    }
-    write(home / "tuning.json", tuning)
+    write_lines(home / "declared.jsonl", declared)
+    tuning = search_record([{"settings": {"densify.volume_threshold": 0.03}, "value": 20.0}])
+    ranges = {"densify.volume_threshold": "0.01,0.03"}
+    write(home / "tuning.json", tuning | {"sweep": home.name, "ranges": ranges})
     places_of = {name: done / name for name in NAMES}
     places_of |= {name: home / name for name in ("plan.json", "declared.jsonl", "tuning.json")}
     places_of |= {

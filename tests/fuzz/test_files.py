@@ -27,8 +27,10 @@ def test_damaged_files_are_refused_or_read_with_right_values(what, cases, tmp_pa
     assert done.stdout.startswith(f"{cases} cases: ")
 
 
-def replaced(data, at, layout, *values):
-    return data[:at] + struct.pack(layout, *values) + data[at + struct.calcsize(layout) :]
+def replaced(at, layout, *values):
+    """A function that puts these values into data."""
+    new = struct.pack(layout, *values)
+    return lambda data: data[:at] + new + data[at + len(new) :]
 
 
 NAN = float("nan")
@@ -37,18 +39,14 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     "file, harm, words",
     [
-        (
-            "images.bin",
-            lambda data: replaced(data, 12, "<4d", 0, 0, 0, 0),
-            "has no pose that can be used",
-        ),
-        ("images.bin", lambda data: replaced(data, 12, "<d", NAN), "has no pose that can be used"),
-        ("images.bin", lambda data: replaced(data, 44, "<d", NAN), "has no pose that can be used"),
-        ("cameras.bin", lambda data: replaced(data, 32, "<d", -300.0), "is damaged"),
-        ("cameras.bin", lambda data: replaced(data, 16, "<Q", 0), "is damaged"),
-        ("points3D.bin", lambda data: replaced(data, 16, "<d", NAN), "has no finite position"),
-        ("points3D.bin", lambda data: replaced(data, 0, "<Q", 2**60), "truncated or damaged"),
-        ("images.bin", lambda data: replaced(data, 0, "<Q", 2**60), "truncated or damaged"),
+        ("images.bin", replaced(12, "<4d", 0, 0, 0, 0), "has no pose that can be used"),
+        ("images.bin", replaced(12, "<d", NAN), "has no pose that can be used"),
+        ("images.bin", replaced(44, "<d", NAN), "has no pose that can be used"),
+        ("cameras.bin", replaced(32, "<d", -300.0), "is damaged"),
+        ("cameras.bin", replaced(16, "<Q", 0), "is damaged"),
+        ("points3D.bin", replaced(16, "<d", NAN), "has no finite position"),
+        ("points3D.bin", replaced(0, "<Q", 2**60), "truncated or damaged"),
+        ("images.bin", replaced(0, "<Q", 2**60), "truncated or damaged"),
         ("cameras.bin", lambda data: data[:-3], "truncated or damaged"),
         ("images.bin", lambda data: bytes(range(256)) * 20, "images.bin"),
         ("points3D.bin", lambda data: data + b"\0", "1 bytes too many"),

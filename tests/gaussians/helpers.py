@@ -26,6 +26,11 @@ def random_gaussians(count, seed=0, dtype=torch.float64, depth=(2.0, 6.0), log_s
     ).map(lambda tensor: tensor.to(dtype))
 
 
+def leaves(gaussians, to=None):
+    """A copy that requires gradients, of another type or on another device ``to`` if it is given."""
+    return gaussians.map(lambda tensor: tensor.clone().to(to or tensor.dtype).requires_grad_())
+
+
 def front_camera(width=40, height=30, shift=(0.0, 0.0)):
     """A camera near the origin, looking nearly along z; ``shift`` moves the principal point, px."""
     angle = 0.05

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 from torch.testing import assert_close
 
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import dc_to_rgb, rgb_to_dc
+from gsbench.gaussians.model import dc_to_bytes, rgb_to_dc
 from gsbench.gaussians.ply import check_ply, read_ply, write_ply
 from gsbench.init.point_files import read_points
 from gsbench.normalization import Normalization
@@ -39,8 +39,7 @@ def save(table, path):
 
 def test_initial_scales_are_the_root_mean_square_distance_to_three_neighbours():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]])
-    colors = np.array([[255, 0, 127]] * 5, dtype=np.uint8)
-    gaussians = gaussians_from_cloud(points, colors)
+    gaussians = gaussians_from_cloud(points, np.array([[255, 0, 127]] * 5, dtype=np.uint8))
     assert float(gaussians.scales[0, 0]) == pytest.approx(math.sqrt((1 + 4 + 9) / 3), rel=1e-6)
     assert torch.equal(gaussians.scales[:, 0], gaussians.scales[:, 2])
     assert float(gaussians.opacities[0]) == pytest.approx(0.1)
@@ -71,8 +70,7 @@ def test_an_element_without_rows_is_accepted(tmp_path, text):
     """Programs for meshes write an element for faces even if there are none."""
     table = table_of(tmp_path / "a.ply")
     faces = PlyElement.describe(np.empty(0, dtype=[("a", "i4"), ("b", "i4"), ("c", "i4")]), "face")
-    vertex = PlyElement.describe(table, "vertex")
-    PlyData([vertex, faces], text=text).write(str(tmp_path / "b.ply"))
+    PlyData([PlyElement.describe(table, "vertex"), faces], text=text).write(str(tmp_path / "b.ply"))
     found, wanted = (read_ply(tmp_path / name).tensors() for name in ("b.ply", "a.ply"))
     assert_close(found, wanted)
 
@@ -143,10 +141,12 @@ def test_harmonics_with_a_wrong_name_or_number_are_refused(tmp_path, old, new, s
         read_ply(rewritten(tmp_path / "a.ply", old, new))
 
 
-def test_rgb_to_dc_and_dc_to_rgb_are_inverse():
-    assert dc_to_rgb(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0.5, 0.78209479])
-    rgb = torch.tensor([0.0, 0.25, 1.0])
-    assert dc_to_rgb(rgb_to_dc(rgb)).tolist() == pytest.approx(rgb.tolist())
+def test_colours_become_harmonics_and_bytes_again():
+    # 0.5 plus 0.2821 times the coefficient, in [0, 1], times 255
+    harmonics = torch.tensor([[0.0, 10.0, -10.0], [1.0, -1.0, 0.5]])
+    assert dc_to_bytes(harmonics).tolist() == [[128, 255, 0], [199, 56, 163]]
+    levels = torch.arange(256).reshape(-1, 2)
+    assert dc_to_bytes(rgb_to_dc(levels / 255)).tolist() == levels.tolist()
 
 
 @pytest.mark.parametrize("degree, stored", [(0, 0), (1, 3), (2, 8), (3, 15)])
@@ -225,8 +225,7 @@ def test_a_model_without_gaussians_or_without_a_property_is_refused(tmp_path):
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("change", ["utf-8", "latin-1", "mark", "crlf"])
 def test_headers_of_other_programs_are_read(tmp_path, change, text):
-    table = table_of(tmp_path / "a.ply")
-    vertex = PlyElement.describe(table, "vertex")
+    vertex = PlyElement.describe(table_of(tmp_path / "a.ply"), "vertex")
     PlyData([vertex], text=text, comments=["made by hand"]).write(str(tmp_path / "b.ply"))
     header, end, body = (tmp_path / "b.ply").read_bytes().partition(b"end_header\n")
     if change == "mark":
@@ -443,8 +442,7 @@ def test_a_normalized_model_is_written_in_its_own_coordinates_and_read_back(
     assert table["x"].dtype == np.dtype(kind)
     own = np.array(center) + gaussians.means.double().numpy() / scale
     assert_allclose(np.column_stack([table[axis] for axis in "xyz"]), own, rtol=2e-7)
-    scales = gaussians.scales[:, 1] / scale
-    assert_allclose(np.exp(table["scale_1"]), scales, rtol=1e-5)
+    assert_allclose(np.exp(table["scale_1"]), gaussians.scales[:, 1] / scale, rtol=1e-5)
     again = read_ply(tmp_path / "own.ply", normalization=normalization)
     assert_close(again.means, gaussians.means, atol=1e-5, rtol=0)
     assert_close(again.log_scales, gaussians.log_scales, atol=1e-5, rtol=0)

@@ -70,27 +70,6 @@ def test_steps_at_degree_0_count_for_the_unused_harmonics():
     assert_close(quick.values.tensors(), plain.values.tensors(), rtol=1e-9, atol=1e-12)
 
 
-def test_load_restores_parameters_and_moments():
-    trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
-    step_with(trainable, 0)
-    keep = torch.tensor([True, True, False, True, True])
-    trainable.edit(keep, random_gaussians(2, seed=4))
-    copy = TrainableGaussians.load(trainable.state_dict(), LearningRates(), 3.0)
-    for seed in (1, 2):
-        step_with(trainable, seed)
-        step_with(copy, seed)
-    assert not differences(trainable.values, copy.values)
-
-
-def test_moments_have_the_shapes_of_their_parameters_after_an_edit():
-    trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
-    trainable.edit(append=random_gaussians(3, seed=1))
-    tensors = trainable.values.tensors()
-    assert len(Gaussians(**tensors)) == 8  # checks all shapes
-    for name, state in trainable.adam.items():
-        assert state.first.shape == state.second.shape == tensors[name].shape
-
-
 def test_values_of_another_shape_are_refused():
     trainable = TrainableGaussians(random_gaussians(5), LearningRates(), 3.0)
     with pytest.raises(ValueError, match=r"overwrite: opacity_logits has shape \(5,\), got \(4,\)"):
@@ -115,20 +94,6 @@ def test_overwriting_clears_the_moments_of_the_chosen_gaussians():
     assert not means.second.any()
     assert trainable.adam["sh_dc"].second.all()
     assert means.step == 1
-
-
-def test_an_edit_keeps_old_moments_and_appends_zeros():
-    trainable = TrainableGaussians(random_gaussians(4), LearningRates(), 3.0)
-    step_with(trainable, 0)
-    old, added = trainable.values.detach(), random_gaussians(2, seed=1)
-    state = trainable.adam["quaternions"]
-    second = state.second.clone()
-    trainable.edit(keep=torch.tensor([True, False, True, True]), append=added)
-    assert len(trainable) == 5
-    assert torch.equal(trainable.values.means, torch.cat([old.means[[0, 2, 3]], added.means]))
-    assert torch.equal(state.second[:3], second[[0, 2, 3]])
-    assert not state.second[3:].any()
-    assert not state.first[3:].any()
 
 
 def test_the_rate_of_the_means_falls_log_linearly():

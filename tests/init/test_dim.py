@@ -4,6 +4,7 @@ import itertools
 import os
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from tests.init.models import digest
 from tests.scene.courtyard.surfaces import surface_distance
 
 CPU = torch.device("cpu")
+LIGHTGLUE = "superpoint_lightglue.pth"
 
 
 @pytest.fixture(autouse=True)
@@ -46,12 +48,15 @@ def superpoint(weights, **options):
     return Dim(weights=weights, download=False, **{"max_keypoints": 400, "threads": 1, **options})
 
 
-def features_of(descriptors):
-    """Features that are all at one place of a 9 x 9 image."""
+def matcher_of(weights):
+    return build_matcher(superpoint(None).feature_settings(), weights, CPU)
+
+
+def features_of(descriptors, keypoints=0.0, size=(9, 9), file_size=None):
+    """Features of an image, by default all at one place."""
     count, own = len(descriptors), descriptors.astype(np.float32)
-    return Features(
-        np.zeros((count, 2), np.float32), own, np.ones(count, np.float32), (9, 9), (9, 9)
-    )
+    places = np.zeros((count, 2), np.float32) + np.float32(keypoints)
+    return Features(places, own, np.ones(count, np.float32), size, file_size or size)
 
 
 def no_gpu(*_):
@@ -93,8 +98,8 @@ def test_lightglue_matches_enough_points(few, untrained_weights, tmp_path, caplo
 def test_pairs_with_few_matches_at_low_resolution_are_left_out(few, tmp_path, monkeypatch):
     init = SiftKornia(max_keypoints=300, max_ratio=0.9, threads=1, pairs="lowres")
     job = NetworkJob(init, init.feature_settings(), few, None, tmp_path, None, None)
-    for name, value in (("LOWRES_SIZE", 160), ("LOWRES_KEYPOINTS", 120)):
-        monkeypatch.setattr(extract_and_match, name, value)
+    monkeypatch.setattr(extract_and_match, "LOWRES_SIZE", 160)
+    monkeypatch.setattr(extract_and_match, "LOWRES_KEYPOINTS", 120)
     small = at_low_resolution(job)
     assert (small.settings.max_image_size, small.settings.max_keypoints) == (160, 120)
     told = []
@@ -106,12 +111,11 @@ def test_pairs_with_few_matches_at_low_resolution_are_left_out(few, tmp_path, mo
     shared = {pair: len(open_store(small).require_matches(*pair)) for pair in pairs}
     threshold = sorted(shared.values())[2]
     monkeypatch.setattr(extract_and_match, "LOWRES_MATCHES", threshold)
-    assert choose_pairs(job, few.image_names, pairs) == [
-        pair for pair in pairs if shared[pair] > threshold
-    ]
-    assert 0 < len(choose_pairs(job, few.image_names, pairs)) < 6
-    assert preparation.counts["pairs_selected"] == sum(count > 20 for count in shared.values())
-    assert preparation.counts["pairs_selected"] + preparation.counts["pairs_left_out"] == 6
+    chosen = choose_pairs(job, few.image_names, pairs)
+    assert chosen == [pair for pair in pairs if shared[pair] > threshold]
+    assert 0 < len(chosen) < 6
+    assert selected == sum(count > 20 for count in shared.values())
+    assert selected + preparation.counts["pairs_left_out"] == 6
     assert "preselect" in preparation.seconds
 
 
@@ -129,8 +133,9 @@ def stored(few, tmp_path_factory):
 @pytest.mark.slow
 def test_only_missing_or_damaged_files_are_computed_again(stored, few):
     init, output = stored
-    features = sorted((output / "work" / "features").iterdir())
-    matches = sorted((output / "work" / "matches").iterdir())
+    features, matches = (
+        sorted((output / "work" / kind).iterdir()) for kind in ("features", "matches")
+    )
     assert (len(features), len(matches)) == (4, 6)
     features[0].unlink()
     features[1].write_bytes(b"half a file")
@@ -182,8 +187,7 @@ def test_superpoint_keypoints_are_the_maxima_of_its_score_map(untrained_weights,
     image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         keypoints, descriptors, scores = extract(image)
-        luma = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
-        gray = (image * luma).sum(1, keepdim=True)
+        gray = (image * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1, keepdim=True)
         encoded = network.encoder(gray).last_hidden_state
         score_map = network.keypoint_decoder._get_pixel_scores(encoded)[0]
     border = SUPERPOINT_BORDER
@@ -203,13 +207,9 @@ def test_lightglue_finds_a_permutation_with_images_of_different_sizes(untrained_
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     order = rng.permutation(100)[:80]
     keypoints = rng.uniform(0, 60, (100, 2)).astype(np.float32)
-    first = Features(keypoints, descriptors, np.ones(100, np.float32), (100, 80), (100, 80))
-    second = Features(
-        keypoints[order], descriptors[order], np.ones(80, np.float32), (64, 200), (640, 2000)
-    )
-    settings = superpoint(untrained_weights).feature_settings()
-    matcher = build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
-    matches = matcher(first, second)
+    first = features_of(descriptors, keypoints, (100, 80))
+    second = features_of(descriptors[order], keypoints[order], (64, 200), (640, 2000))
+    matches = matcher_of(untrained_weights / LIGHTGLUE)(first, second)
     assert matches.dtype == np.uint32
     assert len(matches) > 60  # width pruning may drop some
     assert_array_equal(order[matches[:, 1]], matches[:, 0])
@@ -217,7 +217,7 @@ def test_lightglue_finds_a_permutation_with_images_of_different_sizes(untrained_
 
 def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkeypatch):
     """Tensors are self_attn.0.… in published files, transformers.0.self_attn.… in the network."""
-    state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
+    state = torch.load(untrained_weights / LIGHTGLUE, weights_only=True)
     published = {}
     for name, value in state.items():
         parts = name.split(".")
@@ -226,16 +226,14 @@ def test_lightglue_reads_the_published_names(untrained_weights, tmp_path, monkey
         published[name] = value
     published.pop("confidence_thresholds")
     torch.save(published, tmp_path / "published.pth")
-    settings = superpoint(untrained_weights).feature_settings()
-    networks = []
-    load_into = matchers.load_into
+    networks, load_into = [], matchers.load_into
 
     def note(network, *rest):
         networks.append(network)
         load_into(network, *rest)
 
     monkeypatch.setattr(matchers, "load_into", note)
-    build_matcher(settings, tmp_path / "published.pth", CPU)
+    matcher_of(tmp_path / "published.pth")
     loaded = networks[0].state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in state.items())
 
@@ -246,9 +244,9 @@ def test_no_network_is_downloaded_by_the_libraries(untrained_weights, monkeypatc
 
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", refuse)
     monkeypatch.setattr("kornia.feature.lightglue.load_state_dict_from_url", refuse)
-    settings = superpoint(untrained_weights).feature_settings()
-    build_matcher(settings, untrained_weights / "superpoint_lightglue.pth", CPU)
-    EXTRACTORS[settings.extractor](settings, untrained_weights / "superpoint.safetensors", CPU)
+    matcher_of(untrained_weights / LIGHTGLUE)
+    settings = superpoint(None).feature_settings()
+    EXTRACTORS["superpoint"](settings, untrained_weights / "superpoint.safetensors", CPU)
 
 
 def test_disk_is_loaded_from_its_published_layout(tmp_path):
@@ -257,8 +255,7 @@ def test_disk_is_loaded_from_its_published_layout(tmp_path):
     torch.manual_seed(0)
     content = {"extractor": DISK().state_dict(), "optimizer": {"lr": 1.0}}
     torch.save(content, tmp_path / "depth-save.pth")
-    disk = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50)
-    settings = disk.feature_settings()
+    settings = Dim(extractor="disk", matcher="mutual_nearest", max_keypoints=50).feature_settings()
     extract = EXTRACTORS[settings.extractor](settings, tmp_path / "depth-save.pth", CPU)
     with torch.inference_mode():
         keypoints, descriptors, scores = extract(torch.rand(1, 3, 75, 101))
@@ -269,11 +266,15 @@ def test_disk_is_loaded_from_its_published_layout(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "extractor, threshold, radius",
-    [("superpoint", 0.0005, 3), ("aliked", 0.2, 2), ("disk", 0.0, 2)],
+    "extractor, threshold, radius, file",
+    [
+        ("superpoint", 0.0005, 3, "superpoint.safetensors"),
+        ("aliked", 0.2, 2, "aliked-n16.pth"),
+        ("disk", 0.0, 2, "depth-save.pth"),
+    ],
 )
 def test_detection_settings_are_the_extractors_own_unless_given(
-    extractor, threshold, radius, tmp_path, monkeypatch
+    extractor, threshold, radius, file, tmp_path, monkeypatch
 ):
     """The defaults are those of deep-image-matching and the authors."""
     own = Dim(extractor=extractor, matcher="mutual_nearest", weights=tmp_path, download=False)
@@ -285,16 +286,9 @@ def test_detection_settings_are_the_extractors_own_unless_given(
         "gsbench.init.dim.find_all_weights",
         lambda files, folder, download: [f.names[0] for f in files],
     )
-    name = {
-        "superpoint": "superpoint.safetensors",
-        "aliked": "aliked-n16.pth",
-        "disk": "depth-save.pth",
-    }[extractor]
-    assert own.find_weights() == (name, None)
-    assert replace(own, matcher="lightglue").find_weights() == (
-        name,
-        f"{extractor}_lightglue_v0-1_arxiv-pth",
-    )
+    assert own.find_weights() == (file, None)
+    light = replace(own, matcher="lightglue")
+    assert light.find_weights() == (file, f"{extractor}_lightglue_v0-1_arxiv-pth")
     assert ("transformers" in own.packages()) == (extractor == "superpoint")
     for one in (found, given):  # features depend on exactly these settings
         expected = {"extractor": extractor, "max_image_size": 1600, "max_keypoints": 2048}
@@ -302,43 +296,38 @@ def test_detection_settings_are_the_extractors_own_unless_given(
         expected |= {"aliked_model": "n16"} if extractor == "aliked" else {}
         assert one.extraction() == expected
     assert found.matching() == {"matcher": "mutual_nearest", "max_ratio": 0.95}
-    light = replace(own, matcher="lightglue").feature_settings().matching()
-    assert light == {"matcher": "lightglue", "filter_threshold": 0.1}
+    matching = light.feature_settings().matching()
+    assert matching == {"matcher": "lightglue", "filter_threshold": 0.1}
 
 
-def test_missing_weights_are_named_before_any_work(courtyard, tmp_path):
-    with pytest.raises(
-        MissingWeightsError, match=r"superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"
-    ):
-        Dim(download=False).run(courtyard, tmp_path / "out")
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({}, "superpoint.safetensors, superpoint_lightglue_v0-1_arxiv-pth"),
+        ({"extractor": "aliked"}, "aliked-n16.pth has sha256 .* expected 5be8704840ed662d"),
+    ],
+)
+def test_missing_and_wrong_weights_are_named_before_any_work(courtyard, tmp_path, options, said):
+    (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
+    weights = tmp_path if options else None
+    with pytest.raises(MissingWeightsError, match=said):
+        Dim(weights=weights, download=False, **options).run(courtyard, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_weights_with_a_wrong_checksum_are_refused(courtyard, tmp_path):
-    (tmp_path / "aliked-n16.pth").write_bytes(b"not ALIKED")
-    with pytest.raises(
-        MissingWeightsError, match=r"aliked-n16.pth has sha256 .* expected 5be8704840ed662d"
-    ):
-        Dim(extractor="aliked", weights=tmp_path, download=False).run(courtyard, tmp_path / "out")
-
-
-def test_weights_of_another_network_are_refused(tmp_path):
-    torch.save({"conv.weight": torch.zeros(3)}, tmp_path / "foreign.pth")
-    settings = superpoint(tmp_path).feature_settings()
-    with pytest.raises(MissingWeightsError, match="is for another network"):
-        build_matcher(settings, tmp_path / "foreign.pth", CPU)
-    with pytest.raises(MissingWeightsError, match="is for another network"):
-        EXTRACTORS["aliked"](
-            Dim(extractor="aliked").feature_settings(), tmp_path / "foreign.pth", CPU
-        )
-
-
-def test_weights_of_another_shape_are_refused(untrained_weights, tmp_path):
-    state = torch.load(untrained_weights / "superpoint_lightglue.pth", weights_only=True)
+def test_weights_of_another_network_or_shape_are_refused(untrained_weights, tmp_path):
+    state = torch.load(untrained_weights / LIGHTGLUE, weights_only=True)
     state["log_assignment.0.final_proj.weight"] = torch.zeros(3, 3)
     torch.save(state, tmp_path / "bad.pth")
-    with pytest.raises(MissingWeightsError, match="other shapes"):
-        build_matcher(superpoint(tmp_path).feature_settings(), tmp_path / "bad.pth", CPU)
+    torch.save({"conv.weight": torch.zeros(3)}, foreign := tmp_path / "foreign.pth")
+    aliked = partial(EXTRACTORS["aliked"], Dim(extractor="aliked").feature_settings(), device=CPU)
+    for build, file, said in (
+        (matcher_of, foreign, "is for another network"),
+        (aliked, foreign, "is for another network"),
+        (matcher_of, tmp_path / "bad.pth", "other shapes"),
+    ):
+        with pytest.raises(MissingWeightsError, match=said):
+            build(file)
 
 
 @pytest.mark.slow
@@ -410,8 +399,7 @@ def test_mutual_nearest_matches_equal_those_of_brute_force():
         row, column = np.sort(distance[i]), np.sort(distance[:, j])
         if distance[:, j].argmin() == i and row[0] <= 0.9 * row[1] and column[0] <= 0.9 * column[1]:
             expected.append((i, j))
-    matches = mutual_nearest_matcher(0.9, CPU)(*sides)
-    assert sorted(map(tuple, matches.tolist())) == expected
+    assert sorted(map(tuple, mutual_nearest_matcher(0.9, CPU)(*sides).tolist())) == expected
     assert len(expected) > 3
 
 

@@ -77,9 +77,8 @@ def test_sift_through_the_external_path_gives_the_same_model(own_path, bare_phot
     for point_id, point in first.points3D.items():
         assert_array_equal(point.xyz, second.points3D[point_id].xyz)
     for image_id, image in first.images.items():
-        assert_array_equal(
-            image.cam_from_world().matrix(), second.images[image_id].cam_from_world().matrix()
-        )
+        other = second.images[image_id].cam_from_world().matrix()
+        assert_array_equal(image.cam_from_world().matrix(), other)
 
 
 def extract(path, max_image_size):
@@ -111,15 +110,13 @@ def test_a_blob_is_found_at_its_centre(tmp_path, center):
     x, y = np.meshgrid(np.arange(100) + 0.5, np.arange(80) + 0.5)
     blob = 40 + 200 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * 4.0**2))
     Image.fromarray(blob.round().astype(np.uint8)).save(tmp_path / "blob.png")
-    features = extract(tmp_path / "blob.png", 1600)
-    assert_allclose(features.colmap_keypoints[0], center, atol=0.05)
+    assert_allclose(extract(tmp_path / "blob.png", 1600).colmap_keypoints[0], center, atol=0.05)
 
 
 def test_keypoints_are_scaled_separately_in_x_and_y():
     features = Features(
         np.array([[0, 0], [99, 49]], dtype=np.float32),
-        np.zeros((2, 8), dtype=np.float32),
-        np.ones(2, dtype=np.float32),
+        *(np.zeros((2, 8), np.float32), np.ones(2, np.float32)),
         network_size=(100, 50),
         file_size=(400, 201),
     )

@@ -21,9 +21,7 @@ class Networks:
     """Notes what is computed: ``keypoints`` of each image, and ``matched`` pairs of ``counts``."""
 
     def __init__(self):
-        self.made = []
-        self.extracted = []
-        self.matched = []
+        self.made, self.extracted, self.matched = [], [], []
         self.keypoints = {"a.png": 2, "b.png": 3, "c.png": 4}
         self.without = set()
 
@@ -70,23 +68,19 @@ def job(bare_photos, tmp_path):
     return NetworkJob(options, options.feature_settings(), capture, None, work, None, None)
 
 
-def run(job, told=None):
-    progress = (lambda *at: None) if told is None else (lambda *at: told.append(at))
+def run(job, progress=lambda *at: None):
     return extract_and_match.extract_and_match(job, progress)
 
 
 def test_each_image_and_pair_is_computed_once(networks, job):
     told = []
-    found = run(job, told)
+    found = run(job, lambda *at: told.append(at))
     assert networks.made == ["extractor", "matcher"]
     assert networks.extracted == list(NAMES)
     assert networks.matched == [(2, 3), (2, 4), (3, 4)]
     assert told == [(what, done, 3) for what in ("extract", "match") for done in range(4)]
-    assert found.counts == {
-        "pairs_selected": 3,
-        "pairs_without_matches": 0,
-        "images_without_keypoints": 0,
-    }
+    counted = {"pairs_selected": 3, "pairs_without_matches": 0, "images_without_keypoints": 0}
+    assert found.counts == counted
     assert set(found.seconds) == {"extract", "match"}
     again = run(job)
     assert networks.made == ["extractor", "matcher"]  # no network is loaded again
@@ -153,9 +147,11 @@ def test_the_weights_are_named_by_their_digests_and_tell_stored_files_apart(
 
 def test_stored_files_that_are_gone_are_named(networks, job):
     store = open_store(job)
-    with pytest.raises(GsbenchError, match=r"the stored features of a\.png are gone from .*work"):
-        store.require_features("a.png")
-    with pytest.raises(GsbenchError, match=r"the stored matches of a\.png and b\.png are gone"):
-        store.require_matches("a.png", "b.png")
+    for read, names, said in (
+        (store.require_features, ("a.png",), r"features of a\.png are gone from .*work"),
+        (store.require_matches, ("a.png", "b.png"), r"matches of a\.png and b\.png are gone"),
+    ):
+        with pytest.raises(GsbenchError, match=f"the stored {said}"):
+            read(*names)
     np.save(store.matches_path("a.png", "b.png"), np.zeros((4, 3)))
     assert store.read_matches("a.png", "b.png") is None

@@ -84,7 +84,9 @@ def test_a_report_has_the_numbers_of_its_model(capture):
     assert report.versions["pycolmap"] == pycolmap.__version__
 
 
-POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
+def errors(**changes):
+    known = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
+    return {"pose_errors": replace(known, **changes)}
 
 
 @pytest.mark.parametrize(
@@ -93,8 +95,9 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
         (
             {"num_registered": 9},
             {"num_registered": 8},
-            "only 8 of 10 images have a pose (missing: a, b, c, d, e …)",
+            "only 8 of 10 images have a pose (missing: ",
         ),
+        ({}, {"num_registered": 8}, "(missing: a, b, c, d, e …)"),
         (
             {},
             {"num_registered": 8, "unregistered": tuple("abcde")},
@@ -104,20 +107,16 @@ POSES = PoseErrors(4, True, 0.1, 0.1, 0.1, 0.04, 1.0, 1.0)
         ({"mean_reprojection_error": 1.5}, {"mean_reprojection_error": 1.52}, "1.52 px is large"),
         ({"mean_reprojection_error": None}, {"mean_reprojection_error": 40.0}, "40.00 px is large"),
         (
-            {"pose_errors": replace(POSES, rotation_mean_deg=2.0, rotation_max_deg=90.0)},
-            {"pose_errors": replace(POSES, rotation_mean_deg=2.1)},
+            errors(rotation_mean_deg=2.0, rotation_max_deg=90.0),
+            errors(rotation_mean_deg=2.1),
             "turned 2.1 degrees against the true ones",
         ),
         (
-            {"pose_errors": replace(POSES, center_rmse_relative=0.05)},
-            {"pose_errors": replace(POSES, center_rmse_relative=0.051, exact=False)},
+            errors(center_rmse_relative=0.05),
+            errors(center_rmse_relative=0.051, exact=False),
             "5.1% of the scene extent away from the reference ones",
         ),
-        (
-            {"pose_errors": replace(POSES, center_rmse_relative=None)},
-            {"num_points": 0},
-            "only 0 points",
-        ),
+        (errors(center_rmse_relative=None), {"num_points": 0}, "only 0 points"),
     ],
 )
 def test_each_limit_has_its_own_warning(capture, sound, doubtful, said):
@@ -145,8 +144,7 @@ def test_a_field_of_view_outside_5_to_150_degrees_gives_a_warning(capture, focal
 def test_a_similarity_leaves_no_pose_errors_and_a_tilt_does():
     """A model moved by a similarity has no error; tilted cameras have an angle only."""
     turn = Rotation.from_rotvec([0.2, 0.1, -0.4])
-    reference = model_of(CENTERS)
-    model = model_of(CENTERS)
+    reference, model = model_of(CENTERS), model_of(CENTERS)
     rotation = pycolmap.Rotation3d(turn.as_matrix())
     model.transform(pycolmap.Sim3d(3.0, rotation, np.array([1.0, 2.0, 3.0])))
     similarity = similarity_to(model, reference)
@@ -167,43 +165,43 @@ def test_two_common_cameras_are_not_compared_and_give_a_warning(capture, tmp_pat
     model, reference = model_of(CENTERS), model_of(CENTERS)
     for image_id in (3, 4):
         reference.deregister_frame(reference.images[image_id].frame_id)
-    work = ReconstructionJob(
-        Sfm(), capture, tmp_path / "out", tmp_path / "work", None, Preparation()
-    )
+    folders = tmp_path / "out", tmp_path / "work"
+    work = ReconstructionJob(Sfm(), capture, *folders, None, Preparation())
     mapped = MappingResult(model, 1, "incremental", ())
     report = finish(work, model, reference, mapped, Timer({}), {})
     assert report.pose_errors is None
     (warning,) = [line for line in report.warnings if "common cameras" in line]
-    assert finish(work, model, None, mapped, Timer({}), {}).warnings == tuple(
-        line for line in report.warnings if line != warning
-    )
+    others = finish(work, model, None, mapped, Timer({}), {}).warnings
+    assert others == tuple(line for line in report.warnings if line != warning)
 
 
 def test_centre_errors_are_in_reference_units_and_relative_to_the_extent():
     moved = CENTERS.copy()
     moved[3, 2] += 0.3
     model, reference = model_of(moved), model_of(CENTERS)
-    identity = similarity_to(reference, reference)
-    errors = compare_poses(model, reference, identity, 2.0, exact=True)
-    assert errors.center_max == pytest.approx(0.3)
-    assert errors.center_mean == pytest.approx(0.3 / 4)
-    assert errors.center_rmse == pytest.approx(0.3 / 2)
-    assert errors.center_rmse_relative == pytest.approx(0.3 / 4)
+    found = compare_poses(model, reference, similarity_to(reference, reference), 2.0, exact=True)
+    assert found.center_max == pytest.approx(0.3)
+    assert found.center_mean == pytest.approx(0.3 / 4)
+    assert found.center_rmse == pytest.approx(0.3 / 2)
+    assert found.center_rmse_relative == pytest.approx(0.3 / 4)
+
+
+def assert_axes(axes, up):
+    """Check the axes of a view from above: at right angles, right-handed, and the last is ``up``."""
+    assert_allclose(axes[2], up, atol=1e-9)
+    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
 def test_up_is_the_normal_of_a_ring_of_cameras():
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     ring = np.stack([np.cos(angles), np.sin(angles), 0.3 + 0 * angles], axis=1) * 4
-    up = np.array([0.0, 0.0, 1.0])
-    rotations = []
+    up, rotations = np.array([0.0, 0.0, 1.0]), []
     for center in ring:
         forward = -center / np.linalg.norm(center)
         right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
         rotations.append([right, np.cross(forward, right), forward])
-    axes = view_from_above(ring, np.array(rotations), np.zeros((1, 3)))
-    assert_allclose(axes[2], up, atol=1e-9)
-    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert_axes(view_from_above(ring, np.array(rotations), np.zeros((1, 3))), up)
 
 
 @pytest.mark.parametrize("size", [0.01, 100.0])
@@ -212,9 +210,8 @@ def test_up_is_that_of_the_images_unless_the_cameras_lie_in_a_plane(size, flatne
     """A plane may be half as thick as it is wide; the cameras are tilted by 20 degrees."""
     grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
     turn = Rotation.from_euler("x", -70, degrees=True).as_matrix()
-    axes = view_from_above(
-        size * grid * [1, 1, flatness], np.tile(turn, (27, 1, 1)), np.zeros((1, 3))
-    )
+    places = size * grid * [1, 1, flatness]
+    axes = view_from_above(places, np.tile(turn, (27, 1, 1)), np.zeros((1, 3)))
     tilted = [0, math.sin(math.radians(20)), math.cos(math.radians(20))]
     expected = tilted if flatness > 0.5 else [0, 0, 1]
     assert_allclose(axes[2] * np.sign(axes[2, 2]), expected, atol=1e-9)
@@ -225,9 +222,7 @@ def test_cameras_in_a_plane_across_their_right_have_a_right_hand_view():
     centers = np.array([[0.0, y, z] for y in range(3) for z in range(4)])
     looking_along_y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     axes = view_from_above(centers, np.tile(looking_along_y, (12, 1, 1)), np.zeros((0, 3)))
-    assert_allclose(np.abs(axes[2]), [1, 0, 0], atol=1e-9)
-    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert_axes(axes, [np.sign(axes[2, 0]), 0, 0])
 
 
 @pytest.mark.parametrize("points", [1, 5])
@@ -241,14 +236,19 @@ def test_up_points_from_the_points_to_cameras_that_look_down(points, side):
     assert_allclose(axes[2], [0, 0, side], atol=1e-9)
 
 
+def drawn(model, folder):
+    """The pixels [H, W, 3] of the picture of a model."""
+    draw_cloud(model, folder / "cloud.png", "hand-made")
+    return np.asarray(Image.open(folder / "cloud.png").convert("RGB")).astype(int)
+
+
 def test_the_picture_shows_cameras_and_points_at_their_places(tmp_path):
     """All cameras are in the plane z = 0 and look along +z: x is right, y is down.
 
     Five units, and a twentieth of that on each side, fill 840 of 960 px. So a unit takes
     840 / 5.5 px, and (0, 2.5) is in the middle.
     """
-    draw_cloud(model_of(CENTERS), tmp_path / "cloud.png", "hand-made")
-    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
+    pixels = drawn(model_of(CENTERS), tmp_path)
     assert pixels.shape == (960, 960, 3)
     scale = 840 / 5.5
     for x, y, *_ in CENTERS:
@@ -270,12 +270,8 @@ def test_a_line_shows_the_viewing_direction_of_a_camera(tmp_path):
     """All cameras are in the plane z = 0 and look along +x, which is up in the picture."""
     sideways = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     places = [(0, 0, 0), (4, 0, 0), (0, 4, 0), (4, 4, 0), (2, 2, 0)]
-    draw_cloud(
-        model_with({f"{x} {y}": camera_at([x, y, z], sideways) for x, y, z in places}),
-        tmp_path / "cloud.png",
-        "hand-made",
-    )
-    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB")).astype(int)
+    cameras = {f"{x} {y}": camera_at([x, y, z], sideways) for x, y, z in places}
+    pixels = drawn(model_with(cameras), tmp_path)
     red = np.abs(pixels - [214, 39, 40]).max(axis=-1) < 8
     assert red[480 - 40, 478:483].any()  # the line of the camera in the middle
     assert not red[480 + 40, 478:483].any()
@@ -288,9 +284,7 @@ def test_more_points_are_drawn_smaller(count, inked, tmp_path, monkeypatch):
     points[0], colors[0] = (6, 4, 5), (30, 90, 30)
     monkeypatch.setattr(picture, "model_points", lambda model: (points, colors))
     model = model_with({"a": camera_at([0, 0, 0]), "b": camera_at([8, 5, 0])})
-    draw_cloud(model, tmp_path / "cloud.png", "hand-made")
-    pixels = np.asarray(Image.open(tmp_path / "cloud.png").convert("RGB"))
-    assert (pixels == [30, 90, 30]).all(axis=-1).sum() == inked
+    assert (drawn(model, tmp_path) == [30, 90, 30]).all(axis=-1).sum() == inked
 
 
 def test_a_camera_whose_right_is_up_gives_axes_at_right_angles():
@@ -299,8 +293,5 @@ def test_a_camera_whose_right_is_up_gives_axes_at_right_angles():
     down = np.array([2.0, 1, -2]) / 3  # at a right angle to it
     first, second = np.stack([up, down, np.cross(up, down)]), np.eye(3)
     second[1] = -2 * up - down  # the mean of both downward directions is -up
-    axes = view_from_above(
-        np.array([[0, 0, 0], [1.0, 0, 0]]), np.stack([first, second]), np.empty((0, 3))
-    )
-    assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert_allclose(axes[2], up, atol=1e-12)
+    centers, rotations = np.array([[0, 0, 0], [1.0, 0, 0]]), np.stack([first, second])
+    assert_axes(view_from_above(centers, rotations, np.empty((0, 3))), up)

@@ -19,11 +19,6 @@ from tests.init.models import camera_at, digest, model_with
 from tests.scene.courtyard.surfaces import surface_distance
 
 
-def picture(path, pixels):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels.astype(np.uint8)).save(path)
-
-
 def capture_of(folder):
     names = tuple(sorted(path.name for path in folder.iterdir()))
     return Capture("photos", folder, names, (), None, False, "0")
@@ -80,11 +75,8 @@ def test_jittered_is_sfm_with_copies_nearby(shared, courtyard, tmp_path):
 def test_own_model_is_written_in_both_gauges(own, courtyard):
     report, output = own
     aligned, raw, exact = (
-        {
-            name: center
-            for name, (center, _) in poses_by_name(pycolmap.Reconstruction(folder)).items()
-        }
-        for folder in (output / MODEL_FOLDER, output / OWN_GAUGE_FOLDER, courtyard.model)
+        {name: center for name, (center, _) in poses_by_name(pycolmap.Reconstruction(at)).items()}
+        for at in (output / MODEL_FOLDER, output / OWN_GAUGE_FOLDER, courtyard.model)
     )
     scale = report.own_gauge.scale_to_reference
     assert report.gauge.scale_to_reference == 1.0
@@ -108,10 +100,8 @@ def test_known_poses_give_points_on_the_true_surfaces(shared, courtyard):
     model = pycolmap.Reconstruction(output / MODEL_FOLDER)
     exact = pycolmap.Reconstruction(courtyard.model)
     for image in exact.images.values():  # the cameras equal the reference's, bit for bit
-        assert_array_equal(
-            model.find_image_with_name(image.name).cam_from_world().matrix(),
-            image.cam_from_world().matrix(),
-        )
+        found = model.find_image_with_name(image.name).cam_from_world()
+        assert_array_equal(found.matrix(), image.cam_from_world().matrix())
 
 
 def test_colours_are_those_of_the_photographs(shared, courtyard):
@@ -186,9 +176,8 @@ def test_bare_photos_get_poses_of_their_own_and_serve_as_reference(bare_photos, 
     assert report.pose_errors is None
     assert report.gauge.scale_to_reference is None
     assert SfmDense().needs_reference(bare_photos)
-    dense = SfmDense().run(
-        bare_photos, tmp_path / "dense", reference=tmp_path / "sfm" / MODEL_FOLDER
-    )
+    reference = tmp_path / "sfm" / MODEL_FOLDER
+    dense = SfmDense().run(bare_photos, tmp_path / "dense", reference=reference)
     assert dense.poses == "shared"
     assert dense.gauge.scene_extent == pytest.approx(report.gauge.scene_extent, rel=1e-12)
     assert dense.num_points > report.num_points
@@ -204,8 +193,7 @@ def test_names_with_spaces_and_photos_of_two_sizes_are_accepted(courtyard, tmp_p
         with Image.open(courtyard.images / name) as image:
             size = (320, 240) if index % 2 else (480, 360)
             image.resize(size).save(images / f"IMG {index} (1).png")
-    report = Sfm().run(capture_of(images), tmp_path / "out")
-    assert report.num_registered >= 7
+    assert Sfm().run(capture_of(images), tmp_path / "out").num_registered >= 7
     model = pycolmap.Reconstruction(tmp_path / "out" / MODEL_FOLDER)
     for image in model.images.values():  # one camera for each size of files
         camera = model.cameras[image.camera_id]
@@ -251,20 +239,19 @@ def test_a_wrong_reference_gives_a_warning(courtyard, tmp_path):
     assert any("degrees against the true ones" in warning for warning in report.warnings)
 
 
-NOISE = np.random.default_rng(0).integers(0, 255, (4, 120, 160, 3))
-
-
 @pytest.mark.parametrize(
     "pixels, said",
     [
         ([np.full((60, 80, 3), 40 * index) for index in range(4)], "no keypoint in any image"),
-        (NOISE, "no pair of images shares enough matches"),
+        (
+            np.random.default_rng(0).integers(0, 255, (4, 120, 160, 3)),
+            "no pair of images shares enough matches",
+        ),
     ],
-    ids=["without texture", "without overlap"],
 )
 def test_photos_that_cannot_be_matched_are_refused(tmp_path, pixels, said):
     for index, own in enumerate(pixels):
-        picture(tmp_path / f"{index}.png", own)
+        Image.fromarray(own.astype(np.uint8)).save(tmp_path / f"{index}.png")
     with refusal(said):
         Sfm().run(capture_of(tmp_path), tmp_path.with_name("out"))
 
@@ -287,19 +274,13 @@ def test_two_photos_are_refused(courtyard, tmp_path):
     "options, message",
     [
         ({"poses": "both"}, "init.poses must be 'shared' or 'own', got 'both'"),
-        (
-            {"camera_model": "THIN_PRISM"},
-            "init.camera_model must be 'SIMPLE_PINHOLE', .*, got 'THIN_PRISM'",
-        ),
+        ({"camera_model": "THIN_PRISM"}, "init.camera_model must be 'SIMPLE_PINHOLE', .*, got 'TH"),
         ({"pairs": "all"}, "init.pairs must be .* got 'all'"),
         ({"max_ratio": 1.5}, r"init.max_ratio must be a number in \(0, 1\], got 1.5"),
         ({"max_image_size": 0}, "init.max_image_size must be a whole number of at least 32, got 0"),
         ({"threads": 0}, r"init.threads must be a whole number in \[1, 4096\] or 'auto', got 0"),
         ({"seed": 0.5}, "init.seed must be a whole number in .*, got 0.5"),
-        (
-            {"focal_length": float("nan")},
-            "init.focal_length must be a number above 0 or null, got nan",
-        ),
+        ({"focal_length": float("nan")}, "init.focal_length must be a number above 0 or null, got"),
     ],
 )
 def test_settings_are_checked_by_name(options, message):

@@ -13,7 +13,7 @@ from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia, read_cloud
 from gsbench.init.base import REPORT_FILE
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
-from tests.helpers import read_json, refusal
+from tests.helpers import read_json
 from tests.init.models import add_point
 
 
@@ -79,8 +79,7 @@ def test_dataset_keeps_the_points_that_two_training_views_see(with_points, tmp_p
     kept, total = len(wanted), before.num_points3D()
     assert (points.choice, points.kept, points.total) == ("train", kept, total)
     assert points.removed == pytest.approx(1 - kept / total)
-    said = read_json(tmp_path / REPORT_FILE)["training_points"]
-    assert said["removed"] == points.removed
+    assert read_json(tmp_path / REPORT_FILE)["training_points"]["removed"] == points.removed
     assert not (tmp_path / "work").exists()
 
 
@@ -145,15 +144,7 @@ def test_estimated_cameras_keep_all_views_and_points_of_training_views(bare_phot
     model, test = read_model(tmp_path / MODEL_FOLDER), set(capture.test_names)
     assert report.num_registered == len(capture.image_names)
     assert not any(names & test for names in seen_by(model))
-    points = report.training_points
-    assert points.total is not None
-    assert points.kept == model.num_points3D() < points.total
-
-
-def test_points_from_train_is_refused_with_one_training_view(with_points, tmp_path):
-    lonely = replace(with_points, test_names=with_points.image_names[1:])
-    with refusal(r"init\.points_from=train: no point is left"):
-        Dataset(points_from="train").run(lonely, tmp_path)
+    assert report.training_points.kept == model.num_points3D() < report.training_points.total
 
 
 def test_the_key_of_an_initialiser_contains_points_from():

@@ -13,7 +13,7 @@ from gsbench.launch.record import add_to_plan, declare, declare_questions, decla
 from gsbench.runs.experiments import Declaration, Question, declared_now, read_declarations
 from tests.end_to_end.conftest import SMALL
 from tests.helpers import refusal, write
-from tests.launch.test_jobs import trial
+from tests.trials import bare_trial as trial
 
 # later words win: a trial of seconds
 TINY = [
@@ -118,21 +118,22 @@ def test_one_command_cannot_declare_two_metrics(tmp_path, refused):
 def test_claims_are_kept_beside_declared_metrics(tmp_path, caplog):
     home = tmp_path / "exp"
 
-    def claims(metric, moment, **more):
-        return Declaration(time=moment, questions=(Question(metric=metric, name="claim"),), **more)
+    def claims(metric, year, **more):
+        asked = (Question(metric=metric, name="claim"),)
+        return Declaration(time=f"{year}-01-01T00:00:00Z", questions=asked, **more)
 
     nothing = Declaration(time="2020-01-01T00:00:00Z")
     assert declare_questions(home, nothing) is nothing
     assert not home.exists()
-    first = declare_questions(home, claims("psnr", "2020-01-01T00:00:00Z"))
+    first = declare_questions(home, claims("psnr", 2020))
     # the first declaration stays, with its time
-    assert declare_questions(home, claims("psnr", "2021-01-01T00:00:00Z")) == first
+    assert declare_questions(home, claims("psnr", 2021)) == first
     declare([declaring(tmp_path, "psnr")])
     for number in "12":  # votes are judged by their own round alone
-        declare_questions(home, claims("psnr", f"2020-01-0{number}T00:00:00Z", vote_round=number))
+        declare_questions(home, claims("psnr", f"202{number}", vote_round=number))
     assert not caplog.text
     with caplog.at_level(logging.WARNING):
-        declare_questions(home, claims("ssim", "2022-01-01T00:00:00Z"))
+        declare_questions(home, claims("ssim", 2022))
     assert "other questions were declared before" in caplog.text
     every = read_declarations(home)
     assert [one.primary for one in every if one.kind == "claims"] == ["psnr", "ssim"]

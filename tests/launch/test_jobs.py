@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 import submitit
 
-from gsbench.config.compose import Trial
 from gsbench.errors import InputError, TrainingError
 from gsbench.files import DiskFullError
 from gsbench.launch import jobs
+from gsbench.launch import slurm as slurm_jobs
 from gsbench.launch.jobs import (
     Outcome,
     TrialJob,
@@ -33,28 +33,16 @@ from gsbench.launch.states import QueuedJob, current_user, read_submission, reco
 from gsbench.runs.config_hash import config_hash
 from gsbench.system.locks import BusyError
 from gsbench.system.stopping import Stopped
-from tests.finished import record_of, write_results
 from tests.helpers import refusal
-from tests.tracking.helpers import trial_values
+from tests.trials import LOCAL, record_of, trial_values, write_results
+from tests.trials import bare_trial as trial
 
-LOCAL = {"name": "local", "parallel": 2, "timeout_min": None}
 SLURM = {
     **dict.fromkeys(("partition", "account", "qos", "mem_gb"), None),
     **{"name": "slurm", "parallel": 2, "timeout_min": 60, "wait": False},
     **{"cpus_per_trial": 4, "gpus_per_trial": 0, "signal_seconds": 90},
     **{"setup": [], "sbatch": {}, "max_requeues": 5},
 }
-
-
-def trial(runs, seed=0, launch=LOCAL, **settings):
-    more = {
-        "launch": launch,
-        "tracking": {"sink": f"of {seed}"},
-        "device": "auto",
-        "threads": 3,
-        "eval": {},
-    }
-    return Trial(trial_values(runs, seed, "x") | more | settings, ())
 
 
 class Mirrored:
@@ -385,8 +373,8 @@ def slurm(tmp_path, monkeypatch):
         return [job(tmp_path, f"9_{number}") for number, _ in enumerate(tasks)]
 
     executor = SimpleNamespace(folder=tmp_path, submit_array=submit_array)
-    monkeypatch.setattr(jobs, "make_executor", lambda launch, folder: executor)
-    monkeypatch.setattr(jobs, "ask_queue", lambda folders: state.queue)
+    monkeypatch.setattr(slurm_jobs, "make_executor", lambda launch, folder: executor)
+    monkeypatch.setattr(slurm_jobs, "ask_queue", lambda folders: state.queue)
     monkeypatch.setattr(submitit, "SlurmJob", job)
     return state
 
@@ -396,7 +384,7 @@ def test_trials_in_the_queue_are_not_submitted_again(tmp_path, slurm, capsys):
     slurm.queue = {"7_1": QueuedJob("RUNNING", "None")}
     for seed, name in ((0, "7_0"), (1, "7_1")):  # the first has left the queue
         record_submission(trials[seed].folder, name, tmp_path / "old")
-    outcomes = jobs.run_slurm(trials)
+    outcomes = slurm_jobs.run_slurm(trials)
     assert slurm.submitted == [0, 2]
     assert {(one.folder, one.status, one.message) for one in outcomes} == {
         (trials[0].folder, "queued", "9_0"),
@@ -412,10 +400,10 @@ def test_without_a_listing_or_a_scheduler_nothing_counts_as_submitted(tmp_path, 
     one = trial(tmp_path, launch=SLURM)
     slurm.queue = None
     with refusal("nothing was submitted"):
-        jobs.run_slurm([one])
+        slurm_jobs.run_slurm([one])
     slurm.queue, slurm.error = {}, RuntimeError("no such\npartition " + 300 * "x")
     with pytest.raises(InputError) as refused:
-        jobs.run_slurm([one])
+        slurm_jobs.run_slurm([one])
     assert str(refused.value) == "Slurm refused the job: no such partition " + 282 * "x"
     assert (read_submission(one.folder), slurm.submitted) == (None, [])
 
@@ -424,15 +412,15 @@ def test_a_command_waits_for_slurm_unless_told_otherwise(tmp_path, slurm, monkey
     caplog.set_level(logging.INFO, "gsbench")
     launch = {key: value for key, value in SLURM.items() if key != "wait"}
     one = trial(tmp_path, launch=launch)
-    monkeypatch.setattr(jobs, "_wait", lambda waiting, trials: (list(waiting), trials))
-    assert jobs.run_slurm([one]) == ([one.folder], [one])
+    monkeypatch.setattr(slurm_jobs, "_wait", lambda waiting, trials: (list(waiting), trials))
+    assert slurm_jobs.run_slurm([one]) == ([one.folder], [one])
 
     def stop(waiting, trials):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(jobs, "_wait", stop)
+    monkeypatch.setattr(slurm_jobs, "_wait", stop)
     with pytest.raises(KeyboardInterrupt):
-        jobs.run_slurm([one])
+        slurm_jobs.run_slurm([one])
     assert caplog.messages[0] == f"1 trial in Slurm, job 9; logs: {tmp_path.parent}"
     assert caplog.messages[-1].endswith("`scancel 9` ends them")
 
@@ -452,11 +440,11 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
         **{"folder": tmp_path, "requeues": 5, "job_name": "gsbench", "time": 60},
         **{"cpus_per_task": 4, "signal_delay_s": 90, "array_parallelism": 2},
     }
-    jobs.make_executor(SLURM, tmp_path)
+    slurm_jobs.make_executor(SLURM, tmp_path)
     assert given == expected
     more = {"partition": "p", "account": "a", "qos": "q", "setup": ["module load"]}
     sizes = {"gpus_per_trial": 1, "mem_gb": 16, "sbatch": {"constraint": "a100"}}
-    jobs.make_executor(SLURM | more | sizes, tmp_path)
+    slurm_jobs.make_executor(SLURM | more | sizes, tmp_path)
     assert given == expected | more | {
         **{"gpus_per_node": 1, "mem": "16GB"},
         "additional_parameters": {"constraint": "a100"},
@@ -467,7 +455,7 @@ def test_settings_become_options_of_slurm(tmp_path, monkeypatch):
 
     monkeypatch.setattr(submitit, "SlurmExecutor", missing)
     with refusal("there is no srun here"):
-        jobs.make_executor(SLURM, tmp_path)
+        slurm_jobs.make_executor(SLURM, tmp_path)
 
 
 def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
@@ -477,17 +465,17 @@ def test_waiting_ends_with_the_last_job_and_counts_jobs_that_left_the_queue(
     caplog.set_level(logging.INFO, "gsbench")
     queues = iter([{"7_1"}, None, set(), {"7_1"}, set(), set()])
     asked = []
-    monkeypatch.setattr(jobs, "read_queue", lambda users: asked.append(users) or next(queues))
+    monkeypatch.setattr(slurm_jobs, "read_queue", lambda users: asked.append(users) or next(queues))
     pauses = []
     monkeypatch.setattr("time.sleep", pauses.append)
-    monkeypatch.setattr(jobs, "SECONDS_BETWEEN_QUEUE_CHECKS", -1)
+    monkeypatch.setattr(slurm_jobs, "SECONDS_BETWEEN_QUEUE_CHECKS", -1)
     trials = [trial(tmp_path, seed, SLURM) for seed in (0, 1)]
     waiting = {one.folder: job(tmp_path, f"7_{k}") for k, one in enumerate(trials)}
     record_submission(trials[1].folder, "7_1", tmp_path / "log")
     submitted = trials[1].folder / ".submitted.json"
     submitted.write_text(submitted.read_text().replace(f'"{current_user()}"', '"ada"'))
     (tmp_path / "7_0.pkl").write_bytes(b"")
-    outcomes = jobs._wait(waiting, trials)
+    outcomes = slurm_jobs._wait(waiting, trials)
     assert [outcome.folder for outcome in outcomes] == [trial.folder for trial in trials]
     assert list(queues) == []
     assert pauses == [1.0] * 4

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from gsbench.config.compose import Trial
 from gsbench.launch import batch, dry_run
 from gsbench.launch.batch import (
     begin_for_another_launcher,
@@ -17,12 +16,11 @@ from gsbench.launch.batch import (
     run_batch,
 )
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import read_plan
 from gsbench.runs.experiments import read_declarations
-from tests.finished import write_results
+from gsbench.runs.plan import read_plan
 from tests.helpers import refusal
-from tests.launch.test_jobs import LOCAL, SLURM, Mirrored
-from tests.launch.test_jobs import trial as bare_trial
+from tests.launch.test_jobs import SLURM, Mirrored
+from tests.trials import LOCAL, bare_trial, write_results
 
 
 @pytest.mark.parametrize(
@@ -54,8 +52,7 @@ def trial(runs, seed=0, launch=None, **settings):
     launch = launch or LOCAL | {"name": "serial"}
     tracking = {"enabled": False, "_target_": "gsbench.tracking.NoSuch"}
     settings = {"scene": courtyard, "tracking": tracking} | settings
-    one = bare_trial(runs, seed, launch, **settings)
-    return Trial(one.values, (f"seed={seed}",))
+    return bare_trial(runs, seed, launch, [f"seed={seed}"], **settings)
 
 
 @pytest.fixture
@@ -198,8 +195,8 @@ def test_weights_are_searched_once_for_equal_options(monkeypatch):
 
     parts = SimpleNamespace(make_evaluator=make_evaluator)
     monkeypatch.setitem(sys.modules, "gsbench.pipeline.parts", parts)
-    dry_run.unavailable_now.cache_clear()
-    for options in ('{"flip": false}', '{"flip": true}', '{"flip": false}'):
-        assert dry_run.unavailable_now(options) == {"lpips_vgg"}
+    dry_run._unavailable_now.cache_clear()
+    for flip in (False, True, False):
+        assert dry_run.unavailable_now({"flip": flip}) == ["lpips_vgg"]
     assert [options.flip for options in asked] == [False, True]
-    dry_run.unavailable_now.cache_clear()
+    dry_run._unavailable_now.cache_clear()

@@ -13,15 +13,15 @@ from gsbench.launch.progress import Progress, _in_words, _seconds_left, progress
 from gsbench.launch.states import TrialState
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
-from tests.helpers import write
-from tests.tracking.helpers import begin_trial, trial_values, write_trial
+from tests.helpers import write, write_lines
+from tests.tracking.helpers import begin_trial, write_trial
+from tests.trials import trial_values
 
 ARMS, SEEDS = ("adc", "volumetric"), (0, 1, 2)
 
 
 def begin(runs, arm, seed):
-    values = trial_values(runs, seed, "swept") | {"densify": {"name": arm}}
-    return begin_trial(values)
+    return begin_trial(trial_values(runs, seed, "swept", densify=arm))
 
 
 @pytest.fixture
@@ -32,11 +32,8 @@ def sweep(tmp_path):
     # worse.
     psnr = {("adc", 0): 25.0, ("adc", 1): 10.0, ("adc", 2): 10.0, ("volumetric", 0): 20.0}
     for (arm, seed), value in psnr.items():
-        write_trial(
-            folders[arm, seed],
-            trial_values(tmp_path, seed, "swept") | {"densify": {"name": arm}},
-            psnr=value,
-        )
+        values = trial_values(tmp_path, seed, "swept", densify=arm)
+        write_trial(folders[arm, seed], values, psnr=value)
     write(folders["volumetric", 1] / "failed.json", {"message": "x"})
     return folders
 
@@ -44,42 +41,27 @@ def sweep(tmp_path):
 def test_states_speed_time_left_and_leader(sweep, tmp_path):
     running = sweep["volumetric", 2]
     building = tmp_path / "store" / "train" / "now"
-    write(
-        building / "metrics.jsonl", '{"step": 50, "seconds": 5.0}\n{"step": 75, "seconds": 10.0}\n'
-    )
+    rows = [{"step": 50, "seconds": 5.0}, {"step": 75, "seconds": 10.0}]
+    write_lines(building / "metrics.jsonl", rows)
     write(running / "building.json", {"stage": "train", "folder": str(building)})
     with hold(running / ".lock", "a trial"):
         frame = progress_frame(tmp_path, "swept").set_index("arm")
-    assert frame.loc["a_init-adc", ["done", "running", "failed", "waiting"]].to_list() == [
-        3,
-        0,
-        0,
-        0,
-    ]
-    assert frame.loc["a_init-volumetric", ["done", "running", "failed", "waiting"]].to_list() == [
-        1,
-        1,
-        1,
-        0,
-    ]
+    counts = frame[["done", "running", "failed", "waiting"]]
+    assert counts.loc["a_init-adc"].to_list() == [3, 0, 0, 0]
+    assert counts.loc["a_init-volumetric"].to_list() == [1, 1, 1, 0]
     assert frame.loc["a_init-volumetric", "iterations_per_second"] == pytest.approx(7.5)
     # half of 150 iterations, of trials that take 2 s
     assert frame.attrs["seconds_left"] == pytest.approx(1.0)
-    assert frame.attrs["leader"].startswith(
-        "a_init-adc leads so far: PSNR (dB) 25.00, mean of the 1 "
-    )
-    assert "not a verdict" in frame.attrs["leader"]
+    leader = frame.attrs["leader"]
+    assert leader.startswith("a_init-adc leads so far: PSNR (dB) 25.00, mean of the 1 ")
+    assert "not a verdict" in leader
 
 
 def test_a_trial_that_no_process_runs_counts_as_waiting(sweep):
     home = TrialFolder(sweep["adc", 0]).home
     progress = progress_of(home)
-    assert progress.cells["a_init-volumetric", "a_scene"] == {
-        "done": 1,
-        "running": 0,
-        "failed": 1,
-        "waiting": 1,
-    }
+    cell = {"done": 1, "running": 0, "failed": 1, "waiting": 1}
+    assert progress.cells["a_init-volumetric", "a_scene"] == cell
     assert not progress.has_ended
     assert progress.speeds == {}
     cell = {"done": 0, "running": 1, "failed": 0, "waiting": 1}
@@ -97,7 +79,7 @@ def test_no_arm_leads_before_all_arms_share_a_seed(tmp_path):
 def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned):
     folders = [begin(tmp_path, "adc", seed) for seed in (0, 1)]
     values = trial_values(tmp_path, 0, "swept") | {"densify": {"name": "adc", "start": 5}}
-    other = begin_trial(values | {"scene": {"name": "a_scene"}})
+    other = begin_trial(values)
     begin(tmp_path, "mcmc", 0)
     arms = [f"a_init-adc[{folder.name[:8]}]" for folder in (folders[0], other)]
     if planned:
@@ -105,11 +87,7 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
         words |= {folder: [*own, "densify.start=7"] for folder, own in words.items()}
         words[other] = split("densify=adc seed=0 +densify.start=5")
         trials = {
-            folder.relative_to(tmp_path / "swept").as_posix(): {
-                "overrides": own,
-                "cwd": ".",
-                "time": 0.0,
-            }
+            "/".join(folder.parts[-3:]): {"overrides": own, "cwd": ".", "time": 0.0}
             for folder, own in words.items()
         }
         write(tmp_path / "swept" / "plan.json", {"trials": trials})
@@ -137,16 +115,14 @@ def test_an_arm_of_several_settings_is_named_with_their_values(tmp_path, planned
 )
 def test_a_trial_takes_as_long_as_those_most_like_it(tmp_path, names, states, seconds):
     known = {("adc", "a"): 1.0, ("adc", "b"): 11.0, ("volumetric", "a"): 30.0}
-    done = [
-        SimpleNamespace(
-            path=Path(str(k)), record=SimpleNamespace(seconds={"init": 10.0, "train": took})
-        )
-        for k, took in enumerate(known.values())
-    ]
-    waiting = [TrialState(tmp_path / str(k), state, None, "") for k, state in enumerate(states)]
-    by_folder = {one.path: name for one, name in zip(done, known, strict=True)} | {
-        one.folder: name for one, name in zip(waiting, names, strict=True)
-    }
+    by_folder, done, waiting = {}, [], []
+    for name, took in known.items():
+        record = SimpleNamespace(seconds={"init": 10.0, "train": took})
+        done.append(SimpleNamespace(path=Path(*name), record=record))
+        by_folder[done[-1].path] = name
+    for k, (name, state) in enumerate(zip(names, states, strict=True)):
+        waiting.append(TrialState(tmp_path / str(k), state, None, ""))
+        by_folder[waiting[-1].folder] = name
     assert _seconds_left(waiting, by_folder, done) == pytest.approx(seconds)
 
 

@@ -11,7 +11,7 @@ import pytest
 from gsbench.config.compose import Trial
 from gsbench.launch import states
 from gsbench.launch.dry_run import FinishedTrials, _determining, describe_plan
-from gsbench.launch.record import PlanFile, PlannedTrial, add_to_plan, read_plan, remove
+from gsbench.launch.record import add_to_plan, remove
 from gsbench.launch.states import (
     QueuedJob,
     current_user,
@@ -19,11 +19,12 @@ from gsbench.launch.states import (
     record_submission,
     states_of_experiment,
 )
+from gsbench.runs.plan import PlanFile, PlannedTrial, read_plan
 from gsbench.system.locks import hold
-from tests.finished import write_results
-from tests.helpers import read_json, refusal, write
-from tests.launch.test_jobs import trial
+from tests.helpers import read_json, refusal, write, write_lines
 from tests.tracking.helpers import options
+from tests.trials import bare_trial as trial
+from tests.trials import write_results
 
 LISTING = (
     "7_1|PENDING|Resources\n7_2|RUNNING|None\nslurm_load_jobs: retrying|soon\n7_3|SPECIAL_EXIT|\n"
@@ -63,11 +64,10 @@ def write_configuration(one, folder):
 def begun(runs, seed=0, step=0, **settings):
     """A trial with a folder, whose training has got to iteration ``step``."""
     one = trial(runs, seed, raster={"name": "cpu"}, **settings)
-    one.folder.mkdir(parents=True, exist_ok=True)
     write_configuration(one, one.folder)
     if step:
         write(one.folder / "building.json", {"stage": "train", "folder": str(one.folder)})
-        (one.folder / "metrics.jsonl").write_text(f'{{"step": 1}}\n{{"step": {step}}}\n')
+        write_lines(one.folder / "metrics.jsonl", [{"step": 1}, {"step": step}])
     return one
 
 
@@ -97,11 +97,8 @@ def test_the_state_of_a_submitted_trial_is_that_of_its_job(
     (one.folder / "config.yaml").unlink()
     if state == "partial":  # it was only planned
         assert states_of_experiment(tmp_path / "x") == []
-        record = PlanFile(
-            trials={
-                "/".join(one.folder.parts[-3:]): PlannedTrial(overrides=("a=1",), cwd="", time=5)
-            }
-        )
+        planned = PlannedTrial(overrides=("a=1",), cwd="", time=5)
+        record = PlanFile(trials={"/".join(one.folder.parts[-3:]): planned})
         write(tmp_path / "x" / "plan.json", record.to_json())
         (found,) = states_of_experiment(tmp_path / "x")
         assert (found.state, found.since) == ("missing", 5)
@@ -128,9 +125,9 @@ def test_states_have_the_time_of_the_file_that_tells_them(tmp_path, monkeypatch)
         holder.unlink()
         unknown = {state.folder: state for state in states_of_experiment(tmp_path / "x")}
     found = [seen[one.folder] for one in (done, damaged, failed, running, stopped)]
-    assert [(one.state, one.since) for one in found] == [
-        *(("done", 1), ("damaged", 2), ("failed", 3), ("running", since), ("partial", 4))
-    ]
+    assert {one.state: one.since for one in found} == {
+        **{"done": 1, "damaged": 2, "failed": 3, "running": since, "partial": 4}
+    }
     assert "results.json is not JSON" in found[1].note
     assert [found[2].note, found[4].note] == ["no luck", "stopped"]
     assert unknown[running.folder].since is None
@@ -141,7 +138,6 @@ def test_states_have_the_time_of_the_file_that_tells_them(tmp_path, monkeypatch)
 def test_a_failed_trial_is_superseded_by_one_with_its_settings_that_got_further(tmp_path):
     def copied(one, name, message=""):
         folder = one.folder.with_name(name)
-        folder.mkdir()
         write_configuration(one, folder)
         if message:
             write(folder / "failed.json", {"message": message})

@@ -7,13 +7,14 @@ import os
 import re
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import pytest
 import yaml
 
 from gsbench.app.command import compose_trials, launch, run_trials
 from gsbench.config.command_words import parse
-from gsbench.config.compose import Trial, compose_one
+from gsbench.config.compose import compose_one
 from gsbench.config.groups import GROUPS, options
 from gsbench.config.permissions import check_target
 from gsbench.errors import InputError
@@ -22,18 +23,19 @@ from gsbench.launch import dry_run, jobs
 from gsbench.launch.batch import run_batch
 from gsbench.launch.dry_run import FinishedTrials, describe_plan
 from gsbench.launch.jobs import Outcome
-from gsbench.launch.record import add_to_plan, forget, read_plan
+from gsbench.launch.record import add_to_plan
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import set_up_logging
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.keys import TRAIN, Step
+from gsbench.runs.plan import change_plan, read_plan
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
 from tests.composed import composed
-from tests.finished import record_of
-from tests.launch.test_jobs import trial as bare_trial
+from tests.helpers import read_json, refusal, write
 from tests.runs.test_trial_folder import edit
+from tests.trials import bare_trial, record_of
 
 pytestmark = pytest.mark.usefixtures("runs")
 
@@ -44,11 +46,6 @@ def trial_values(*words):
     return trial.values
 
 
-def planned(runs, seed=0):
-    """A trial for a plan, which is not composed."""
-    return Trial(bare_trial(runs, seed).values, (f"seed={seed}",))
-
-
 def why_not_done(values):
     return TrialFolder.of(values).why_not_done(values)
 
@@ -56,16 +53,14 @@ def why_not_done(values):
 def finish(values, seconds=100.0, awaited=()):
     """Make the files of a finished trial, with one stage in the store and one source file."""
     folder = TrialFolder.of(values)
-    folder.path.mkdir(parents=True, exist_ok=True)
     source = folder.runs.parent / "photos" / "a.jpg"
-    source.parent.mkdir(exist_ok=True)
     if not source.exists():
-        source.write_bytes(b"photo")
+        write(source, b"photo")
     entry = Store(folder.runs / "store").get(
         Step(TRAIN, {"x": 1}, lambda folder: (folder / "model").write_text("m"))
     )
-    (folder.path / "table.csv").write_text("a,b")
-    (folder.path / "config.yaml").write_text(yaml.safe_dump(values))
+    published = write(folder.path / "table.csv", "a,b")
+    write(folder.path / "config.yaml", yaml.safe_dump(values))
     results = record_of(
         values,
         seconds={"init": 1.0, "train": seconds, "evaluate": 0.0},
@@ -73,9 +68,7 @@ def finish(values, seconds=100.0, awaited=()):
         resolution=(400, 300),
         awaited=list(awaited),
     )
-    folder.write_finished(
-        values, results, [source], {"train": entry.path}, [folder.path / "table.csv"]
-    )
+    folder.write_finished(values, results, [source], {"train": entry.path}, [published])
     return results
 
 
@@ -153,58 +146,39 @@ def test_paper_experiments_have_the_papers_trials_and_share_them():
 
 
 def test_a_grid_is_the_product_of_its_lists_and_typed_words_replace_the_files():
-    trials = compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])
-    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
+    def made(trials):
+        return [(one.values["densify"]["name"], one.values["seed"]) for one in trials]
+
+    assert made(compose_trials(["+experiment=demo", "seed=5,7", "densify=adc"])) == [
         ("adc", 5),
         ("adc", 7),
     ]
-    trials = compose_trials(
-        ["densify=adc,mcmc", "seed=range(3)", "train.iterations=10"], multirun=True
-    )
-    assert [(t.values["densify"]["name"], t.values["seed"]) for t in trials] == [
-        (d, s) for d in ("adc", "mcmc") for s in range(3)
-    ]
-    assert {t.values["train"]["iterations"] for t in trials} == {10}
+    words = ["densify=adc,mcmc", "seed=range(3)", "train.iterations=10"]
+    trials = compose_trials(words, multirun=True)
+    assert made(trials) == [*product(("adc", "mcmc"), range(3))]
+    assert {one.values["train"]["iterations"] for one in trials} == {10}
 
 
 def test_the_hash_covers_settings_but_not_name_seed_and_machine():
     hash_of = lambda *words: config_hash(trial_values(*words))  # noqa: E731
-    assert hash_of() == hash_of(
-        "name=other",
-        "seed=9",
-        "device=cpu",
-        "threads=1",
-        "launch=local",
-        "tracking=none",
-        "eval.primary=psnr",
-    )
-    others = [
-        hash_of(word)
-        for word in (
-            "densify=adc",
-            "train.iterations=7",
-            "init.seed=3",
-            "scene.width=99",
-            "eval=standard",
-        )
-    ]
-    assert len({hash_of(), *others}) == 6
+    ignored = "name=other seed=9 device=cpu threads=1 launch=local tracking=none eval.primary=psnr"
+    assert hash_of() == hash_of(*ignored.split())
+    counted = "densify=adc train.iterations=7 init.seed=3 scene.width=99 eval=standard"
+    assert len({hash_of(), *map(hash_of, counted.split())}) == 6
 
 
 def test_mistake_in_a_users_yaml_names_the_file(tmp_path):
-    (tmp_path / "own" / "train").mkdir(parents=True)
-    (tmp_path / "own" / "train" / "mine.yaml").write_text(
-        "defaults: [paper, _self_]\nname: mine\niteratons: 5\n"
-    )
+    text = "defaults: [paper, _self_]\nname: mine\niteratons: 5\n"
+    write(tmp_path / "own/train/mine.yaml", text)
     words, _, _ = parse(["--config-dir", "own", "train=mine"])
-    with pytest.raises(InputError, match=r"iteratons is not a setting in train/mine.*iterations"):
+    with refusal(r"iteratons is not a setting in train/mine.*iterations"):
         compose_trials(words)
 
 
 def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GSBENCH_DATA", str(tmp_path / "data"))
     words = ["-m", "scene=courtyard,truck", "init=dataset", "tracking=none", "train.iterations=1"]
-    with pytest.raises(InputError, match=r"scene truck: .*truck does not exist.*; .*gsbench fetch"):
+    with refusal(r"scene truck: .*truck does not exist.*; .*gsbench fetch"):
         launch(words)
     assert not list((tmp_path / "runs").glob("*/*/*/*-seed*"))  # no trial has begun
     assert launch([*words, "--dry-run"]) == 0
@@ -214,31 +188,22 @@ def test_a_missing_folder_stops_a_sweep_before_its_first_trial(tmp_path, monkeyp
 # ---- a _target_ is code
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "os.system",
-        "subprocess.Popen",
-        "gsbenchevil.Class",
-        "builtins.eval",
-        "gsbench",
-        "",
-        None,
-        "hydra.utils.instantiate",
-        " gsbench.x",
-    ],
+FOREIGN = (
+    "os.system subprocess.Popen gsbenchevil.Class builtins.eval gsbench hydra.utils.instantiate"
 )
+
+
+@pytest.mark.parametrize("target", [*FOREIGN.split(), "", None, " gsbench.x"])
 def test_foreign_targets_are_refused(target):
-    with pytest.raises(InputError, match="densify"):
+    with refusal("densify"):
         check_target(target, "densify", [])
 
 
 def test_own_and_allowed_targets_pass():
     check_target("gsbench.densify.ADC", "densify", [])
-    check_target("mine.sub.Class", "densify", ["mine"])
-    check_target("mine.sub.Class", "densify", ["mine."])
-    check_target("mine.sub.Class", "densify", ["mine.sub.Class"])
-    with pytest.raises(InputError, match=r"allow_targets=\[mine,minefield\]"):
+    for allowed in ("mine", "mine.", "mine.sub.Class"):
+        check_target("mine.sub.Class", "densify", [allowed])
+    with refusal(r"allow_targets=\[mine,minefield\]"):
         check_target("minefield.Class", "densify", ["mine"])
 
 
@@ -273,7 +238,7 @@ def test_changes_are_noticed_and_named(change, names, runs):
     values = trial_values()
     finish(values)
     folder = TrialFolder.of(values).path
-    content = json.loads((folder / "results.json").read_text())
+    content = read_json(folder / "results.json")
     if change == "photo":
         (runs.parent / "photos" / "a.jpg").write_bytes(b"other")
     elif change == "photo gone":
@@ -333,7 +298,7 @@ def test_a_dry_run_tells_arms_and_their_changes_apart(runs):
 )
 def test_a_dry_run_checks_only_what_can_be_computed_now(runs, monkeypatch, missing, download, note):
     def unavailable(options):
-        assert not json.loads(options)["download"]  # a dry run downloads nothing
+        assert not options["download"]  # a dry run downloads nothing
         return missing
 
     monkeypatch.setattr(dry_run, "unavailable_now", unavailable)
@@ -357,11 +322,9 @@ def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     assert list(read_plan(runs / "x")) == folders
     assert compose_one(read_plan(runs / "x")[folders[1]].overrides).values == trials[1].values
     finish(trials[0].values)
-    folders[1].mkdir(parents=True)
-    (folders[1] / "config.yaml").touch()
-    (folders[1] / "failed.json").write_text(json.dumps({"message": "no luck\nsecond line"}))
-    folders[2].mkdir(parents=True)
-    (folders[2] / "config.yaml").touch()
+    for folder in folders[1:3]:
+        write(folder / "config.yaml", "")
+    write(folders[1] / "failed.json", {"message": "no luck\nsecond line"})
     with hold(folders[2] / ".lock", "a trial"):
         states = [(trial.state, trial.note) for trial in states_of_experiment(runs / "x")]
     assert states[0] == ("done", "")
@@ -370,7 +333,7 @@ def test_the_plan_keeps_requested_trials_and_status_lists_missing_ones(runs):
     assert f"process {os.getpid()}" in states[2][1]
     assert states[3] == ("missing", "never started")
     assert states_of_experiment(runs / "x")[2].state == "partial"
-    forget(runs / "x", [folders[3]])
+    change_plan(runs / "x", dropped=[folders[3]])
     assert len(states_of_experiment(runs / "x")) == 3
 
 
@@ -380,7 +343,7 @@ def test_a_damaged_plan_is_named_and_the_next_command_repairs_it(runs, caplog):
     assert read_plan(runs / "x") == {}
     assert states_of_experiment(runs / "x") == []
     assert "left out: " in caplog.text
-    add_to_plan([planned(runs)])
+    add_to_plan([bare_trial(runs, words=["seed=0"])])
     assert "plan.json is not JSON" in caplog.text
     assert len(read_plan(runs / "x")) == 1
 
@@ -492,8 +455,8 @@ def test_verbs_that_write_report_storage_errors_in_one_line(number, runs, monkey
     def refuse(*arguments):
         raise OSError(number, os.strerror(number), str(runs / "x" / "plan.json"))
 
-    add_to_plan([planned(runs)])
-    monkeypatch.setattr("gsbench.launch.record.write_json", refuse)
+    add_to_plan([bare_trial(runs, words=["seed=0"])])
+    monkeypatch.setattr("gsbench.runs.plan.write_json", refuse)
     said = refused("status", "x", "--forget")
     assert len(said.splitlines()) == 1
     assert "plan.json" in said
@@ -504,7 +467,7 @@ def test_a_file_system_without_locks_is_named(runs, monkeypatch, refused):
     def refuse(descriptor, operation):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    add_to_plan([planned(runs)])
+    add_to_plan([bare_trial(runs, words=["seed=0"])])
     monkeypatch.setattr(fcntl, "flock", refuse)
     assert "has no locks" in refused("status", "x", "--forget")
 
@@ -527,5 +490,5 @@ def test_finished_trials_are_found_in_a_read_only_folder(runs, monkeypatch):
     (outcome,) = run_batch(trials)
     assert outcome.status == "done"
     assert sorted(path for path in runs.rglob("*")) == before
-    with pytest.raises(InputError, match="cannot be written to"):
+    with refusal("cannot be written to"):
         run_batch([replace(composed([])[0], values=trial_values("seed=1"))])

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from shlex import split
 
 import pytest
@@ -17,6 +18,7 @@ from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.scene.types import Capture
 from gsbench.train.proof import Proven
+from tests.helpers import write
 
 TRAINING = {
     "iterations": 7,
@@ -29,26 +31,22 @@ TRAINING = {
     "machine": {"cpu": "c"},
     "checkout": {"commit": "abc", "edited": True},
 }
-PROGRAM = {
-    "trained_by": {"program": "other", "version": "2"},
-    "evaluated_from": "model",
-    "checkout": {},
-}
+PROGRAM = {"trained_by": {"program": "other", "version": "2"}}
+PROGRAM |= {"evaluated_from": "model", "checkout": {}}
+RENDERS = {"evaluated_from": "renders", "num_gaussians": None}
 EVENTS = [{"step": 1, "cloned": 2, "pruned_size": 1}, {"step": 2, "cloned": 3}]
 
 
-def write(files, folder):
+def write_all(files, folder):
     for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(content if isinstance(content, str) else json.dumps(content))
+        write(folder / name, content)
 
 
 @pytest.fixture
 def made(tmp_path, tiny_scene):
     """A function that makes the results of a trial with the training ``TRAINING`` and changes."""
-    values = compose_one(
-        split(f"scene=courtyard name=x runs={tmp_path} eval.primary=psnr seed=4")
-    ).values
+    words = f"scene=courtyard name=x runs={tmp_path} eval.primary=psnr seed=4"
+    values = compose_one(split(words)).values
     store = Store(tmp_path / "store")
     capture = Capture("made", tmp_path, (), (), None, False, "0abc", "every eighth view")
     larger = replace(tiny_scene.test[0], camera=tiny_scene.test[0].camera.resized(80, 64))
@@ -72,16 +70,9 @@ def made(tmp_path, tiny_scene):
             TRAIN: {"training.json": training, "events.jsonl": events},
             EVALUATE: {"metrics.json": evaluation},
         }
-        entries = {
-            stage.name: store.get(
-                Step(
-                    stage,
-                    {"protocol": "paper-1", "training": training},
-                    lambda folder, own=own: write(own, folder),
-                )
-            )
-            for stage, own in files.items()
-        }
+        inputs = {"protocol": "paper-1", "training": training}
+        steps = [Step(stage, inputs, partial(write_all, own)) for stage, own in files.items()]
+        entries = {step.stage.name: store.get(step) for step in steps}
         raster = Proven(ReferenceRasterizer())
         return results_of(values, capture, scene, raster, entries, {"train": "2", "init": "1"})
 
@@ -135,13 +126,7 @@ def test_results_combine_the_results_of_the_steps(made):
         (PROGRAM, "model", "reference", set(), True),
         (PROGRAM | {"iterations": 0}, "model", "reference", set(), True),
         (PROGRAM | {"peak_memory_mb": None}, "model", "reference", {"peak_memory_mb"}, True),
-        (
-            PROGRAM | {"evaluated_from": "renders", "num_gaussians": None},
-            "renders",
-            "unknown",
-            {"gaussians"},
-            True,
-        ),
+        (PROGRAM | RENDERS, "renders", "unknown", {"gaussians"}, True),
     ],
 )
 def test_unknown_costs_are_unavailable(made, changes, evaluated_from, raster, unknown, timed):
@@ -170,22 +155,12 @@ def test_the_hash_of_a_cloud_covers_its_model_and_its_gaussians(tmp_path):
 
     def hash_of(number, **changes):
         files = {f"{MODEL_FOLDER}/a.bin": "a", GAUSSIANS_FILE: "b", "report.json": "c"} | changes
-        return cloud_hash(
-            store.get(Step(INIT, {"number": number}, lambda folder: write(files, folder))).path
-        )
+        return cloud_hash(store.get(Step(INIT, {"number": number}, partial(write_all, files))).path)
 
     first = hash_of(0)
     assert hash_of(1, **{"report.json": "other"}) == first != sha256_of({})
-    assert (
-        len(
-            {
-                first,
-                hash_of(2, **{f"{MODEL_FOLDER}/a.bin": "x"}),
-                hash_of(3, **{GAUSSIANS_FILE: "x"}),
-            }
-        )
-        == 3
-    )
+    others = [hash_of(2, **{f"{MODEL_FOLDER}/a.bin": "x"}), hash_of(3, **{GAUSSIANS_FILE: "x"})]
+    assert len({first, *others}) == 3
 
 
 def test_versions_cover_python_and_the_installed_packages():
@@ -196,18 +171,15 @@ def test_versions_cover_python_and_the_installed_packages():
 
 
 def test_source_files_are_the_users_files_of_a_capture(tmp_path):
-    store = Store(tmp_path / "store")
-    (tmp_path / "model").mkdir()
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        (tmp_path / "model" / name).touch()
+    store, model = Store(tmp_path / "store"), {"cameras.bin", "images.bin", "points3D.bin"}
+    write_all(dict.fromkeys(model, ""), tmp_path / "model")
     capture = Capture("own", tmp_path, ("a.png", "b.png"), (), None, False, "0")
     images = [tmp_path / "a.png", tmp_path / "b.png"]
     assert source_files(capture, store) == images
-    more = replace(
-        capture, masks={"a.png": tmp_path / "m.png"}, read_from=(tmp_path / "transforms.json",)
-    )
-    assert source_files(more, store) == [*images, tmp_path / "m.png", tmp_path / "transforms.json"]
+    mask, listed = tmp_path / "m.png", tmp_path / "transforms.json"
+    more = replace(capture, masks={"a.png": mask}, read_from=(listed,))
+    assert source_files(more, store) == [*images, mask, listed]
     with_model = source_files(replace(capture, model=tmp_path / "model"), store)
     assert with_model[:2] == images
-    assert {path.name for path in with_model[2:]} >= {"cameras.bin", "images.bin", "points3D.bin"}
+    assert {path.name for path in with_model[2:]} >= model
     assert source_files(replace(capture, images=store.root / "scene" / "key"), store) == []

@@ -20,10 +20,10 @@ from gsbench.runs.store import Store, StoredResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.locks import BusyError, hold
-from tests.finished import record_of
 from tests.gaussians.helpers import random_gaussians
 from tests.helpers import read_json, write
-from tests.launch.test_jobs import trial
+from tests.trials import bare_trial as trial
+from tests.trials import record_of
 
 # ---- the frame
 
@@ -196,21 +196,15 @@ def test_steps_before_the_initialisation_change_what_it_sees(made, tmp_path):
 @pytest.mark.parametrize("normalization", [IDENTITY, Normalization((1.0, 2.0, 3.0), 0.5)])
 def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normalization):
     content = {
-        INIT: ["picture.png", "report.json"],
-        TRAIN: ["lineage.npz", "metrics.jsonl", "events.jsonl", "checkpoint-1.pt"],
-        EVALUATE: [
-            "per_view.csv",
-            "renders/a.png",
-            "renders/b.png",
-            "figures/c.png",
-            "metrics.json",
-        ],
-        GROUND_TRUTH: ["a.png", "b.png", "masks/b.png"],
+        INIT: "picture.png report.json",
+        TRAIN: "lineage.npz metrics.jsonl events.jsonl checkpoint-1.pt",
+        EVALUATE: "per_view.csv renders/a.png renders/b.png figures/c.png metrics.json",
+        GROUND_TRUTH: "a.png b.png masks/b.png",
     }
     entries = {}
     for stage, names in content.items():
         place = tmp_path / stage.name
-        for name in names:
+        for name in names.split():
             write(place / name, f"{stage.name} {name}")
         entries[stage.name] = SimpleNamespace(path=place)
     gaussians = random_gaussians(5, dtype=torch.float32)
@@ -221,7 +215,7 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     published = _publish(folder, entries, normalization)
     texts = {
         **{name: f"train {name}" for name in ("lineage.npz", "metrics.jsonl", "events.jsonl")},
-        **{name: f"evaluate {name}" for name in content[EVALUATE][:4]},
+        **{name: f"evaluate {name}" for name in content[EVALUATE].split()[:4]},
         **{f"ground_truth/{name}": f"ground_truth {name}" for name in ("a.png", "b.png")},
         **{"masks/b.png": "ground_truth masks/b.png"},
         **{"figures/initial_cloud.png": "init picture.png"},
@@ -233,9 +227,8 @@ def test_files_of_the_steps_are_published_in_the_trials_folder(tmp_path, normali
     model = read_ply(folder / "point_cloud.ply")
     given = gaussians.means / normalization.scale + torch.tensor(normalization.center)
     assert_close(model.means, given.float())
-    assert (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply") == (
-        normalization is IDENTITY
-    )
+    is_linked = (folder / "point_cloud.ply").samefile(tmp_path / "train" / "point_cloud.ply")
+    assert is_linked == (normalization is IDENTITY)
 
 
 @pytest.fixture
@@ -243,9 +236,8 @@ def running(tmp_path, monkeypatch):
     """A trial whose steps write a file each; ``record`` are the results."""
     one = trial(tmp_path)
     state = SimpleNamespace(trial=one, seen={}, error=None, raster="raster")
-    state.record = record_of(
-        one.values, metrics={"psnr": 20.456}, hashes={"config": config_hash(one.values)}
-    )
+    hashes = {"config": config_hash(one.values)}
+    state.record = record_of(one.values, metrics={"psnr": 20.456}, hashes=hashes)
 
     class Parts:
         threads = 3
@@ -273,11 +265,8 @@ def running(tmp_path, monkeypatch):
 
         def steps(self):
             for number, stage in enumerate((CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)):
-                yield replace(
-                    step(stage, number=number),
-                    code={stage.name: str(number), "all": str(number)},
-                    build=build,
-                )
+                code = dict.fromkeys((stage.name, "all"), str(number))
+                yield replace(step(stage, number=number), code=code, build=build)
                 if stage is INIT:  # read while the training runs
                     state.seen["report"] = (one.folder / "init_report.json").read_text()
 
@@ -303,37 +292,25 @@ def test_a_trial_builds_its_steps_and_writes_its_results(running, caplog):
     one, folder = running.trial, running.trial.folder
     write(folder / "failed.json", "{}")
     assert run_trial(one) == running.record
-    seen = running.seen
+    seen, names = running.seen, ("scene", "init", "train", "ground_truth", "evaluate")
     assert (seen["checked"], seen["rasterizer"], seen["threads"]) == (True, True, 3)
-    assert [building.stage for building in seen["building"]] == [
-        *("scene", "init", "train", "ground_truth", "evaluate")
-    ]
+    assert [building.stage for building in seen["building"]] == [*names]
     assert all(building.folder for building in seen["building"])
     assert seen["report"] == "{}"
     values, _, scene, raster, entries, code = seen["given"]
     assert (values, raster) == (one.values, "proven")
     assert len(scene.train) == 3
     assert [type(entry) for entry in entries.values()] == [StoredResult] * 5
-    assert code == {
-        "scene": "0",
-        "init": "1",
-        "train": "2",
-        "ground_truth": "3",
-        "evaluate": "4",
-        "all": "4",
-    }
+    assert code == {name: str(number) for number, name in enumerate(names)} | {"all": "4"}
     assert (folder / "config.yaml").read_text() == one.yaml
     assert not (folder / "failed.json").exists()
     assert not (folder / "building.json").exists()
     made_of = one.files.made_of()
     # the photographs of a scene that gsbench made are not looked at again
-    assert set(made_of.entries) == {"init", "train", "ground_truth", "evaluate"}
+    assert set(made_of.entries) == {*names[1:]}
     assert set(made_of.published) == {"config.yaml", "init_report.json"}
-    label = one.files.label
-    assert caplog.messages == [
-        f"{label}: 3 training and 2 test views",
-        f"{label}: psnr 20.46  10 Gaussians",
-    ]
+    lines = ("3 training and 2 test views", "psnr 20.46  10 Gaussians")
+    assert caplog.messages == [f"{one.files.label}: {line}" for line in lines]
 
 
 def test_equal_results_are_called_done_and_useless_ones_are_named(running, caplog):

@@ -36,11 +36,7 @@ def test_code_that_ends_the_process_counts_as_a_failure(code, tmp_path):
         (["raster=cpu"], True, None),
         (["raster=gsplat"], False, None),  # the machine on which it will run may have a GPU
         (["raster=gsplat"], True, "raster=gsplat runs on device=cuda"),
-        (
-            ["raster=gsplat", "densify=taming"],
-            False,
-            "densify=taming .*; take raster=reference or raster=cpu",
-        ),
+        (["raster=gsplat", "densify=taming"], False, "densify=taming .*; take raster=reference or"),
         (["raster=auto", "densify=taming"], False, None),
         (["raster=cpu", "densify=taming"], True, None),
     ],
@@ -61,10 +57,8 @@ def test_auto_threads_are_those_that_parallel_trials_leave(monkeypatch):
 
 def test_auto_threads_of_the_initialiser_are_those_of_the_trial():
     for word, threads in (("init.threads=auto", 3), ("init.threads=2", 2)):
-        initializer = Parts(
-            compose_one(["scene=courtyard", "init=sfm", "threads=3", word]).values
-        ).initializer
-        assert initializer.threads == threads
+        words = ["scene=courtyard", "init=sfm", "threads=3", word]
+        assert Parts(compose_one(words).values).initializer.threads == threads
 
 
 def test_iterations_measured_earlier_are_sorted_and_before_the_last():
@@ -82,9 +76,8 @@ def test_a_configuration_that_was_not_composed_is_checked_for_permissions_too():
 def test_a_program_must_exist_only_on_the_machine_where_it_runs():
     command = "densify.command='/nowhere/program {data} {output}'"
     words = split("densify=external/program densify.result=a.ply densify.version=1")
-    parts = Parts(
-        compose_one([*words, "scene=courtyard", command, "allow_targets=[/nowhere/program]"]).values
-    )
+    words += ["scene=courtyard", command, "allow_targets=[/nowhere/program]"]
+    parts = Parts(compose_one(words).values)
     parts.check(on_this_machine=False)
     with refusal("program"):
         parts.check(on_this_machine=True)
@@ -127,6 +120,9 @@ function = len
 """
 
 
+ADC_PATH = "gsbench.densify.ADC"
+
+
 @pytest.fixture
 def own_module(tmp_path, monkeypatch):
     (tmp_path / "own_classes.py").write_text(OWN)
@@ -135,43 +131,27 @@ def own_module(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "group, values, said",
+    "group, target, options, said",
     [
-        ("densify", {"_target_": "own_classes.Picky", "least": 2.0}, None),
-        ("densify", {"_target_": "own_classes.Picky", "lest": 2.0}, r"densify\.lest"),
-        (
-            "densify",
-            {"_target_": "own_classes.Picky", "least": -1.0},
-            r"own_classes\.Picky cannot be made .KeyError",
-        ),
-        (
-            "raster",
-            {"_target_": "own_classes.Bare", "least": 2.0},
-            "has options but is not a dataclass",
-        ),
-        ("raster", {"_target_": "own_classes.Bare"}, None),
-        ("densify", {"_target_": "own_classes.Ender"}, "cannot be made .SystemExit: 3"),
-        ("densify", {"_target_": "own_classes.Nothing"}, "is not a class for densify: it has no "),
-        ("densify", {"_target_": "own_classes.function"}, "is not a class for densify"),
-        (
-            "densify",
-            {"_target_": "gsbench.densify.ADC", "gradient_treshold": 1},
-            "did you mean gradient_threshold",
-        ),
-        (
-            "densify",
-            {"_target_": "gsbench.densify.ADC", "stop": 1, "start": 5},
-            r"densify\.stop must be above",
-        ),
-        ("init", {"_target_": "gsbench.init.Random", "count": 0}, "init"),
+        ("densify", "own_classes.Picky", {"least": 2.0}, None),
+        ("densify", "own_classes.Picky", {"lest": 2.0}, r"densify\.lest"),
+        ("densify", "own_classes.Picky", {"least": -1.0}, "Picky cannot be made .KeyError"),
+        ("raster", "own_classes.Bare", {"least": 2.0}, "has options but is not a dataclass"),
+        ("raster", "own_classes.Bare", {}, None),
+        ("densify", "own_classes.Ender", {}, "cannot be made .SystemExit: 3"),
+        ("densify", "own_classes.Nothing", {}, "is not a class for densify: it has no "),
+        ("densify", "own_classes.function", {}, "is not a class for densify"),
+        ("densify", ADC_PATH, {"gradient_treshold": 1}, "did you mean gradient_threshold"),
+        ("densify", ADC_PATH, {"stop": 1, "start": 5}, r"densify\.stop must be above"),
+        ("init", "gsbench.init.Random", {"count": 0}, "init"),
     ],
 )
 def test_a_part_that_cannot_be_made_is_refused_with_the_name_of_its_setting(
-    own_module, group, values, said
+    own_module, group, target, options, said
 ):
     with refusal(said):
-        made = build(group, values, ["own_classes"])
-        assert type(made).__name__ == str(values["_target_"]).rpartition(".")[2]
+        made = build(group, {"_target_": target, **options}, ["own_classes"])
+        assert type(made).__name__ == target.rpartition(".")[2]
         assert getattr(made, "least", 2.0) == 2.0
 
 
@@ -186,10 +166,9 @@ def test_a_users_rasterizer_needs_a_name_of_its_own(own_module, name, sound):
         if sound and densify == "adc":
             parts.check(on_this_machine=True)
         elif sound:
-            with refusal("raster=named does not give; take raster=reference"):
-                parts.check(on_this_machine=False)
-            with refusal("raster=named does not give; take raster=reference"):
-                _ = parts.rasterizer
+            for use in (lambda: parts.check(on_this_machine=False), lambda: parts.rasterizer):  # noqa: B023
+                with refusal("raster=named does not give; take raster=reference"):
+                    use()
     assert build_own_rasterizer({"name": "cpu"}, []) is None
 
 

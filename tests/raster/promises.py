@@ -11,6 +11,7 @@ from torch import Tensor
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
+from tests.gaussians.helpers import leaves as of_gaussians
 
 BLACK = torch.zeros(3)
 
@@ -35,7 +36,7 @@ def bits_of(rasterizer, case):
 
 
 def leaves(case):
-    return case.gaussians().map(lambda tensor: tensor.float().requires_grad_())
+    return of_gaussians(case.gaussians(), torch.float32)
 
 
 def both(subject, gaussians, case, degree, name):
@@ -48,10 +49,10 @@ def both(subject, gaussians, case, degree, name):
         (subject.make(), torch.float32),
         (ReferenceRasterizer(), torch.float64),
     ):
-        copy = gaussians.map(lambda tensor, dtype=dtype: tensor.to(dtype).requires_grad_())
-        image = rasterizer.render(copy, case.camera(), degree, BLACK.to(dtype)).image
+        own = of_gaussians(gaussians, dtype)
+        image = rasterizer.render(own, case.camera(), degree, BLACK.to(dtype)).image
         image.square().sum().backward()
-        found.append(getattr(copy, name).grad.double())
+        found.append(getattr(own, name).grad.double())
     return found
 
 

@@ -20,6 +20,7 @@ from gsbench.raster.contract import (
 from gsbench.raster.executors import find_executor
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.scene.types import Camera
+from tests.gaussians.helpers import leaves
 from tests.raster.strategies import extreme_gaussians
 
 PEERS = ("gsplat",)  # only for comparison; their modules list their departures from the contract
@@ -47,9 +48,8 @@ def device(request):
 
 @pytest.fixture
 def rasterizer(request, device):
-    return create_rasterizer(
-        request.node.callspec.params["device"], torch.device(device), threads=2
-    )
+    name = request.node.callspec.params["device"]
+    return create_rasterizer(name, torch.device(device), threads=2)
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -72,11 +72,10 @@ def test_values_and_gradients_match_the_reference(rasterizer, device, case):
 
 
 def test_unused_coefficients_get_a_zero_gradient(rasterizer, device):
-    _, gradients = render_with_gradients(
-        rasterizer, Case(50, 37, 120, sh_degree=1), torch.float32, device
-    )
-    assert gradients["sh_rest"][:, :3].abs().max() > 0
-    assert gradients["sh_rest"][:, 3:].abs().max() == 0
+    case = Case(50, 37, 120, sh_degree=1)
+    gradient = render_with_gradients(rasterizer, case, torch.float32, device)[1]["sh_rest"]
+    assert gradient[:, :3].abs().max() > 0
+    assert gradient[:, 3:].abs().max() == 0
 
 
 def test_the_gradient_of_the_colour_clamp_passes_at_zero(rasterizer, device):
@@ -103,18 +102,18 @@ def test_the_gradient_of_the_colour_clamp_passes_at_zero(rasterizer, device):
 
 def test_without_visible_gaussians_the_image_is_the_background(rasterizer, device):
     background = torch.tensor([0.1, 0.2, 0.3], device=device)
-    for gaussians in (
+    for one in (
         _one_gaussian(device, z=-5.0),
         _one_gaussian(device).select(torch.zeros(0, dtype=torch.long)),
     ):
-        leaves = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
-        output = rasterizer.render(leaves, _camera(20, 17), 3, background)
+        own = leaves(one)
+        output = rasterizer.render(own, _camera(20, 17), 3, background)
         assert torch.equal(output.image, background.expand(17, 20, 3))
         assert output.alpha.abs().max() == 0
         assert not output.visible.any()
         assert not output.footprint(torch.ones(17, 20, device=device)).values.any()
         output.image.sum().backward()
-        for name, tensor in leaves.tensors().items():
+        for name, tensor in own.tensors().items():
             assert tensor.grad is None or tensor.grad.abs().sum() == 0, name
 
 
@@ -126,36 +125,34 @@ def test_without_visible_gaussians_the_image_is_the_background(rasterizer, devic
 )
 @given(gaussians=extreme_gaussians())
 def test_extreme_gaussians_give_finite_results(rasterizer, device, gaussians):
-    leaves = gaussians.map(lambda tensor: tensor.to(device).requires_grad_())
-    background = torch.zeros(3, device=device)
+    own, background = leaves(gaussians, device), torch.zeros(3, device=device)
     output = rasterizer.render(
-        leaves, _camera(37, 21), 3, background, absolute_gradient=True, extra="splitting_matrix"
+        own, _camera(37, 21), 3, background, absolute_gradient=True, extra="splitting_matrix"
     )
     assert output.image.isfinite().all()
     assert ((output.alpha >= 0) & (output.alpha <= 1)).all()
     assert (output.radii >= 0).all()
     (output.image.sum() + output.alpha.sum()).backward()
-    for name, tensor in leaves.tensors().items():
-        assert tensor.grad is None or tensor.grad.isfinite().all(), name
-    assert output.screen_points.grad is None or output.screen_points.grad.isfinite().all()
     assert output.screen_gradient_abs.isfinite().all()
-    assert output.extra.grad is None or output.extra.grad.isfinite().all()
+    others = {"screen_points": output.screen_points, "extra": output.extra}
+    for name, tensor in (own.tensors() | others).items():
+        assert tensor.grad is None or tensor.grad.isfinite().all(), name
 
 
 @pytest.mark.parametrize(
     "name", ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"]
 )
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 0.0])
 def test_an_error_names_the_parameter_that_is_not_finite(rasterizer, device, name, value):
     gaussians = _one_gaussian(device)
     getattr(gaussians, name).flatten()[0] = value
-    with pytest.raises(ValueError, match=name):
-        rasterizer.render(gaussians, _camera(16, 16), 3, torch.zeros(3, device=device))
+    if value or name == "quaternions":  # of length zero
+        with pytest.raises(ValueError, match=name):
+            rasterizer.render(gaussians, _camera(16, 16), 3, torch.zeros(3, device=device))
 
 
 def test_an_error_names_the_input_that_cannot_be_used(rasterizer, device):
-    gaussians, black = _one_gaussian(device), torch.zeros(3, device=device)
-    camera = _camera(16, 16)
+    black, camera = torch.zeros(3, device=device), _camera(16, 16)
     for word, view, degree, background in (
         ("sh_degree", camera, 4, black),
         ("background", camera, 0, torch.zeros(4, device=device)),
@@ -165,16 +162,12 @@ def test_an_error_names_the_input_that_cannot_be_used(rasterizer, device):
         ("fx", _camera(16, 16, focal=1e-6), 0, black),
     ):
         with pytest.raises(ValueError, match=word):
-            rasterizer.render(gaussians, view, degree, background)
-    gaussians.quaternions[:] = 0
-    with pytest.raises(ValueError, match="quaternions"):
-        rasterizer.render(gaussians, _camera(16, 16), 0, black)
+            rasterizer.render(_one_gaussian(device), view, degree, background)
 
 
 def _camera(width, height, focal=None):
-    return Camera(
-        width, height, focal or width, focal or width, width / 2, height / 2, np.eye(3), np.zeros(3)
-    )
+    focal = focal or width
+    return Camera(width, height, focal, focal, width / 2, height / 2, np.eye(3), np.zeros(3))
 
 
 def _one_gaussian(device, z=3.0):

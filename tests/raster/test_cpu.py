@@ -8,7 +8,6 @@ import os
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -29,6 +28,7 @@ from gsbench.raster.cpu import (
 )
 from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import project, tile_rectangles
+from tests.conftest import ROOT
 from tests.processes import completed
 from tests.raster.promises import BLACK, PROMISES, Subject, bits_of, leaves
 from tests.raster.strategies import Case, render_with_gradients
@@ -36,6 +36,11 @@ from tests.raster.strategies import Case, render_with_gradients
 CASE = Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1))
 MANY = Case(150, 110, 4000, sh_degree=3, log_scale=-3.0)
 SUBJECT = Subject(lambda: CpuRasterizer(threads=1), CASE, MANY, 2e-5)
+
+
+def rendered(case):
+    gaussians = case.gaussians().map(torch.Tensor.float)
+    return CpuRasterizer(threads=1).render(gaussians, case.camera(), 0, BLACK)
 
 
 @pytest.mark.parametrize("promise", PROMISES)
@@ -110,10 +115,7 @@ def highest(records, low_x, low_y, size):
 def test_a_record_is_listed_in_the_tiles_and_blocks_that_its_contour_reaches():
     """These have a pixel with alpha >= 1/255; a margin for rounding is allowed."""
     case = Case(96, 64, 150, sh_degree=0, log_scale=-2.5, logit=-3.0)  # faint: no pixel stops
-    output = CpuRasterizer(threads=1).render(
-        case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
-    )
-    passed = output.footprint.args[0]
+    passed = rendered(case).footprint.args[0]
     frame, edges = passed.frame, executor._edges(case.count)
     assert (frame.last == composite.NEVER_STOPPED).all()
     shards = zip(edges[:-1], passed.visible, strict=True)
@@ -173,10 +175,7 @@ def test_a_record_is_listed_in_the_tiles_and_blocks_that_its_contour_reaches():
 
 def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block():
     case = Case(40, 40, 300, sh_degree=0, log_scale=-1.5, logit=3.0)
-    output = CpuRasterizer(threads=1).render(
-        case.gaussians().map(torch.Tensor.float), case.camera(), 0, BLACK
-    )
-    frame = output.footprint.args[0].frame
+    frame = rendered(case).footprint.args[0].frame
     skipped = 0
     for tile in range(9):
         begin, end = frame.starts[tile], frame.processed[tile]
@@ -220,8 +219,7 @@ def test_zero_threads_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cpu", ["generic"])
-def test_hosts_without_wide_vectors_match_the_reference(cpu, tmp_path):
+def test_hosts_without_wide_vectors_match_the_reference(tmp_path):
     """A separate process compiles for the simplest CPU of this architecture (SSE2 on x86)."""
     script = """
 import sys, torch
@@ -235,14 +233,12 @@ worst = max(float((gradients[n] - r).abs().max() / r.abs().max()) for n, r in re
 print(float((output.image.double() - expected.image).abs().max()), worst)
 """
     environment = os.environ | {
-        "NUMBA_CPU_NAME": cpu,
+        "NUMBA_CPU_NAME": "generic",
         "NUMBA_CPU_FEATURES": "",
         "NUMBA_CACHE_DIR": str(tmp_path),
         "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
     }
-    root = Path(__file__).resolve().parents[2]
-    command = [sys.executable, "-c", script]
-    run = completed(command, env=environment, cwd=root)
+    run = completed([sys.executable, "-c", script], env=environment, cwd=ROOT)
     value_error, gradient_error = map(float, run.stdout.split())
     assert value_error < 1e-4
     assert gradient_error < 1e-3
@@ -264,8 +260,7 @@ def _vector_functions(a, b, out):
 
 
 def test_vector_functions_match_numpy():
-    generator = np.random.default_rng(0)
-    a, b = generator.normal(size=(2, 16)).astype(np.float32)
+    a, b = np.random.default_rng(0).normal(size=(2, 16)).astype(np.float32)
     out = np.full(96, np.nan, np.float32)
     bits, lowest = _vector_functions(a, b, out)
     mask = (a < b) & ~(a > 0)

@@ -3,7 +3,6 @@
 import dataclasses
 import inspect
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from gsbench.raster.executors import EXECUTORS, RasterConfig, find_executor, res
 from gsbench.raster.reference import ReferenceRasterizer
 from gsbench.system.install import conf_dir, install_command
 from tests.helpers import refusal
+from tests.processes import completed
 
 CPU = torch.device("cpu")
 
@@ -51,10 +51,9 @@ def test_the_documents_name_every_executor():
 
 def test_the_table_does_not_import_torch():
     code = (
-        "import sys, gsbench.raster.executors, gsbench.raster.base; sys.exit('torch' in "
-        "sys.modules)"
+        "import sys, gsbench.raster.executors, gsbench.raster.base; print('torch' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
+    assert completed([sys.executable, "-c", code]).stdout == "False\n"
 
 
 def test_auto_takes_the_best_installed_executor(monkeypatch, caplog):
@@ -105,26 +104,19 @@ def test_departures_lists_errors_and_accepts_missing_options():
 def test_python_headers_are_searched_in_the_usual_scheme(tmp_path, monkeypatch):
     """Debian's own scheme, ``posix_local``, names a folder without headers."""
     asked = []
-    monkeypatch.setattr(
-        executors.sysconfig,
-        "get_paths",
-        lambda scheme: asked.append(scheme) or {"include": tmp_path},
-    )
+    get = lambda scheme: asked.append(scheme) or {"include": tmp_path}  # noqa: E731
+    monkeypatch.setattr(executors.sysconfig, "get_paths", get)
     monkeypatch.setenv("CC", sys.executable)
     for default in ("posix_local", "posix_prefix", "nt"):
-        monkeypatch.setattr(
-            executors.sysconfig, "get_default_scheme", lambda default=default: default
-        )
-        assert [line.partition(":")[0] for line in executors.missing_tools()] == [
-            str(tmp_path / "Python.h")
-        ]
+        monkeypatch.setattr(executors.sysconfig, "get_default_scheme", lambda of=default: of)
+        (line,) = executors.missing_tools()
+        assert line.startswith(f"{tmp_path / 'Python.h'}:")
     assert asked == ["posix_prefix", "posix_prefix", "nt"]
     (tmp_path / "Python.h").touch()
     assert executors.missing_tools() == []
     monkeypatch.setenv("CC", "no-such-compiler -O2")
-    assert executors.missing_tools() == [
-        "a C compiler (CC is no-such-compiler -O2, which is not there): install the package gcc"
-    ]
+    (line,) = executors.missing_tools()
+    assert line.startswith("a C compiler (CC is no-such-compiler -O2, which is not there): install")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
@@ -170,29 +162,29 @@ def footprint_of(out, **changes):
     return footprint
 
 
+OFF = "is off by up to"
+
+
 @pytest.mark.parametrize(
     "change, told",
     [
-        (
-            lambda out: {"image": out.image[None]},
-            "image has shape (1, 5, 7, 3), expected (5, 7, 3)",
-        ),
-        (lambda out: {"image": out.image + 0.5}, "image is off by up to 5.00e-01"),
-        (lambda out: {"alpha": out.alpha - 0.25}, "alpha is off by up to 2.50e-01"),
-        (lambda out: {"image": out.image + torch.nan}, "image is off by up to nan"),
+        (lambda out: {"image": out.image[None]}, "image has shape (1, 5, 7, 3), expected (5, 7"),
+        (lambda out: {"image": out.image + 0.5}, f"image {OFF} 5.00e-01"),
+        (lambda out: {"alpha": out.alpha - 0.25}, f"alpha {OFF} 2.50e-01"),
+        (lambda out: {"image": out.image + torch.nan}, f"image {OFF} nan"),
         (lambda out: {"radii": out.radii.long()}, "radius is torch.int64, expected torch.int32"),
         (
             lambda out: {"radii": out.radii + (out.radii == out.radii.max())},
-            "radius is off by up to 1.00e+00 at Gaussian",
+            f"radius {OFF} 1.00e+00 at Gaussian",
         ),
         (lambda out: {"screen_points": torch.zeros(20, 2)}, "gradient of screen_points is missing"),
         (
             lambda out: {"footprint": footprint_of(out, pixels=3)},
-            "footprint (pixels) is off by up to 2.00e+00 of the sum",
+            f"footprint (pixels) {OFF} 2.00e+00 of the sum",
         ),
         (
             lambda out: {"footprint": footprint_of(out, values=0.5)},
-            "footprint (values) is off by up to 5.00e-01 of the sum",
+            f"footprint (values) {OFF} 5.00e-01 of the sum",
         ),
     ],
 )
@@ -201,48 +193,31 @@ def test_each_kind_of_departure_is_listed(change, told):
     assert line.startswith(f"{TINY}: {told}")
 
 
-@pytest.mark.parametrize("name", ["image", "alpha"])
-def test_departures_tests_the_image_without_gaussians(name):
-    wrong = Changed(lambda n, out: {name: getattr(out, name) + (n == 0)})
-    assert departures(wrong, cases=(TINY,)) == [
-        "without Gaussians: the image is not the background"
-    ]
-
-
-def test_departures_tests_the_backward_pass_without_gaussians():
-    wrong = Changed(lambda n, out: {} if n else {"image": out.image.detach()})
-    (told,) = departures(wrong, cases=(TINY,))
-    assert told.startswith("without Gaussians: RuntimeError: ")
+@pytest.mark.parametrize(
+    "change, told",
+    [
+        (lambda out: {"image": out.image + 1}, "the image is not the background"),
+        (lambda out: {"alpha": out.alpha + 1}, "the image is not the background"),
+        (lambda out: {"image": out.image.detach()}, "RuntimeError: "),
+    ],
+)
+def test_departures_tests_a_view_without_gaussians(change, told):
+    (line,) = departures(Changed(lambda n, out: {} if n else change(out)), cases=(TINY,))
+    assert line.startswith(f"without Gaussians: {told}")
 
 
 def test_the_scenes_of_the_contract_do_not_change():
     """Reports about rasterizers outside gsbench name these scenes."""
-    assert [str(case) for case in CASES] == [
-        "33x49-n50-sh3",
-        "97x65-n250-sh3",
-        "64x48-n150-sh2",
-        "50x37-n120-sh1",
-        "81x50-n150-sh0",
-        "40x40-n300-sh3",
-        "7x5-n20-sh3",
-    ]
-    camera = CASES[1].camera()
-    assert (camera.width, camera.height) == (97, 65)
-    assert [camera.fx, camera.fy, camera.cx, camera.cy] == pytest.approx(
-        [106.7, 101.85, 55.8, 27.4]
+    assert " ".join(map(str, CASES)) == (
+        "33x49-n50-sh3 97x65-n250-sh3 64x48-n150-sh2 50x37-n120-sh1 81x50-n150-sh0 40x40-n300-sh3 "
+        "7x5-n20-sh3"
     )
+    camera = CASES[1].camera()
+    intrinsics = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    assert intrinsics == pytest.approx([97, 65, 106.7, 101.85, 55.8, 27.4])
     assert camera.rotation[0].tolist() == pytest.approx([0.9800666, 0, 0.1986693])
     assert camera.rotation[2].tolist() == pytest.approx([-0.1986693, 0, 0.9800666])
     assert camera.translation.tolist() == [0.1, -0.2, 0.3]
-    sums = {name: tensor.sum().item() for name, tensor in CASES[-2].gaussians().tensors().items()}
-    assert sums == pytest.approx(
-        {
-            "means": 1186.380758,
-            "log_scales": -1317.554622,
-            "quaternions": -18.917049,
-            "opacity_logits": 900.250302,
-            "sh_dc": 15.529487,
-            "sh_rest": -11.050933,
-        },
-        rel=1e-6,
-    )
+    sums = [tensor.sum().item() for tensor in CASES[-2].gaussians().tensors().values()]
+    expected = [1186.380758, -1317.554622, -18.917049, 900.250302, 15.529487, -11.050933]
+    assert sums == pytest.approx(expected, rel=1e-6)

@@ -25,20 +25,20 @@ TINY = split(
 TINY += split(
     "scene=courtyard train.iterations=12 eval.lpips=[] eval.flip=false tracking=none device=cpu"
 )
-OWN = ["raster._target_=untiled.Untiled", "allow_targets=[untiled]"]
+OWN = ["raster._target_=oversampled.Oversampled", "allow_targets=[oversampled]"]
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with the document's ``untiled.py``, from which modules can be imported."""
+    """A folder with the document's ``oversampled.py``, from which modules can be imported."""
     blocks = re.findall(
-        r"^```python\n(# untiled\.py\n.*?)^```$",
+        r"^```python\n(# oversampled\.py\n.*?)^```$",
         (ROOT / "docs/rasterizer.md").read_text(),
         re.S | re.M,
     )
-    (tmp_path / "untiled.py").write_text(blocks[0])
+    (tmp_path / "oversampled.py").write_text(blocks[0])
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "untiled", raising=False)
+    monkeypatch.delitem(sys.modules, "oversampled", raising=False)
     return tmp_path
 
 
@@ -49,44 +49,44 @@ def gsbench(folder, *words):
 
 @pytest.mark.slow
 def test_the_real_program_trains_with_it_and_records_its_source(folder):
-    gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own")
+    gsbench(folder, *TINY, *OWN, "+raster.factor=1", "name=own")
     (path,) = (folder / "runs").glob("own/*/*/*/results.json")
-    assert read_json(path)["raster"] == "untiled"
+    assert read_json(path)["raster"] == "oversampled"
     (manifest,) = (folder / "runs" / "store" / "train").glob("*/manifest.json")
     recorded = read_json(manifest)["inputs"]["raster"]
-    assert (recorded["class"], recorded["name"], recorded["rows"]) == (
-        "untiled.Untiled",
-        "untiled",
-        36,
+    assert (recorded["class"], recorded["name"], recorded["factor"]) == (
+        "oversampled.Oversampled",
+        "oversampled",
+        1,
     )
-    assert len(recorded["source"]["untiled"]) == 64
+    assert len(recorded["source"]["oversampled"]) == 64
 
-    assert "already done" in gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own").stderr
-    with (folder / "untiled.py").open("a") as stream:
+    assert "already done" in gsbench(folder, *TINY, *OWN, "+raster.factor=1", "name=own").stderr
+    with (folder / "oversampled.py").open("a") as stream:
         stream.write("# a comment makes no other version\n")
-    same = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
+    same = gsbench(folder, *TINY, *OWN, "+raster.factor=1", "name=own", "--dry-run")
     assert "missing" not in same.stdout
-    with (folder / "untiled.py").open("a") as stream:
+    with (folder / "oversampled.py").open("a") as stream:
         stream.write("VERSION = 2\n")
-    changed = gsbench(folder, *TINY, *OWN, "+raster.rows=36", "name=own", "--dry-run")
+    changed = gsbench(folder, *TINY, *OWN, "+raster.factor=1", "name=own", "--dry-run")
     assert "missing" in changed.stdout
 
 
 def test_its_options_are_checked_and_are_part_of_the_key(folder):
-    values = composed(*OWN, "+raster.rows=7")
+    values = composed(*OWN, "+raster.factor=7")
     rasterizer = build_own_rasterizer(values["raster"], values["allow_targets"])
     key = rasterizer_inputs(rasterizer)
-    assert key["rows"] == 7
+    assert key["factor"] == 7
     assert rasterizer_inputs(create_rasterizer("reference", CPU)) == "reference"
     for words, message in (
-        (["+raster.rows=0"], r"raster\.rows must be a whole number above 0"),
-        (["+raster.rows=many"], r"raster\.rows"),
-        (["+raster.row=3"], r"raster\.row is not a setting; did you mean rows"),
+        (["+raster.factor=0"], r"raster\.factor must be a whole number above 0"),
+        (["+raster.factor=many"], r"raster\.factor"),
+        (["+raster.facto=3"], r"raster\.facto is not a setting; did you mean factor"),
     ):
         values = composed(*OWN, *words)
         with refusal(message):
             build_own_rasterizer(values["raster"], values["allow_targets"])
-    with refusal(r"allow_targets=\[untiled\]"):
+    with refusal(r"allow_targets=\[oversampled\]"):
         compose_one(OWN[:1])
 
 
@@ -101,7 +101,7 @@ def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(folder, a
     Parts(composed(*OWN)).check(on_this_machine=False)
     parts = Parts(composed(*OWN, f"densify={arm}"))
     able = "raster=reference or raster=cpu or raster=triton"
-    line = f"{output}, which raster=untiled does not give; take {able}"
+    line = f"{output}, which raster=oversampled does not give; take {able}"
     with refusal(f"densify={arm} needs {line}"):
         parts.check(on_this_machine=False)
     vars(parts.own_rasterizer).update(gives)
@@ -109,7 +109,7 @@ def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(folder, a
 
 
 def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder):
-    (folder / "untiled.py").write_text(
+    (folder / "oversampled.py").write_text(
         "from gsbench.raster.reference import ReferenceRasterizer\n"
         "class Same(ReferenceRasterizer):\n    pass\n"
         "class Blind:\n    name = 'blind'\n"
@@ -126,12 +126,12 @@ def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder):
     ):
         with refusal(message):
             build_own_rasterizer(
-                {"name": "auto", "_target_": f"untiled.{target}", **options}, ["untiled"]
+                {"name": "auto", "_target_": f"oversampled.{target}", **options}, ["oversampled"]
             )
 
 
 def test_its_source_is_part_of_the_hash(folder):
     own = config_hash(composed(*OWN))
     assert own != config_hash(composed())
-    (folder / "untiled.py").write_text("changed = True\n")
+    (folder / "oversampled.py").write_text("changed = True\n")
     assert config_hash(composed(*OWN)) != own

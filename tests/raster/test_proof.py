@@ -429,8 +429,8 @@ def test_doctor_makes_a_proof_on_request_and_shows_the_last_one(monkeypatch, cap
 
 # ---- faults in the kernels: each is planted in a copy of gsbench that Triton's interpreter runs
 
-COMPOSITE, PROJECTION, GEOMETRY = (
-    f"raster/triton/{name}.py" for name in ("composite", "projection", "geometry")
+COMPOSITE, FOOTPRINT, PROJECTION, GEOMETRY = (
+    f"raster/triton/{name}.py" for name in ("composite", "footprint", "projection", "geometry")
 )
 FAULTS = {
     "none": ("raster/triton/layout.py", "SEGMENT = tl.constexpr(256)", "SEGMENT = tl.constexpr(8)"),
@@ -442,7 +442,7 @@ FAULTS = {
     ),
     "no state at the border of a segment": (
         COMPOSITE,
-        "light = tl.load(border + TRANSMITTANCE)",
+        "light = tl.load(border + TRANSMITTANCE, mask=crossed, other=light)",
         "pass",
     ),
     "a short segment": (
@@ -450,13 +450,18 @@ FAULTS = {
         "tl.minimum(begin + SEGMENT, end)",
         "tl.minimum(begin + SEGMENT - 1, end)",
     ),
+    "a program of a long list that looks at another's pixels": (
+        COMPOSITE,
+        "along = (steps * LANE_COLUMNS)",
+        "along = (tl.arange(0, steps.shape[0]) * LANE_COLUMNS)",
+    ),
     "swapped channels": (
         COMPOSITE,
         "tl.fma(weight, record[7], green)",
         "tl.fma(weight, record[8], green)",
     ),
     "a footprint of one pixel too many": (
-        COMPOSITE,
+        FOOTPRINT,
         "blended = (power >= LOG2_ALPHA_MIN) & (position < seen)",
         "blended = power >= LOG2_ALPHA_MIN",
     ),

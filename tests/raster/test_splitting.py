@@ -9,6 +9,8 @@ from gsbench.raster import create_rasterizer
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.contract import Case
 from gsbench.raster.reference import project, tile_rectangles
+from tests.densify.helpers import generator
+from tests.gaussians.helpers import leaves
 
 CASES = (
     Case(7, 5, 20, sh_degree=0),
@@ -50,10 +52,7 @@ class Slow:
             self.gaussians.sh_dc[self.projected.index] * 0.28209479177387814 + 0.5
         ).clamp_min(0)
         self.order = torch.sort(self.projected.depths, stable=True).indices.tolist()
-        generator = torch.Generator().manual_seed(3)
-        self.weights = torch.randn(
-            case.height, case.width, 3, generator=generator, dtype=torch.float64
-        )
+        self.weights = torch.randn(case.height, case.width, 3, generator=generator(3)).double()
         self.background = torch.tensor([0.3, 0.1, 0.8], dtype=torch.float64)
 
         self.means = self.gaussians.means[self.projected.index]
@@ -73,17 +72,12 @@ class Slow:
         The movement on the image is linearised.
         """
         moved = self.projected.means[k] + self.linear[k] @ displacement
-        return heights(
-            self.pixels,
-            moved,
-            self.projected.conics[k],
-            self.gaussians.opacities[self.projected.index[k]],
-        )
+        opacity = self.gaussians.opacities[self.projected.index[k]]
+        return heights(self.pixels, moved, self.projected.conics[k], opacity)
 
     def all_heights(self):
-        return torch.stack(
-            [self.height(k, torch.zeros(3).double()) for k in range(len(self.projected.index))]
-        )
+        rest = torch.zeros(3).double()
+        return torch.stack([self.height(k, rest) for k in range(len(self.projected.index))])
 
     def loss(self, s):
         """The loss as a function of the heights [M, P]; the clamp to 0.99 passes the gradient."""
@@ -104,13 +98,9 @@ class Slow:
     def matrices(self, rasterizer):
         """The splitting matrices that the rasterizer computes, [N, 3, 3] float64."""
         dtype = torch.float64 if rasterizer == "reference" else torch.float32
-        gaussians = self.gaussians.map(
-            lambda tensor: tensor.detach().clone().to(dtype).requires_grad_()
-        )
         executor = create_rasterizer(rasterizer, torch.device("cpu"), threads=1)
-        output = executor.render(
-            gaussians, self.camera, 0, self.background.to(dtype), extra="splitting_matrix"
-        )
+        inputs = leaves(self.gaussians, dtype), self.camera, 0, self.background.to(dtype)
+        output = executor.render(*inputs, extra="splitting_matrix")
         (output.image * self.weights.to(dtype)).sum().backward()
         return output.require_extra().double()
 
@@ -146,12 +136,9 @@ def test_the_matrix_predicts_how_a_split_changes_the_loss():
     """Two halves at the distances e and -e along v change the loss by e^2 v S v / 2."""
     slow = Slow(CASES[1])
     s, matrices = slow.all_heights(), slow.matrices("reference")
-    generator = torch.Generator().manual_seed(5)
-    compared = 0
+    rng, compared = generator(5), 0
     for k, index in enumerate(slow.projected.index.tolist()):
-        direction = torch.nn.functional.normalize(
-            torch.randn(3, generator=generator, dtype=torch.float64), dim=0
-        )
+        direction = torch.nn.functional.normalize(torch.randn(3, generator=rng).double(), dim=0)
         foretold = float(direction @ matrices[index] @ direction)
 
         def split(distance, k=k, direction=direction):

@@ -21,7 +21,7 @@ from gsbench.raster.staged import (
     raise_for_values,
 )
 from gsbench.scene.types import Camera
-from tests.gaussians.helpers import random_gaussians
+from tests.gaussians.helpers import leaves, random_gaussians
 
 BLACK = torch.zeros(3, dtype=torch.float64)
 
@@ -63,47 +63,44 @@ class Recording(StagedRasterizer[str]):
         return Footprint(*[torch.zeros(2)] * 4)
 
 
+def rendered(view=None, background=BLACK, **options):
+    """The calls of stages by a render, its parameters and its output."""
+    rasterizer, own = Recording(), leaves(random_gaussians(2))
+    return rasterizer.calls, own, rasterizer.render(own, view or camera(), 1, background, **options)
+
+
 def test_gradients_reach_the_backward_stage_and_its_results_the_parameters():
-    rasterizer = Recording()
-    leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
     background = BLACK.clone().requires_grad_()
-    output = rasterizer.render(leaves, camera(), 1, background, True, extra="five")
+    calls, own, output = rendered(background=background, absolute_gradient=True, extra="five")
     assert not output.radii.requires_grad
     (2 * output.image).sum().backward()
-    ((frame, given, request, g_image, g_alpha),) = rasterizer.calls
-    assert (frame, g_alpha, request.extra) == ("frame", None, "five")
-    assert torch.equal(given.means, leaves.means)
-    assert request.degree == 1
+    ((frame, given, request, g_image, g_alpha),) = calls
+    assert (frame, g_alpha, request.extra, request.degree) == ("frame", None, "five", 1)
+    assert torch.equal(given.means, own.means)
     assert request.absolute is output.screen_gradient_abs
     assert g_image.is_contiguous()
     assert (g_image == 2).all()
-    assert all((tensor.grad == 6).all() for tensor in leaves.tensors().values())
+    assert all((tensor.grad == 6).all() for tensor in own.tensors().values())
     assert (output.screen_points.grad == 7).all()
     assert (output.require_extra() == 8).all()
     assert background.grad.tolist() == [2 * 12 * 0.75] * 3
 
 
 def test_alpha_may_be_differentiated_without_the_image():
-    rasterizer = Recording()
-    leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
-    rasterizer.render(leaves, camera(), 1, BLACK).alpha.sum().backward()
-    ((_, _, request, g_image, g_alpha),) = rasterizer.calls
-    assert g_image.shape == (3, 4, 3)
-    assert not g_image.any()
+    calls, _, output = rendered()
+    output.alpha.sum().backward()
+    ((_, _, request, g_image, g_alpha),) = calls
+    assert torch.equal(g_image, torch.zeros(3, 4, 3))
     assert (g_alpha == 1).all()
     assert g_alpha.is_contiguous()
-    assert request.extra is None
-    assert request.absolute is None
+    assert request.extra is request.absolute is None
 
 
 def test_the_footprint_stage_gets_the_frame_and_the_values():
-    rasterizer = Recording()
-    leaves = random_gaussians(2).map(lambda tensor: tensor.requires_grad_())
-    view = camera()
-    output = rasterizer.render(leaves, view, 1, BLACK)
+    calls, _, output = rendered(view := camera())
     values = torch.ones(3, 4)
     output.require_footprint(values)
-    ((frame, given, request, passed),) = rasterizer.calls
+    ((frame, given, request, passed),) = calls
     assert frame == "frame"
     assert not given.means.requires_grad
     assert request.camera is view
@@ -111,81 +108,69 @@ def test_the_footprint_stage_gets_the_frame_and_the_values():
 
 
 def test_errors_of_the_checks_are_raised():
-    with pytest.raises(ValueError, match="one is too few"):
-        Recording().render(random_gaussians(1), camera(), 0, BLACK)
-    with pytest.raises(ValueError, match="sh_degree"):
-        Recording().render(random_gaussians(2), camera(), 4, BLACK)
+    for count, degree, said in ((1, 0, "one is too few"), (2, 4, "sh_degree")):
+        with pytest.raises(ValueError, match=said):
+            Recording().render(random_gaussians(count), camera(), degree, BLACK)
+
+
+TWO = random_gaussians(2)
 
 
 @pytest.mark.parametrize(
-    "of, said",
+    "changes, said",
     [
-        (camera(16385), "camera: width is 16385 px, more than 16384"),
-        (camera(4, 16385), "camera: height is 16385 px, more than 16384"),
-        (camera(fx=0.0039), "camera: fx is 0.0039 px"),
-        (camera(fx=4.1e6), "camera: fx is 4100000.0 px"),
-        (camera(fy=0.0029), "camera: fy is 0.0029 px"),
-        (camera(fy=3.1e6), "camera: fy is 3100000.0 px"),
-        (camera(cx=400.1), "camera: cx is 400.1 px"),
-        (camera(cy=-300.1), "camera: cy is -300.1 px"),
+        ({"view": camera(16385)}, "camera: width is 16385 px, more than 16384"),
+        ({"view": camera(4, 16385)}, "camera: height is 16385 px, more than 16384"),
+        ({"view": camera(fx=0.0039)}, "camera: fx is 0.0039 px"),
+        ({"view": camera(fx=4.1e6)}, "camera: fx is 4100000.0 px"),
+        ({"view": camera(fy=0.0029)}, "camera: fy is 0.0029 px"),
+        ({"view": camera(fy=3.1e6)}, "camera: fy is 3100000.0 px"),
+        ({"view": camera(cx=400.1)}, "camera: cx is 400.1 px"),
+        ({"view": camera(cy=-300.1)}, "camera: cy is -300.1 px"),
+        ({"degree": -1}, "sh_degree: must be 0 to 3, got -1"),
+        ({"of": TWO.map(Tensor.half)}, r"dtype must be float32 or float64, got torch\.float16"),
+        ({"background": BLACK.to("meta")}, r"background: is torch\.float64 on meta, but means is"),
+        ({"background": BLACK.new_zeros(4)}, r"background: must be three numbers, got shape \(4,"),
+        ({"background": BLACK + math.inf}, "background: must be three finite numbers"),
     ],
 )
-def test_degenerate_cameras_are_refused(of, said):
+def test_an_error_names_the_setting_that_does_not_fit(changes, said):
+    settings = {"of": TWO, "view": camera(), "degree": 0, "background": BLACK}
     with pytest.raises(ValueError, match=said):
-        check_settings(random_gaussians(1), of, 0, BLACK)
+        check_settings(*(settings | changes).values())
 
 
 def test_the_largest_settings_are_accepted():
     for degree in (0, 3):
-        check_settings(random_gaussians(1), camera(16384, 16384), degree, BLACK)
-    check_settings(random_gaussians(1), camera(cx=400.0, cy=-300.0, fx=0.004, fy=3e6), 0, BLACK)
-
-
-def test_an_error_names_the_setting_that_does_not_fit():
-    gaussians = random_gaussians(2)
-    with pytest.raises(ValueError, match="sh_degree: must be 0 to 3, got -1"):
-        check_settings(gaussians, camera(), -1, BLACK)
-    with pytest.raises(ValueError, match=r"dtype must be float32 or float64, got torch\.float16"):
-        check_settings(gaussians.map(Tensor.half), camera(), 0, BLACK.half())
-    with pytest.raises(
-        ValueError,
-        match=r"background: is torch\.float64 on meta, but means is torch\.float64 on cpu",
-    ):
-        check_settings(gaussians, camera(), 0, BLACK.to("meta"))
-    with pytest.raises(ValueError, match=r"background: must be three numbers, got shape \(4,\)"):
-        check_settings(gaussians, camera(), 0, torch.zeros(4, dtype=torch.float64))
-    with pytest.raises(ValueError, match="background: must be three finite numbers"):
-        check_settings(gaussians, camera(), 0, BLACK + math.inf)
+        check_settings(TWO, camera(16384, 16384), degree, BLACK)
+    check_settings(TWO, camera(cx=400.0, cy=-300.0, fx=0.004, fy=3e6), 0, BLACK)
     # values on a device are not read
-    check_settings(gaussians.map(lambda tensor: tensor.to("meta")), camera(), 0, BLACK.to("meta"))
+    check_settings(TWO.map(lambda tensor: tensor.to("meta")), camera(), 0, BLACK.to("meta"))
 
 
-@pytest.mark.parametrize("name", ["means", "opacity_logits", "sh_rest"])
-def test_the_first_gaussian_with_a_bad_value_is_named(name):
+@pytest.mark.parametrize(
+    "name, value, said",
+    [
+        *((name, math.nan, "not finite") for name in ("means", "opacity_logits", "sh_rest")),
+        ("quaternions", 1e-13, "length 0"),
+    ],
+)
+def test_the_first_gaussian_with_a_bad_value_is_named(name, value, said):
     gaussians = random_gaussians(5)
     assert not bad_values(gaussians, BLACK)
     raise_for_values(gaussians, BLACK)
-    getattr(gaussians, name)[[2, 4]] = math.nan
+    getattr(gaussians, name)[[2, 4]] = value
     assert bad_values(gaussians, BLACK)
-    for refuse in (
-        lambda: raise_for_values(gaussians),
-        lambda: check_inputs(gaussians, camera(), 0, BLACK),
-    ):
-        with pytest.raises(ValueError, match=rf"^{name}: not finite at Gaussian 2 \(2 in all\)"):
-            refuse()
+    for refuse, more in ((raise_for_values, ()), (check_inputs, (camera(), 0, BLACK))):
+        with pytest.raises(ValueError, match=rf"^{name}: {said} at Gaussian 2 \(2 in all\)"):
+            refuse(gaussians, *more)
 
 
-def test_a_quaternion_of_length_zero_and_a_bad_background_are_named():
-    gaussians = random_gaussians(4)
-    gaussians.quaternions[[1, 2]] = 1e-13
-    assert bad_values(gaussians, BLACK)
-    with pytest.raises(ValueError, match=r"quaternions: length 0 at Gaussian 1 \(2 in all\)"):
-        raise_for_values(gaussians)
-    assert bad_values(random_gaussians(4), BLACK + math.nan)
+def test_a_bad_background_is_named_and_no_gaussians_are_good():
+    assert bad_values(TWO, BLACK + math.nan)
     with pytest.raises(ValueError, match="background"):
-        raise_for_values(random_gaussians(4), BLACK + math.nan)
-    nothing = random_gaussians(4).select(torch.zeros(0, dtype=torch.long))
-    assert not bad_values(nothing, BLACK)
+        raise_for_values(TWO, BLACK + math.nan)
+    assert not bad_values(TWO.select(torch.zeros(0, dtype=torch.long)), BLACK)
 
 
 class Event:

@@ -23,7 +23,7 @@ from gsbench.gaussians.trainable import AdamState, Update
 from gsbench.raster import staged
 from gsbench.raster.contract import Case, render_with_gradients
 from gsbench.raster.reference import ReferenceRasterizer
-from gsbench.raster.triton import composite, layout, lists
+from gsbench.raster.triton import composite, executor, layout, lists
 from gsbench.raster.triton.executor import TritonRasterizer
 from gsbench.raster.triton.launch import Workspace
 from gsbench.scene.types import Camera, Scene, View
@@ -61,13 +61,19 @@ def shorten_segments(monkeypatch):
     """Make segments so short that the lists of the tests' scenes have many."""
     for module in (layout, composite):
         monkeypatch.setattr(module, "SEGMENT", tl.constexpr(8))
+    monkeypatch.setattr(composite, "BATCH", tl.constexpr(8))
+
+
+def ends_of(frame):
+    """The end of the entries of each block that compositing reached."""
+    return frame.last.view(frame.blocks, -1).amax(1)
 
 
 def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch):
     """No kernel reads memory before it is written, and the order of programs does not matter.
 
-    The second run starts with memory full of NaN and of places far outside, and shuffles the
-    programs. The Gaussians are opaque, so compositing does not reach many entries of the lists.
+    The second run starts with memory full of NaN and of places far outside, shuffles the programs,
+    and composites most blocks by four programs each, which stop at different entries. The Gaussians are opaque, so compositing does not reach many entries of the lists.
     """
     shorten_segments(monkeypatch)
     case = Case(20, 17, 80, sh_degree=1, log_scale=-0.5, logit=4.0)
@@ -77,13 +83,15 @@ def test_neither_old_memory_nor_the_order_of_programs_changes_a_bit(monkeypatch)
         output, gradients = render_with_gradients(TritonRasterizer(), case, torch.float32)
         footprint = output.footprint(values)
         frame = output.footprint.args[0]
-        skipped.append(int((frame.lists.starts[1:] - frame.past).sum()))
+        skipped.append(int((frame.lists.starts[1:] - ends_of(frame)).sum()))
         return bits(output, gradients) + [
             tensor.numpy().tobytes() for tensor in vars(footprint).values()
         ]
 
     skipped = []
+    monkeypatch.setattr(executor, "SPLIT_BLOCKS", 0)
     expected = run()
+    monkeypatch.setattr(executor, "SPLIT_BLOCKS", 5)
     original, place, builder = Workspace.take, interpreter_builder.set_grid_idx, interpreter_builder
 
     def poisoned(self, name, count, dtype):
@@ -146,7 +154,7 @@ def test_the_backward_pass_of_a_long_list_runs_in_segments():
     gaussians.opacity_logits[::40] = 6.0
     errors, output = misses(case, gaussians)
     frame = output.footprint.args[0]
-    assert int(frame.past[0]) > 2 * layout.SEGMENT.value > int(frame.last.min()) > 0
+    assert int(ends_of(frame)[0]) > 2 * layout.SEGMENT.value > int(frame.last.min()) > 0
     assert len(frame.borders) == 2 * layout.BORDER.value
     assert max(errors.values()) < 1e-5
 
@@ -161,7 +169,7 @@ def test_lists_with_short_segments_match_the_reference(monkeypatch, logit):
     shorten_segments(monkeypatch)
     errors, output = misses(case, case.gaussians())
     frame = output.footprint.args[0]
-    crossed = (frame.past - frame.lists.starts[:-1] - 1) // 8
+    crossed = (ends_of(frame) - frame.lists.starts[:-1] - 1) // 8
     assert int(crossed.sum()) > 15
     assert bool(((frame.lists.starts[1:] - frame.lists.starts[:-1] - 1) // 8 > crossed).any())
     assert max(errors.values()) < 1e-5
@@ -285,7 +293,7 @@ def test_the_memory_of_a_render_is_the_documented_one(case):
     borders = (pairs - 1) // layout.SEGMENT.value * layout.BORDER.value * 4
     # bytes per Gaussian, unit, pair and block, as docs/gpu.md says; and once per render: the
     # invisible record, the end of the lists, flags and status
-    stated = 136 * count + 20 * room + 84 * pairs + 1052 * blocks + borders + (64 + 4 + 4 + 3 * 8)
+    stated = 136 * count + 20 * room + 84 * pairs + 1048 * blocks + borders + (64 + 4 + 4 + 3 * 8)
     assert sum(tensor.nbytes for tensor in buffers) == stated
 
 

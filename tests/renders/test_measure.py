@@ -15,18 +15,13 @@ from gsbench.analysis.results import load_experiment
 from gsbench.cli import run
 from gsbench.config.compose import compose_one
 from gsbench.eval.pictures import Matching
-from gsbench.renders import measure
-from gsbench.renders.measure import (
-    Destination,
-    ReferenceImages,
-    _lines,
-    check_destination,
-    find_destination,
-    find_reference_images,
-)
+from gsbench.renders import truth as truths
+from gsbench.renders.imported import Destination, Measured, check_destination, find_destination
+from gsbench.renders.measure import _lines
+from gsbench.renders.truth import ReferenceImages, find_reference_images
 from gsbench.runs.keys import STAGES
-from tests.analysis.synthetic import Plan, write_runs
 from tests.helpers import read_json, refusal, write
+from tests.trials import write_runs
 
 QUICK = ["eval.lpips=[]", "eval.flip=false"]
 COURTYARD = ReferenceImages(
@@ -62,8 +57,8 @@ def defaults():
 @pytest.fixture
 def trial(runs, defaults):
     """The folder of a trial of ``exp`` that tests the scene garden in two views, one masked."""
-    plan = Plan("exp", ["garden"], densifiers=["adc"], seeds=[0], views=2, pictures=True)
-    (folder,) = write_runs(runs, plan)
+    plan = {"scenes": ["garden"], "densifiers": ["adc"], "seeds": [0]}
+    (folder,) = write_runs(runs, **plan, views=2, pictures=True)
     config = read_json(folder / "config.yaml")
     config = defaults | config | {"scene": {"name": "garden", "path": "there"}}
     write(folder / "config.yaml", config)
@@ -194,7 +189,7 @@ def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
         "Store": lambda root: SimpleNamespace(get=get),
         "TrialSteps": lambda config, store: trial,
     }.items():
-        monkeypatch.setattr(measure, name, stand_in)
+        monkeypatch.setattr(truths, name, stand_in)
     place = tmp_path / "ground_truth"
     write(place / "masks" / "a.png", b"")
     truth = find_reference_images("garden", [word], tmp_path)
@@ -208,7 +203,7 @@ def test_photographs_of_a_scene_are_its_test_views_at_the_size_of_a_trial(
 
 
 def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_path):
-    write_runs(tmp_path, Plan("exp", ["garden"], ["random"], seeds=[0]))
+    write_runs(tmp_path, scenes=["garden"], inits=["random"], seeds=[0])
     garden = ReferenceImages(
         {}, "the pictures in a folder", "0" * 64, (96, 72), {}, "garden", "sfm"
     )
@@ -217,7 +212,7 @@ def test_the_initialiser_of_an_arm_is_that_of_the_experiments_own_trials(tmp_pat
         "exp", "garden", "a", "mine-2", 0
     )
     assert find_destination("new:mine", "garden", 0, FOLDER, tmp_path).init == "renders"
-    write_runs(tmp_path, Plan("exp", ["garden"], ["sfm"], seeds=[0]))
+    write_runs(tmp_path, scenes=["garden"], seeds=[0])
     with refusal(r"has random, sfm on garden: say which, .* exp:random-mine"):
         find_destination("exp:mine", None, 0, garden, tmp_path)
     for folder in (tmp_path / "exp" / "garden").glob("sfm-*/*"):
@@ -244,7 +239,7 @@ def test_the_scene_of_the_photographs_may_be_repeated(tmp_path):
 def test_renders_of_other_photographs_than_the_experiments_are_refused(
     data, resolution, said, tmp_path
 ):
-    write_runs(tmp_path, Plan(scenes=("garden",), seeds=(0,)))
+    write_runs(tmp_path, scenes=("garden",), seeds=(0,))
     truth = ReferenceImages({}, "the pictures in a folder", data, resolution, {})
     destination = Destination("exp", "garden", "sfm", "mine", 0)
     with refusal(said):
@@ -260,7 +255,7 @@ def test_printed_lines_have_the_views_their_mean_and_the_reasons_of_missing_metr
     )
     matching = Matching({}, "by their order", ("x", "y"))
     views = {"a": {"psnr": 20.0, "ssim": 0.5}, "bcdef": {"psnr": 21.0, "ssim": 0.25}}
-    lines = _lines(FOLDER, evaluator, matching, views, Path("runs/x"))
+    lines = _lines(Measured(FOLDER, [], views, evaluator, {}), matching, Path("runs/x"))
     assert lines[0] == "2 views: the pictures in a folder; protocol paper-1"
     assert lines[1:3] == ["names matched by their order", "left out, without a photograph: x, y"]
     assert lines[3:7] == [

@@ -74,15 +74,13 @@ def test_predictions_are_measured_with_their_photographs_or_others(members, tmp_
     assert measured["metrics"]["psnr"] == pytest.approx(20 * np.log10(255 / 10))
     photographs = tmp_path / "photos"
     for view in VIEWS:
-        file = photographs / f"{view}.JPG"
-        write(file, members[f"gt-color/{view}.png"])
+        write(photographs / f"{view}.JPG", members[f"gt-color/{view}.png"])
     assert "names matched" in said("evaluate", place, "--truth", photographs, *quick)
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_only_renders_and_photographs_are_unpacked_and_only_for_a_while(form, members, tmp_path):
-    place = FORMS[form](members, tmp_path / "predictions")
-    with opened_renders(place) as (renders, photographs):
+    with opened_renders(FORMS[form](members, tmp_path / "predictions")) as (renders, photographs):
         assert photographs is not None
         home = renders.parent
         assert (renders.name, photographs) == ("color", home / "gt-color")

@@ -19,20 +19,11 @@ from gsbench.runs.experiments import (
 )
 from gsbench.runs.trial_record import Declared
 from tests.helpers import refusal, write
+from tests.trials import search_record
 
 POINTS = [{"settings": {"x": 0.5}, "value": 2.0}, {"settings": {"x": 1}, "value": 4.0}]
-TUNING = {
-    "sweep": "s",
-    "arm": "sfm-adc",
-    "metric": "psnr",
-    "direction": 1,
-    "wanted": 3,
-    "seeds": [0],
-    "scenes": ["garden"],
-    "ranges": {"x": "0,1"},
-    "log": ["x"],
-    "points": [*POINTS, {"settings": {}, "value": None}],
-}
+TUNING = search_record([*POINTS, {"settings": {}, "value": None}])
+TUNING |= {"ranges": {"x": "0,1"}, "log": ["x"]}
 
 
 def test_experiments_are_folders_that_are_not_hidden(tmp_path):
@@ -65,12 +56,8 @@ def tuning(tmp_path, **changes):
 def test_the_best_point_is_the_one_with_the_best_value(tmp_path):
     assert tuning(tmp_path).best.value == 4.0
     assert tuning(tmp_path, direction=-1).best.value == 2.0
-    assert (
-        tuning(
-            tmp_path, direction=-1, points=[*POINTS, {"settings": {"x": 2.0}, "value": 0.0}]
-        ).best.value
-        == 0.0
-    )
+    more = [*POINTS, {"settings": {"x": 2.0}, "value": 0.0}]
+    assert tuning(tmp_path, direction=-1, points=more).best.value == 0.0
     assert tuning(tmp_path, points=[{"settings": {}, "value": None}]).best is None
 
 
@@ -100,10 +87,8 @@ def test_a_declaration_knows_its_time_and_its_metric():
     assert one.when == "1970-01-01 02:00 UTC"
     assert one.primary == "psnr@extrapolation"
     assert one.summary() == Declared(metric="psnr@extrapolation", time=one.time)
-    assert [(question.metric, question.sign) for question in one.questions] == [
-        ("psnr", 0),
-        ("ssim", 0),
-    ]
+    asked = [(question.metric, question.sign) for question in one.questions]
+    assert asked == [("psnr", 0), ("ssim", 0)]
     assert Question(metric="psnr").sign == 1
     with pytest.raises(ValueError, match="time is not a time"):
         Declaration(time="yesterday")
@@ -126,11 +111,8 @@ def test_planned_trials_are_those_of_the_declaration_and_of_its_questions():
 
 
 def test_a_repeated_declaration_is_in_force_since_its_first_time(tmp_path):
-    first, second, third = (
-        declared(1, "psnr"),
-        declared(2, "psnr"),
-        declared(3, "psnr", missing={"a": ["b"]}),
-    )
+    first, second = declared(1, "psnr"), declared(2, "psnr")
+    third = declared(3, "psnr", missing={"a": ["b"]})
     other, last = declared(2, "ssim"), declared(4, "ssim")
     assert latest_declaration([first]) is first
     assert latest_declaration([first, second]) is first

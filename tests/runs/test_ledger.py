@@ -26,12 +26,7 @@ from tests.helpers import refusal
 
 TIME = "2026-11-27T06:00:00Z"
 OPENED = Opened(
-    time=TIME,
-    metric="psnr",
-    sign=1,
-    least=0.1,
-    ideas=3,
-    rate=0.1,
+    **{"time": TIME, "metric": "psnr", "sign": 1, "least": 0.1, "ideas": 3, "rate": 0.1},
     seeds=(0, 1, 2),
     words=("densify=adc",),
     keys={"garden": "garden/sfm-adc/00000000"},
@@ -39,14 +34,8 @@ OPENED = Opened(
 
 
 def started(idea, against="baseline"):
-    return Started(
-        time=TIME,
-        idea=idea,
-        against=against,
-        identity=idea,
-        words=("densify=x",),
-        keys={"garden": f"garden/sfm-{idea}/11111111"},
-    )
+    own = {"words": ("densify=x",), "keys": {"garden": f"garden/sfm-{idea}/11111111"}}
+    return Started(time=TIME, idea=idea, against=against, identity=idea, **own)
 
 
 def promoted(idea, *seeds):
@@ -54,10 +43,16 @@ def promoted(idea, *seeds):
 
 
 def ended(idea, result):
-    difference = Difference(mean=1.0, low=0.5, high=1.5)
-    return Ended(
-        time=TIME, idea=idea, result=result, reason="better", seeds=3, difference=difference
-    )
+    found = {"reason": "better", "difference": Difference(mean=1.0, low=0.5, high=1.5)}
+    return Ended(time=TIME, idea=idea, result=result, seeds=3, **found)
+
+
+def confirming(**keys):
+    return Confirming(time=TIME, seeds=(0, 1), keys=keys)
+
+
+def confirmed(number=0, **results):
+    return Confirmed(time=TIME, number=number, results=results, differences={})
 
 
 ENTRIES = [
@@ -66,10 +61,8 @@ ENTRIES = [
     ended("a", KEPT),
     started("b", "a"),
     ended("b", FAILED),
-    Confirming(
-        time=TIME, seeds=(0, 1), keys={"baseline": {"park": "park/x/1"}, "a": {"park": "park/y/2"}}
-    ),
-    Confirmed(time=TIME, number=0, results={"a": KEPT}, differences={}),
+    confirming(baseline={"park": "park/x/1"}, a={"park": "park/y/2"}),
+    confirmed(a=KEPT),
 ]
 
 
@@ -171,11 +164,11 @@ AFTER_ALL = {
     "tests with seeds that ideas have": promoted("b", 2, 3),
     "tests on other seeds than the ideas before": replace(started("c"), level=0.1),
     "has other captures": replace(started("c"), keys={"park": "park/x/1"}),
-    "lacks the baseline": Confirming(time=TIME, seeds=(0, 1), keys={}),
-    "on none": Confirming(time=TIME, seeds=(0, 1), keys={"baseline": {}, "a": {}}),
-    "were not kept": Confirming(time=TIME, seeds=(0, 1), keys={"baseline": {}, "b": {}}),
-    "was not begun": Confirmed(time=TIME, number=1, results={}, differences={}),
-    "or was ended before": Confirmed(time=TIME, number=0, results={"a": KEPT}, differences={}),
+    "lacks the baseline": confirming(),
+    "on none": confirming(baseline={}, a={}),
+    "were not kept": confirming(baseline={}, b={}),
+    "was not begun": confirmed(1),
+    "or was ended before": confirmed(a=KEPT),
 }
 
 

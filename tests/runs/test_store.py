@@ -63,14 +63,8 @@ def test_a_result_that_edited_code_may_have_built_is_not_kept(store):
 
 
 def test_every_input_and_the_version_make_another_key(store):
-    keys = {
-        LETTERS.key({"x": 1}),
-        LETTERS.key({"x": 2}),
-        LETTERS.key({"y": 1}),
-        LETTERS.key({"x": 1.5}),
-        Stage("letters", 2).key({"x": 1}),
-        Stage("other", 1).key({"x": 1}),
-    }
+    keys = {LETTERS.key(inputs) for inputs in ({"x": 1}, {"x": 2}, {"y": 1}, {"x": 1.5})}
+    keys |= {stage.key({"x": 1}) for stage in (Stage("letters", 2), Stage("other", 1))}
     assert len(keys) == 6
     assert LETTERS.key({"x": 1, "y": 2}) == LETTERS.key({"y": 2, "x": 1})
 
@@ -260,9 +254,7 @@ def test_sweep_removes_leftovers_and_keeps_what_a_build_would_continue(store):
         os.utime(path, (time.time() - hours * 3600,) * 2)
     store.sweep([long, LETTERS])
     assert useful.exists()
-    assert not stale.exists()
-    assert not useless.exists()
-    assert not half_removed.exists()
+    assert not any(folder.exists() for folder in (stale, useless, half_removed))
     assert sorted(path.name for path in (store.root / "views").iterdir()) == [".file", ".young"]
     assert store.get(Step(long, {"x": 1}, refuse)).cached
 

@@ -9,18 +9,19 @@ import pytest
 from gsbench.analysis.results import read_experiment
 from gsbench.errors import InputError
 from gsbench.files import remove_special_files, require_no_links
-from gsbench.launch.record import declare, forget, remove
+from gsbench.launch.record import declare, remove
 from gsbench.launch.states import states_of_experiment
 from gsbench.logs import log_to
 from gsbench.parsing import DamagedError, read_bytes
 from gsbench.runs.experiments import list_experiments
 from gsbench.runs.keys import Step
+from gsbench.runs.plan import change_plan
 from gsbench.runs.store import Store
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import describe_holder, hold, is_held
-from tests.finished import write_results
 from tests.helpers import refusal
 from tests.runs.toy import TOY, build, toy_inputs
+from tests.trials import trial_values, write_results
 
 SECRET = "what nobody else may read or change"
 
@@ -38,10 +39,7 @@ def outside(tmp_path):
 def trial(tmp_path):
     """A finished trial in the runs folder, with results alone."""
     folder = tmp_path / "runs" / "x" / "s" / "a-b" / "01234567-seed0"
-    named = {
-        group: {"name": name} for group, name in {"scene": "s", "init": "a", "densify": "b"}.items()
-    }
-    write_results(folder, {"name": "x", "seed": 0, **named})
+    write_results(folder, trial_values("runs", name="x", scene="s", init="a", densify="b"))
     return folder
 
 
@@ -56,7 +54,7 @@ def _hold(folder):
 
 
 def _forget(folder):
-    forget(folder.parents[2], [])
+    change_plan(folder.parents[2])
 
 
 def _declare(folder):

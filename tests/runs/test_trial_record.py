@@ -16,27 +16,10 @@ from gsbench.runs.trial_record import (
     split_text,
     whole_lines,
 )
+from tests.trials import results_of, trial_values
 
-RESULTS = {
-    "status": "complete",
-    "experiment": "x",
-    "scene": "s",
-    "init": "a",
-    "densify": "b",
-    "seed": 0,
-    "raster": "cpu",
-    "protocol": "paper-1",
-    "iterations": 7,
-    "metrics": {},
-    "unavailable": {},
-    "seconds": {},
-    "num_init_points": 1,
-    "num_gaussians": 2,
-    "peak_memory_mb": 3.0,
-    "hashes": {},
-    "versions": {},
-}
 PATH = Path("results.json")
+RESULTS = results_of(trial_values("runs"), num_gaussians=2)
 
 
 def record(**changes):

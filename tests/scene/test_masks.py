@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from gsbench.pipeline.steps.scene import masking_step
-from gsbench.scene.images import (
+from gsbench.scene.load import load_scene
+from gsbench.scene.masks import (
     fill_ignored,
     find_masks,
     prepare_photograph,
@@ -17,7 +18,6 @@ from gsbench.scene.images import (
     read_mask,
     resize_mask,
 )
-from gsbench.scene.load import load_scene
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
@@ -267,8 +267,7 @@ def test_a_mask_is_undistorted_with_its_photograph(make_scene, tmp_path):
         save(path, np.repeat(disc[..., None] * np.uint8(255), 3, axis=2))
         save(root / "masks" / f"{path.name}.png", disc * np.uint8(255))
     raw = read_colmap("toy", root, masks="masks")
-    scene = load_scene(raw, raw.model, tmp_path / "cache")
-    view = scene.train[0]
+    view = load_scene(raw, raw.model, tmp_path / "cache").train[0]
     assert view.mask.shape != (90, 120), "undistorting changes the size"
     assert_array_equal(view.mask, view.image[..., 0] == 255)
 

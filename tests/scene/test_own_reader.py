@@ -148,8 +148,7 @@ def test_a_reader_goes_with_its_kind_of_scene(settings, said):
 
 
 def test_options_of_the_reader_stand_among_the_settings_of_the_scene(monkeypatch, folder):
-    module = SimpleNamespace(Reader=Reader, __spec__=None)
-    monkeypatch.setitem(sys.modules, "mine", module)
+    monkeypatch.setitem(sys.modules, "mine", SimpleNamespace(Reader=Reader, __spec__=None))
     words = ["scene=reader", f"scene.path={folder}", "allow_targets=[mine,tests]"]
     words += ["scene._target_=mine.Reader", "+scene.scale=3"]
     parts = Parts(compose_one(words).values)

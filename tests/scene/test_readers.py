@@ -13,8 +13,9 @@ from PIL import Image
 from gsbench.scene.colmap import read_model, read_reference
 from gsbench.scene.hold_out import select_images, split_names
 from gsbench.scene.images import list_images, match_names
+from gsbench.scene.model_folders import missing_model
 from gsbench.scene.options import SceneConfig, SplitRule
-from gsbench.scene.readers import missing_model, read_colmap, read_photos
+from gsbench.scene.readers import read_colmap, read_photos
 from tests.helpers import refusal, write
 
 
@@ -170,8 +171,7 @@ def test_names_with_blanks_are_read_whole_with_any_byte_order_mark_and_line_end(
     root = make_scene(names=names, text=text)
     for file in (root / "sparse/0").glob("*.txt"):
         file.write_bytes(mark + file.read_bytes().replace(b"\n", line_end))
-    capture = read_colmap("toy", root)
-    assert list(capture.image_names) == names
+    assert list(read_colmap("toy", root).image_names) == names
     model = read_model(root / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == names
     (root / "tests.txt").write_bytes(mark + names[3].encode() + line_end)

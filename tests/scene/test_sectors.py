@@ -44,11 +44,9 @@ def is_cyclic_run(found, order):
 
 @given(st.integers(0, 99), st.integers(2, 6), st.booleans())
 def test_a_ring_is_cut_by_azimuth_in_any_order_and_coordinates(seed, sectors, far):
-    rng = np.random.default_rng(seed)
-    degrees = list(rng.permutation(np.arange(24) * 15.0))
+    degrees = list(np.random.default_rng(seed).permutation(np.arange(24) * 15.0))
     rotation, shift = some_rotation(seed), np.array([5.0, -3.0, 2.0]) * (100 if far else 1)
-    cameras = [turned(camera, rotation, shift, 0.3) for camera in ring(degrees)]
-    found = arrange_cameras(cameras)
+    found = arrange_cameras([turned(camera, rotation, shift, 0.3) for camera in ring(degrees)])
     assert "surround" in found.description
     assert found.order[0] == 0, "a closed ring begins at the first camera"
     around = [int(index) for index in np.argsort(degrees)]
@@ -76,8 +74,7 @@ def test_an_open_ring_starts_after_its_gap():
 
 
 def test_cameras_on_one_side_are_cut_by_planes_in_order():
-    arc = ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0])
-    found = arrange_cameras(arc)
+    found = arrange_cameras(ring([0.0, 20.0, 40.0, 60.0, 80.0, 100.0]))
     assert "one side" in found.description
     assert found.order == (0, 1, 2, 3, 4, 5)
 

@@ -113,8 +113,7 @@ def test_photographs_of_two_cameras_with_the_same_numbers_are_all_read(tmp_path,
 def test_of_folders_of_several_sizes_the_largest_is_read(tmp_path, caplog, patterns, kept):
     for pattern, scale in patterns.items():
         photographs(tmp_path, pattern, scale)
-    capture = read_photos("a", tmp_path)
-    assert capture.image_names == tuple(kept.format(k) for k in range(COUNT))
+    assert read_photos("a", tmp_path).image_names == tuple(kept.format(k) for k in range(COUNT))
     assert "smaller copies" in caplog.text
 
 

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from shlex import split
 
 import pytest
 
@@ -31,8 +32,7 @@ def test_runs_and_current_folder_have_utf8_names(where, words, tmp_path, monkeyp
     folder = tmp_path / BAD
     folder.mkdir()
     monkeypatch.chdir(folder if where == "current" else tmp_path)
-    runs = tmp_path / "runs" if where == "current" else folder
-    monkeypatch.setenv("GSBENCH_RUNS", str(runs))
+    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs" if where == "current" else folder))
     assert "not UTF-8, or has a line break: rename it" in refused(*words) or where == "runs"
     assert not (folder / "runs").exists()
 
@@ -40,7 +40,7 @@ def test_runs_and_current_folder_have_utf8_names(where, words, tmp_path, monkeyp
 @pytest.mark.parametrize(
     "words",
     [
-        ["scene=photos", "scene.path=photos", "init=sfm", "tracking=none"],
+        split("scene=photos scene.path=photos init=sfm tracking=none"),
         ["evaluate", "photos", "--truth", "photos"],
     ],
 )

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from gsbench.scene.types import Camera, CameraModel, to_pinhole
 from tests.scene.cameras import looking
@@ -44,11 +43,6 @@ def test_one_focal_length_is_used_for_both_axes():
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 50.0, 20.0, 15.0)
         assert (camera.width, camera.height) == (40, 30)
         assert not camera.center.any()
-
-
-def test_the_camera_centre_is_the_eye():
-    eye = np.array([3.0, -2.0, 1.5])
-    assert_allclose(looking(eye, np.array([0.5, 0.0, 0.2])).center, eye, atol=1e-12)
 
 
 def test_a_point_keeps_its_relative_place_in_a_resized_image():

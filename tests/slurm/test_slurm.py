@@ -42,24 +42,13 @@ class Broken(ADC):
 """
 # seconds per iteration: a trial of 300 does not fit into Slurm's shortest time limit, a minute
 PAUSE = 0.2
-SWEEP = [
-    "--config-dir",
-    "conf",
-    "-m",
-    *SMALL,
-    "name=cluster",
-    "densify=slow",
-    "allow_targets=[slow]",
-    "tracking=none",
-]
-CLUSTER = [
-    "launch=slurm",
-    "launch.timeout_min=1",
-    "launch.signal_seconds=5",  # Slurm sends it up to half a minute earlier
-    "launch.cpus_per_trial=1",
-    "launch.gpus_per_trial=0",
-    "launch.parallel=2",
-]
+SWEEP = [*split("--config-dir conf -m"), *SMALL]
+SWEEP += split("name=cluster densify=slow allow_targets=[slow] tracking=none")
+# Slurm sends its signal up to half a minute before the five seconds.
+CLUSTER = split(
+    "launch=slurm launch.timeout_min=1 launch.signal_seconds=5 launch.cpus_per_trial=1 "
+    "launch.gpus_per_trial=0 launch.parallel=2"
+)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -17,14 +17,13 @@ SRC = Path(programs.__file__).parents[1]
 # relative paths count from there. A Python starts with -P, and imports nothing from there.
 STARTS = {
     ("external/program.py", "watch", "subprocess.Popen"): "own",
-    ("launch/jobs.py", "make_executor", "submitit.SlurmExecutor"): "current",
+    ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
-    ("launch/states.py", "read_queue", "subprocess.run"): "neutral",
     ("pipeline/steps/train.py", "check_version", "subprocess.run"): "own",
     ("system/install.py", "run_git", "subprocess.run"): "neutral",
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",
-    ("system/resources.py", "nvidia_smi", "subprocess.run"): "neutral",
+    ("system/programs.py", "answer_of", "subprocess.run"): "neutral",
     ("tracking/mirror.py", "_start", "subprocess.Popen"): "own",
     ("verbs/servers.py", "_announce", "subprocess.run"): "neutral",
     ("verbs/servers.py", "serve", "subprocess.Popen"): "own",
@@ -153,8 +152,7 @@ def test_every_python_starts_without_the_current_folder_in_its_search_path():
 @pytest.mark.parametrize("entry", [".", "", "bin"])
 def test_no_program_of_the_current_folder_starts(name, start, entry, tmp_path, monkeypatch):
     for folder in (tmp_path, tmp_path / "bin"):
-        write(folder / name, f"#!/bin/sh\ntouch {tmp_path}/exploded\n")
-        (folder / name).chmod(0o755)
+        write(folder / name, f"#!/bin/sh\ntouch {tmp_path}/exploded\n").chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", entry)
     start(tmp_path)
@@ -187,16 +185,10 @@ def test_the_current_folder_is_no_place_for_modules_and_programs(
     assert (str(tmp_path) in sys.path) == (given in ("", "{here}"))
 
 
-READ_BY_LIBRARIES = ("sitecustomize.py", "usercustomize.py", "json.py", "yaml.py", "requests.py")
-READ_BY_LIBRARIES += (
-    "wandb/settings",
-    ".env",
-    ".netrc",
-    "MLproject",
-    "pyproject.toml",
-    "conftest.py",
-)
-READ_BY_LIBRARIES += ("matplotlibrc", ".numba_config.yaml", "alembic.ini", "uname", "git", "python")
+READ_BY_LIBRARIES = """
+sitecustomize.py usercustomize.py json.py yaml.py requests.py wandb/settings .env .netrc MLproject
+pyproject.toml conftest.py matplotlibrc .numba_config.yaml alembic.ini uname git python
+"""
 WATCHED = """
 import os, sys
 here, seen = os.getcwd(), set()
@@ -217,11 +209,9 @@ TINY += " densify=none train.iterations=1 eval.lpips=[] raster=reference name=ti
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["", ".:"])
 def test_no_library_reads_what_lies_in_the_current_folder(path, tmp_path):
-    (tmp_path / "wandb").mkdir()
-    for name in READ_BY_LIBRARIES:
-        file = tmp_path / name
-        file.write_text("#!/bin/sh\ntouch exploded\n" if "." not in name else "raise SystemExit(9)")
-        file.chmod(0o755)
+    for name in READ_BY_LIBRARIES.split():
+        text = "#!/bin/sh\ntouch exploded\n" if "." not in name else "raise SystemExit(9)"
+        write(tmp_path / name, text).chmod(0o755)
     environment = os.environ | {"PATH": path + os.environ["PATH"], "PYTHONPATH": str(SRC.parent)}
     for words in (TINY.split(), ["sync"], ["tables", "tiny"], ["report", "tiny"], ["doctor"]):
         command = [sys.executable, "-P", "-c", WATCHED, *words]

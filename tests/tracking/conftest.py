@@ -24,15 +24,10 @@ def runs(tmp_path_factory):
 def postgresql(tmp_path):
     """The address of an empty database in a new PostgreSQL server; skips without PostgreSQL."""
     pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
-    homes = (
-        sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
-        if os.name == "posix"
-        else []
-    )
-    binaries = [str(path) for path in homes] + os.environ.get("PATH", "").split(os.pathsep)
-    initdb = shutil.which(
-        "initdb", path=os.pathsep.join(reversed(binaries[: len(homes)])) or None
-    ) or shutil.which("initdb")
+    homes = Path("/usr/lib/postgresql").glob("*/bin")
+    newest = sorted(homes, key=lambda path: -int(path.parent.name))
+    places = os.pathsep.join(map(str, newest)) or None
+    initdb = shutil.which("initdb", path=places) or shutil.which("initdb")
     if initdb is None:
         pytest.skip("needs a PostgreSQL server (apt-get install postgresql)")
     home = Path(initdb).parent
@@ -57,17 +52,8 @@ def postgresql(tmp_path):
     settings = (
         f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={data} -c fsync=off"
     )
-    run(
-        str(home / "pg_ctl"),
-        "-D",
-        str(data),
-        "-l",
-        str(data / "log"),
-        "-w",
-        "-o",
-        settings,
-        "start",
-    )
+    control = [str(home / "pg_ctl"), "-D", str(data)]
+    run(*control, "-l", str(data / "log"), "-w", "-o", settings, "start")
     yield f"postgresql+psycopg2://gsbench@127.0.0.1:{port}/postgres"
-    stop = [*prefix, str(home / "pg_ctl"), "-D", str(data), "-m", "immediate", "stop"]
+    stop = [*prefix, *control, "-m", "immediate", "stop"]
     subprocess.run(stop, check=False, timeout=300)

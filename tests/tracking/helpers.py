@@ -1,19 +1,20 @@
 """Trials as files, and what MLflow shows of them."""
 
-import json
 import os
 import socket
 import sys
 from contextlib import contextmanager
+from hashlib import sha256
 from pathlib import Path
 
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror
-from gsbench.tracking.mirror import mirror_ended
+from gsbench.tracking.tracker_run import mirror_ended
+from tests.helpers import write, write_lines
+from tests.trials import STEPS, results_of, trial_values
 
 ROOT = Path(__file__).resolve().parents[2]
-RECORDS = 150
 STATE = "mlflow.json"  # in the trial's folder
 
 
@@ -27,24 +28,10 @@ def options(uri=None, patience=30.0):
     }
 
 
-def trial_values(runs, seed=0, name="tracked"):
-    named = {group: {"name": f"a_{group}"} for group in ("scene", "init", "densify")}
-    return {
-        "name": name,
-        "seed": seed,
-        "runs": str(runs),
-        "train": {"iterations": RECORDS},
-        **named,
-    }
-
-
 def begin_trial(values, uri=None, patience=30.0, **more):
     """The folder of a trial that has written its configuration, as the mirror finds it."""
     folder = TrialFolder.of(values).path
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(
-        json.dumps(values | {"tracking": options(uri, patience) | more})
-    )
+    write(folder / "config.yaml", values | {"tracking": options(uri, patience) | more})
     return folder
 
 
@@ -61,44 +48,41 @@ def mirror_trial(settings, folder, values, allowed=()):
     return mirror_ended(TrialFolder(folder), settings, values, allowed)
 
 
-def write_trial(folder, values, records=RECORDS, psnr=20.0):
-    folder.mkdir(parents=True, exist_ok=True)
-    seed = values["seed"]
-    lines = [
-        {"step": i, "loss": 1 / i, "l1": seed, "seconds": 0.01 * i} for i in range(1, records + 1)
-    ]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (folder / "events.jsonl").write_text(
-        "".join(json.dumps({"step": i, "cloned": i}) + "\n" for i in (50, 100))
-    )
+def write_trial(folder, values, records=STEPS, psnr=20.0, **changes):
+    """Write the files of a finished trial with that many records of its training."""
+    seed, steps = values["seed"], range(1, records + 1)
+    rows = [{"step": i, "loss": 1 / i, "l1": seed, "seconds": 0.01 * i} for i in steps]
+    write_lines(folder / "metrics.jsonl", rows)
+    write_lines(folder / "events.jsonl", [{"step": i, "cloned": i} for i in (50, 100)])
     if not (folder / "config.yaml").exists():
         begin_trial(values)
-    results = {
-        "status": "complete",
-        "experiment": values["name"],
-        **{group: values[group]["name"] for group in ("scene", "init", "densify")},
-        "seed": seed,
-        "unavailable": {},
-        "versions": {},
-        "metrics": {"psnr": psnr},
-        "num_gaussians": 10 + seed,
-        "num_init_points": 5,
-        "peak_memory_mb": 1.5,
-        "iterations": records,
-        "seconds": {"train": 2.0},
-        "events": {"cloned": 150},
-        "protocol": "paper-1",
-        "raster": "cpu",
-        "hashes": {"config": "abc", "data": f"data of {values['scene']['name']}"},
-        "train_views": 20,
-        "test_views": 3,
-        "init_report": {
-            "num_points": 5,
-            "pose_errors": None,
-            "gauge": {"scene_extent": 4.5, "scale_to_reference": None},
-        },
-    }
-    (folder / "results.json").write_text(json.dumps(results))
+    gauge = {"scene_extent": 4.5, "scale_to_reference": None}
+    results = results_of(
+        values,
+        metrics={"psnr": psnr},
+        num_gaussians=10 + seed,
+        iterations=records,
+        seconds={"train": 2.0},
+        events={"cloned": 150},
+        hashes={"config": "abc", "data": sha256(values["scene"]["name"].encode()).hexdigest()},
+        train_views=20,
+        test_views=3,
+        init_report={"num_points": 5, "pose_errors": None, "gauge": gauge},
+    )
+    write(folder / "results.json", results | changes)
+
+
+def begun_trial(runs, seed=0, name="tracked", uri=None, patience=30.0, **more):
+    """A trial that has begun, as (folder, configuration)."""
+    values = trial_values(runs, seed, name)
+    return begin_trial(values, uri, patience, **more), values
+
+
+def ended_trial(runs, seed=0, name="tracked", uri=None, **more):
+    """A finished trial, as (folder, configuration)."""
+    folder, values = begun_trial(runs, seed, name, uri, **more)
+    write_trial(folder, values)
+    return folder, values
 
 
 def found_runs(client, name):
@@ -115,10 +99,9 @@ def run_of(client, seed):
 MIRROR = """
 import sys
 from pathlib import Path
-from tests.tracking.helpers import begin_trial, following, options, trial_values, write_trial
+from tests.tracking.helpers import begun_trial, following, options, write_trial
 runs, uri, seed, patience = Path(sys.argv[1]), sys.argv[2] or None, int(sys.argv[3]), float(sys.argv[4])
-values = trial_values(runs, seed)
-folder = begin_trial(values, uri, patience)
+folder, values = begun_trial(runs, seed, uri=uri, patience=patience)
 with following(options(uri, patience), folder):
     write_trial(folder, values)
 """

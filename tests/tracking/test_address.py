@@ -1,22 +1,18 @@
 """A tracker that a stranger's file names gets nothing unless the user types its address."""
 
-import json
-
 import pytest
 
 from gsbench.cli import run
-from gsbench.errors import InputError
 from gsbench.tracking import connect, default_uri, tracker_uri
 from gsbench.tracking.mlflow_sink import VARIABLE
+from tests.helpers import change_json, read_json, refusal, write
 from tests.tracking.helpers import (
     STATE,
-    begin_trial,
+    ended_trial,
     found_runs,
     free_port,
     mirror_trial,
     options,
-    trial_values,
-    write_trial,
 )
 
 
@@ -36,9 +32,7 @@ def test_sync_sends_nothing_to_a_tracker_that_was_not_typed(kind, tmp_path, monk
     runs, target = tmp_path / "runs", tmp_path / "elsewhere" / "theirs.db"
     target.parent.mkdir()
     address = f"sqlite:///{target}" if kind == "sqlite" else f"http://127.0.0.1:{free_port()}"
-    values = trial_values(runs, name="theirs")
-    folder = begin_trial(values, address)
-    write_trial(folder, values)
+    ended_trial(runs, name="theirs", uri=address)
     monkeypatch.setenv("GSBENCH_RUNS", str(runs))
     monkeypatch.delenv(VARIABLE, raising=False)
     assert run(["sync", "theirs"]) == 0
@@ -52,8 +46,8 @@ def test_sync_sends_nothing_to_a_tracker_that_was_not_typed(kind, tmp_path, monk
 
 
 def test_sync_asks_for_an_address_also_where_tracking_was_off(tmp_path, monkeypatch, capfd):
-    values, address = trial_values(tmp_path, name="theirs"), "http://127.0.0.1:9"
-    write_trial(begin_trial(values, address, enabled=False), values)
+    address = "http://127.0.0.1:9"
+    ended_trial(tmp_path, name="theirs", uri=address, enabled=False)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     monkeypatch.delenv(VARIABLE, raising=False)
     assert run(["sync", "theirs"]) == 0
@@ -65,12 +59,10 @@ def test_sync_asks_for_an_address_also_where_tracking_was_off(tmp_path, monkeypa
 def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
     lacking, tmp_path, monkeypatch, capfd
 ):
-    values = trial_values(tmp_path, name="theirs")
-    folder = begin_trial(values)
-    write_trial(folder, values)
-    content = json.loads((folder / "config.yaml").read_text())
+    folder, _ = ended_trial(tmp_path, name="theirs")
+    content = read_json(folder / "config.yaml")
     del content[lacking]
-    (folder / "config.yaml").write_text(json.dumps(content))
+    write(folder / "config.yaml", content)
     monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path))
     assert run(["sync", "theirs"]) == 0
     said = capfd.readouterr()
@@ -85,13 +77,11 @@ def test_sync_leaves_out_a_trial_whose_configuration_lacks_a_group(
 def test_artifacts_outside_the_runs_folder_are_refused(place, tmp_path, monkeypatch, capfd):
     runs, outside = tmp_path / "runs", tmp_path / "outside"
     outside.mkdir()
-    values = trial_values(runs, name="theirs")
-    folder = begin_trial(values)
-    write_trial(folder, values)
+    folder, values = ended_trial(runs, name="theirs")
     monkeypatch.delenv(VARIABLE, raising=False)
     address = place.format(port=free_port(), outside=outside, runs=runs)
     connect(None, runs).create_experiment("theirs", artifact_location=address)
-    with pytest.raises(InputError, match="would send artifacts to"):
+    with refusal("would send artifacts to"):
         mirror_trial(options(), folder, values)
     assert not list(outside.iterdir())
 
@@ -99,24 +89,20 @@ def test_artifacts_outside_the_runs_folder_are_refused(place, tmp_path, monkeypa
 def test_a_link_among_the_artifacts_is_not_followed(tmp_path):
     runs, private = tmp_path / "runs", tmp_path / "private"
     private.write_text("secret")
-    values = trial_values(runs, name="theirs")
-    folder = begin_trial(values)
-    write_trial(folder, values)
+    folder, values = ended_trial(runs, name="theirs")
     client = connect(None, runs)
     mirror_trial(options(), folder, values)
     (made,) = found_runs(client, "theirs")
     shown = runs / "mlartifacts" / "theirs" / made.info.run_id / "artifacts" / "config.yaml"
     shown.unlink()
     shown.symlink_to(private)
-    state = json.loads((folder / STATE).read_text())
-    (folder / STATE).write_text(json.dumps(state | {"complete": None}))
-    with pytest.raises(InputError, match="follows no links"):
+    change_json(folder / STATE, complete=None)
+    with refusal("follows no links"):
         mirror_trial(options(), folder, values)
     assert private.read_text() == "secret"
 
 
 @pytest.mark.parametrize("address", ["./mlruns", "mlruns", "file:./mlruns", "http:/host"])
 def test_an_address_that_is_a_folder_is_refused_in_one_line(address, refused):
-    said = refused("scene=courtyard", f"tracking.uri={address}", "--dry-run").splitlines()
-    assert len(said) == 1
-    assert "tracking.uri must be an address such as http://HOST:PORT" in said[0]
+    said = refused("scene=courtyard", f"tracking.uri={address}", "--dry-run")
+    assert "tracking.uri must be an address such as http://HOST:PORT" in said

@@ -20,7 +20,6 @@ from tests.end_to_end.conftest import SMALL
 from tests.helpers import read_json
 from tests.processes import completed, heed_interrupts
 from tests.tracking.helpers import (
-    RECORDS,
     begin_trial,
     child_environment,
     found_runs,
@@ -29,23 +28,16 @@ from tests.tracking.helpers import (
     mirror_command,
     mirror_trial,
     options,
-    trial_values,
     write_trial,
 )
 from tests.tracking.servers import Gate, Listener
+from tests.trials import STEPS, trial_values
 
 pytestmark = pytest.mark.slow
 # A limit for programs that hang; a slow machine needs less.
 SECONDS = 240
 PATIENCE = 4.0
-TINY = [
-    *SMALL,
-    "train.iterations=20",
-    "scene.views=8",
-    "init.count=500",
-    "eval.lpips=[]",
-    "eval.flip=false",
-]
+TINY = split("train.iterations=20 scene.views=8 init.count=500 eval.lpips=[] eval.flip=false")
 
 
 @pytest.fixture(scope="module")
@@ -59,15 +51,9 @@ def start(runs, *words):
         for key, value in child_environment().items()
         if not key.startswith(("GSBENCH_", "MLFLOW_"))
     }
+    settings = [*SMALL, *TINY, f"tracking.patience_seconds={PATIENCE}", *words]
     return subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "gsbench.cli",
-            *TINY,
-            f"tracking.patience_seconds={PATIENCE}",
-            *words,
-        ],
+        [sys.executable, "-m", "gsbench.cli", *settings],
         cwd=runs,
         env=kept | {"GSBENCH_RUNS": str(runs)},
         stdout=subprocess.PIPE,
@@ -97,15 +83,12 @@ def test_a_trial_with_a_bad_tracker_is_complete_and_prints_one_line(kind, runs):
             port = stack.enter_context(Listener(seconds=60)).port
         elif kind == "hangs up":
             port = stack.enter_context(Gate(free_port())).port
-        uri = (
-            f"postgresql+psycopg2://x@127.0.0.1:{port}/x"
-            if kind == "postgresql"
-            else f"http://127.0.0.1:{port}"
-        )
+        uri = f"http://127.0.0.1:{port}"
+        if kind == "postgresql":
+            uri = f"postgresql+psycopg2://x@127.0.0.1:{port}/x"
         name = kind.replace(" ", "_")
-        _, errors = (program := start(runs, f"name={name}", f"tracking.uri={uri}")).communicate(
-            timeout=SECONDS
-        )
+        program = start(runs, f"name={name}", f"tracking.uri={uri}")
+        _, errors = program.communicate(timeout=SECONDS)
     check_complete(runs, name, program.returncode, errors)
 
 
@@ -113,12 +96,8 @@ def test_a_trial_with_a_bad_tracker_is_complete_and_prints_one_line(kind, runs):
 def test_no_mirror_outlives_a_trial_that_is_ended_while_its_tracker_hangs(signum, runs):
     name = f"ended_by_{signum}"
     with Listener() as tracker:
-        program = start(
-            runs,
-            f"name={name}",
-            f"tracking.uri=http://127.0.0.1:{tracker.port}",
-            "train.iterations=100000",
-        )
+        address = f"tracking.uri=http://127.0.0.1:{tracker.port}"
+        program = start(runs, f"name={name}", address, "train.iterations=100000")
         mirrors = mirrors_of(program)
         wait_until(
             lambda: bool(tracker.connections) and any((runs / name).glob("**/building.json"))
@@ -187,12 +166,8 @@ def tracker(request, tmp_path_factory):
             port = urlsplit(request.getfixturevalue("postgresql")).port
         gate = stack.enter_context(Gate(port))
         address = f"127.0.0.1:{gate.port}"
-        uri = (
-            f"http://{address}"
-            if request.param == "http"
-            else f"postgresql+psycopg2://gsbench@{address}/postgres"
-        )
-        yield gate, uri
+        database = f"postgresql+psycopg2://gsbench@{address}/postgres"
+        yield gate, f"http://{address}" if request.param == "http" else database
 
 
 def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_path, monkeypatch):
@@ -221,7 +196,7 @@ def test_sync_completes_runs_whose_tracker_was_lost_at_any_moment(tracker, tmp_p
     for run in found:
         assert run.info.status == "FINISHED"
         assert history(client, run.info.run_id, "train/loss") == [
-            (i, 1 / i) for i in range(1, RECORDS + 1)
+            (i, 1 / i) for i in range(1, STEPS + 1)
         ]
         assert run.data.metrics["eval/gaussians"] == 10 + int(run.data.tags["seed"])
 
@@ -236,24 +211,15 @@ def mirror_a_trial(runs, uri, seed, patience):
 @contextmanager
 def mlflow_server(folder):
     port = free_port()
-    words = split(
-        f"server --backend-store-uri sqlite:///{folder}/mlflow.db --artifacts-destination {folder}"
+    words = (
+        f"server --backend-store-uri sqlite:///{folder}/mlflow.db --host 127.0.0.1 --port {port}"
     )
-    command = [
-        sys.executable,
-        "-m",
-        "mlflow",
-        *words,
-        *split(f"--host 127.0.0.1 --port {port} --workers 1"),
-    ]
+    more = f"--workers 1 --artifacts-destination {folder}"
+    command = [sys.executable, "-m", "mlflow", *split(f"{words} {more}")]
     lean = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
-    server = subprocess.Popen(
-        command,
-        env=os.environ | lean,
-        start_new_session=True,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    environment = os.environ | lean
+    server = subprocess.Popen(command, env=environment, start_new_session=True, **silent)
 
     def answers():
         with (

@@ -18,18 +18,19 @@ from gsbench.analysis.results import read_experiment
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, publish
 from gsbench.tracking.comparison import MAX_TAG, OWN_NOTE, _set, addresses, description
-from gsbench.tracking.mirror import sync
+from gsbench.tracking.tracker_run import sync
 from gsbench.verbs import servers
 from tests.tracking.helpers import (
     begin_trial,
+    ended_trial,
     found_runs,
     free_port,
     mirror_trial,
     options,
     run_of,
-    trial_values,
     write_trial,
 )
+from tests.trials import trial_values
 from tests.view.browser import Browser
 
 NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.gsbench"
@@ -41,10 +42,7 @@ def write_sweep(runs, arms=("adc", "volumetric"), name="swept"):
     for number, arm in enumerate(arms):
         for scene in ("courtyard", "yard"):
             for seed in (0, 1):
-                values = trial_values(runs, seed, name) | {
-                    "scene": {"name": scene},
-                    "densify": {"name": arm},
-                }
+                values = trial_values(runs, seed, name, scene=scene, densify=arm)
                 folder = begin_trial(values)
                 write_trial(folder, values, psnr=20 + number + seed / 10)
                 folders.append(TrialFolder(folder))
@@ -77,11 +75,8 @@ def test_sync_makes_the_page_from_the_files(kind, tmp_path, request):
     assert {"eval/psnr_dB", "train/gaussians"} <= charted
     assert charted - {"train/gaussians"} <= names  # these files have no counts over iterations
     collapsed = {f"param.arm.{run.data.params['arm']}" for run in found_runs(client, "swept")}
-    assert (
-        set(view["groupsExpanded"])
-        == collapsed
-        == {"param.arm.adc · a_init", "param.arm.volumetric · a_init"}
-    )
+    arms = {f"param.arm.{arm} · a_init" for arm in ("adc", "volumetric")}
+    assert set(view["groupsExpanded"]) == collapsed == arms
 
 
 def test_a_users_description_is_kept(runs):
@@ -132,9 +127,7 @@ def test_other_versions_of_mlflow_get_the_plain_page(version):
 
 @pytest.mark.slow
 def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
-    values = trial_values(runs, seed=2000)
-    folder = TrialFolder.of(values).path
-    write_trial(folder, values)
+    folder, values = ended_trial(runs, seed=2000)
     sizes = {"a": (8, 4), "b": (4, 8)}
     for kind in ("renders", "ground_truth"):
         (folder / kind).mkdir()
@@ -143,11 +136,8 @@ def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
     assert mirror_trial(options(), folder, values)
     client = connect(None, runs)
     run = run_of(client, 2000)
-    names = [
-        item.path
-        for item in client.list_artifacts(run.info.run_id, "images")
-        if item.path.endswith(".png")
-    ]
+    paths = [item.path for item in client.list_artifacts(run.info.run_id, "images")]
+    names = [path for path in paths if path.endswith(".png")]
     assert len(names) == 6
     for name in names:
         with Image.open(client.download_artifacts(run.info.run_id, name)) as image:
@@ -159,31 +149,28 @@ def test_portrait_and_landscape_pictures_keep_their_sizes(runs):
 def test_a_browser_shows_the_arms_as_groups_and_a_chart(tmp_path, monkeypatch):
     runs, port = tmp_path / "runs", free_port()
     list(sync(write_sweep(runs), None))
-    page = addresses(f"http://127.0.0.1:{port}", publish(runs / "swept", None), mlflow.__version__)[
-        "arms"
-    ]
+    server = f"http://127.0.0.1:{port}"
+    page = addresses(server, publish(runs / "swept", None), mlflow.__version__)["arms"]
     started = []
     popen = servers.subprocess.Popen
     monkeypatch.setattr(
         servers.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1]
     )
-    thread = threading.Thread(
-        target=servers.ui, args=(split(f"swept --port {port} --no-browser"), runs)
-    )
+    words = split(f"swept --port {port} --no-browser")
+    thread = threading.Thread(target=servers.ui, args=(words, runs))
     # signals need the main thread
     monkeypatch.setattr(servers, "stop_on_signals", lambda: threading.Lock())
     thread.start()
     try:
         deadline = time.monotonic() + 120
-        while not servers._serves(f"http://127.0.0.1:{port}", "swept", page):
+        while not servers._serves(server, "swept", page):
             assert time.monotonic() < deadline
             time.sleep(0.5)
         with Browser(page, tmp_path / "profile", (1500, 1000)) as browser:
 
             def evaluated(script):
-                return browser.call("Runtime.evaluate", expression=script, returnByValue=True)[
-                    "result"
-                ].get("value")
+                found = browser.call("Runtime.evaluate", expression=script, returnByValue=True)
+                return found["result"].get("value")
 
             bars = (
                 "[...document.querySelectorAll('.barlayer .point path')].filter(p => "

@@ -1,6 +1,5 @@
 """One contract, four trackers: what each shows of the same files, and after each interruption."""
 
-import json
 import re
 import shutil
 import sys
@@ -15,17 +14,17 @@ from PIL import Image
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError
 from gsbench.tracking import connect
-from gsbench.tracking.mirror import TrackerRun, make_sink
+from gsbench.tracking.tracker_run import TrackerRun, make_sink
 from tests.conftest import ROOT
+from tests.helpers import read_json, write
 from tests.tracking.helpers import (
-    RECORDS,
-    begin_trial,
+    begun_trial,
     found_runs,
     mirror_trial,
     options,
-    trial_values,
     write_trial,
 )
+from tests.trials import STEPS
 
 AT = {"50": {"metrics": {"psnr": 15.0}, "num_gaussians": 7}}
 METHODS = ("open", "params", "tags", "metrics", "artifacts", "close")
@@ -89,7 +88,7 @@ class Shown:
         return shown[-1]
 
     def _own(self):
-        shown = [json.loads(file.read_text()) for file in (self.runs / "kept").glob("*.json")]
+        shown = [read_json(file) for file in (self.runs / "kept").glob("*.json")]
         return [
             {
                 "params": one["params"],
@@ -211,11 +210,8 @@ def shown(request, runs, tmp_path, monkeypatch):
 
 def finished(runs, psnr=20.0):
     """A finished trial with a picture, which was also measured at iteration 50."""
-    values = trial_values(runs, 1)
-    folder = begin_trial(values)
-    write_trial(folder, values, psnr=psnr)
-    results = json.loads((folder / "results.json").read_text()) | {"metrics_at": AT}
-    (folder / "results.json").write_text(json.dumps(results))
+    folder, values = begun_trial(runs, 1)
+    write_trial(folder, values, psnr=psnr, metrics_at=AT)
     for kind, value in (("renders", 200), ("ground_truth", 50)):
         (folder / kind).mkdir(exist_ok=True)
         Image.fromarray(np.full((4, 6, 3), value, np.uint8)).save(folder / kind / "view 1#.png")
@@ -224,10 +220,10 @@ def finished(runs, psnr=20.0):
 
 def check_whole(run, psnr=20.0):
     """The run shows the trial of `finished`, all of it."""
-    losses = {("train/loss", i): 1 / i for i in range(1, RECORDS + 1)}
+    losses = {("train/loss", i): 1 / i for i in range(1, STEPS + 1)}
     cloned = {("train/densify/cloned", i): i for i in (50, 100)}
-    ends = {("eval/psnr_dB", 50): 15.0, ("eval/psnr_dB", RECORDS): psnr}
-    ends |= {("eval/gaussians", RECORDS): 11, ("eval/init_points", RECORDS): 5}
+    ends = {("eval/psnr_dB", 50): 15.0, ("eval/psnr_dB", STEPS): psnr}
+    ends |= {("eval/gaussians", STEPS): 11, ("eval/init_points", STEPS): 5}
     for key, value in (losses | cloned | ends).items():
         assert run["metrics"][key] == value, key
     assert run["params"]["densify.name"] == "a_densify"
@@ -241,41 +237,48 @@ def check_whole(run, psnr=20.0):
     assert run["status"] == ("FINISHED", None)
 
 
-def test_a_whole_trial_is_shown_once(shown):
-    folder, values = finished(shown.runs)
-    assert shown.mirror(folder, values)
-    check_whole(shown.one())
-    before = shown.one()
-    assert not shown.mirror(folder, values)
-    assert shown.one() == before
+@pytest.fixture
+def mirrored(shown):
+    """A finished trial that the tracker shows, as (folder, values)."""
+    trial = finished(shown.runs)
+    assert shown.mirror(*trial)
+    return trial
 
 
-def test_what_was_sent_before_a_crash_is_not_shown_twice(shown):
-    folder, values = finished(shown.runs)
-    assert shown.mirror(folder, values)
-    (state,) = [path for path in folder.glob("*.json") if "token" in path.read_text()]
-    kept = json.loads(state.read_text())
-    del kept["complete"]
-    state.write_text(json.dumps(kept | {"logged": {"metrics.jsonl": 70}}))
-    assert shown.mirror(folder, values)
+def check_one(shown, trial):
+    """Mirror the trial again: one run shows all of it."""
+    assert shown.mirror(*trial)
     check_whole(shown.one())
     assert len(shown()) == 1
 
 
+def test_a_whole_trial_is_shown_once(shown, mirrored):
+    before = shown.one()
+    check_whole(before)
+    assert not shown.mirror(*mirrored)
+    assert shown.one() == before
+
+
+def test_what_was_sent_before_a_crash_is_not_shown_twice(shown, mirrored):
+    (state,) = [path for path in mirrored[0].glob("*.json") if "token" in path.read_text()]
+    kept = read_json(state)
+    del kept["complete"]
+    write(state, kept | {"logged": {"metrics.jsonl": 70}})
+    check_one(shown, mirrored)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_after_an_error_anywhere_the_next_time_completes_the_run(shown, method, monkeypatch):
-    folder, values = finished(shown.runs)
+    trial = finished(shown.runs)
     cls = type(make_sink(shown.settings, ["kept"]))
     with monkeypatch.context() as patch:
         for done in (False, True):  # before the tracker did it, and after: its answer is lost
             whole = getattr(cls, method)
             patch.setattr(cls, method, _failing(whole, done))
             with pytest.raises(ConnectionError):
-                shown.mirror(folder, values)
+                shown.mirror(*trial)
             patch.setattr(cls, method, whole)
-    assert shown.mirror(folder, values)
-    check_whole(shown.one())
-    assert len(shown()) == 1
+    check_one(shown, trial)
 
 
 def _failing(whole, done):
@@ -287,29 +290,23 @@ def _failing(whole, done):
     return method
 
 
-def test_changed_results_replace_those_that_were_shown(shown):
-    folder, values = finished(shown.runs)
-    assert shown.mirror(folder, values)
+def test_changed_results_replace_those_that_were_shown(shown, mirrored):
     finished(shown.runs, psnr=33.0)
-    assert shown.mirror(folder, values)
+    assert shown.mirror(*mirrored)
     check_whole(shown.one(), psnr=33.0)
     assert len(shown()) == (2 if shown.kind == "WandB" else 1)
-    assert not shown.mirror(folder, values)
+    assert not shown.mirror(*mirrored)
 
 
 def test_a_failure_is_shown_with_its_reason_until_the_trial_succeeds(shown):
-    values = trial_values(shown.runs, 1)
-    folder = begin_trial(values)
-    (folder / "failed.json").write_text(json.dumps({"message": "the loss became nan\nagain"}))
+    folder, values = begun_trial(shown.runs, 1)
+    write(folder / "failed.json", {"message": "the loss became nan\nagain"})
     assert shown.mirror(folder, values)
     run = shown.one()
     assert run["status"] == ("FAILED", "the loss became nan")
     assert run["files"] is None or run["files"] >= {"config.yaml", "failed.json"}
     (folder / "failed.json").unlink()
-    finished(shown.runs)
-    assert shown.mirror(folder, values)
-    check_whole(shown.one())
-    assert len(shown()) == 1
+    check_one(shown, finished(shown.runs))
 
 
 def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
@@ -323,7 +320,7 @@ def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
     assert ("train/loss", 1) not in shown.one()["metrics"]
     training = {"stage": "train", "folder": str(tmp_path / "building")}
     (tmp_path / "building").mkdir()
-    (folder / "building.json").write_text(json.dumps(training))
+    write(folder / "building.json", training)
     seen = []
     for text in ('{"step": 10, "loss": 0.5}\n{"step": 20, "lo', 'ss": 0.25}\n', ""):
         with (tmp_path / "building" / "metrics.jsonl").open("a") as stream:
@@ -337,15 +334,10 @@ def test_curves_are_shown_while_the_trial_runs(shown, tmp_path):
 
 
 @pytest.mark.parametrize("shown", ["MLflow", "TensorBoard", "own"], indirect=True)
-def test_a_run_that_was_deleted_there_is_made_again(shown):
-    folder, values = finished(shown.runs)
-    assert shown.mirror(folder, values)
+def test_a_run_that_was_deleted_there_is_made_again(shown, mirrored):
     if shown.kind == "MLflow":
         client = connect(None, shown.runs)
         client.delete_run(found_runs(client, "tracked")[0].info.run_id)
-    elif shown.kind == "TensorBoard":
-        shutil.rmtree(shown.runs / "tensorboard")
     else:
-        shutil.rmtree(shown.runs / "kept")
-    assert shown.mirror(folder, values)
-    check_whole(shown.one())
+        shutil.rmtree(shown.runs / {"TensorBoard": "tensorboard", "own": "kept"}[shown.kind])
+    check_one(shown, mirrored)

@@ -16,9 +16,10 @@ import pytest
 
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.system.locks import BusyError, hold
-from gsbench.tracking import Mirror, mirror
-from gsbench.tracking.mirror import MirrorError, mirror_ended, refusal, sync
-from tests.tracking.helpers import begin_trial, options, trial_values, write_trial
+from gsbench.tracking import Mirror, mirror, tracker_run
+from gsbench.tracking.tracker_run import MirrorError, mirror_ended, refusal, sync
+from tests.tracking.helpers import begin_trial, begun_trial, options, write_trial
+from tests.trials import trial_values
 
 # ---- the sweep's side
 
@@ -183,8 +184,8 @@ class Tracker:
 @pytest.fixture
 def told(monkeypatch):
     monkeypatch.setattr(Tracker, "told", [], raising=False)
-    monkeypatch.setattr(mirror, "make_sink", lambda settings, allowed: Tracker())
-    monkeypatch.setattr(mirror, "publish", lambda home, uri: None)
+    monkeypatch.setattr(tracker_run, "make_sink", lambda settings, allowed: Tracker())
+    monkeypatch.setattr(tracker_run, "publish", lambda home, uri: None)
     return Tracker.told
 
 
@@ -220,7 +221,7 @@ def test_sync_mirrors_ended_trials_and_counts_them(told, tmp_path, monkeypatch):
     (failed / "failed.json").write_text("{}")
     folders = [TrialFolder(one) for one in (done, damaged, failed, partial, strange, busy)]
     label = {one.path: one.label for one in folders}
-    with hold(busy / mirror.LOCK, "mirroring"):
+    with hold(busy / tracker_run.LOCK, "mirroring"):
         lines = list(sync(folders, None))
     assert lines == [
         f"mirrored {label[done]}",
@@ -243,22 +244,22 @@ def test_sync_mirrors_ended_trials_and_counts_them(told, tmp_path, monkeypatch):
 
 def test_the_page_of_an_experiment_is_renewed_in_mlflow_alone(tmp_path, monkeypatch):
     published = []
-    monkeypatch.setattr(mirror, "publish", lambda home, uri: published.append((home, uri)))
+    monkeypatch.setattr(tracker_run, "publish", lambda home, uri: published.append((home, uri)))
     folder = TrialFolder.of(trial_values(tmp_path))
     pages = {
         (folder.home, "u"): (folder, options("u")),
         (folder.home, "w"): (folder, options("w") | {"_target_": "gsbench.tracking.WandB"}),
     }
-    mirror._renew(pages)
+    tracker_run.renew_pages(pages)
     assert published == [(folder.home, "u")]
     assert pages == {}
 
     def refuse(home, uri):
         raise KeyError("no page")
 
-    monkeypatch.setattr(mirror, "publish", refuse)
+    monkeypatch.setattr(tracker_run, "publish", refuse)
     with pytest.raises(MirrorError, match=r"could not be sent to MLflow .*KeyError: 'no page'"):
-        mirror._renew({(folder.home, None): (folder, options())})
+        tracker_run.renew_pages({(folder.home, None): (folder, options())})
 
 
 # ---- the process's side
@@ -312,7 +313,9 @@ def line(folder):
 def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
     renewed = []
     now = iter([100.0, 100.0, 159.0, 160.5, 160.5, 170.0, 170.0])
-    monkeypatch.setattr(mirror, "_renew", lambda pages: renewed.append(sorted(map(str, pages))))
+    monkeypatch.setattr(
+        mirror, "renew_pages", lambda pages: renewed.append(sorted(map(str, pages)))
+    )
     monkeypatch.setattr(time, "monotonic", lambda: next(now))
     lines = Lines([line("a/b/c/d"), line("a/b/c/e")], [], [line("a/b/c/f")], [None])
     mirror._follow(lines, 0.5)
@@ -328,7 +331,7 @@ def test_trials_are_read_until_the_end_of_the_input(followed, monkeypatch):
 @pytest.mark.parametrize("error", [ValueError("down"), SystemExit("down"), BusyError("other")])
 def test_an_error_is_only_raised_at_the_end(followed, monkeypatch, error):
     monkeypatch.setattr(Followed, "error", error)
-    monkeypatch.setattr(mirror, "_renew", lambda pages: None)
+    monkeypatch.setattr(mirror, "renew_pages", lambda pages: None)
     lines = Lines([line("a/b/c/d")], [], [None])
     if isinstance(error, BusyError):
         mirror._follow(lines, 0)
@@ -364,14 +367,12 @@ def test_a_trial_that_never_began_is_not_sent_where_its_old_configuration_says(t
     folder = TrialFolder(begin_trial(values, "http://theirs"))
     one = mirror._FollowedTrial(folder, options("http://own"))
     one.catch_up(last=True)
-    assert one._run is not None
     assert one._run._options["uri"] == "http://own"
 
 
 @pytest.mark.parametrize("name", ["results.json", "failed.json", "none"])
 def test_a_trial_that_ended_before_it_was_seen_is_mirrored(told, tmp_path, name):
-    values = trial_values(tmp_path)
-    folder = begin_trial(values)
+    folder, values = begun_trial(tmp_path)
     one = mirror._FollowedTrial(TrialFolder(folder), options())
     one._added_at = 100.0
     if name == "failed.json":

@@ -7,28 +7,27 @@ import sys
 
 import pytest
 
-from gsbench.errors import InputError
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect, default_uri
+from tests.helpers import refusal
 from tests.tracking.helpers import (
-    begin_trial,
+    begun_trial,
     child_environment,
+    ended_trial,
     following,
     mirror_trial,
     options,
     run_of,
-    trial_values,
     write_trial,
 )
+from tests.trials import trial_values
 
 pytestmark = pytest.mark.slow
 
 
 def mirrored(runs, seed, **more):
     """A client, and the run of a finished trial."""
-    values = trial_values(runs, seed)
-    folder = TrialFolder.of(values).path
-    write_trial(folder, values)
+    folder, values = ended_trial(runs, seed)
     (folder / "point_cloud.ply").write_text("ply\n")
     assert mirror_trial(options() | more, folder, values)
     client = connect(None, runs)
@@ -42,8 +41,7 @@ def artifacts(client, run):
 
 def test_a_trial_goes_to_the_tracker_in_the_environment(runs, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(runs))
-    values = trial_values(tmp_path, seed=20)
-    folder = begin_trial(values)
+    folder, values = begun_trial(tmp_path, seed=20)
     with following(options(), folder):
         write_trial(folder, values)
     assert not (tmp_path / "mlflow.db").exists()
@@ -66,9 +64,7 @@ def test_a_moved_runs_folder_is_mirrored_again_from_its_files(runs, tmp_path):
     shutil.copytree(runs, moved)
     values = trial_values(moved, seed=26)
     folder = TrialFolder.of(values).path
-    with pytest.raises(
-        InputError, match=r"if this runs folder was moved, remove mlflow.db and mlartifacts there"
-    ):
+    with refusal(r"if this runs folder was moved, remove mlflow.db and mlartifacts there"):
         mirror_trial(options(), folder, values)
     (moved / "mlflow.db").unlink()
     shutil.rmtree(moved / "mlartifacts")

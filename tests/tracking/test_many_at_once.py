@@ -7,15 +7,14 @@ import pytest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking import connect
 from tests.tracking.helpers import (
-    RECORDS,
     child_environment,
     found_runs,
     history,
     mirror_command,
     mirror_trial,
     options,
-    trial_values,
 )
+from tests.trials import STEPS, trial_values
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +49,7 @@ def check_jobs(client):
         seed = int(run.data.tags["seed"])
         assert run.info.status == "FINISHED"
         assert history(client, run.info.run_id, "train/loss") == [
-            (i, 1 / i) for i in range(1, RECORDS + 1)
+            (i, 1 / i) for i in range(1, STEPS + 1)
         ]
         assert {value for _, value in history(client, run.info.run_id, "train/l1")} == {float(seed)}
         assert run.data.metrics["eval/gaussians"] == 10 + seed

@@ -12,20 +12,22 @@ import pytest
 
 from gsbench.system.locks import hold
 from gsbench.tracking import Mirror, connect, ensure_experiment
+from tests.helpers import read_json, write
 from tests.processes import bytes_written
 from tests.tracking.helpers import (
     STATE,
     begin_trial,
+    begun_trial,
     child_environment,
     following,
     found_runs,
     free_port,
     options,
     run_of,
-    trial_values,
     write_trial,
 )
 from tests.tracking.servers import Listener
+from tests.trials import trial_values
 
 SECONDS = 240  # a limit for what never comes; a slow machine needs less
 
@@ -33,23 +35,20 @@ SECONDS = 240  # a limit for what never comes; a slow machine needs less
 def wait_for_run(folder):
     """Wait until the trial's folder records its run."""
     deadline = time.monotonic() + SECONDS
-    while "described" not in (
-        json.loads((folder / STATE).read_text()) if (folder / STATE).exists() else {}
-    ):
+    while "described" not in (read_json(folder / STATE) if (folder / STATE).exists() else {}):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 
 
 @pytest.mark.slow
 def test_runs_of_failed_and_stopped_trials_say_so_and_are_continued(runs):
-    values = trial_values(runs, seed=4)
-    folder = begin_trial(values)
+    folder, values = begun_trial(runs, seed=4)
     client = connect(None, runs)
     for error, status in ((KeyboardInterrupt(), "KILLED"), (RuntimeError("x"), "FAILED")):
         with pytest.raises(type(error)), following(options(), folder):  # noqa: PT012
             wait_for_run(folder)
             if status == "FAILED":  # as a trial does before its error is raised
-                (folder / "failed.json").write_text(json.dumps({"message": "x"}))
+                write(folder / "failed.json", {"message": "x"})
             raise error
         run = run_of(client, 4)
         assert run.info.status == status
@@ -70,8 +69,7 @@ def test_a_broken_tracker_harms_no_trial(uri, tmp_path, caplog):
         "no such place": "sqlite:////proc/no/such/place.db",
         "nonsense": "gopher://x",
     }[uri]
-    values = trial_values(tmp_path)
-    folder = begin_trial(values, address)
+    folder, values = begun_trial(tmp_path, uri=address)
     with following(options(address), folder):
         write_trial(folder, values)
     warnings = [
@@ -104,8 +102,7 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs):
     others = set(psutil.Process().children())
     with Mirror() as mirror:
         for seed in (9, 10, 11):
-            values = trial_values(runs, seed)
-            folder = begin_trial(values)
+            folder, values = begun_trial(runs, seed)
             mirror.follow(folder, options())
             if seed < 11:  # the last never runs
                 with hold(folder / ".lock", "a trial"):
@@ -120,8 +117,7 @@ def test_one_process_mirrors_all_trials_of_a_sweep(runs):
 @pytest.mark.slow
 def test_a_crash_of_the_mirror_is_reported_and_the_next_trial_gets_another_mirror(runs, caplog):
     for seed in (6, 7):
-        values = trial_values(runs, seed)
-        folder = begin_trial(values)
+        folder, values = begun_trial(runs, seed)
         with following(options(), folder):
             write_trial(folder, values)
             if seed == 6:
@@ -139,8 +135,7 @@ def test_a_crash_of_the_mirror_is_reported_and_the_next_trial_gets_another_mirro
 @pytest.mark.slow
 def test_the_trials_process_loads_no_mlflow(runs):
     """So MLflow cannot crash the process, and takes no memory beside a training."""
-    values = trial_values(runs, seed=8)
-    folder = begin_trial(values)
+    folder, _ = begun_trial(runs, seed=8)
     code = (
         "import json, sys\nfrom pathlib import Path\nfrom gsbench.tracking import Mirror\noptions, "
         "folder = json.loads(sys.argv[1])\nwith Mirror() as mirror: mirror.follow(Path(folder), "

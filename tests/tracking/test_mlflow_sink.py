@@ -17,6 +17,7 @@ from gsbench.tracking.mlflow_sink import (
 )
 from gsbench.tracking.sinks import Run
 from gsbench.tracking.trial import Picture, Scalar
+from tests.helpers import refusal
 
 PICTURE = Picture("view", np.zeros((2, 3, 3), np.uint8), 30, 2.5)
 
@@ -79,7 +80,7 @@ def test_artifacts_of_the_own_database_stay_in_the_runs_folder(tmp_path):
     (tmp_path / "mlartifacts").mkdir()
     (tmp_path / "mlartifacts" / "link").symlink_to("/tmp")
     for place in (tmp_path / "elsewhere", inside / ".." / ".." / "..", Path("/tmp")):
-        with pytest.raises(InputError, match="would send artifacts to "):
+        with refusal("would send artifacts to "):
             require_own_artifacts(own, f"file://{place}", tmp_path)
     with pytest.raises(InputError):
         require_own_artifacts(own, f"file://{inside.parents[1]}/link/a", tmp_path)

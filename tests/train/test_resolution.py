@@ -104,8 +104,7 @@ def test_pictures_of_several_shapes_and_without_content_have_a_schedule():
     black = scale_schedule([*mixed, np.zeros((8, 8, 3), np.uint8)], 500)
     assert {black.at(step) for step in range(501)} == {1}
     # a constant picture has energy only at frequency zero, which is in every window
-    grey = scale_schedule([np.full((8, 8, 3), 99, np.uint8)], 500)
-    assert grey.at(500) == 1
+    assert scale_schedule([np.full((8, 8, 3), 99, np.uint8)], 500).at(500) == 1
 
 
 def weights(size, smaller):
@@ -244,8 +243,7 @@ def test_masks_are_as_small_as_their_pictures(lab):
             small(), resolution_schedule="pictures", iterations=30, position_steps=30, **SHORT
         )
         training.resolution.schedule = ScaleSchedule((0, 100), (2.0, 1.0))
-        mask = training.scaled_views.at(2)[1].mask(0)
-        assert mask.shape == (16, 20, 1)
+        assert training.scaled_views.at(2)[1].mask(0).shape == (16, 20, 1)
         (lab.folder / str(value)).mkdir()
         trained.append(training.run(lab.folder / str(value)))
     assert same(*trained)

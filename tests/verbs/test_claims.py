@@ -4,24 +4,22 @@ import json
 import re
 from shlex import split
 
-import numpy as np
 import pytest
 
 from gsbench.verbs import claims
 from gsbench.verbs.claims import plan
-from tests.analysis.synthetic import Plan, write_runs, write_trial
-from tests.finished import write_results
-from tests.helpers import refusal
+from tests.helpers import change_json, refusal
+from tests.trials import write_results, write_runs, write_trial
 
 
 @pytest.fixture
 def pilots(tmp_path):
     """The runs folder of three experiments: on three scenes, on one, and with a single arm."""
-    write_runs(tmp_path, Plan(scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2))
-    write_runs(tmp_path, Plan(experiment="one", scenes=("a",), trial_noise=0.3))
-    write_runs(tmp_path, Plan(experiment="alone", densifiers=("adc",)))
+    write_runs(tmp_path, scenes=("a", "b", "c"), trial_noise=0.3, effect_noise=0.2)
+    write_runs(tmp_path, experiment="one", scenes=("a",), trial_noise=0.3)
+    write_runs(tmp_path, experiment="alone", densifiers=("adc",))
     for densify, seeds in (("adc", (0, 1)), ("volumetric", (2, 3))):
-        write_runs(tmp_path, Plan(experiment="apart", densifiers=(densify,), seeds=seeds))
+        write_runs(tmp_path, experiment="apart", densifiers=(densify,), seeds=seeds)
     return tmp_path
 
 
@@ -49,14 +47,11 @@ def test_arms_that_cannot_be_planned_for_are_named_beside_the_others(pilots, cap
     """One is equal to the baseline, another has one seed."""
     (pilots / "one").rename(pilots / "some")
     for path in (pilots / "some").glob("*/*/*/results.json"):
-        data = json.loads(path.read_text()) | {"experiment": "some"}
-        path.write_text(json.dumps(data))
-        for arm in ("same", "short"):
-            changed = {"densify": arm}
-            if arm == "same" and data["densify"] == "adc":
-                write_trial(pilots, data | changed, {"psnr": np.full(2, data["metrics"]["psnr"])})
-            if arm == "short" and data["densify"] != "adc" and data["seed"] == 0:
-                write_trial(pilots, data | changed, {"psnr": np.full(2, data["metrics"]["psnr"])})
+        data = change_json(path, experiment="some")
+        arm = "same" if data["densify"] == "adc" else "short"
+        if arm == "same" or data["seed"] == 0:
+            place = {"experiment": "some", "scene": data["scene"], "densify": arm}
+            write_trial(pilots, data["seed"], **place, psnr=data["metrics"]["psnr"])
     assert plan(["some"], pilots) == 0
     out = capsys.readouterr().out
     assert "sfm-adc and sfm-same: differences in PSNR (dB) do not vary between seeds" in out

@@ -18,7 +18,7 @@ from gsbench.runs.ledger import Ended, Promoted, Started, read_ledger
 from gsbench.verbs import ledger as verb
 from tests.composed import composed
 from tests.conftest import script
-from tests.finished import write_results
+from tests.trials import write_results
 
 SETTINGS = split("scene=courtyard init=random densify=adc tracking=none eval.lpips=[]")
 NEW = [*split("new night --metric psnr --least 0.5"), *SETTINGS, "seed=0,1,2,3"]
@@ -59,10 +59,8 @@ class Trainings:
 
 
 @pytest.fixture
-def trainings(monkeypatch, tmp_path):
+def trainings(monkeypatch, runs):
     made = Trainings()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("GSBENCH_RUNS", str(tmp_path / "runs"))
     monkeypatch.setattr(verb, "compose_trials", composed)
     monkeypatch.setattr(verb, "run_trials", made)
     # The new seeds follow from all lines before, so from their times.
@@ -84,6 +82,12 @@ def home(trainings, tmp_path):
 
 def attempt(*words):
     return run(["ledger", "try", "night", *words])
+
+
+@pytest.fixture
+def not_tried(refused):
+    """A function that tries an idea, which must be refused, and returns the error's line."""
+    return lambda *words: refused("ledger try night", *words)
 
 
 def entries(home, kind):
@@ -208,11 +212,10 @@ def test_an_idea_may_be_tried_again_if_its_baseline_fails(home, trainings):
     assert entries(home, Ended)[0].result == "failed"
 
 
-def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, capsys):
+def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, not_tried):
     run(["ledger", *NEW, "--ideas", "1"])
     assert attempt(f"{SPLIT}=0.04") == 1
-    assert attempt(f"{SPLIT}=0.02") == 2
-    assert "all 1 planned ideas were tried" in capsys.readouterr().err
+    assert "all 1 planned ideas were tried" in not_tried(f"{SPLIT}=0.02")
     assert attempt(f"{SPLIT}=0.04") == 1  # it is only shown
 
 
@@ -232,10 +235,9 @@ def test_after_all_planned_ideas_no_further_idea_is_tried(trainings, capsys):
         (["densify=nothing_like_it"], "nothing_like_it"),
     ],
 )
-def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, reason, capsys):
+def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, reason, not_tried):
     before = (home / LEDGER).read_bytes()
-    assert attempt(*words) == 2
-    assert reason in capsys.readouterr().err
+    assert reason in not_tried(*words)
     assert (home / LEDGER).read_bytes() == before
 
 
@@ -264,26 +266,25 @@ def test_a_ledger_is_declared_once(home, trainings, refused):
     assert "has no ledger" in refused("ledger", "show", "other")
 
 
-def test_trials_that_the_ledger_does_not_know_are_refused(home, capsys):
+def test_trials_that_the_ledger_does_not_know_are_refused(home, not_tried):
     attempt(f"{SPLIT}=0.02")
     whole = (home / LEDGER).read_text().splitlines(keepends=True)
     (home / LEDGER).write_text(whole[0])  # the end is cut off
-    assert attempt(f"{SPLIT}=0.03") == 2
-    assert "the ledger does not know 1 configuration with trials" in capsys.readouterr().err
+    line = not_tried(f"{SPLIT}=0.03")
+    assert "the ledger does not know 1 configuration with trials" in line
 
 
-def test_edited_code_of_the_baseline_is_noticed(home, monkeypatch, capsys):
+def test_edited_code_of_the_baseline_is_noticed(home, monkeypatch, not_tried):
     monkeypatch.setattr("gsbench.runs.trial_folder.config_hash", lambda values: "f" * 64)
-    assert attempt(f"{SPLIT}=0.02") == 2
-    assert "the code of baseline have changed" in capsys.readouterr().err
+    assert "the code of baseline have changed" in not_tried(f"{SPLIT}=0.02")
 
 
-def test_a_ledger_cannot_allow_code_to_run(home, tmp_path, capsys):
+def test_a_ledger_cannot_allow_code_to_run(home, tmp_path, not_tried):
     (tmp_path / "mine.py").write_text("from gsbench.densify import ADC\nclass Mine(ADC): pass\n")
     own = split("densify._target_=mine.Mine densify.name=mine allow_targets=[mine]")
     assert attempt(*own, f"{SPLIT}=0.02") == 0
-    assert attempt(f"{SPLIT}=0.03", "--against", "mine") == 2
-    assert "mine runs code of yours: add allow_targets=[mine]" in capsys.readouterr().err
+    line = not_tried(f"{SPLIT}=0.03", "--against", "mine")
+    assert "mine runs code of yours: add allow_targets=[mine]" in line
     assert attempt(f"{SPLIT}=0.03", "--against", "mine", "allow_targets=[mine]") == 0
 
 
@@ -324,21 +325,16 @@ def test_a_kill_between_any_two_lines_changes_nothing(home, monkeypatch):
 # ---- confirmation
 
 
-def confirm(*words):
-    return run(["ledger", "confirm", "night", *words])
-
-
+CONFIRM = "ledger confirm night"
 PARK = split("scene=photos scene.path=/captures/park seed=5,6,7")
 
 
-def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, trainings, capsys):
+def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, trainings, said):
     for size in (0.02, 0.04, 0.03):
         attempt(f"{SPLIT}={size}")
     trainings.effects[0.03] = 0.0  # its gain was luck
     trainings.noise = 0.01
-    capsys.readouterr()
-    assert confirm(*PARK) == 0
-    shown = capsys.readouterr().out
+    shown = said(CONFIRM, *PARK)
     assert "Confirmation on park with 3 seeds" in shown
     assert re.search(r"^\| adc \| \+[23]\.\S+ \(.+\) \| kept \|$", shown, re.MULTILINE)
     assert re.search(r"^\| adc-3 \| .+ \| dropped \|$", shown, re.MULTILINE)
@@ -347,7 +343,7 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, traini
     assert results.results == {"adc": "kept", "adc-3": "dropped"}
     assert results.differences["adc"].mean == pytest.approx(3, abs=0.1)
     count = len(trainings.trained)
-    assert confirm(*PARK) == 0  # shown again
+    said(CONFIRM, *PARK)  # shown again
     assert len(trainings.trained) == count
 
 
@@ -359,27 +355,24 @@ def test_kept_ideas_are_confirmed_on_captures_that_no_idea_has_seen(home, traini
         ([*PARK, "--only", "adc-2"], "kept were adc"),
     ],
 )
-def test_a_confirmation_that_confirms_nothing_is_refused(home, words, reason, capsys):
+def test_a_confirmation_that_confirms_nothing_is_refused(home, words, reason, refused):
     attempt(f"{SPLIT}=0.02")
     attempt(f"{SPLIT}=0.04")
-    assert confirm(*words) == 2
-    assert reason in capsys.readouterr().err
+    assert reason in refused(CONFIRM, *words)
 
 
-def test_a_copy_of_a_capture_under_another_name_is_not_fresh(home, trainings, capsys):
+def test_a_copy_of_a_capture_under_another_name_is_not_fresh(home, trainings, refused):
     attempt(f"{SPLIT}=0.02")
     trainings.data = "courtyard"  # the same photographs
     before = len(trainings.trained)
-    assert confirm(*PARK) == 2
-    assert "park was seen by the ideas" in capsys.readouterr().err
+    assert "park was seen by the ideas" in refused(CONFIRM, *PARK)
     assert len(trainings.trained) == before + 1  # one training showed it
 
 
-def test_a_second_confirmation_needs_other_captures(home, capsys):
+def test_a_second_confirmation_needs_other_captures(home, said, refused):
     attempt(f"{SPLIT}=0.02")
-    assert confirm(*PARK) == 0
-    assert confirm(*PARK[:2], "seed=8,9") == 2
-    assert "by an earlier confirmation" in capsys.readouterr().err
+    said(CONFIRM, *PARK)
+    assert "by an earlier confirmation" in refused(CONFIRM, *PARK[:2], "seed=8,9")
 
 
 # ---- the report, the archive, and the simulated rule
@@ -417,9 +410,8 @@ def test_an_archived_ledger_names_no_folder_and_no_server(home, trainings, tmp_p
     assert "tracking=none" not in shared.opened.words
 
 
-def test_show_prints_all_for_programs(home, capsys, said):
+def test_show_prints_all_for_programs(home, said):
     attempt(f"{SPLIT}=0.02")
-    capsys.readouterr()
     shown = json.loads(said("ledger show night --json"))
     assert [one["result"] for one in shown["ideas"]] == ["kept"]
     assert (shown["tried"], shown["planned"], shown["kept"]) == (1, 40, ["adc"])

@@ -10,30 +10,25 @@ import pytest
 from gsbench.runs.freshness import Change
 from gsbench.runs.package_code import AS_RELEASED
 from gsbench.verbs.results import _origin, explain, explain_cell, report, tables
-from tests.analysis.synthetic import Plan, write_runs
 from tests.helpers import refusal
+from tests.trials import write_runs
 
 
 def test_a_cell_names_its_trials_hashes_and_versions(tmp_path, capsys):
-    paths = write_runs(tmp_path, Plan(experiment="table1", inits=("dim",), scenes=("garden",)))
+    paths = write_runs(tmp_path, experiment="table1", inits=("dim",), scenes=("garden",))
     assert explain(["table1:garden:lpips:volumetric"], tmp_path) == 0
     text = capsys.readouterr().out
     for path in paths:
         assert (str(path) in text) == ("volumetric" in str(path))
     for expected in (
-        "LPIPS VGG raw of dim-volumetric on garden",
-        "over 3 of 3 trials",
-        "data-garden",
-        "torch 2.13.0",
-        "protocol: paper-1",
-        "resolution: 400x300",
-        "iterations: 2000",
+        *("LPIPS VGG raw of dim-volumetric on garden", "over 3 of 3 trials", "data-garden"),
+        *("torch 2.13.0", "protocol: paper-1", "resolution: 400x300", "iterations: 2000"),
     ):
         assert expected in text
 
 
 def test_missing_trials_and_metrics_are_reported(tmp_path):
-    paths = write_runs(tmp_path, Plan(scenes=("garden",), densifiers=("adc", "adc_2")))
+    paths = write_runs(tmp_path, scenes=("garden",), densifiers=("adc", "adc_2"))
     (paths[0] / "results.json").unlink()
     (paths[-1] / "results.json").unlink()  # of another arm, whose name has the arm's
     text = explain_cell("exp:garden:psnr:adc", tmp_path)
@@ -60,7 +55,7 @@ def test_missing_trials_and_metrics_are_reported(tmp_path):
     ],
 )
 def test_bad_addresses_are_explained(tmp_path, address, words):
-    write_runs(tmp_path, Plan(scenes=("garden",), inits=("sfm", "dim")))
+    write_runs(tmp_path, scenes=("garden",), inits=("sfm", "dim"))
     with refusal(words):
         explain_cell(address, tmp_path)
 
@@ -71,8 +66,8 @@ def test_bad_addresses_are_explained(tmp_path, address, words):
 @pytest.fixture
 def made(tmp_path, monkeypatch):
     """The runs folder of an experiment with two arms on one scene, and of one with a single arm."""
-    write_runs(tmp_path / "runs", Plan(scenes=("garden",)))
-    write_runs(tmp_path / "runs", Plan(experiment="alone", densifiers=("adc",)))
+    write_runs(tmp_path / "runs", scenes=("garden",))
+    write_runs(tmp_path / "runs", experiment="alone", densifiers=("adc",))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "runs"
 
@@ -140,7 +135,7 @@ def test_a_field_is_a_row_or_a_column(made):
 def test_the_papers_contradictions_are_listed_unless_an_experiment_has_their_name(made, capsys):
     assert tables(["paper"], made) == 0
     assert all(line.startswith("- ") for line in capsys.readouterr().out.splitlines())
-    write_runs(made, Plan(experiment="paper", scenes=("garden",)))
+    write_runs(made, experiment="paper", scenes=("garden",))
     tables(["paper"], made)
     assert capsys.readouterr().out.startswith("### Experiment paper")
 
@@ -185,24 +180,14 @@ def test_a_report_compares_with_a_densifier_of_the_experiment(made, capsys):
 
 def test_an_origin_names_program_machine_and_code():
     record = SimpleNamespace(
-        num_gaussians=12345,
-        num_init_points=None,
-        test_views=7,
-        hashes={"data": "d", "train": "t"},
-        trained_by=None,
+        **{"num_gaussians": 12345, "num_init_points": None, "test_views": 7, "trained_by": None},
+        **{"hashes": {"data": "d", "train": "t"}, "versions": {"torch": "2.13.0"}},
         renders={"folder": "r"},
         code=SimpleNamespace(commit="", edited=False, rooms={"init": AS_RELEASED}),
-        versions={"torch": "2.13.0"},
     )
     trial = SimpleNamespace(
-        record=record,
-        path=Path("runs/x"),
-        from_renders=False,
-        program=None,
-        conditions={"data": 1},
-        machine="",
-        code_texts=[],
-        edits=[],
+        **{"record": record, "path": Path("runs/x"), "from_renders": False, "program": None},
+        **{"conditions": {"data": 1}, "machine": "", "code_texts": [], "edits": []},
     )
     own = {"folder": "runs/x", "Gaussians": "12,345 from 0 points", "views": "7 for testing"}
     assert _origin(trial) == own | {"train": "t", "versions": "torch 2.13.0"}
@@ -229,7 +214,7 @@ def test_an_origin_names_program_machine_and_code():
 
 
 def test_a_report_of_some_trials_keeps_the_verdicts_of_all(tmp_path, capsys):
-    write_runs(tmp_path, Plan(scenes=("garden", "room"), densifiers=("adc", "mcmc", "volumetric")))
+    write_runs(tmp_path, scenes=("garden", "room"), densifiers=("adc", "mcmc", "volumetric"))
     assert report(["exp"], tmp_path) == 0
     whole = (tmp_path / "exp" / "report.html").read_text()
     assert report(split("exp --where scene=garden --where densify=adc,mcmc"), tmp_path) == 0

@@ -5,16 +5,15 @@ from pathlib import Path
 from shlex import split
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from gsbench.claims.gate import PASSED, WORSE, declare_gate, first_worse, most_steps
 from gsbench.errors import TrainingError
 from gsbench.verbs import versions
 from gsbench.verbs.versions import CommitSearch
-from tests.analysis.synthetic import Plan, trial_data, write_trial
 from tests.composed import composed
 from tests.helpers import refusal, write
+from tests.trials import write_trial
 
 COMMITS = [
     (letter * 40, f"2026-01-0{day}", f"change {letter}") for day, letter in enumerate("abc", 1)
@@ -43,9 +42,8 @@ class Trainings:
         assert command[-4:-2] == ["-m", "scene=courtyard"]
         assert log == Path(environment["GSBENCH_RUNS"], name, "bisect.log")
         for seed in map(int, seeds.split(",")):
-            views = {"psnr": QUALITY[commit] + 0.001 * seed + np.zeros(3)}
-            data = trial_data(Plan(experiment=name), "courtyard", "sfm", "adc", seed, views)
-            write_trial(Path(environment["GSBENCH_RUNS"]), data, views)
+            psnr = QUALITY[commit] + 0.001 * seed
+            write_trial(log.parents[1], seed, experiment=name, scene="courtyard", psnr=psnr)
 
 
 def begun(tmp_path, monkeypatch, trainings):

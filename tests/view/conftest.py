@@ -10,8 +10,8 @@ from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
 from gsbench.scene.colmap import write_model
 from gsbench.scene.types import Camera
-from tests.analysis.synthetic import Plan, write_runs
 from tests.gaussians.helpers import random_gaussians
+from tests.trials import write_runs
 
 VIEWS = {"view000.png": (64, 48), "view001.png": (48, 64)}  # width, height of their photographs
 POINTS = np.array([[0, 0, z] for z in (-3.0, 0.1, 4, 5, 8)])  # two are not before the cameras
@@ -33,8 +33,8 @@ def small_runs(tmp_path_factory):
     inputs = {"scene": "courtyard", "init": "random"}
     model = Step(INIT, inputs, lambda folder: write_model(folder / "sparse/0", cameras, cloud))
     Store(runs / "store").get(model)
-    plan = Plan("small", ["courtyard"], ["random"], seeds=[0, 1], views=len(VIEWS))
-    for seed, trial in enumerate(write_runs(runs, plan)):
+    plan = {"experiment": "small", "scenes": ["courtyard"], "inits": ["random"], "seeds": [0, 1]}
+    for seed, trial in enumerate(write_runs(runs, **plan, views=len(VIEWS))):
         gaussians = random_gaussians(40, seed, torch.float32, log_scale=(-4.0, -2.2))
         write_ply(gaussians, trial / "point_cloud.ply")
         causes = np.arange(50, dtype=np.uint8) % 6  # ten Gaussians were pruned
@@ -43,5 +43,6 @@ def small_runs(tmp_path_factory):
         for name, (width, height) in VIEWS.items():
             noise = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
             Image.fromarray(noise).save(trial / "ground_truth" / name)
-    write_runs(runs, Plan("small", ["garden"], ["random", "sfm"], ["adc"], [0]))
+    more = {"scenes": ["garden"], "inits": ["random", "sfm"], "densifiers": ["adc"], "seeds": [0]}
+    write_runs(runs, **plan | more)
     return runs

@@ -79,8 +79,7 @@ def test_two_trials_and_their_photograph_share_one_camera(viewer, painters, monk
     panes = [view.image, *(painter.draw(view.camera, Layers()) for painter in painters)]
     for place, pane in enumerate(panes):
         # below the label, right of the dividing line
-        shown = picture[20:, place * width + 2 : (place + 1) * width]
-        assert_array_equal(shown, pane[20:, 2:])
+        assert_array_equal(picture[20:, place * width + 2 : (place + 1) * width], pane[20:, 2:])
     monkeypatch.setattr(server, "side_by_side", dict)
     labels = [f"courtyard random-{name} seed 0: 40 Gaussians" for name in ("adc", "volumetric")]
     assert list(viewer.draw(view.camera, Layers(), None)) == labels
@@ -89,8 +88,7 @@ def test_two_trials_and_their_photograph_share_one_camera(viewer, painters, monk
 
 def test_controls_choose_what_is_drawn_and_wake_the_pages(viewer):
     woken = []
-    page = SimpleNamespace(wake=lambda: woken.append(1), stop=lambda: None)
-    viewer._sessions[7] = page
+    viewer._sessions[7] = SimpleNamespace(wake=lambda: woken.append(1), stop=lambda: None)
     first, second = viewer.views.values()
     assert viewer.layers() == Layers(3, 100.0, False, -1.523, False)
     assert (viewer.resting_height, viewer.photograph()) == (540, first)

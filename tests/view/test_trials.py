@@ -112,8 +112,7 @@ def test_page_camera_projects_as_the_page_does():
 
 @pytest.mark.parametrize("aspect", [0.4, 1.0, 3.0])
 def test_fitting_field_of_view_shows_the_whole_picture_and_no_more(aspect):
-    view = make_view()
-    fov = fitting_fov(view.camera, aspect)
+    fov = fitting_fov(make_view().camera, aspect)
     pane = page_camera(np.array([1.0, 0, 0, 0]), np.zeros(3), fov, aspect, 1000, 1)
     shown = []
     for u, v in ((0, 0), (80, 0), (80, 60), (0, 60)):
@@ -131,8 +130,7 @@ def test_page_stands_upright_where_the_photograph_was_taken(roll):
     turn = Rotation.from_euler("YXZ", [0.7, -0.5, roll]).as_matrix()
     camera = Camera(80, 60, 70.0, 70.0, 40.0, 30.0, turn.T, np.zeros(3))
     up = level_up(camera, np.array([0.0, -1.0, 0.0]))
-    forward = camera.rotation[2]
-    right = np.cross(forward, up)
+    right = np.cross(camera.rotation[2], up)
     assert_allclose(right / np.linalg.norm(right), camera.rotation[0], atol=1e-12)
     assert np.linalg.norm(up) == pytest.approx(1)
     if roll == 0:
@@ -150,8 +148,7 @@ def test_a_page_turns_around_the_middle_of_the_cameras_and_their_mean_direction(
     assert_allclose(mean_up(views), [0, -1, 0])
     assert orbit_distance(views) == pytest.approx(10 / 3)
     assert orbit_distance(views[:1]) == 1e-3
-    camera = views[0].camera
-    opposite = replace(views[0], camera=replace(camera, rotation=np.diag([-1.0, -1, 1])))
+    opposite = replace(views[0], camera=replace(views[0].camera, rotation=np.diag([-1.0, -1, 1])))
     assert_array_equal(mean_up([views[0], opposite]), [0, 0, 1])
 
 
@@ -210,8 +207,7 @@ def test_layers_choose_what_is_drawn():
     counts = shown.counts_above(0.05)
     assert (counts[Cause.CLONE], counts[Cause.SPLIT_VOLUME], sum(counts.values())) == (4, 5, 9)
     plain = shown.draw(camera, Layers()).astype(float)
-    none_large = shown.draw(camera, Layers(causes=True, log10_volume=99.0))
-    assert_array_equal(none_large, plain)
+    assert_array_equal(shown.draw(camera, Layers(causes=True, log10_volume=99.0)), plain)
     marked = shown.draw(camera, Layers(causes=True, log10_volume=0.05)).astype(float)
     with torch.no_grad():
         large = gaussians.select(torch.arange(31, 40))
@@ -253,16 +249,14 @@ def test_a_trial_is_loaded_with_all_that_is_drawn(small_runs):
     volumes = 4 / 3 * np.pi * viewed.gaussians.scales.double().prod(-1).numpy()
     assert_allclose(10**viewed.log10_volumes, volumes, rtol=1e-5)
     assert_array_equal(viewed.cloud.points, POINTS)
-    own = 2 * (viewed.gaussians.means - torch.tensor([1.0, 2, 3]))
-    assert_close(there.gaussians.means, own)
+    assert_close(there.gaussians.means, 2 * (viewed.gaussians.means - torch.tensor([1.0, 2, 3])))
     first, second = viewed.views
     camera = first.camera  # of a photograph of half the model's size
     assert (first.name, camera.width, camera.height) == ("view000.png", 64, 48)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 55, 33.5, 23)
     assert_allclose(second.camera.center, [2, 2, 0])
     folder = model_folder(trial)
-    centred = configured(trial, scene__principal_point="centred")
-    camera = read_test_views(centred, folder)[1].camera
+    camera = read_test_views(configured(trial, scene__principal_point="centred"), folder)[1].camera
     assert (camera.cx, camera.cy) == (24, 32)
 
 
@@ -285,8 +279,7 @@ def test_addresses_name_a_trial_by_its_arm_seed_or_folder(small_runs, tmp_path):
         with refusal(words):
             find_trial(address, small_runs)
     copy = Path(shutil.copytree(small_runs, tmp_path / "runs")) / first.path.relative_to(small_runs)
-    results = read_json(copy / "results.json")
-    write(copy / "results.json", results | {"status": "running"})
+    write(copy / "results.json", read_json(copy / "results.json") | {"status": "running"})
     with refusal("is not a complete trial"):
         find_trial(str(copy), tmp_path / "runs")
 

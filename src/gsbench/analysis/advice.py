@@ -17,7 +17,7 @@ from gsbench.runs.layout import PLAN
 DIGITS = 3  # significant digits of a number of Gaussians
 LOOKS = "launch.stop_when_decided"  # needs both arms in one command
 REPLACED = ("name", "densify.cap", "densify.max_gaussians")  # words that the advice gives itself
-# the record of ``--config-dir``
+# the word that records ``--config-dir``
 OF_CONFIG_DIR = re.compile(r"hydra\.searchpath=\['file://([\w./-]+)'\]")
 
 Words = dict[str, list[str]]  # the values of each key of a command, in order

@@ -14,7 +14,8 @@ from gsbench.analysis.results import TrialPair, TrialResult
 from gsbench.errors import InputError
 from gsbench.parsing import Number, Record, read_if_sound
 from gsbench.runs.layout import FROM_PIXELS, GROUND_TRUTH, MASKS, RENDERS
-from gsbench.scene.images import read_image, read_mask
+from gsbench.scene.images import read_image
+from gsbench.scene.masks import read_mask
 
 TEXTURE_SIGMA = 2.0  # px: the Gaussian over which the squared gradient is averaged
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
@@ -47,7 +48,6 @@ def absolute_error(render: Pixels, truth: Pixels) -> Array:
     return np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1)
 
 
-@dataclass(frozen=True, kw_only=True)
 class PixelMeasures(Record):
     """Measures of a trial's pictures, which an archive stores in place of the pictures."""
 

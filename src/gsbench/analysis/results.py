@@ -49,8 +49,8 @@ class Experiment:
 
     ``older`` are trials of earlier code that `newest_code` left out, of which ``versions`` has a
     line for each part of the code, and those that were forgotten (``status --forget-superseded``).
-    ``lacking`` are the folders of trials without a usable result: they failed, were stopped, or are
-    damaged.
+    ``lacking`` are the folders of trials without a usable result: they failed, were stopped, or
+    are damaged.
     """
 
     name: str

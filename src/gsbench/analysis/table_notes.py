@@ -13,8 +13,8 @@ from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, TwinViews
 from gsbench.words import counted
 
 LEARNT_NOTHING = "(!)"  # marks means over a trial that is not better than one colour
-# notes on arms that gsbench did not train: trained here by another program (or elsewhere), and
-# what was measured
+# notes on arms that gsbench did not train: whether another program trained them here, and the
+# source of their metrics
 ORIGINS = {
     (True, FROM_MODEL): "program's model",
     (True, FROM_RENDERS): "program's renders",

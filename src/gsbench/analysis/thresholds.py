@@ -6,7 +6,7 @@ where ``normal`` is the threshold of the normal distribution. The part f in 0..1
 numbers of scenes and seeds, on the level, and on how ``even`` the shares are: log(1 / largest
 share) / log(scenes), 0 if one scene has all variance and 1 if all have the same.
 `scripts/regions.py` chose f for the greatest power among all f that keep the level for every ratio
-of noise (docs/verdict.md, "How large a difference must be"); it is tabulated in ``thresholds.npz``.
+of noise (findings/simulations.md, "Thresholds"); it is tabulated in ``thresholds.npz``.
 """
 
 from dataclasses import dataclass

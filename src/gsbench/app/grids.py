@@ -55,7 +55,7 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
     jobs: list[list[str]] = []
     # for each job, the settings that are searched for its arm
     intervals: list[dict[str, Override]] = []
-    for grid_words in words_of_grids(params, grids, sweep.own_words):
+    for grid_words in words_of_grids(params, grids, sweep.task_words):
         own = {bare_key(word.get_key_element()): word for word in sweep.parse(grid_words)}.values()
         points = grid_points([word for word in own if not is_interval(word)])
         jobs += points
@@ -65,7 +65,9 @@ def planned_trials(sweep: Sweep, run: Run | None) -> tuple[list[Trial], bool]:
         jobs, are_known = tuned_jobs(sweep, tune or {}, jobs, intervals, run)
         trials = sweep.composer.trials(jobs)
     except InputError as error:
-        typed = {bare_key(one.get_key_element()): one for one in sweep.parse(sweep.own_words)}
+        # A setting that only some of the listed choices have is the usual cause, and grids are its
+        # remedy: the message writes them out.
+        typed = {bare_key(word.get_key_element()): word for word in sweep.parse(sweep.task_words)}
         if grids or not (advice := _advise_grids(sweep, typed)):
             raise
         raise InputError(advice) from error

@@ -41,8 +41,8 @@ from gsbench.config.command_words import (
     grid_points,
     is_sweep,
     key_of,
-    own_words,
     parse_word,
+    task_words,
 )
 from gsbench.config.compose import (
     Trial,
@@ -191,7 +191,7 @@ class TrialTask:
     def _launch(self, trials: Sequence[Trial], launcher: Launcher, name: str) -> None:
         """Run trials by another launcher than gsbench's; all are checked before the first."""
         begin_for_another_launcher(trials)
-        jobs = [own_words(trial.overrides) for trial in trials]
+        jobs = [task_words(trial.overrides) for trial in trials]
         try:
             returned = launcher.launch(jobs, initial_job_idx=len(self.ended.trials))
         except GsbenchError:
@@ -221,7 +221,7 @@ class TrialTask:
             own = list(itertools.islice(rest, len(seeds)))
             ended = JobReturn(overrides=job, status=JobStatus.COMPLETED)
             try:
-                ended.return_value = self._report(own, [by_folder[one.folder] for one in own])
+                ended.return_value = self._report(own, [by_folder[trial.folder] for trial in own])
             except GsbenchError as error:
                 ended.return_value, ended.status = error, JobStatus.FAILED
             returned.append(ended)
@@ -297,7 +297,7 @@ def best_line(trials: Sequence[Trial], objective: Objective) -> str:
 
     It is "" if no job has all of its values.
     """
-    by_job = group_by(trials, lambda trial: _job_words(trial, without="seed"))
+    by_job = group_by(trials, _words_without_seed)
     values: dict[tuple[str, ...], float] = {}
     for words, own in by_job.items():
         with suppress(GsbenchError):  # a job that failed has no value
@@ -309,17 +309,18 @@ def best_line(trials: Sequence[Trial], objective: Objective) -> str:
     swept = [word for word in best if not all(word in words for words in by_job)]
     seeds = dict.fromkeys(str(trial.values["seed"]) for trial in by_job[best])
     command = [*best, f"seed={','.join(seeds)}"]
+    if len(seeds) > 1:
+        command.insert(0, "-m")
     return (
         f"best: {' '.join(swept) or 'the only job'}, {metric} "
         f"{values[best] * direction * objective.sign:.4g} of test views "
-        f"({counted(len(seeds), 'seed')}); again: gsbench "
-        f"{'-m ' * (len(seeds) > 1)}{shlex.join(command)}"
+        f"({counted(len(seeds), 'seed')}); again: gsbench {shlex.join(command)}"
     )
 
 
-def _job_words(trial: Trial, without: str) -> tuple[str, ...]:
-    """The words of a trial's job without Hydra's own and without one key."""
-    return tuple(word for word in own_words(trial.overrides) if key_of(word) != without)
+def _words_without_seed(trial: Trial) -> tuple[str, ...]:
+    """The words of a trial's job without the seed and those for Hydra."""
+    return tuple(word for word in task_words(trial.overrides) if key_of(word) != "seed")
 
 
 def words_without_sweeper(sweep: Sweep) -> tuple[list[str], bool]:
@@ -356,7 +357,7 @@ def prepare_other_sweeper(sweep: Sweep) -> tuple[list[str], Objective]:
         for key, word in lists.items()
         if "." not in key and key != "seed"
     ]
-    own = own_words(single)
+    own = task_words(single)
     for number, point in enumerate(itertools.product(*choices)):
         if number == MAX_CHOICES:
             raise InputError(
@@ -380,7 +381,8 @@ def prepare_other_sweeper(sweep: Sweep) -> tuple[list[str], Objective]:
         "maximized" if sign > 0 else "minimized",
     )
     kept = [word for word in words if key_of(word) != "seed" or not is_sweep(word)]
-    kept += ["~hydra.sweeper.params.seed"] * ("seed" in params)
+    if "seed" in params:
+        kept.append("~hydra.sweeper.params.seed")
     return kept, Objective(sign, tuple(seeds))
 
 

@@ -13,7 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.claims.stopping import facts_for
-from gsbench.config.command_words import check_removal, check_words, is_sweep, own_words, parse_word
+from gsbench.config.command_words import (
+    check_removal,
+    check_words,
+    is_sweep,
+    parse_word,
+    task_words,
+)
 from gsbench.config.compose import Composer, Trial, config_loader, hydra_config, hydra_ready
 from gsbench.config.explain import explained
 from gsbench.errors import InputError
@@ -75,9 +81,9 @@ class Sweep:
         return self.composer.config
 
     @property
-    def own_words(self) -> list[str]:
+    def task_words(self) -> list[str]:
         """The words without those for Hydra."""
-        return own_words(self.words)
+        return task_words(self.words)
 
     @property
     def other_sweeper(self) -> str:

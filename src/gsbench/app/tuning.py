@@ -171,7 +171,9 @@ def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) 
     while True:
         points: list[tuple[ArmSearch, Proposal, list[list[str]]]] = []
         for search in searches:
-            points += [(search, one, search.jobs_of(one.params)) for one in search.propose()]
+            points += [
+                (search, proposal, search.jobs_of(proposal.params)) for proposal in search.propose()
+            ]
         if not points:
             break
         # Composed together, because the trials of a point share all but the seed.

@@ -159,8 +159,8 @@ def check_text(word: str) -> None:
             break
 
 
-def own_words(words: Iterable[str]) -> list[str]:
-    """The words without those for Hydra."""
+def task_words(words: Iterable[str]) -> list[str]:
+    """The words for the trials, which Hydra calls task overrides: those not for Hydra itself."""
     return [word for word in words if not parse_word(word).is_hydra_override()]
 
 

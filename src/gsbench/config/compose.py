@@ -110,7 +110,7 @@ class Composer:
         allow_modules(self.allowed, os.getcwd() if modules is None else modules)
         check_places(command_words.searched_folders(words), packages)
         single = [word for word in words if not command_words.is_sweep(word)]
-        own = command_words.own_words(single)
+        own = command_words.task_words(single)
         self.hydra_words = tuple(word for word in single if word not in own)
         self._chosen: dict[tuple[str, ...], DictConfig] = {}
         self._times: dict[str, Any] = {}  # what ${now:…} stands for, the same in all trials
@@ -165,7 +165,7 @@ class Composer:
 
     def trial(self, overrides: Sequence[str]) -> Trial:
         """The single trial of the command's words, which are its ``overrides``."""
-        words = command_words.own_words(overrides)
+        words = command_words.task_words(overrides)
         trial = self._trial(words, words) or self._trial_of_hydra(words)
         return replace(trial, overrides=tuple(overrides))
 
@@ -183,7 +183,9 @@ class Composer:
         config = self.settings(others)
         if seed is not None:
             config.seed = ANY_SEED
-        with suppress(OmegaConfBaseException):  # or it has a fault: Hydra's composition says it
+        # Reading `ANY_SEED` or the missing node raises; so does a fault, which Hydra's composition
+        # then names.
+        with suppress(OmegaConfBaseException):
             return self._checked(config, None, words, {} if seed is None else {"seed": seed})
         return None
 
@@ -216,6 +218,8 @@ class Composer:
     def _choose(self, words: Sequence[str]) -> DictConfig:
         """Hydra's composition of the choices among ``words``, checked; do not change it."""
         choices = _choices(words)
+        # A list often repeats what the files choose anyway (densify=adc,volumetric): composing
+        # takes 0.1 s, so equal choices share a composition.
         if self._are_own(choices):
             choices = self._own_choices
         key = tuple(choices.values())
@@ -377,6 +381,8 @@ def compose_one(
 
 def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
     """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
+    # Composed from these words alone: whatever else sets the address, such as a file of somebody
+    # else's, could send results and a password there.
     own = ("tracking", "hydra.searchpath")
     words = [word for word in typed if key_of(word).startswith(own)]
     with hydra_ready(), explained(words):

@@ -61,16 +61,16 @@ def explain(error: BaseException, words: Sequence[str]) -> str:
     causes = [error]
     while (cause := causes[-1].__cause__ or causes[-1].__context__) is not None:
         causes.append(cause)
-    for one in causes:
-        if isinstance(one, MissingConfigException) and one.missing_cfg_file:
-            return _missing_choice(one.missing_cfg_file, one.options or ())
-        if isinstance(one, UNKNOWN):
-            return unknown_setting(one, words)
-        if isinstance(one, MissingMandatoryValue) and one.full_key:
-            return f"{one.full_key} is not set: give it a value"
-        if isinstance(one, OmegaConfBaseException):  # its other lines say what it says itself
-            place = f"{one.full_key}: " if one.full_key else ""
-            return place + " ".join(str(one).partition("\n    ")[0].split())[:MAX_MESSAGE]
+    for cause in causes:
+        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+            return _missing_choice(cause.missing_cfg_file, cause.options or ())
+        if isinstance(cause, UNKNOWN):
+            return unknown_setting(cause, words)
+        if isinstance(cause, MissingMandatoryValue) and cause.full_key:
+            return f"{cause.full_key} is not set: give it a value"
+        if isinstance(cause, OmegaConfBaseException):  # its other lines say what it says itself
+            place = f"{cause.full_key}: " if cause.full_key else ""
+            return place + " ".join(str(cause).partition("\n    ")[0].split())[:MAX_MESSAGE]
     return " ".join(" ".join(map(str, causes)).split())[:MAX_MESSAGE]
 
 

@@ -58,16 +58,16 @@ def check_program(settings: Mapping[str, Any], allowed: Sequence[str]) -> None:
         programs.append(program_of(settings["version_command"], options, "densify.version_command"))
     programs = [program for program in dict.fromkeys(programs) if program not in allowed]
     variables = foreign_variables(settings.get("environment") or {}, allowed)
-    if not programs and not variables:
-        return
-    runs = [f"runs the program {' and '.join(map(repr, programs))}"] * bool(programs)
-    sets = ["sets " + ", ".join(f"{name}={value!r}" for name, value in variables.items())] * bool(
-        variables
-    )
-    raise InputError(
-        f"densify={settings['name']} {' and '.join(runs + sets)}; if you trust it, "
-        + permission_advice([*programs, *variables], allowed)
-    )
+    acts = []
+    if programs:
+        acts.append(f"runs the program {' and '.join(map(repr, programs))}")
+    if variables:
+        acts.append("sets " + ", ".join(f"{name}={value!r}" for name, value in variables.items()))
+    if acts:
+        raise InputError(
+            f"densify={settings['name']} {' and '.join(acts)}; if you trust it, "
+            + permission_advice([*programs, *variables], allowed)
+        )
 
 
 def foreign_variables(variables: Mapping[str, Any], allowed: Sequence[str]) -> dict[str, Any]:

@@ -301,7 +301,7 @@ def groups_keep_their_schemas(values: dict[str, Any]) -> None:
         given = values[group]
         target = given.get("_target_") or GSBENCH
         if not str(target).startswith(GSBENCH):  # keys that are no settings are its options
-            known = {one.name for one in dataclasses.fields(schema)}
+            known = {entry.name for entry in dataclasses.fields(schema)}
             given = {key: value for key, value in given.items() if key in known}
         settings = schema(**check_values(schema, given, group))
         values[group] |= plain({key: getattr(settings, key) for key in given})

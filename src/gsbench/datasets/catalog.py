@@ -76,8 +76,8 @@ def read_catalog() -> dict[str, PublicDataset]:
     datasets = {}
     for name, entry in content.items():
         archives = []
-        for one in entry.pop("archives"):
-            archives.append(Archive(one["url"], one["scenes"], one.get("size", "")))
+        for archive in entry.pop("archives"):
+            archives.append(Archive(archive["url"], archive["scenes"], archive.get("size", "")))
         datasets[name] = PublicDataset(name=name, archives=tuple(archives), **entry)
     return datasets
 

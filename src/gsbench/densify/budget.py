@@ -58,6 +58,7 @@ def find_factor(count: Callable[[float], int], target: int, low: float, high: fl
     """
     if count(low) <= target:
         return low
+    # The logarithm is halved, since factors span six orders of magnitude.
     log_low, log_high = math.log(low), math.log(high)
     for _ in range(BISECTION_STEPS):
         middle = (log_low + log_high) / 2

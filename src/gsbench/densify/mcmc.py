@@ -252,12 +252,12 @@ class MRNF(Budgeted):
         candidates = (weights > self.growth_threshold) & seen
         wanted = int(self.growth_share * int(candidates.sum()) + 0.5)
 
-        room = (self.allowance(refinement) or 0) + num_pruned
+        free = (self.allowance(refinement) or 0) + num_pruned
         opacity_scores = values.opacities.detach() * edge_factor
         replacing = draw(seen & ~pruned, opacity_scores, num_pruned, rng)
         remaining = max(0, wanted - int(replacing.sum())) if step < self.grow_until else 0
         eligible = candidates & ~pruned & ~replacing
-        allowed = min(remaining, room - int(replacing.sum()))
+        allowed = min(remaining, free - int(replacing.sum()))
         growing = draw(eligible, weights * edge_factor, allowed, rng)
         event.blocked_by_cap += max(0, min(remaining, int(eligible.sum())) - int(growing.sum()))
         event.pruned_opacity += num_pruned

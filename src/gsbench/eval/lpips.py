@@ -196,11 +196,6 @@ class Lpips:
         With a ``mask`` [H, W], each position of a layer is weighted by the share of its pixels that
         count.
         """
-        if first.shape != second.shape or first.ndim != 4 or first.shape[1] != 3:
-            raise ValueError(
-                f"lpips compares batches [B, 3, H, W], got {tuple(first.shape)} and "
-                f"{tuple(second.shape)}"
-            )
         if min(first.shape[-2:]) < self.backbone.min_size:
             raise ValueError(
                 f"lpips {self.net} needs sides of at least {self.backbone.min_size} px"

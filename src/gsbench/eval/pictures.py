@@ -9,7 +9,8 @@ from pathlib import Path, PurePosixPath
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.images import image_size, read_image, read_mask
+from gsbench.scene.images import image_size, read_image
+from gsbench.scene.masks import read_mask
 from gsbench.words import counted, some_of
 
 DIGITS = re.compile(r"\d+")

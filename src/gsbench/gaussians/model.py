@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.words import NamesAttributes
@@ -162,6 +164,6 @@ def rgb_to_dc(rgb: Tensor) -> Tensor:
     return (rgb - 0.5) / C0
 
 
-def dc_to_rgb(sh_dc: Tensor) -> Tensor:
-    """The inverse of ``rgb_to_dc``, not clamped."""
-    return sh_dc * C0 + 0.5
+def dc_to_bytes(sh_dc: Tensor) -> NDArray[np.uint8]:
+    """The colours [N, 3] from 0 to 255 that harmonics [N, 3] stand for: ``rgb_to_dc`` inverted."""
+    return ((sh_dc * C0 + 0.5).clamp(0, 1) * 255).round().byte().cpu().numpy()

@@ -32,4 +32,4 @@ class LearningRates:
 
 
 # the settings of `LearningRates` that are rates
-RATES = tuple(one.name for one in fields(LearningRates) if one.name != "position_steps")
+RATES = tuple(entry.name for entry in fields(LearningRates) if entry.name != "position_steps")

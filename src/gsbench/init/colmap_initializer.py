@@ -122,13 +122,13 @@ class ColmapInitializer(ColmapOptions):
 
 def report_unused(options: ColmapOptions) -> None:
     """Write a line on each setting for cameras to be estimated, where cameras are given."""
-    for one in fields(ColmapOptions):
-        value = getattr(options, one.name)
-        if one.name in ("camera", "camera_model", "focal_length") and value != one.default:
+    for entry in fields(ColmapOptions):
+        value = getattr(options, entry.name)
+        if entry.name in ("camera", "camera_model", "focal_length") and value != entry.default:
             logger.warning(
                 "init.%s=%s is not used, since the cameras are given: init.poses=own "
                 "init.intrinsics=estimate estimates them",
-                one.name,
+                entry.name,
                 value,
             )
 

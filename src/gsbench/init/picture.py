@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from PIL import Image, ImageDraw
 
-from gsbench.scene.colmap import model_points
+from gsbench.scene.colmap import camera_centers, model_points
 from gsbench.scene.types import Array
 
 SIDE, MARGIN = 960, 60  # px
@@ -30,7 +30,7 @@ def draw_cloud(model: pycolmap.Reconstruction, path: Path, title: str) -> None:
         chosen = np.random.default_rng(0).permutation(len(points))[:MAX_POINTS]
         points, colors = points[chosen], colors[chosen]
     images = [image for _, image in sorted(model.images.items()) if image.has_pose]
-    centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
+    centers = camera_centers(model)
     poses = [image.cam_from_world() for image in images]
     rotations = np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3)
     axes = view_from_above(centers, rotations, points)  # [3, 3]

@@ -32,7 +32,8 @@ from gsbench.init.base import (
 )
 from gsbench.init.point_files import read_points
 from gsbench.logs import Progress, no_progress
-from gsbench.scene.images import read_image, read_mask
+from gsbench.scene.images import read_image
+from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Array, Capture
 from gsbench.settings import AnyPath, check_settings
 from gsbench.system.isolate import run_with_progress
@@ -338,11 +339,11 @@ class Ply(FromFile):
     def set_points(
         self, model: pycolmap.Reconstruction, capture: Capture, output_dir: Path
     ) -> TrainingPoints | None:
-        from gsbench.gaussians.model import dc_to_rgb
+        from gsbench.gaussians.model import dc_to_bytes
         from gsbench.gaussians.ply import read_ply, write_ply
 
         gaussians = read_ply(self.file, normalization=capture.normalization)
         write_ply(gaussians, output_dir / GAUSSIANS_FILE)
-        colors = (dc_to_rgb(gaussians.sh_dc).clamp(0, 1) * 255).round().byte().numpy()  # [N, 3]
-        replace_points(model, PointCloud(gaussians.means.double().numpy(), colors))
+        cloud = PointCloud(gaussians.means.double().numpy(), dc_to_bytes(gaussians.sh_dc))
+        replace_points(model, cloud)
         return None

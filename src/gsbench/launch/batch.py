@@ -1,6 +1,5 @@
 """A batch of trials: skip finished ones, check the others before any work, and run them."""
 
-import json
 import logging
 import re
 from collections.abc import Sequence
@@ -13,8 +12,9 @@ from gsbench.config.schema import COMPONENTS
 from gsbench.errors import InputError
 from gsbench.files import FORBIDDEN, checked_runs_folder, make_runs_folder, storage_errors
 from gsbench.launch.dry_run import unavailable_now
-from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial, run_slurm
+from gsbench.launch.jobs import Outcome, outcome_of_results, run_local, run_serial
 from gsbench.launch.record import add_to_plan, declare, declared_metrics
+from gsbench.launch.slurm import run_slurm
 from gsbench.runs.freshness import Change
 from gsbench.runs.keys import STAGES
 from gsbench.runs.layout import STORE
@@ -22,7 +22,7 @@ from gsbench.runs.nested import GSBENCH
 from gsbench.runs.store import Store
 from gsbench.system.stopping import stop_on_signals
 from gsbench.tracking import Mirror
-from gsbench.tracking.mirror import make_sink
+from gsbench.tracking.tracker_run import make_sink
 
 log = logging.getLogger(__name__)
 
@@ -90,9 +90,7 @@ def _skip_finished(trials: Sequence[Trial]) -> tuple[list[Outcome], list[Trial]]
 
 
 def _why_not_done(trial: Trial) -> Change | None:
-    return trial.files.why_not_done(
-        trial.values, lambda options: unavailable_now(json.dumps(options, sort_keys=True))
-    )
+    return trial.files.why_not_done(trial.values, unavailable_now)
 
 
 # ---- checks before any trial starts: wrong options of components, missing folders and devices
@@ -101,12 +99,13 @@ def _why_not_done(trial: Trial) -> Change | None:
 def missing_folders(trials: Sequence[Trial]) -> list[str]:
     """A line for each missing folder of photographs, model or weights, and where to get them."""
     from gsbench.datasets.catalog import how_to_get
-    from gsbench.scene.readers import missing_folder, missing_model
+    from gsbench.scene.model_folders import missing_model
+    from gsbench.scene.readers import missing_folder
 
     missing: list[tuple[str, Path]] = []
     models: list[str] = []
     scenes = [trial.values["scene"] for trial in trials]
-    known = {(one["name"], one["path"], one["kind"], one.get("sparse")) for one in scenes}
+    known = {(scene["name"], scene["path"], scene["kind"], scene.get("sparse")) for scene in scenes}
     for name, path, kind, sparse in sorted(known, key=str):
         if kind == "courtyard":
             continue

@@ -131,12 +131,12 @@ def _what_is_left(trial: Trial) -> str:
     change = trial.files.why_not_done(trial.values, lambda options: ())
     if change is not None and change.kind == "computable":
         lacking, asked = change.name.split(", "), trial.values["eval"]
-        absent = unavailable_now(json.dumps(asked | {"download": False}, sort_keys=True))
+        absent = unavailable_now(asked | {"download": False})
         here = [name for name in lacking if name not in absent]
         if not here:
-            weights = [name for name in lacking if name.startswith(LPIPS)] * asked["download"]
-            missing = f"  lacks {', '.join(weights)}: its weights are not here; a run will try to "
-            return f"{missing}download them" if weights else ""
+            weights = ", ".join(name for name in lacking if name.startswith(LPIPS))
+            note = f"  lacks {weights}: its weights are not here; a run will try to download them"
+            return note if weights and asked["download"] else ""
         change = replace(change, name=", ".join(here))
     return "" if change is None else f"  will be checked: {change}"
 
@@ -171,13 +171,17 @@ def _determining(values: Mapping[str, Any], modules: Mapping[str, str]) -> dict[
     return flatten(determining_settings(values)) | code
 
 
-@cache
-def unavailable_now(options: str) -> frozenset[str]:
-    """The metrics that cannot be computed now, by the ``eval`` settings as JSON.
+def unavailable_now(options: Mapping[str, Any]) -> Collection[str]:
+    """The metrics that cannot be computed now, by the ``eval`` settings.
 
-    The cache searches for (and downloads) weights once per sweep.
+    Weights are searched for, and downloaded, once per sweep.
     """
+    return _unavailable_now(json.dumps(options, sort_keys=True))
+
+
+@cache
+def _unavailable_now(options: str) -> Collection[str]:
     from gsbench.eval.options import EvalConfig
     from gsbench.pipeline.parts import make_evaluator
 
-    return frozenset(make_evaluator(EvalConfig(**json.loads(options))).awaited)
+    return make_evaluator(EvalConfig(**json.loads(options))).awaited

@@ -1,7 +1,8 @@
-"""Running trials: one after the other in this process, in processes of this machine, or in Slurm.
+"""Running trials: one after the other in this process, or in processes of this machine.
 
-For the last two, a trial is a job of submitit, which returns the trial's outcome. Whether a trial
-is done is decided by its files alone, since a scheduler may report a process wrongly.
+There, and in Slurm (`gsbench.launch.slurm`), a trial is a job of submitit, which returns its
+outcome. Whether a trial is done is decided by its files alone, since a scheduler may report a
+process wrongly.
 """
 
 from __future__ import annotations
@@ -22,23 +23,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from gsbench.config.compose import Trial
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import DiskFullError, require_no_links
-from gsbench.launch.states import (
-    arm_names,
-    ask_queue,
-    current_user,
-    forget_submission,
-    label_of,
-    read_queue,
-    read_submission,
-    record_submission,
-)
+from gsbench.launch.states import arm_names, forget_submission, label_of
 from gsbench.logs import set_up_logging
 from gsbench.runs.layout import JOBS, LOG
 from gsbench.runs.nested import sha256_of
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord
 from gsbench.system.isolate import error_tail
-from gsbench.system.locks import BusyError, hold
+from gsbench.system.locks import BusyError
 from gsbench.system.own_modules import adopt_modules, allowed_modules
 from gsbench.system.resources import assign_gpu, assign_threads, names_one_gpu, take_slot
 from gsbench.system.stopping import (
@@ -52,7 +44,7 @@ from gsbench.tracking import Mirror
 from gsbench.words import counted
 
 if TYPE_CHECKING:
-    from submitit import Executor, Job, SlurmExecutor
+    from submitit import Executor, Job
     from submitit.helpers import DelayedSubmission
 
 
@@ -81,13 +73,13 @@ class Outcome:
         return TrialFolder(self.folder).label
 
 
-def _say_last(outcomes: Sequence[Outcome], labels: Mapping[Path, str]) -> None:
+def say_last(outcomes: Sequence[Outcome], labels: Mapping[Path, str]) -> None:
     """Log the outcome of the trial that ended last, and how many have ended."""
     last, label = outcomes[-1], labels[outcomes[-1].folder]
     log.info("%s: %s  (%d of %d)", label, last.message, len(outcomes), len(labels))
 
 
-def _labels(trials: Sequence[Trial]) -> dict[Path, str]:
+def labels_of(trials: Sequence[Trial]) -> dict[Path, str]:
     """The names of trials in messages, with the settings that distinguish their arms."""
     names = arm_names({trial.folder: trial.overrides for trial in trials})
     return {folder: label_of(folder, names) for folder in names}
@@ -95,8 +87,7 @@ def _labels(trials: Sequence[Trial]) -> dict[Path, str]:
 
 def outcome_of_results(folder: Path, results: TrialRecord) -> Outcome:
     """The outcome of a complete trial."""
-    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
-    return Outcome(folder, "done", metrics)
+    return Outcome(folder, "done", results.metrics_line)
 
 
 def outcome_of_error(folder: Path, error: Exception) -> Outcome:
@@ -114,7 +105,7 @@ def run_serial(trials: Sequence[Trial], mirror: Mirror) -> list[Outcome]:
     """
     outcomes: list[Outcome] = []
     busy: list[Trial] = []
-    labels = _labels(trials)
+    labels = labels_of(trials)
     for number, trial in enumerate(trials, 1):
         if len(trials) > 1:
             log.info("%d of %d: %s", number, len(trials), labels[trial.folder])
@@ -265,7 +256,7 @@ def _run(
     If this process is stopped, it stops them; if it is killed, they go on.
     """
     waiting, running, outcomes = clouds_first(trials), dict[Path, "Job[Outcome]"](), list[Outcome]()
-    labels = _labels(trials)
+    labels = labels_of(trials)
     try:
         while waiting or running:
             while waiting and len(running) < parallel:
@@ -278,11 +269,12 @@ def _run(
             ended = [folder for folder, job in running.items() if job.done()]
             for folder in ended:
                 outcomes.append(collect(running.pop(folder), folder, trials))
-                _say_last(outcomes, labels)
+                say_last(outcomes, labels)
             if not ended:
                 time.sleep(SECONDS_BETWEEN_POLLS)
     except KeyboardInterrupt:
         for job in running.values():
+            # submitit's own `cancel` kills at once; its process is no public attribute
             process = getattr(job, "_process", None)
             if process is not None and process.poll() is None:
                 # submitit's controller passes it on; the trial saves a checkpoint
@@ -333,135 +325,3 @@ def job_of(trial: Trial) -> TrialJob:
     """The trial as a job with the environment of this process."""
     path = [entry for entry in sys.path if entry]
     return TrialJob(trial.values, path, allowed_modules(), os.environ.get("CUDA_VISIBLE_DEVICES"))
-
-
-# ---- tasks of a Slurm array job: submitted once, then awaited or left to Slurm
-
-# in the folder of the jobs' output, so that two commands do not submit a trial twice
-SUBMIT_LOCK = ".submit.lock"
-SECONDS_BETWEEN_QUEUE_CHECKS = 20.0
-# a job without a result is lost if it is missing in the queue so many times in a row
-CHECKS_UNTIL_LOST = 2
-
-
-def run_slurm(trials: Sequence[Trial]) -> list[Outcome]:
-    """Run the trials in Slurm; those in its queue from an earlier command are not submitted again.
-
-    Returns when all have ended; with ``launch.wait=false``, after submitting, with outcomes of
-    status "queued".
-    """
-    values = trials[0].values
-    executor = make_executor(values["launch"], new_job_folder(values))
-    folder = Path(executor.folder)
-    with hold(folder.parent / SUBMIT_LOCK, f"submitting trials of {values['name']}"):
-        jobs = _submit(trials, executor)
-    with suppress(OSError):  # nothing was submitted
-        folder.rmdir()
-    array = sorted({job.job_id.split("_")[0] for job in jobs.values()})
-    if not values["launch"].get("wait", True):
-        print(
-            f"Slurm job {', '.join(array)}: {counted(len(jobs), 'trial')}; see gsbench status "
-            f"{values['name']}"
-        )
-        return [Outcome(folder, "queued", job.job_id) for folder, job in jobs.items()]
-    log.info(
-        "%s in Slurm, job %s; logs: %s",
-        counted(len(jobs), "trial"),
-        ", ".join(array),
-        folder.parent,
-    )
-    try:
-        return _wait(jobs, trials)
-    except KeyboardInterrupt:
-        log.info(
-            "the jobs stay in Slurm: the same command waits for them again, `scancel %s` ends them",
-            " ".join(array),
-        )
-        raise
-
-
-def make_executor(launch: dict[str, Any], folder: Path) -> SlurmExecutor:
-    """The submitit executor for the settings ``launch``; raises InputError if Slurm is missing."""
-    import submitit
-
-    try:
-        slurm = submitit.SlurmExecutor(folder, max_num_timeout=launch["max_requeues"])
-    except RuntimeError:
-        raise InputError(
-            "launch=slurm: there is no srun here; start gsbench on a login node of the cluster"
-        ) from None
-    wanted = {
-        "job_name": "gsbench",
-        "partition": launch["partition"],
-        "account": launch["account"],
-        "qos": launch["qos"],
-        "time": launch["timeout_min"],
-        "cpus_per_task": launch["cpus_per_trial"],
-        "gpus_per_node": launch["gpus_per_trial"] or None,
-        "mem": None if launch["mem_gb"] is None else f"{launch['mem_gb']}GB",
-        "signal_delay_s": launch["signal_seconds"],
-        "array_parallelism": launch["parallel"],
-        "setup": launch["setup"] or None,
-        "additional_parameters": launch["sbatch"] or None,
-    }
-    slurm.update_parameters(**{key: value for key, value in wanted.items() if value is not None})
-    return slurm
-
-
-def _submit(trials: Sequence[Trial], executor: SlurmExecutor) -> dict[Path, Job[Outcome]]:
-    """The job of each trial by its folder: its job in the queue, else a task of a new array job."""
-    import submitit
-
-    folders = [trial.folder for trial in trials]
-    queue = ask_queue(folders)
-    if queue is None:
-        raise InputError(
-            "Slurm does not list its jobs (squeue failed), so nothing was submitted: try again "
-            "later"
-        )
-    jobs: dict[Path, Job[Outcome]] = {}
-    to_submit: dict[Path, Trial] = {}
-    for folder, trial in zip(folders, trials, strict=True):
-        submission = read_submission(folder)
-        if submission and submission.job in queue:
-            jobs[folder] = submitit.SlurmJob(Path(submission.log).parent, submission.job)
-        else:
-            to_submit[folder] = trial
-    if to_submit:
-        try:
-            submitted = executor.submit_array([job_of(trial) for trial in to_submit.values()])
-        except Exception as error:
-            raise InputError(
-                f"Slurm refused the job: {' '.join(str(error).split())[:300]}"
-            ) from error
-        for folder, job in zip(to_submit, submitted, strict=True):
-            record_submission(folder, job.job_id, job.paths.stderr)
-            jobs[folder] = job
-    return jobs
-
-
-def _wait(jobs: dict[Path, Job[Outcome]], trials: Sequence[Trial]) -> list[Outcome]:
-    outcomes: list[Outcome] = []
-    labels = _labels(trials)
-    submissions = filter(None, map(read_submission, jobs))
-    users = {submission.user or current_user() for submission in submissions} | {current_user()}
-    unseen = dict.fromkeys(jobs, 0)  # successive checks in which the queue did not list the job
-    checked = time.monotonic()
-    while jobs:
-        ended = [folder for folder, job in jobs.items() if job.paths.result_pickle.exists()]
-        if time.monotonic() - checked > SECONDS_BETWEEN_QUEUE_CHECKS:
-            checked = time.monotonic()
-            queue = read_queue(users)
-            if queue is not None:  # while the scheduler does not answer, no job counts as lost
-                for folder, job in jobs.items():
-                    unseen[folder] = 0 if job.job_id in queue else unseen[folder] + 1
-            lost = [folder for folder in jobs if unseen[folder] >= CHECKS_UNTIL_LOST]
-            ended += [folder for folder in lost if folder not in ended]
-        for folder in ended:
-            outcomes.append(collect(jobs.pop(folder), folder, trials))
-            with suppress(OSError):
-                forget_submission(folder)
-            _say_last(outcomes, labels)
-        if not ended:
-            time.sleep(SECONDS_BETWEEN_POLLS)
-    return outcomes

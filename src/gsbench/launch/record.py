@@ -1,8 +1,6 @@
-"""Plan and declarations, which a command writes before its trials run. Loads no torch.
+"""Adding to the plan (`gsbench.runs.plan`) and the declarations (`gsbench.runs.experiments`).
 
-``<runs>/<experiment>/plan.json`` maps the folder of every trial of all commands to the overrides
-that describe it, so that missing trials can be listed. For ``declared.jsonl`` see
-`gsbench.runs.experiments`.
+A command does this before its trials run. Loads no torch.
 """
 
 import logging
@@ -10,17 +8,12 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import AfterValidator
 
 from gsbench.config.compose import Trial
 from gsbench.errors import InputError
-from gsbench.files import require_no_links, write_json, write_text
-from gsbench.parsing import Amount, DamagedError, Record, read_typed
+from gsbench.files import require_no_links, write_text
 from gsbench.runs.experiments import (
     Declaration,
     Planned,
@@ -32,37 +25,12 @@ from gsbench.runs.experiments import (
     read_declarations,
     record_text,
 )
-from gsbench.runs.layout import CONFIG, DECLARED, FORGOTTEN, PER_VIEW, PLAN, RESULTS, SEED
-from gsbench.settings import ARM_BYTES, is_folder_name
+from gsbench.runs.layout import CONFIG, DECLARED, FORGOTTEN, PER_VIEW, RESULTS, SEED
+from gsbench.runs.plan import PlannedTrial, change_plan
 from gsbench.system.locks import hold
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
-
-LEVELS = 3  # folders of scene, arm and trial
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlannedTrial(Record):
-    """A planned trial: its overrides, the folder of the command, and the Unix time."""
-
-    overrides: tuple[str, ...]
-    cwd: str
-    time: Amount
-
-
-def _checked_folder(name: str) -> str:
-    parts = name.split("/")
-    if len(parts) != LEVELS or not all(is_folder_name(part, ARM_BYTES) for part in parts):
-        raise ValueError("it is not a folder of a trial")
-    return name
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanFile(Record):
-    """The file ``plan.json``: the trials by their folders within the experiment."""
-
-    trials: dict[Annotated[str, AfterValidator(_checked_folder)], PlannedTrial]
 
 
 def add_to_plan(trials: Sequence[Trial]) -> None:
@@ -79,19 +47,7 @@ def add_to_plan(trials: Sequence[Trial]) -> None:
             )
             by_home.setdefault(trial.files.home, {})[trial.folder] = planned
     for home, added in by_home.items():
-        make_home(home)
-        with hold(home / f".{PLAN}.lock", "the plan"):
-            _write_plan(home, read_plan(home) | added)
-
-
-def forget(home: Path, folders: Iterable[Path]) -> None:
-    """Drop trials from the plan of the experiment in ``home``."""
-    dropped = set(folders)
-    with hold(home / f".{PLAN}.lock", "the plan"):
-        _write_plan(
-            home,
-            {folder: trial for folder, trial in read_plan(home).items() if folder not in dropped},
-        )
+        change_plan(home, added)
 
 
 def remove(home: Path, folders: Iterable[Path]) -> None:
@@ -112,28 +68,7 @@ def remove(home: Path, folders: Iterable[Path]) -> None:
         # first: a half-deleted trial must not look complete
         (folder / RESULTS).unlink(missing_ok=True)
         shutil.rmtree(folder)
-    forget(home, folders)
-
-
-def read_plan(home: Path) -> dict[Path, PlannedTrial]:
-    """The planned trials of the experiment in ``home`` by their folders; {} without a plan.
-
-    A damaged plan gives {} with a warning: trials that have begun are found by their folders
-    anyway.
-    """
-    try:
-        trials = read_typed(home / PLAN, PlanFile).trials
-    except FileNotFoundError:
-        return {}
-    except DamagedError as error:
-        log.warning("left out: %s: to write it again, run the sweep's command", error)
-        return {}
-    return {home / name: trial for name, trial in sorted(trials.items())}
-
-
-def _write_plan(home: Path, trials: dict[Path, PlannedTrial]) -> None:
-    names = {folder.relative_to(home).as_posix(): trial for folder, trial in trials.items()}
-    write_json(home / PLAN, PlanFile(trials=names).to_json())
+    change_plan(home, dropped=folders)
 
 
 # ---- declarations
@@ -173,10 +108,14 @@ def declare(trials: Sequence[Trial]) -> None:
         make_home(home)
         with hold(home / f".{DECLARED}.lock", "the declarations"):
             declarations = read_declarations(home)
-            latest = next((one for one in reversed(declarations) if one.kind == "sweep"), None)
+            latest = next(
+                (declared for declared in reversed(declarations) if declared.kind == "sweep"), None
+            )
             metric = given or (None if latest is None else latest.primary)
             if metric is None:
                 continue
+            # The declared metric stays, since the time of its first declaration decides whether a
+            # verdict was declared before its trials.
             if latest is not None and given is None:
                 first = of_latest_metric([one for one in declarations if one.kind == "sweep"])[0]
                 log.info("%s: %s stays declared, since %s", home.name, metric, first.when)
@@ -231,12 +170,12 @@ def declare_questions(home: Path, asked: Declaration) -> Declaration:
     make_home(home)
     with hold(home / f".{DECLARED}.lock", "the declarations"):
         declarations = read_declarations(home)
-        same_kind = [one for one in declarations if one.kind == asked.kind]
+        same_kind = [declared for declared in declarations if declared.kind == asked.kind]
         if same_kind and same_kind[-1].hash == asked.hash:
             return same_kind[-1]
         write_text(home / DECLARED, record_text([*declarations, asked]))
     if same_kind and asked.kind == "sweep":
-        before: Planned = reduce(merge_planned, (one.planned for one in same_kind))
+        before: Planned = reduce(merge_planned, (declared.planned for declared in same_kind))
         _warn_of_added_seeds(home, asked.primary, before, asked.planned)
     if same_kind and asked.kind == "claims":  # votes are judged by their own round alone
         log.warning(

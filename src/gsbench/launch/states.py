@@ -5,7 +5,6 @@ A file in a trial's folder names its Slurm job. Loads no torch.
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,14 +15,14 @@ from pydantic import Field
 
 from gsbench.errors import InputError
 from gsbench.files import write_json
-from gsbench.launch.record import PlannedTrial, read_plan
 from gsbench.parsing import Record, read_if_sound
 from gsbench.runs.config_hash import determining_settings
 from gsbench.runs.experiments import trial_folders
 from gsbench.runs.layout import CONFIG, FAILED, LOCK, RESULTS, SEED, SUBMITTED
+from gsbench.runs.plan import PlannedTrial, read_plan
 from gsbench.runs.trial_folder import State, TrialFolder
 from gsbench.system.locks import read_holder
-from gsbench.system.programs import NEUTRAL, safe_environment
+from gsbench.system.programs import answer_of
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,6 @@ WAITING = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Submission(Record):
     """``.submitted.json``: a trial's Slurm job, its log, and its user."""
 
@@ -215,26 +213,12 @@ def state_in_queue(folder: Path, queue: Queue | None) -> Literal["queued", "runn
 
 def read_queue(users: Iterable[str]) -> Queue | None:
     """The jobs and array tasks of ``users`` by id; None if Slurm does not answer."""
-    command = [
-        "squeue",
-        f"--user={','.join(sorted(users))}",
-        "--noheader",
-        "--array",
-        "--format=%i|%T|%r",
-    ]
-    try:
-        listing = subprocess.run(
-            command,
-            cwd=NEUTRAL,
-            env=safe_environment(),
-            capture_output=True,
-            text=True,
-            timeout=SECONDS_TO_ANSWER,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
+    chosen = f"--user={','.join(sorted(users))}"
+    words = ["squeue", chosen, "--noheader", "--array", "--format=%i|%T|%r"]
+    listing = answer_of(words, SECONDS_TO_ANSWER)
+    if listing is None:
         return None
-    lines = [line.split("|") for line in listing.stdout.splitlines() if line.count("|") == 2]
+    lines = [line.split("|") for line in listing.splitlines() if line.count("|") == 2]
     return {job: QueuedJob(state, reason) for job, state, reason in lines}
 
 

@@ -49,13 +49,13 @@ class Parts:
 
     @cached_property
     def scene(self) -> SceneConfig:
-        values, known = self.values["scene"], {one.name for one in fields(SceneConfig)}
+        values, known = self.values["scene"], {entry.name for entry in fields(SceneConfig)}
         return SceneConfig(**{key: value for key, value in values.items() if key in known})
 
     @cached_property
     def reader(self) -> SceneReader | None:
         """The user's own reader of the capture; None for gsbench's own readers."""
-        known = {one.name for one in fields(SceneConfig)} - {TARGET}
+        known = {entry.name for entry in fields(SceneConfig)} - {TARGET}
         values = {key: value for key, value in self.values["scene"].items() if key not in known}
         return build("scene", values, self._allowed) if values.get(TARGET) else None
 
@@ -113,6 +113,7 @@ class Parts:
     @cached_property
     def raster(self) -> Proven:
         """The rasterizer for ``device``, with its proof. A user's own has none."""
+        # Its contract is the user's to test (docs/rasterizer.md): a proof compares gsbench's own.
         chosen = None if self.own_rasterizer is None else Proven(self.own_rasterizer)
         chosen = chosen or create_proven(self.values["raster"]["name"], self.device, self.threads)
         self._check_outputs(chosen.rasterizer.name)

@@ -236,9 +236,9 @@ def _run(trial: Trial, folder: TrialFolder) -> TrialRecord:
         sources = source_files(trial_steps.photographs, store)
         was_done = folder.write_finished(values, results, sources, kept, published)
         (folder.path / layout.BUILDING).unlink(missing_ok=True)
-    metrics = "  ".join(f"{key} {value:.4g}" for key, value in results.metrics.items())
     size = "" if results.num_gaussians is None else f"  {results.num_gaussians} Gaussians"
-    log.info("%s: %s%s%s", folder.label, metrics, size, "  (already done)" if was_done else "")
+    ending = f"{size}  (already done)" if was_done else size
+    log.info("%s: %s%s", folder.label, results.metrics_line, ending)
     if results.learnt_nothing:
         log.warning("%s: %s", folder.label, results.learnt_nothing)
     return results

@@ -79,7 +79,6 @@ def folders_in(folder: str | Path) -> list[str]:
 # ---- the search for the settings of an arm
 
 
-@dataclass(frozen=True, kw_only=True)
 class SearchPoint(Record):
     """A point of a search.
 
@@ -90,7 +89,6 @@ class SearchPoint(Record):
     value: Number | None
 
 
-@dataclass(frozen=True, kw_only=True)
 class TuningRecord(Record):
     """The search for the settings of ``arm`` (INIT-DENSIFY), which ``sweep`` then trains.
 
@@ -176,7 +174,6 @@ class Arm:
         return name == own and all(str(config.get(key)) == value for key, value in self.variant)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Question(Record):
     """A question: is ``arm`` better than ``baseline`` in ``metric`` (``sign``) by ``least``?
 
@@ -211,7 +208,6 @@ class Question(Record):
         return {key: self.seeds for keys in self.scenes.values() for key in keys}
 
 
-@dataclass(frozen=True, kw_only=True)
 class Declaration(Record):
     """Questions that were declared at ``time`` (UTC).
 

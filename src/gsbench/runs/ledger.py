@@ -43,7 +43,6 @@ Seeds = Annotated[tuple[Count, ...], Field(min_length=2)]
 Level = Annotated[float, Field(gt=0, lt=1)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Opened(Record):
     """The first line: what decides, on which trials, and how many ideas share the error rate.
 
@@ -65,7 +64,6 @@ class Opened(Record):
     keys: dict[Text, TrialKey]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Started(Record):
     """An idea, written before its first trial.
 
@@ -84,7 +82,6 @@ class Started(Record):
     keys: dict[Text, TrialKey]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Promoted(Record):
     """An idea that looks better: the ``level`` of its test, and seeds that no idea has seen."""
 
@@ -95,7 +92,6 @@ class Promoted(Record):
     seeds: Seeds
 
 
-@dataclass(frozen=True, kw_only=True)
 class Difference(Record):
     """A mean difference with its interval; for a relative question all three are logarithms."""
 
@@ -104,7 +100,6 @@ class Difference(Record):
     high: Number
 
 
-@dataclass(frozen=True, kw_only=True)
 class Ended(Record):
     """The result of an idea; "failed" if there is none, so that the idea may be tried again.
 
@@ -123,7 +118,6 @@ class Ended(Record):
     seconds: Amount | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Confirming(Record):
     """Captures and seeds that no idea has seen, chosen before their first trial.
 
@@ -136,7 +130,6 @@ class Confirming(Record):
     keys: dict[Text, dict[Text, TrialKey]]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Confirmed(Record):
     """The results of the confirmation ``number`` (from 0): each idea's difference."""
 
@@ -150,7 +143,6 @@ class Confirmed(Record):
 Entry = Opened | Started | Promoted | Ended | Confirming | Confirmed
 
 
-@dataclass(frozen=True, kw_only=True)
 class Line(Record):
     """An entry with the sha256 of the line before it, "" for the first, and its own."""
 
@@ -318,7 +310,9 @@ def _fault(before: Ledger, entry: Entry) -> str:
     ideas = begun[entry.number][0].keys.keys() - {BASELINE}
     if entry.results.keys() != ideas or not entry.differences.keys() <= ideas:
         return "has results of other ideas than its confirmation"
-    faults = (_fault_of_size(before.opened, one) for one in entry.differences.values())
+    faults = (
+        _fault_of_size(before.opened, difference) for difference in entry.differences.values()
+    )
     return next(filter(None, faults), "")
 
 

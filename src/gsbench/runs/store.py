@@ -39,7 +39,6 @@ KEY = re.compile("[0-9a-f]+")
 LEFTOVER_AGE = 86_400.0  # seconds after which temporary folders that no lock guards are removed
 
 
-@dataclass(frozen=True, kw_only=True)
 class Output(Record):
     """A file of a result as it was written."""
 
@@ -48,7 +47,6 @@ class Output(Record):
     sha256: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class Manifest(Record):
     """``manifest.json`` of a finished result: its inputs, and a checksum of every file."""
 

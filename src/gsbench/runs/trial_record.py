@@ -7,7 +7,7 @@ The files are ``results.json``, the records of stages in the store (``training.j
 import logging
 import reprlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -46,7 +46,6 @@ BY_LISTS = "list"  # `split_text` of a split by lists of views
 Iteration = Annotated[str, Field(pattern=r"^\d{1,18}$")]  # as the key of an object
 
 
-@dataclass(frozen=True, kw_only=True)
 class Budget(Record):
     """Limits on a trial's growth: a maximum of Gaussians, the rule that keeps it, and seconds."""
 
@@ -55,7 +54,6 @@ class Budget(Record):
     seconds: Amount | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Code(Record):
     """The versions of the code: sha256 of a user's modules (``sources``), and of the stages.
 
@@ -70,7 +68,6 @@ class Code(Record):
     edited: bool | None = None  # None without a checkout, or if git cannot tell
 
 
-@dataclass(frozen=True, kw_only=True)
 class MetricRecord(Record):
     """Facts of a user's own metric; see `gsbench.eval.facts`."""
 
@@ -81,7 +78,6 @@ class MetricRecord(Record):
     worthwhile: Annotated[float, Field(gt=0, le=MAX_NUMBER)] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Earlier(Record):
     """Metrics at an earlier iteration."""
 
@@ -89,7 +85,6 @@ class Earlier(Record):
     num_gaussians: Count | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Declared(Record):
     """The metric that was declared for the verdict, and when (`gsbench.runs.experiments`)."""
 
@@ -97,7 +92,6 @@ class Declared(Record):
     time: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class ExternalTrainer(Record):
     """The program that trained in gsbench's place: its name, version, own words, and command."""
 
@@ -107,7 +101,6 @@ class ExternalTrainer(Record):
     command: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True, kw_only=True)
 class InitialCloud(Record):
     """Facts of the initial points, measured before the first iteration (`gsbench.train.start`)."""
 
@@ -122,7 +115,6 @@ class InitialCloud(Record):
     warnings: list[str]  # about points and training cameras, as logged
 
 
-@dataclass(frozen=True, kw_only=True)
 class TwinViews(Record):
     """Photographs that the capture has twice.
 
@@ -135,7 +127,6 @@ class TwinViews(Record):
     near: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
 class RasterProof(Record):
     """A comparison of a rasterizer with the float64 reference on a device (`gsbench.train.proof`).
 
@@ -156,7 +147,6 @@ class RasterProof(Record):
         return not self.failures
 
 
-@dataclass(frozen=True, kw_only=True)
 class TrialRecord(Record):
     """A finished trial.
 
@@ -220,6 +210,11 @@ class TrialRecord(Record):
         return "; ".join(filter(None, [self.learnt_nothing, *self.raster_passed_over]))
 
     @property
+    def metrics_line(self) -> str:
+        """The metrics to four digits, in one line."""
+        return "  ".join(f"{key} {value:.4g}" for key, value in self.metrics.items())
+
+    @property
     def learnt_nothing(self) -> str:
         """A line that the renders are not better than one colour; "" if they are, or if unknown."""
         psnr, one_color = self.metrics.get("psnr"), self.one_color_psnr
@@ -267,7 +262,6 @@ def record_from(content: bytes, path: Path) -> TrialRecord:
         raise DamagedError(path, describe_misfit(error)) from None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Training(Record):
     """The counts, time and memory of a training.
 
@@ -289,7 +283,6 @@ class Training(Record):
     trained_by: ExternalTrainer | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Evaluation(Record):
     """The metrics of a trial; fields as in `TrialRecord`."""
 
@@ -318,14 +311,12 @@ def split_text(config: Mapping[str, Any]) -> str:
 Stamp = tuple[int, ...]  # size in bytes, times of change in ns
 
 
-@dataclass(frozen=True, kw_only=True)
 class NamedGroup(Record):
     """A group of the configuration that must have a name."""
 
     name: FolderName
 
 
-@dataclass(frozen=True, kw_only=True)
 class TrackingSettings(Record):
     """The settings of the group ``tracking`` that later mirroring of a trial needs."""
 
@@ -335,7 +326,6 @@ class TrackingSettings(Record):
     images: Count
 
 
-@dataclass(frozen=True, kw_only=True)
 class Configuration(Record):
     """The keys that every usable ``config.yaml`` has; `gsbench.config.schema` checks the others."""
 
@@ -348,7 +338,6 @@ class Configuration(Record):
     tracking: TrackingSettings
 
 
-@dataclass(frozen=True, kw_only=True)
 class Failure(Record):
     """``failed.json``: the error's type, its text, its traceback, and the Unix time."""
 
@@ -366,7 +355,6 @@ class Failure(Record):
         return one_line(lines[0]) if lines else "no reason was given"
 
 
-@dataclass(frozen=True, kw_only=True)
 class Building(Record):
     """``building.json``: the present stage of an unfinished trial, and where it is built."""
 
@@ -374,7 +362,6 @@ class Building(Record):
     folder: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
 class MadeOf(Record):
     """The inputs of a trial's results: configuration, versions, and files with their stamps.
 
@@ -401,7 +388,6 @@ class MadeOf(Record):
             raise ValueError(f"in settings {fault}")
 
 
-@dataclass(frozen=True, kw_only=True)
 class ResultsFile(Record):
     """The part of ``results.json`` that this module reads."""
 
@@ -426,14 +412,12 @@ Value = bool | Whole | Number
 Row = Annotated[dict[str, Value], AfterValidator(_with_step)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class RowWithStep(Record):
     """A row of any of these files; only its iteration is checked."""
 
     step: Count
 
 
-@dataclass(frozen=True, kw_only=True)
 class Histogram(RowWithStep):
     """A row of ``volume_histograms.jsonl``: counts between edges, which are log10 of volumes."""
 

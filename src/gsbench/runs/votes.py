@@ -5,7 +5,6 @@ import hmac
 import itertools
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,7 +27,6 @@ RoundId = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 PersonId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Showing(Record):
     """One decision of a round: ``left`` and ``right`` name arms, or the sides of a trap.
 
@@ -46,7 +44,6 @@ class Showing(Record):
     of: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
 class RoundKey(Record):
     """The key of a round, which stays in the runs folder until the votes are there.
 
@@ -79,7 +76,7 @@ class RoundKey(Record):
     @property
     def pairs(self) -> list[Showing]:
         """The showings that count: pairs of arms, seen for the first time."""
-        return [one for one in self.showings if one.kind == "pair"]
+        return [showing for showing in self.showings if showing.kind == "pair"]
 
     @property
     def votes(self) -> int:
@@ -87,7 +84,6 @@ class RoundKey(Record):
         return self.people * len(self.pairs)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Vote(Record):
     """The answer to a showing, and the seconds that it took."""
 
@@ -96,7 +92,6 @@ class Vote(Record):
     seconds: Amount
 
 
-@dataclass(frozen=True, kw_only=True)
 class Ballot(Record):
     """The file that a person saves at the end of a round.
 
@@ -124,7 +119,6 @@ class Ballot(Record):
         return {vote.showing: vote.answer for vote in self.votes}
 
 
-@dataclass(frozen=True, kw_only=True)
 class StoredBallot(Record):
     """A ballot as the runs folder keeps it.
 
@@ -167,7 +161,9 @@ def read_ballots(folder: Path, key: RoundKey) -> tuple[dict[int, Ballot], dict[s
 def store_ballots(folder: Path, key: RoundKey, ballots: Iterable[Ballot]) -> None:
     """Store new ballots, each in the first free place: by finishing time, after earlier ones."""
     places = set(read_ballots(folder, key)[0])
-    for ballot in sorted(ballots, key=lambda one: (unix_time(one.finished) or 0, one.person)):
+    for ballot in sorted(
+        ballots, key=lambda ballot: (unix_time(ballot.finished) or 0, ballot.person)
+    ):
         place = next(place for place in itertools.count() if place not in places)
         places.add(place)
         stored = StoredBallot.of(key, place, ballot)
@@ -200,7 +196,7 @@ def check_ballot(ballot: Ballot, key: RoundKey, path: Path) -> None:
             f"{path} was finished at {ballot.finished}, before its round was made ({key.time}): "
             "a vote with a wrong clock does not count"
         )
-    showings = {one.id for one in key.showings}
+    showings = {showing.id for showing in key.showings}
     if ballot.answers.keys() != showings or len(ballot.votes) != len(showings):
         known = len(ballot.answers.keys() & showings)
         raise InputError(

@@ -54,13 +54,13 @@ def arrange_cameras(cameras: Sequence[Camera]) -> Arrangement:
     if fault:
         description = f"by planes across the principal axis of the cameras' centres, since {fault}"
         order = np.argsort(along_principal_axis(centers), kind="stable")
-        return Arrangement(tuple(order.tolist()), description)
-    if gap > OPEN_RING:
-        order = np.roll(order, -(widest + 1))
-    description = (
-        "by azimuth around the scene's up and centre, as the cameras surround it (gaps up to "
-        f"{gap:.0f} degrees)"
-    )
+    else:
+        if gap > OPEN_RING:
+            order = np.roll(order, -(widest + 1))
+        description = (
+            "by azimuth around the scene's up and centre, as the cameras surround it (gaps up to "
+            f"{gap:.0f} degrees)"
+        )
     return Arrangement(tuple(order.tolist()), description)
 
 

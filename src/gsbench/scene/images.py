@@ -1,22 +1,15 @@
-"""Photographs and masks: finding, reading, resizing, and filling in what a mask ignores.
+"""Photographs: finding, matching by name, reading and resizing.
 
 Every image becomes uint8 RGB. EXIF orientation is ignored, as in COLMAP, because cameras refer to
 the stored pixels.
-
-A mask says which pixels of a photograph count: black pixels are ignored, all others count. COLMAP
-extracts no features where a mask "is black (pixel intensity value 0 in grayscale)" (its FAQ, "Mask
-image regions"), and nerfstudio trains only where a mask is not 0 (its page "Data conventions").
-Ignored pixels are replaced before any other step reads a photograph, so that they cannot influence
-a result.
 """
 
 import logging
 import os
-import shutil
 import sys
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -50,15 +43,6 @@ _FILTERS = {
 }
 _SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I;16N")
 _WIDE_MODES = ("I", "F")  # 32-bit integers and floats, which have no agreed value for white
-
-Mask = NDArray[np.bool_]  # [H, W], True where a pixel counts
-
-SUFFIX = ".png"
-WHITE = np.uint8(255)
-IMAGES, MASKS = "images", "masks"  # in the folder of `prepare_photograph`
-# largest share of pixels between black and the brightest value; a photograph has far more
-MAX_GREY_SHARE = 0.05
-NEARLY_ONE = 1 - 1e-6  # a mean of ones in float32 may round to less than 1
 WHOLE = 0  # all parts of a path
 
 
@@ -316,164 +300,7 @@ def open_image(path: Path) -> Image.Image:
         raise InputError(f"{path}: {reason}: replace or remove it") from error
 
 
-def find_masks(folder: Path, images: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The mask file in ``folder`` of each image, as COLMAP names it: ``b.jpg.png`` for ``b.jpg``.
-
-    ``names`` are paths below ``images``, the folder of the images. Raises InputError naming the
-    images without a mask, or for a mask that is not an image or differs in size from its
-    photograph.
-    """
-    masks = {name: folder / f"{name}{SUFFIX}" for name in names}
-    if missing := [name for name, mask in masks.items() if not mask.is_file()]:
-        raise InputError(
-            f"scene.masks: no mask of {some_of(missing)} in {folder}: add {missing[0]}{SUFFIX} "
-            "(all white where every pixel counts)"
-        )
-    for name, mask in masks.items():
-        size, wanted = image_size(mask), image_size(images / name)
-        if size != wanted:
-            raise InputError(
-                f"{mask}: the mask is {size[0]}x{size[1]} px and its image {name} "
-                f"{wanted[0]}x{wanted[1]}: give masks of the images' size"
-            )
-    return masks
-
-
-def read_mask(path: Path) -> Mask:
-    """Read a mask [H, W]: False where the file is black.
-
-    Raises InputError for a file that is no mask: with colours, with many greys, or black
-    everywhere.
-    """
-    with open_image(path) as image:
-        try:
-            image.load()
-            transparent = image.has_transparency_data
-            if transparent and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
-                raise InputError(
-                    f"{path}: a mask says by black what is ignored, not by transparency: save it "
-                    "as grey"
-                )
-            in_colors = image.mode in ("P", "CMYK", "YCbCr", "RGBA", "LA")
-            pixels = np.asarray(image.convert("RGB") if in_colors else image)
-        except InputError:
-            raise
-        except Exception as error:  # Pillow's readers may raise any exception on a damaged file
-            raise InputError(f"{path}: the mask is damaged ({error}): replace it") from error
-    if pixels.ndim == 3:
-        if (pixels != pixels[..., :1]).any():
-            raise InputError(
-                f"{path}: is in colours, and no mask: make it black where pixels are ignored, "
-                "else white"
-            )
-        pixels = pixels.max(axis=2)
-    mask: Mask = pixels != 0
-    if not mask.any():
-        raise InputError(
-            f"{path}: the mask is black all over, so no pixel counts: correct it, or leave the "
-            "image out"
-        )
-    grey_share = float((mask & (pixels != pixels.max())).mean())
-    if grey_share > MAX_GREY_SHARE:
-        raise InputError(
-            f"{path}: {grey_share:.0%} of its pixels are grey, so it is not a mask: make it black "
-            "where pixels are ignored, else white"
-        )
-    return mask
-
-
-def write_mask(mask: Mask, path: Path) -> None:
-    """Write the mask as a PNG in black and white."""
-    write_png(mask.astype(np.uint8) * WHITE, path)
-
-
 def write_png(image: NDArray[np.uint8], path: Path, exif: bytes = b"") -> None:
     """Write an image [H, W, 3] or [H, W] as PNG."""
     # At zlib level 1, writing is about five times as fast as at the default level.
     Image.fromarray(image).save(path, format="PNG", compress_level=1, exif=exif)
-
-
-def prepare_photograph(
-    folder: Path, images: Path, masks: Mapping[str, Path], name: str, backdrop: Backdrop = "black"
-) -> None:
-    """Write the photograph ``name`` without its ignored and transparent pixels.
-
-    The photograph goes to ``images/<name>`` below ``folder``: a copy if nothing changes, else a PNG
-    with the original EXIF data. Its mask, if any, goes to ``masks/<name>.png`` in black and white.
-    """
-    target, mask_target = folder / IMAGES / name, prepared_mask(folder, name)
-    for path in (target, mask_target):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    mask = None
-    if name in masks:
-        mask = read_mask(masks[name])
-        write_mask(mask, mask_target)
-    with open_image(images / name) as original:
-        exif, transparent = original.info.get("exif", b""), original.has_transparency_data
-    if (mask is None or mask.all()) and (backdrop == "black" or not transparent):
-        shutil.copyfile(images / name, target)
-        return
-    pixels = read_image(images / name, backdrop)
-    if mask is not None:
-        if pixels.shape[:2] != mask.shape:
-            raise InputError(f"{masks[name]}: the mask changed while it was read: run again")
-        pixels = fill_ignored(pixels, mask)
-    write_png(pixels, target, exif)
-
-
-def prepared_mask(folder: Path, name: str) -> Path:
-    """The file of the mask that `prepare_photograph` writes, as COLMAP names it."""
-    return folder / MASKS / f"{name}{SUFFIX}"
-
-
-def fill_ignored(image: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
-    """``image`` [H, W, 3] with its ignored pixels interpolated from counted pixels nearby.
-
-    Uses the pull and push of Gortler et al. 1996, "The Lumigraph", section 3.4.1: the counted
-    pixels are averaged over blocks of 2, 4, 8, … pixels; then coarser levels are interpolated
-    bilinearly into finer pixels without a value. The filling leaves no edge at the border of the
-    mask where features would be detected.
-    """
-    filled = _pull_push(image.astype(np.float32), mask)
-    return np.where(mask[..., None], image, np.rint(filled).astype(np.uint8))
-
-
-def _pull_push(image: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
-    if mask.all():
-        return image
-    height, width = mask.shape
-    to_even = ((0, height % 2), (0, width % 2))
-    weights = np.pad(mask, to_even).astype(np.float32)
-    rows, columns = weights.shape[0] // 2, weights.shape[1] // 2
-    blocks = (rows, 2, columns, 2)
-    padded = np.pad(image * mask[..., None], (*to_even, (0, 0)))
-    sums = padded.reshape(*blocks, 3).sum((1, 3))  # [H/2, W/2, 3]
-    counted = weights.reshape(blocks).sum((1, 3))  # [H/2, W/2]
-    coarse = _pull_push(sums / np.maximum(counted, 1)[..., None], counted > 0)
-    pushed = _double(_double(coarse, 0), 1)[:height, :width]
-    return np.where(mask[..., None], image, pushed)
-
-
-def _double(image: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """``image`` [H, W, 3] with twice as many pixels along ``axis``, interpolated linearly."""
-    ends = [(0, 0)] * image.ndim
-    ends[axis] = (1, 1)
-    padded = np.pad(image, ends, mode="edge")
-    length = image.shape[axis]
-    before, after = (np.take(padded, range(start, start + length), axis) for start in (0, 2))
-    pair = np.stack([0.75 * image + 0.25 * before, 0.75 * image + 0.25 * after], axis=axis + 1)
-    shape = list(image.shape)
-    shape[axis] = 2 * length
-    return pair.reshape(shape)
-
-
-def resize_mask(mask: Mask, width: int, height: int) -> Mask:
-    """The mask at another size: a pixel counts if all original ones centred in its area count.
-
-    The filters that resize photographs reach further than that. Beyond the mask's border they use
-    the pixels that `fill_ignored` made.
-    """
-    if mask.shape == (height, width):
-        return mask
-    shares = Image.fromarray(mask.astype(np.float32)).resize((width, height), Image.Resampling.BOX)
-    return np.asarray(shares) >= NEARLY_ONE

@@ -19,7 +19,6 @@ import os
 import secrets
 import shutil
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,23 +35,19 @@ from gsbench.parsing import MAX_NUMBER, Count, Number, Record, read_typed
 from gsbench.runs.store import Output, is_sound, record_files
 from gsbench.scene.colmap_files import model_files
 from gsbench.scene.images import (
-    WHITE,
-    Mask,
     Resample,
     check_size,
     image_size,
     read_image,
-    read_mask,
     resize_image,
-    resize_mask,
-    write_mask,
     write_png,
 )
+from gsbench.scene.masks import WHITE, Mask, read_mask, resize_mask, write_mask
 from gsbench.scene.options import MIN_IMAGES, downscaled_size
 from gsbench.scene.types import Camera, CameraModel, Capture, Scene, View, to_pinhole
 from gsbench.scene.undistortion import check_lenses, undistort
 from gsbench.system.isolate import CrashError, run_isolated
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import in_threads
 from gsbench.words import some_of
 
 log = logging.getLogger(__name__)
@@ -83,7 +78,6 @@ Row = tuple[Number, Number, Number, Number]
 Length = Annotated[float, Field(gt=0, le=MAX_NUMBER)]
 
 
-@dataclass(frozen=True, kw_only=True)
 class PreparedView(Record):
     """A view in `CAMERAS_FILE`: its camera and the ``file`` beside it, "" for the photograph."""
 
@@ -103,14 +97,12 @@ class PreparedView(Record):
         return Camera(**intrinsics, rotation=pose[:, :3], translation=pose[:, 3])
 
 
-@dataclass(frozen=True, kw_only=True)
 class PreparedViews(Record):
     """The content of `CAMERAS_FILE`."""
 
     views: dict[str, PreparedView]
 
 
-@dataclass(frozen=True, kw_only=True)
 class PreparedFiles(Record):
     """The content of `SUMS_FILE`."""
 
@@ -173,8 +165,7 @@ def load_scene(
         return View(name, camera, image, mask_of(name))
 
     names = [name for name in capture.image_names if name in entries]
-    with ThreadPoolExecutor(available_threads()) as pool:
-        views = list(pool.map(view, names))
+    views = list(in_threads(view, names))
     held_out = set(capture.test_names)
     return Scene(
         name=capture.name,
@@ -348,8 +339,7 @@ def prepare_all(images: Sequence[ImageToPrepare], progress: Progress) -> list[Ca
 
 def prepare_chunk(images: Sequence[ImageToPrepare]) -> list[Camera]:
     """Prepare some images in this process."""
-    with ThreadPoolExecutor(available_threads()) as pool:
-        return list(pool.map(prepare_image, images))
+    return list(in_threads(prepare_image, images))
 
 
 def prepare_image(image: ImageToPrepare) -> Camera:

@@ -216,7 +216,7 @@ class SceneConfig:
 
     def _check_that_all_is_read(self) -> None:
         """Raise InputError for a setting that the scene's kind or split would ignore."""
-        defaults = {one.name: one.default for one in fields(self)}
+        defaults = {entry.name: entry.default for entry in fields(self)}
         for kinds, keys in READ_BY.items():
             for key in keys:
                 if self.kind not in kinds and getattr(self, key) != defaults[key]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsbench.errors import InputError
 from gsbench.scene.colmap_files import PARAMETERS
-from gsbench.scene.transforms import PosedCamera, nearest_rotation
+from gsbench.scene.transforms_cameras import PosedCamera, nearest_rotation
 from gsbench.scene.types import CameraModel
 
 if TYPE_CHECKING:

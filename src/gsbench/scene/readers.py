@@ -13,17 +13,18 @@ from gsbench.errors import InputError
 from gsbench.files import require_regular
 from gsbench.normalization import find_normalization
 from gsbench.parsing import text_of
-from gsbench.scene.colmap_files import count_images, has_both_forms, model_files
+from gsbench.scene.colmap_files import has_both_forms, model_files
 from gsbench.scene.hold_out import CamerasByName, hold_out, select_images
 from gsbench.scene.images import (
     IMAGE_SUFFIXES,
     check_picture_names,
-    find_masks,
     list_images,
     match_names,
     same_folder,
     stem_of,
 )
+from gsbench.scene.masks import find_masks
+from gsbench.scene.model_folders import find_model, require_subfolder
 from gsbench.scene.options import (
     EVERY_NTH,
     MAX_IMAGES,
@@ -41,9 +42,6 @@ from gsbench.words import counted, some_of
 
 log = logging.getLogger(__name__)
 
-# the usual places, for messages; `_find_sparse` searches numbered folders too
-SPARSE_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-
 
 def read_colmap(
     name: str,
@@ -60,7 +58,7 @@ def read_colmap(
     The photographs are the files in the folder that have a pose in the model; their extensions may
     differ from the model's names. `select_images` chooses the ones that are kept, `SplitRule` the
     ones that are held out. ``masks`` is the folder of the masks below ``path`` (see
-    `gsbench.scene.images.find_masks`).
+    `gsbench.scene.masks.find_masks`).
 
     Raises `InputError` if a folder is missing, the model is damaged, or fewer than three
     photographs are usable.
@@ -69,7 +67,7 @@ def read_colmap(
     from gsbench.scene.colmap import camera_centers, read_model, reference_cameras, registered_names
 
     root = existing_folder(name, path)
-    model_folder, others = _find_sparse(root, sparse)
+    model_folder, others = find_model(root, sparse)
     if others:
         found = counted(len(others) + 1, "COLMAP model")
         why = f"is read because it has the most images ({', '.join(others)})"
@@ -79,30 +77,9 @@ def read_colmap(
     if has_both_forms(model_folder):
         log.warning("%s: the binary model is read, and not the text beside it", model_folder)
     model = read_model(model_folder)
-    wanted = registered_names(model)
     mask_folder, files = _masks_and_images(root, folder, masks)
-    matches = match_names(wanted, files)
-    if not matches:
-        photographs = photographs_among(folder, files)
-        matches = match_names(wanted, photographs, other_folders=True)
-    if missing := [image for image in wanted if image not in matches]:
-        share = f"{len(missing)} of {len(wanted)} images of the model"
-        log.warning("%s: %s have no file: %s", folder, share, some_of(missing))
-    _require_enough(
-        len(matches),
-        folder,
-        f"that the model {model_folder} has a pose for (it names {some_of(wanted)})",
-        "set scene.images to the folder of the model's photographs",
-    )
-    if moved := [image for image, file in matches.items() if not same_folder(image, file)]:
-        pairs = some_of([f"{image} ({matches[image]})" for image in moved])
-        log.warning("%s: files found by the last part of their path: %s", folder, pairs)
-    used = {stem_of(file) for file in matches.values()}
-    if any(stem_of(name) not in used for name in files):
-        photographs = photographs_among(folder, files, report=False)
-        if others := [name for name in photographs if stem_of(name) not in used]:
-            share = f"{len(others)} of {len(others) + len(used)} photographs"
-            log.warning("%s: %s have no pose in the model: %s", folder, share, some_of(others))
+    matches = _files_of_model(folder, files, registered_names(model), model_folder)
+    _report_unused(folder, files, matches)
     model_names = {file: image for image, file in matches.items()}
     capture = _make_capture(
         name,
@@ -121,6 +98,39 @@ def read_colmap(
     if exact_poses:
         return capture
     return replace(capture, advised_normalization=find_normalization(camera_centers(model)))
+
+
+def _files_of_model(
+    folder: Path, files: Sequence[str], wanted: Sequence[str], model: Path
+) -> dict[str, str]:
+    """The file of each image ``wanted`` by the ``model``; images without one are reported."""
+    matches = match_names(wanted, files)
+    if not matches:
+        photographs = photographs_among(folder, files)
+        matches = match_names(wanted, photographs, other_folders=True)
+    if missing := [image for image in wanted if image not in matches]:
+        share = f"{len(missing)} of {len(wanted)} images of the model"
+        log.warning("%s: %s have no file: %s", folder, share, some_of(missing))
+    _require_enough(
+        len(matches),
+        folder,
+        f"that the model {model} has a pose for (it names {some_of(wanted)})",
+        "set scene.images to the folder of the model's photographs",
+    )
+    if moved := [image for image, file in matches.items() if not same_folder(image, file)]:
+        pairs = some_of([f"{image} ({matches[image]})" for image in moved])
+        log.warning("%s: files found by the last part of their path: %s", folder, pairs)
+    return matches
+
+
+def _report_unused(folder: Path, files: Sequence[str], matches: Mapping[str, str]) -> None:
+    """Log one line on photographs without a pose in the model."""
+    used = {stem_of(file) for file in matches.values()}
+    if any(stem_of(name) not in used for name in files):
+        photographs = photographs_among(folder, files, report=False)
+        if others := [name for name in photographs if stem_of(name) not in used]:
+            share = f"{len(others)} of {len(others) + len(used)} photographs"
+            log.warning("%s: %s have no pose in the model: %s", folder, share, some_of(others))
 
 
 def read_transforms(
@@ -256,15 +266,6 @@ def missing_folder(name: str, root: Path) -> str:
     return f"scene {name}: the folder {root} {'is a file' if root.exists() else 'does not exist'}"
 
 
-def missing_model(name: str, root: Path, sparse: str | None) -> str:
-    """The message that ``root`` of the scene ``name`` has no COLMAP model, or "" if it has one."""
-    try:
-        _find_sparse(root, sparse)
-    except InputError as error:
-        return f"scene {name}: {error}"
-    return ""
-
-
 def fingerprint(
     folder: Path,
     names: Iterable[str],
@@ -301,6 +302,7 @@ def _make_capture(
     cameras: CamerasByName | None = None,
     own_split: tuple[list[str], list[str]] | None = None,
 ) -> Capture:
+    # Listed files are used first, so that no twin takes their place.
     lists = own_split if own_split and split.asks_the_capture else _read_lists(root, split)
     left_out = copies_by_name(names, set(chain.from_iterable(filter(None, lists))))
     report_left_out(folder, left_out, "of the same name")
@@ -374,73 +376,6 @@ def _read_list(root: Path, file: str | None, key: str) -> list[str] | None:
             f"{key}: {path} cannot be read ({error.strerror}): name a text file of image names"
         ) from error
     return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-
-
-def require_subfolder(root: Path, folder: str, key: str) -> Path:
-    """The folder below ``root`` that the setting ``key`` names; raises `InputError` without it."""
-    path = root / folder
-    if not path.is_dir():
-        existing = sorted(
-            entry.name
-            for entry in root.iterdir()
-            if entry.is_dir() and not _is_model(entry) and not _is_model(entry / "0")
-        )
-        raise InputError(
-            f"{path}: no such folder; set {key} to one of: "
-            f"{', '.join(existing) or '(there is no folder)'}"
-        )
-    return path
-
-
-def _find_sparse(root: Path, sparse: str | None) -> tuple[Path, list[str]]:
-    """The folder of the COLMAP model, and the others found, each with its number of images.
-
-    COLMAP writes a folder sparse/0, sparse/1, … for each part that it could not connect, in no
-    order of size. The model with the most images is taken, and of equal ones the first.
-    """
-    if sparse is not None:
-        model_files(root / sparse)
-        return root / sparse, []
-    for parent in (root / "sparse", root / "colmap" / "sparse"):
-        numbered = [folder for folder in parent.glob("*") if folder.name.isdecimal()]
-        ordered = [*sorted(numbered, key=lambda path: int(path.name)), parent]
-        found = [folder for folder in ordered if _is_model(folder)]
-        if len(found) == 1:
-            return found[0], []  # not counted: a damaged one gets a better message later
-        if found:
-            counts = {folder: count_images(folder) for folder in found}
-            largest = max(found, key=counts.__getitem__)
-            del counts[largest]
-            return largest, [
-                f"{path.relative_to(root)}: {counted(count, 'image')}"
-                for path, count in counts.items()
-            ]
-    for folder in (root / name for name in SPARSE_FOLDERS):
-        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            model_files(folder)  # its error names what the model lacks
-    raise InputError(
-        f"{root}: no COLMAP model in {' or '.join(SPARSE_FOLDERS)}: {_where_a_model_is(root)}"
-    )
-
-
-def _where_a_model_is(root: Path) -> str:
-    """The setting that finds a model near ``root``; without one, advice to make it."""
-    folders = [root, *(one for pattern in ("*", "*/*", "*/*/*") for one in root.glob(pattern))]
-    folders += [root.parent / name for name in SPARSE_FOLDERS]
-    model = next((one for one in folders if one.is_dir() and _is_model(one)), None)
-    if model is None:
-        why = "a database holds no poses: " if any(root.glob("*.db")) else ""
-        return f"{why}make one with COLMAP, or use scene=photos"
-    base = next((one for one in model.parents if (one / "images").is_dir()), root)
-    setting = f"path={base}" if base != root else f"sparse={model.relative_to(root)}"
-    return f"{model} is one: set scene.{setting}"
-
-
-def _is_model(folder: Path) -> bool:
-    try:
-        return bool(model_files(folder))
-    except InputError:
-        return False
 
 
 def _require_enough(count: int, folder: Path, which: str, remedy: str = "") -> None:

@@ -16,7 +16,8 @@ from PIL import Image
 
 from gsbench.errors import InputError
 from gsbench.files import file_sha256
-from gsbench.scene.images import resize_mask, stem_of
+from gsbench.scene.images import stem_of
+from gsbench.scene.masks import resize_mask
 from gsbench.scene.types import Scene, Twins, View
 from gsbench.words import counted, some_of
 
@@ -118,7 +119,7 @@ def without_copies(scene: Scene) -> Scene:
                 candidates[test.name].append((value, view.name))
     near: dict[str, str] = {}
     for name, found in candidates.items():
-        if trained_on := [one for one in found if one[1] not in equal]:
+        if trained_on := [twin for twin in found if twin[1] not in equal]:
             near[name] = max(trained_on)[1]
     report_left_out(Path(scene.name), equal, "with the pixels of a test view")
     if near:

@@ -164,7 +164,7 @@ class View:
     """One photograph with its camera; ``image`` is [H, W, 3] uint8, sRGB.
 
     ``mask`` [H, W] is True where a pixel counts, or None if all pixels count. Ignored pixels hold
-    the colours made by `gsbench.scene.images.fill_ignored`.
+    the colours made by `gsbench.scene.masks.fill_ignored`.
     """
 
     name: str

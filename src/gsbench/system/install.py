@@ -142,8 +142,8 @@ class WorkTrees:
         ``first`` does not come before ``last``.
         """
         names = [
-            run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{one}^{{commit}}")
-            for one in (first, last)
+            run_git(self._folder, "rev-parse", "--verify", "--end-of-options", f"{name}^{{commit}}")
+            for name in (first, last)
         ]
         log = ("log", "--no-show-signature", "--no-color", "--format=%H%x09%cs%x09%s")
         good = run_git(self._folder, *log, "-1", names[0])

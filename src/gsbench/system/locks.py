@@ -7,7 +7,6 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -82,7 +81,6 @@ def is_held(path: Path) -> bool:
     return False
 
 
-@dataclass(frozen=True, kw_only=True)
 class LockHolder(Record):
     """A lock's holder: its host, process and Slurm job, since when (Unix time), and its work."""
 

@@ -6,9 +6,10 @@ it; other programs have similar habits. `tests/system/test_programs.py` lists al
 
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -54,6 +55,22 @@ def find_program(name: str) -> str | None:
     found = shutil.which(name, path=safe_environment()["PATH"])
     # Windows looks in the current folder first.
     return found if found and os.path.isabs(found) else None
+
+
+def answer_of(command: Sequence[str], seconds: float) -> str | None:
+    """The output of a program that needs no files; None if it fails or takes too long."""
+    try:
+        return subprocess.run(
+            command,
+            cwd=NEUTRAL,
+            env=safe_environment(),
+            capture_output=True,
+            text=True,
+            timeout=seconds,
+            check=True,
+        ).stdout
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 @contextmanager

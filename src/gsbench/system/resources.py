@@ -9,19 +9,19 @@ import logging
 import os
 import re
 import socket
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import psutil
 
 from gsbench.system.locks import BusyError, hold
-from gsbench.system.programs import NEUTRAL, safe_environment
+from gsbench.system.programs import answer_of
 
 try:
     import resource
@@ -30,6 +30,9 @@ except ImportError:  # Windows
 
 if TYPE_CHECKING:
     import torch
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 MIB = 2**20
 STATUS = Path("/proc/self/status")
@@ -58,6 +61,12 @@ def available_threads(parallel: int = 1) -> int:
     if slurm.isdigit() and int(slurm) > 0:
         return int(slurm)
     return max(1, available_cores() // parallel)
+
+
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """The results of ``function`` for ``items``, in their order, computed on all threads."""
+    with ThreadPoolExecutor(available_threads()) as pool:
+        yield from pool.map(function, items)
 
 
 @cache
@@ -125,19 +134,8 @@ def installed_gpus() -> list[str]:
 
 def nvidia_smi(query: str) -> list[str]:
     """The answers of ``nvidia-smi --query-gpu=QUERY``, one for each GPU; [] without a driver."""
-    try:
-        listing = subprocess.run(
-            ["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"],
-            cwd=NEUTRAL,
-            env=safe_environment(),
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return listing.stdout.split()
+    listing = answer_of(["nvidia-smi", f"--query-gpu={query}", "--format=csv,noheader"], 60)
+    return (listing or "").split()
 
 
 def assign_threads(threads: int | str, parallel: int) -> None:

@@ -208,7 +208,8 @@ class MLflow:
         from mlflow.entities import Metric
 
         metrics = [
-            Metric(one.key, one.value, self._time_of(one.seconds), one.step) for one in scalars
+            Metric(scalar.key, scalar.value, self._time_of(scalar.seconds), scalar.step)
+            for scalar in scalars
         ]
         self._client.log_batch(self._id, metrics=metrics)
 
@@ -216,13 +217,13 @@ class MLflow:
         """Upload files, and show the pictures in MLflow's grid."""
         for name, path in files.items():
             self._client.log_artifact(self._id, str(path), name.rpartition("/")[0] or None)
-        for one in pictures:
+        for picture in pictures:
             self._client.log_image(
                 self._id,
-                one.pixels,
-                key=one.key,
-                step=one.step,
-                timestamp=self._time_of(one.seconds),
+                picture.pixels,
+                key=picture.key,
+                step=picture.step,
+                timestamp=self._time_of(picture.seconds),
                 synchronous=True,
             )
 

@@ -19,7 +19,6 @@ from gsbench.tracking.trial import NOTE, Picture, Scalar, TrackedTrial
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Run(Record):
     """The run of a trial, and what was sent to it. gsbench keeps it in the trial's folder."""
 
@@ -119,14 +118,14 @@ class TensorBoard:
         self._table("trial", values)
 
     def metrics(self, scalars: Sequence[Scalar]) -> None:
-        for one in scalars:
-            time = self._run.started / 1000 + one.seconds
-            self._writer.add_scalar(one.key, one.value, one.step, time)
+        for scalar in scalars:
+            time = self._run.started / 1000 + scalar.seconds
+            self._writer.add_scalar(scalar.key, scalar.value, scalar.step, time)
         self._writer.flush()
 
     def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
-        for one in pictures:
-            self._writer.add_image(one.key, one.pixels, one.step, dataformats="HWC")
+        for picture in pictures:
+            self._writer.add_image(picture.key, picture.pixels, picture.step, dataformats="HWC")
         self._writer.flush()
 
     def close(self, status: Status, reason: str | None) -> None:
@@ -197,8 +196,8 @@ class WandB:
     def artifacts(self, files: Mapping[str, Path], pictures: Sequence[Picture]) -> None:
         import wandb
 
-        for one in pictures:
-            self._run.log({STEP: one.step, one.key: wandb.Image(one.pixels)})
+        for picture in pictures:
+            self._run.log({STEP: picture.step, picture.key: wandb.Image(picture.pixels)})
         for path in files.values():
             self._run.save(str(path), base_path=str(self._root), policy="now")
 

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gsbench.eval.facts import find_metric
-from gsbench.parsing import Record, read_if_sound
+from gsbench.parsing import read_if_sound
 from gsbench.runs import layout
 from gsbench.runs.keys import TRAIN
 from gsbench.runs.nested import flatten, sha256_of
+from gsbench.runs.plan import PlanFile
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import TrialRecord, read_rows
 
@@ -218,7 +219,7 @@ class TrackedTrial:
             f"{', '.join(texts)} after {results.iterations:,} iterations.",
             f"Folder: `{self.path}`",
         ]
-        plan = read_if_sound(self.folder.home / layout.PLAN, _Plan)
+        plan = read_if_sound(self.folder.home / layout.PLAN, PlanFile)
         place = self.folder.path.relative_to(self.folder.home).as_posix()
         if plan and (planned := plan.trials.get(place)):
             lines.append(f"Again: `{shlex.join(['gsbench', *planned.overrides])}`")
@@ -240,20 +241,6 @@ class TrackedTrial:
                 error = np.abs(render.astype(np.int16) - truth.astype(np.int16))
                 pictures[picture_key(path.stem, wrong)] = error.astype(np.uint8)
         return pictures
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Planned(Record):
-    """The part of a planned trial that is shown: the words of its command."""
-
-    overrides: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Plan(Record):
-    """The part of an experiment's plan that is shown: its trials by their folders."""
-
-    trials: dict[str, _Planned]
 
 
 def _read_picture(path: Path) -> Array:

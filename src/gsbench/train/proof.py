@@ -91,6 +91,7 @@ def prove(
     failures: list[str] = []
     largest: dict[str, float] = {}
     parts = [
+        _compiled_ahead(rasterizer, device),
         _render_errors(rasterizer, device, scenes, executor),
         _repeat_errors(rasterizer, device, scenes) if executor.same_bits else (),
         _training_errors(rasterizer, device, scenes[0], loss or PhotometricLoss()),
@@ -122,6 +123,17 @@ def prove(
         seconds=round(time.perf_counter() - started, 1),
         direct_fault="" if failures else _direct_fault(rasterizer, device, scenes[-1]),
     )
+
+
+def _compiled_ahead(rasterizer: Rasterizer, device: torch.device) -> Iterator[Error]:
+    """No errors; compile Triton's kernels for a GPU side by side."""
+    if rasterizer.name == "triton" and device.type == "cuda":
+        from gsbench.raster.triton.executor import TritonRasterizer
+        from gsbench.train.compile_ahead import compile_ahead
+
+        if isinstance(rasterizer, TritonRasterizer):
+            compile_ahead(rasterizer, device)
+    yield from ()
 
 
 def _direct_fault(rasterizer: Rasterizer, device: torch.device, case: Case) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsbench.densify import Refinement
 from gsbench.events import RefineEvent
-from gsbench.scene.images import resize_mask
+from gsbench.scene.masks import resize_mask
 from gsbench.scene.types import Camera, View
 from gsbench.train.options import TrainConfig
 from gsbench.train.views import Targets

@@ -42,11 +42,12 @@ HTML = "claims.html"
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
 DEFAULT_METRIC = "psnr"
 MOST_QUESTIONS = 10_000
-# the answer of `plan` for each command
+# the answers of `plan` for each command
 PLANNED = {
     "sweep": "Planned for a sweep: each question errs in {:.3g} %; all seeds are judged at once.",
     "looks": "Planned for a sweep that stops when decided: each question errs in {:.3g} %.",
-    "check": "Planned for a check: each claim errs in {:.3g} %, and is shown by itself.",
+    "check": "Planned for a check of claims: each claim errs in {:.3g} %. It is shown for each, "
+    "not for all at once.",
     "gate": "Planned for a gate: it calls a version worse that is worse by the difference.",
     "ledger": "Planned for a ledger: an idea is kept, at {:.3g} % with both sides, after a quarter "
     "of the ideas were tested and none was kept.",
@@ -178,19 +179,19 @@ def _run(check: Check) -> None:
 
     checked = check.checked(check.asked.answer(run))
     write_text(check.home / HTML, to_html(make_page(checked)))
-    for one in checked.verdicts:
-        print(f"{one.word:<19}  {one.claim.id}: {one.sentence}")
+    for verdict in checked.verdicts:
+        print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.sentence}")
     for note in texts(checked.unused):
         print(note)
     print(check.home / HTML)
 
 
-def plan(argv: Sequence[str], runs: Path) -> int:
-    """Run the verb; raises InputError for bad input."""
+def _plan_parser() -> ArgumentParser:
     parser = ArgumentParser(
         "plan",
         "It estimates from an experiment's trials how many scenes and seeds show a difference of "
-        "one arm in 80 of 100 cases. How many ideas will be found, it cannot say.",
+        "one arm in 80 of 100 cases. The seeds are new ones: those of the trials are seen "
+        "(docs/verdict.md). How many ideas will be found, it cannot say.",
     )
     parser.add_argument("experiment")
     parser.add_argument(
@@ -218,7 +219,12 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         "--baseline", default=BASELINE, help=f"the densifier to compare with ({BASELINE})"
     )
     parser.flag("--json", "print JSON")
-    options = parser.parse_args(argv)
+    return parser
+
+
+def plan(argv: Sequence[str], runs: Path) -> int:
+    """Run the verb; raises InputError for bad input."""
+    options = _plan_parser().parse_args(argv)
     experiment = load_experiment(runs, options.experiment)
     comparison = compare(experiment, options.baseline)
     trials = comparison.trials
@@ -324,7 +330,7 @@ def _lines(planned: Plan, metric: Quantity, difference: float) -> list[str]:
 
 
 def _designs_line(group: str, designs: Sequence[Design], difference: float) -> str:
-    shown = [f"{one.scenes} × {one.seeds} ({one.trials} trials)" for one in designs]
+    shown = [f"{design.scenes} × {design.seeds} ({design.trials} trials)" for design in designs]
     what = f"  to see {difference:g} on {group}, scenes × seeds"
     return f"{what}: {', '.join(shown) or 'none that can be run'}"
 

@@ -297,17 +297,17 @@ def explain_cell(address: str, runs: Path) -> str:
     lines += ["", "Conditions", *(f"  {key}: {value}" for key, value in conditions)]
     lines += _trials_lines(trials, shown)
     place = trials[0].path.parent
-    of_cell = [one for one in everything.trials if one.path.parent == place]
+    of_cell = [trial for trial in everything.trials if trial.path.parent == place]
     versions = newest_code(replace(everything, trials=tuple(of_cell))).versions
     start = f"{place.relative_to(runs).as_posix()}/"
-    if left_out := [*(one for one in experiment.faults if one.startswith(start)), *versions]:
+    if left_out := [*(line for line in experiment.faults if line.startswith(start)), *versions]:
         lines += ["", "Left out", *(f"  {line}" for line in left_out)]
     return "\n".join(lines)
 
 
 def _trials_at(experiment: Experiment, scene: str, word: str) -> list[TrialResult]:
     """The trials of a scene and of the one arm that ``word`` names."""
-    of_scene = [one for one in with_variants(experiment.trials) if one.scene == scene]
+    of_scene = [trial for trial in with_variants(experiment.trials) if trial.scene == scene]
     if not of_scene:
         scenes = ", ".join(sorted({trial.scene for trial in experiment.trials}))
         raise InputError(f"experiment {experiment.name!r} has no scene {scene!r}; it has {scenes}")

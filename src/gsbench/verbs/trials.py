@@ -23,14 +23,15 @@ from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import GsbenchError, InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.progress import Progress, progress_of
-from gsbench.launch.record import PlannedTrial, forget, remove
+from gsbench.launch.record import remove
 from gsbench.launch.states import TrialState, label_of, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home, list_experiments, trial_folders
+from gsbench.runs.plan import PlannedTrial, change_plan
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS
 from gsbench.system.own_modules import allow_modules
-from gsbench.tracking.mirror import MirrorError
-from gsbench.tracking.mirror import sync as send_missing
+from gsbench.tracking.tracker_run import MirrorError
+from gsbench.tracking.tracker_run import sync as send_missing
 from gsbench.verbs.arguments import ArgumentParser
 from gsbench.words import counted, readable_time
 
@@ -74,13 +75,13 @@ def status(argv: Sequence[str], runs: Path) -> int:
         return 0
     if options.forget:
         missing = [trial.folder for trial in trials if trial.state == "missing"]
-        forget(home, missing)
+        change_plan(home, dropped=missing)
         print(f"{counted(len(missing), 'trial')} removed from the plan")
         return 0
     if options.json:
         shown = [asdict(replace(trial, planned=None)) for trial in trials]
-        for one in shown:
-            del one["planned"]  # the plan's own entry, for `retry`
+        for entry in shown:
+            del entry["planned"]  # the plan's own entry, for `retry`
         print(json.dumps(shown, indent=1, default=str))  # `default` is for the folder, a Path
     else:
         print("\n".join(lines_of(trials, options.all)))
@@ -201,7 +202,8 @@ def retry(argv: Sequence[str], runs: Path) -> int:
         return 0
     modules = os.getcwd()  # noted now, since `recompose` changes the current folder
     trials = [
-        recompose(one.folder, one.planned, runs, options.changes, modules) for one in unfinished
+        recompose(state.folder, state.planned, runs, options.changes, modules)
+        for state in unfinished
     ]
     # A plan of somebody's must not declare or run anything in an experiment of the user's.
     for old, trial in zip(unfinished, trials, strict=True):
@@ -222,7 +224,7 @@ def retry(argv: Sequence[str], runs: Path) -> int:
             TrialFolder(old.folder).label,
         )
     code = run_trials(trials)
-    forget(home, [old.folder for old in replaced if old.planned is not None])
+    change_plan(home, dropped=[old.folder for old in replaced if old.planned is not None])
     return code
 
 

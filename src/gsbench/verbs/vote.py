@@ -111,7 +111,7 @@ def make(experiment: Experiment, options: argparse.Namespace) -> None:
     )
     declaration = Declaration(time=key.time, questions=asked, votes=key.votes, vote_round=key.round)
     declare_questions(experiment.folder, declaration)
-    pairs, scenes = len(key.pairs), len({one.scene for one in key.pairs})
+    pairs, scenes = len(key.pairs), len({showing.scene for showing in key.pairs})
     print(
         f"round {key.round}: {counted(len(key.showings), 'showing')}, {counted(pairs, 'pair')} of "
         "renders, and repeats"

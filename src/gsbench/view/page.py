@@ -143,9 +143,9 @@ def _flight(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def _background(trial: TrialResult) -> list[float]:
     """The training's background, three numbers; raises InputError for anything else."""
     color = trial.config.get("train.background", (0.0, 0.0, 0.0))
-    if len(color) != 3 or any(type(one) not in (int, float) for one in color):
+    if len(color) != 3 or any(type(channel) not in (int, float) for channel in color):
         raise InputError(f"{trial.path}: train.background in its configuration is not a colour")
-    return [float(one) for one in color]
+    return [float(channel) for channel in color]
 
 
 def _annotation(name: str, camera: dict[str, Any]) -> dict[str, Any]:

@@ -284,12 +284,12 @@ def side_by_side(panes: Sequence[tuple[str, Picture]]) -> Picture:
 
 def _fitted(label: str, size: float, width: int) -> tuple[str, float]:
     """The label in lines that fit ``width`` px, and the text size, reduced for a long word."""
-    length, room = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
+    length, space = ImageFont.load_default(size).getlength, width - 2 * MARGIN * size
     first, *rest = label.split()
     lines = [first]
     for word in rest:
-        if length(f"{lines[-1]} {word}") <= room:
+        if length(f"{lines[-1]} {word}") <= space:
             lines[-1] += f" {word}"
         else:
             lines.append(word)
-    return "\n".join(lines), size * min(1.0, room / max(map(length, lines)))
+    return "\n".join(lines), size * min(1.0, space / max(map(length, lines)))

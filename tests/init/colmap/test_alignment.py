@@ -47,8 +47,7 @@ def test_reflected_points_give_a_rotation():
 
 
 def test_three_cameras_give_a_similarity_and_two_do_not():
-    similarity = align_poses(*poses(3))
-    assert similarity.scale == pytest.approx(TRUE_SCALE, rel=1e-9)
+    assert align_poses(*poses(3)).scale == pytest.approx(TRUE_SCALE, rel=1e-9)
     with pytest.raises(ValueError, match="at least 3 common cameras, got 2"):
         align_poses(*poses(2))
 

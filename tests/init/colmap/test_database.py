@@ -27,13 +27,12 @@ from gsbench.scene.exif import (
 )
 from gsbench.scene.types import Capture
 
-SIZES = {
-    "a.png": (40, 30),
-    "b.png": (40, 30),
-    "c.png": (40, 32),
-    "left/a.png": (40, 30),
-    "left/b.png": (40, 30),
-}
+SIZES = dict.fromkeys(("a.png", "b.png", "c.png", "left/a.png", "left/b.png"), (40, 30))
+SIZES["c.png"] = (40, 32)
+
+
+def groups_of(images, names=tuple(SIZES), sharing="exif", focal=None):
+    return made.unknown_camera_groups(images, list(names), sharing, "SIMPLE_RADIAL", focal)
 
 
 @pytest.fixture
@@ -47,11 +46,9 @@ def images(tmp_path):
 @pytest.fixture
 def database(images, tmp_path):
     """Cameras and images without features; the names are given unsorted."""
-    made.create_database(
-        tmp_path / "database.db",
-        made.unknown_camera_groups(images, list(SIZES)[::-1], "single", "SIMPLE_RADIAL", None),
-    )
-    return tmp_path / "database.db"
+    path = tmp_path / "database.db"
+    made.create_database(path, groups_of(images, list(SIZES)[::-1], "single"))
+    return path
 
 
 @pytest.mark.parametrize(
@@ -64,28 +61,24 @@ def database(images, tmp_path):
     ],
 )
 def test_images_share_a_camera_by_size_folder_or_not_at_all(images, sharing, expected):
-    groups = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", None)
+    groups = groups_of(images, sharing=sharing)
     assert [set(names) for _, names in groups] == expected
     for camera, names in groups:
         assert (camera.width, camera.height) == SIZES[names[0]]
         assert (camera.focal_length, camera.has_prior_focal_length) == (1.2 * 40, False)
-    known = made.unknown_camera_groups(images, list(SIZES), sharing, "SIMPLE_RADIAL", 51.0)
-    assert all(
-        (camera.focal_length, camera.has_prior_focal_length) == (51.0, True) for camera, _ in known
-    )
+    for camera, _ in groups_of(images, sharing=sharing, focal=51.0):
+        assert (camera.focal_length, camera.has_prior_focal_length) == (51.0, True)
 
 
 def with_exif(path, size=(40, 30), **tags):
     """Write a photograph with EXIF data."""
     exif = Image.Exif()
     own = exif.get_ifd(EXIF_IFD)
-    ids = {"make": MAKE, "model": MODEL}
-    own_ids = {"mm": FOCAL_LENGTH, "film": FOCAL_LENGTH_35MM, "zoom": DIGITAL_ZOOM, "lens": LENS}
+    places = {"make": (exif, MAKE), "model": (exif, MODEL), "mm": (own, FOCAL_LENGTH)}
+    places |= {"film": (own, FOCAL_LENGTH_35MM), "zoom": (own, DIGITAL_ZOOM), "lens": (own, LENS)}
     for name, value in tags.items():
-        if name in ids:
-            exif[ids[name]] = value
-        else:
-            own[own_ids[name]] = value
+        ifd, number = places[name]
+        ifd[number] = value
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", size).save(path, exif=exif)
 
@@ -114,11 +107,10 @@ def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change,
     for k, name in enumerate(names):
         with_exif(tmp_path / "images" / name, **TELEPHONE | (change if k % 3 == 2 else {}))
     images = made.readable_images(tmp_path / "images", names, tmp_path / "work")
-    groups = made.unknown_camera_groups(images, names, "exif", "SIMPLE_RADIAL", None)
+    groups = groups_of(images, names)
     assert [len(group) for _, group in groups] == ([6] if cameras == 1 else [4, 2])
     assert groups[0][0].has_prior_focal_length
-    single = made.unknown_camera_groups(images, names, "single", "SIMPLE_RADIAL", None)
-    assert len(single) == (2 if "size" in change else 1)
+    assert len(groups_of(images, names, "single")) == (2 if "size" in change else 1)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +125,7 @@ def test_photographs_share_a_camera_by_their_exif_data(tmp_path, suffix, change,
 )
 def test_a_focal_length_of_exif_that_no_lens_has_is_not_used(tmp_path, tags, wanted):
     with_exif(tmp_path / "a.jpg", **tags)
-    ((camera, _),) = made.unknown_camera_groups(tmp_path, ["a.jpg"], "exif", "SIMPLE_RADIAL", None)
+    ((camera, _),) = groups_of(tmp_path, ["a.jpg"])
     assert camera.focal_length == pytest.approx(wanted, rel=0.1)
     assert camera.has_prior_focal_length is (tags == TELEPHONE)
 
@@ -165,14 +157,11 @@ def test_ids_follow_the_names_and_each_camera_has_a_rig(database):
         assert made.image_ids(database) == {image.name: image.image_id for image in stored}
         assert len(opened.read_all_rigs()) == len(opened.read_all_cameras()) == 2
         by_id = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        assert {
-            image.name: (by_id[image.camera_id].width, by_id[image.camera_id].height)
-            for image in stored
-        } == SIZES
+        for image in stored:
+            camera = by_id[image.camera_id]
+            assert (camera.width, camera.height) == SIZES[image.name]
     with made.image_ids_as_names(database) as names:
-        assert made.image_ids(database) == {
-            str(number): number for number in map(int, names.values())
-        }
+        assert made.image_ids(database) == {number: int(number) for number in names.values()}
     assert made.image_ids(database).keys() == SIZES.keys()
 
 
@@ -210,12 +199,8 @@ def test_verified_pairs_are_counted_only_with_inliers(database):
     pairs = {(f"{a}.png", f"{b}.png"): count for (a, b), count in inliers.items()}
     made.write_matches(database, dict.fromkeys(pairs, matches))
     write_geometries(database, {pair: matches[:count] for pair, count in pairs.items()})
-    assert made.database_counts(database) == {
-        "features": 10 + 11 + 12 + 13 + 14,
-        "pairs_matched": 3,
-        "pairs_verified": 2,
-        "inlier_matches": 8,
-    }
+    counts = {"features": 60, "pairs_matched": 3, "pairs_verified": 2, "inlier_matches": 8}
+    assert made.database_counts(database) == counts
 
 
 def test_assumed_focal_lengths_count_as_known(database):
@@ -297,18 +282,15 @@ def test_masks_have_the_names_that_colmap_expects(images, tmp_path):
 def test_reference_cameras_are_marked_as_known_and_grouped_with_their_images():
     model = pycolmap.Reconstruction()
     for number, focal in ((1, 50.0), (2, 60.0)):
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera.create_from_model_name(number, "PINHOLE", focal, 40 * number, 30)
-        )
+        settings = (number, "PINHOLE", focal, 40 * number, 30)
+        model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(*settings))
     for number, (name, camera) in enumerate([("d", 1), ("c", 2), ("b", 1), ("a", 2)], start=1):
         image = pycolmap.Image(name=name, camera_id=camera, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     groups = made.reference_camera_groups(model)
     assert [names for _, names in groups] == [["a", "c"], ["b", "d"]]
-    assert [(camera.mean_focal_length(), camera.width) for camera, _ in groups] == [
-        (60.0, 80),
-        (50.0, 40),
-    ]
+    known = [(camera.mean_focal_length(), camera.width) for camera, _ in groups]
+    assert known == [(60.0, 80), (50.0, 40)]
     assert all(camera.has_prior_focal_length for camera, _ in groups)
     assert not any(camera.has_prior_focal_length for camera in model.cameras.values())  # copies
 

@@ -41,16 +41,14 @@ def test_counts_of_agreements_are_exact():
 
 
 def test_float_descriptors_of_networks_are_counted_too():
-    rng = np.random.default_rng(1)
-    base = rng.normal(size=(50, 64)).astype(np.float32)
+    base = np.random.default_rng(1).normal(size=(50, 64)).astype(np.float32)
     base /= np.linalg.norm(base, axis=1, keepdims=True)
     assert count_agreements([base, base[::-1].copy()])[0, 1] == 50
 
 
 def test_each_image_keeps_its_best_partners():
     # images on a line: the nearer two images, the more descriptors they share
-    rng = np.random.default_rng(2)
-    world = rng.integers(0, 256, (600, 128)).astype(np.uint8)
+    world = np.random.default_rng(2).integers(0, 256, (600, 128)).astype(np.uint8)
     images = [world[20 * i : 20 * i + 200] for i in range(12)]
     pairs = best_pairs(images, partners=2)
     expected = {(i, i + 1) for i in range(11)} | {(0, 2), (9, 11)}

@@ -64,11 +64,9 @@ def database(tmp_path_factory):
 def test_points_are_triangulated_from_the_named_images_and_cameras_do_not_change(
     database, tmp_path
 ):
-    said = []
-    images, reference = database.parent / "images", model_of(poses())
-    model = mapping.triangulate(
-        database, images, tmp_path, reference, NAMES[:3], Sfm(), lambda *at: said.append(at)
-    )
+    said, tell = [], lambda *at: said.append(at)
+    inputs = database, database.parent / "images", tmp_path, model_of(poses())
+    model = mapping.triangulate(*inputs, NAMES[:3], Sfm(), tell)
     assert said == [("triangulate", 0, 1), ("triangulate", 1, 1)]
     placed = {image.name: image for image in model.images.values()}
     assert sorted(placed) == NAMES  # an image without points has its camera, too
@@ -104,10 +102,8 @@ def test_the_poses_of_two_models_are_paired_by_name():
     assert_allclose(other_centers, scale * centers + shift, atol=1e-12)
     assert_allclose(rotations, turns, atol=1e-12)
     assert_allclose(other_rotations, rotations, atol=1e-12)
-    found = alignment.similarity_to(first, second)
-    assert found.scale == pytest.approx(scale)
-    lonely = model_of({NAMES[0]: poses()[NAMES[0]]})
-    assert alignment.similarity_to(first, lonely) is None
+    assert alignment.similarity_to(first, second).scale == pytest.approx(scale)
+    assert alignment.similarity_to(first, model_of({NAMES[0]: poses()[NAMES[0]]})) is None
     nothing = reconstruct.common_poses(first, pycolmap.Reconstruction())
     assert [part.shape for part in nothing] == [(0, 3), (0, 3, 3)] * 2
 
@@ -116,8 +112,7 @@ def test_points_of_training_views_keep_place_and_observations_and_get_those_view
     model = model_with(poses(), 3, camera())
     for shade, name in zip((10, 20, 60, 200), NAMES, strict=True):
         Image.new("RGB", (WIDTH, HEIGHT), (shade, 0, 255 - shade)).save(tmp_path / name)
-        image = model.find_image_with_name(name)
-        for point in image.points2D:
+        for point in model.find_image_with_name(name).points2D:
             point.xy = np.array([WIDTH / 2, HEIGHT / 2])
     for index, seen in enumerate(((1, 2, 4), (3, 4), (1, 3))):
         add_point(model, POINTS[index], seen_by=dict.fromkeys(seen, index))

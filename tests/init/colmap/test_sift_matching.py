@@ -33,14 +33,10 @@ def test_every_pair_is_matched_once(pairs, block, processes):
 
 
 def test_shares_are_about_equal_and_parts_hold_few_images():
-    pairs = list(itertools.combinations(range(1, 101), 2))
-    parts = divide_pairs(pairs, 10)
+    parts = divide_pairs(list(itertools.combinations(range(1, 101), 2)), 10)
     assert max(len({image for pair in part for image in pair}) for part in parts) <= 2 * 10
-    assert divide_pairs(list(itertools.combinations(range(1, 5), 2)), 2) == [
-        [(1, 2)],
-        [(1, 3), (1, 4), (2, 3), (2, 4)],
-        [(3, 4)],
-    ]
+    first = divide_pairs(list(itertools.combinations(range(1, 5), 2)), 2)
+    assert first == [[(1, 2)], [(1, 3), (1, 4), (2, 3), (2, 4)], [(3, 4)]]
     sizes = [sum(map(len, share)) for share in distribute_parts(parts, 4)]
     assert max(sizes) - min(sizes) <= 10 * 10
 
@@ -64,16 +60,13 @@ def read_matches(database):
     with pycolmap.Database.open(database) as opened:
         pair_ids, matches = opened.read_all_matches()
         geometry_ids, geometries = opened.read_two_view_geometries()
-    matched = {
-        pair: np.asarray(indices).tobytes() for pair, indices in zip(pair_ids, matches, strict=True)
+    found = {pair: [one] for pair, one in zip(pair_ids, matches, strict=True)}
+    for pair, one in zip(geometry_ids, geometries, strict=True):
+        found[pair] += [one.inlier_matches, one.E, one.F, one.H]
+    return {
+        pair: [None if part is None else np.asarray(part).tobytes() for part in parts]
+        for pair, parts in found.items()
     }
-    verified = {}
-    for pair, found in zip(geometry_ids, geometries, strict=True):
-        parts = (found.inlier_matches, found.E, found.F, found.H)
-        verified[pair] = tuple(
-            b"" if part is None else np.asarray(part).tobytes() for part in parts
-        )
-    return matched, verified
 
 
 @pytest.mark.parametrize("processes", [1, 3])
@@ -84,26 +77,21 @@ def test_matches_equal_those_of_colmap_on_one_thread(features, tmp_path, process
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads, matching.use_gpu = 1, False
     verification.ransac.random_seed = 0
-    pycolmap.match_exhaustive(
-        tmp_path / "colmap.db",
-        matching_options=matching,
-        verification_options=verification,
-        device=pycolmap.Device.cpu,
-    )
+    options = {"matching_options": matching, "verification_options": verification}
+    pycolmap.match_exhaustive(tmp_path / "colmap.db", **options, device=pycolmap.Device.cpu)
     shutil.copy(database, tmp_path / "database.db")
     told = []
     tell = lambda phase, done, total: told.append(done)  # noqa: E731
     match_sift(tmp_path / "database.db", pairs, Sfm(), processes, tell)
     ours, theirs = read_matches(tmp_path / "database.db"), read_matches(tmp_path / "colmap.db")
     assert ours == theirs
-    assert sum(len(matches) > 0 for matches in theirs[0].values()) > 10
+    assert sum(len(parts[0]) > 0 for parts in theirs.values()) > 10
     assert (told[0], max(told)) == (0, len(pairs))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["colmap.db", "database.db"]
     # the images have their own names again
     with pycolmap.Database.open(tmp_path / "database.db") as opened:
-        assert {image.name for image in opened.read_all_images()} == {
-            name for pair in pairs for name in pair
-        }
+        names = {image.name for image in opened.read_all_images()}
+    assert names == {name for pair in pairs for name in pair}
 
 
 def test_colmaps_matcher_never_gets_a_second_thread(features, tmp_path, monkeypatch):
@@ -122,7 +110,7 @@ def test_colmaps_matcher_never_gets_a_second_thread(features, tmp_path, monkeypa
     match_sift(tmp_path / "database.db", pairs, Sfm(), 1, lambda *state: told.append(state))
     assert set(threads) == {1}
     assert (told[0], told[-1]) == (("match", 0, len(pairs)), ("match", len(pairs), len(pairs)))
-    assert sum(map(bool, read_matches(tmp_path / "database.db")[0].values())) > 10
+    assert sum(bool(parts[0]) for parts in read_matches(tmp_path / "database.db").values()) > 10
 
 
 @pytest.mark.slow
@@ -145,13 +133,12 @@ def test_auto_matches_only_the_pairs_that_a_preview_proposes(
     files = tmp_path / "database.db", bare_photos.images
     task = DatabaseTask(*files, names, pairs, bare_photos, tmp_path)
     monkeypatch.setattr("gsbench.init.colmap.pairs.ALL_PAIRS_UP_TO", 5)
-    two_each = partial(best_pairs, partners=2)
-    monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", two_each)
+    monkeypatch.setattr("gsbench.init.colmap.pairs.best_pairs", partial(best_pairs, partners=2))
     monkeypatch.setattr("gsbench.init.colmap.features.extract_sift", lambda *_: None)
     counts = Sfm(threads=1, pairs="auto").fill_database(task, no_progress, Timer())
     assert counts["pairs_selected"] + counts["pairs_left_out"] == len(pairs)
     assert counts["pairs_left_out"] > 10
-    matched = read_matches(task.database)[0]
+    matched = read_matches(task.database)
     assert len(matched) == counts["pairs_selected"]
     kept = {tuple(sorted(pycolmap.pair_id_to_image_pair(pair))) for pair in matched}
     # neighbours on the arc agree best

@@ -26,7 +26,6 @@ from gsbench.pipeline.steps import train as train_steps
 from gsbench.pipeline.steps.scene import init_step
 from gsbench.pipeline.steps.train import (
     _log_normalization,
-    check_gaussians,
     external_step,
     train_step,
 )
@@ -106,8 +105,7 @@ def trainer(tmp_path, model, cameras=True, **settings):
 @pytest.mark.parametrize("cameras", [True, False])
 def test_a_program_gets_the_training_views_and_the_settings(views, tmp_path, monkeypatch, cameras):
     monkeypatch.setenv("GSBENCH_RUNS", "here")
-    gaussians = random_gaussians(9, dtype=torch.float32)
-    write_ply(gaussians, tmp_path / "model.ply")
+    write_ply(random_gaussians(9, dtype=torch.float32), tmp_path / "model.ply")
     program = trainer(tmp_path, str(tmp_path / "model.ply"), cameras)
     step = external_step(views, program, parts_of())
     folder = tmp_path / "built"
@@ -269,20 +267,6 @@ def test_training_starts_from_the_gaussians_of_the_initialiser_if_there_are_any(
     assert len(train_steps.initial_gaussians(init, cpu)) == 7
     write_ply(random_gaussians(9, dtype=torch.float32), init / GAUSSIANS_FILE)
     assert len(train_steps.initial_gaussians(init, cpu)) == 9
-
-
-def test_initial_gaussians_are_checked_with_their_colours_as_bytes(monkeypatch):
-    seen = []
-    monkeypatch.setattr(train_steps, "check_points", lambda *given: seen.append(given))
-    gaussians = random_gaussians(2)
-    gaussians.sh_dc = torch.tensor([[0.0, 10.0, -10.0], [1.0, -1.0, 0.5]])
-    context = ("scene", "parts", "normalization")
-    check_gaussians(gaussians, *context)
-    ((points, colors, *rest),) = seen
-    assert_allclose(points, gaussians.means)
-    # 0.5 plus 0.2821 times the coefficient, in [0, 1], times 255
-    assert colors.tolist() == [[128, 255, 0], [199, 56, 163]]
-    assert tuple(rest) == context
 
 
 def test_a_program_without_a_result_is_named_with_its_log(views, tmp_path):

@@ -22,7 +22,7 @@ from gsbench.pipeline.steps.scene import (
 )
 from gsbench.runs.keys import INIT, Step
 from gsbench.runs.store import Store
-from gsbench.scene.images import read_mask
+from gsbench.scene.masks import read_mask
 from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_photos
 from gsbench.scene.types import Capture
@@ -114,8 +114,7 @@ def test_ground_truth_has_the_test_views_and_their_masks(tmp_path, tiny_scene):
     counts = np.zeros((32, 40), dtype=bool)
     counts[:, 7:] = True
     scene = replace(tiny_scene, test=(tiny_scene.test[0], replace(tiny_scene.test[1], mask=counts)))
-    init = Step(INIT, {}, lambda folder: None)
-    views = SimpleNamespace(scene=scene, inputs={}, init=init)
+    views = SimpleNamespace(scene=scene, inputs={}, init=Step(INIT, {}, lambda folder: None))
     ground_truth_step(views).build(tmp_path)
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png")) == [
         "00.png",

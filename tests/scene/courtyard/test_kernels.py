@@ -185,34 +185,6 @@ def test_textures_change_only_with_the_version(name):
     assert found == pytest.approx(PINNED[name], rel=1e-9), found
 
 
-def test_noise_has_the_values_of_its_cells_at_corners_and_no_slope_there():
-    for i in range(-3, 3):
-        corner = 2 * PLAIN.random_cell(i, 4 - i, 0, 7) - 1
-        assert PLAIN.noise2(i, 4 - i, 7) == pytest.approx(corner)
-        assert PLAIN.noise3(i, 4 - i, 0, 7) == pytest.approx(corner)
-        for x, y in ((i + 1e-4, 4 - i), (i - 1e-4, 4 - i), (i, 4 - i + 1e-4), (i, 4 - i - 1e-4)):
-            assert PLAIN.noise2(x, y, 7) == pytest.approx(corner, abs=1e-9)  # no slope at a corner
-    cells = np.array([PLAIN.random_cell(i - 8, j - 8, k, 0) for i, j, k in np.ndindex(16, 16, 4)])
-    assert 0 <= cells.min() < 0.01 < 0.99 < cells.max() < 1
-    counts, _ = np.histogram(cells, bins=8, range=(0, 1))
-    assert np.abs(counts - 128).max() < 5 * 128**0.5
-
-
-def test_pebbles_are_the_two_nearest_of_all_feature_points():
-    rng = np.random.default_rng(8)
-    cells = [(i, j) for i in range(-9, 9) for j in range(-9, 9)]
-    places = np.array(
-        [[i + PLAIN.random_cell(i, j, 1, 2), j + PLAIN.random_cell(i, j, 2, 2)] for i, j in cells]
-    )
-    for x, y in rng.uniform(-1, 1, (40, 2)):
-        distances = np.linalg.norm(places - [x / 0.2, y / 0.2], axis=1)
-        nearest, second = np.argsort(distances)[:2]
-        first, border, shade = PLAIN.pebbles(x, y, 0.2, 2)
-        assert first == pytest.approx(distances[nearest])
-        assert border == pytest.approx(distances[second] - distances[nearest])
-        assert shade == PLAIN.random_cell(*cells[nearest], 3, 2)
-
-
 def test_light_is_encoded_as_srgb_up_to_a_soft_shoulder():
     for value in np.linspace(0, 0.6, 20) / kernels.EXPOSURE:
         light = kernels.EXPOSURE * value

@@ -61,7 +61,9 @@ def keep_training_points(
         point = model.points3D[point_id]
         seen = [element for element in point.track.elements if element.image_id in kept]
         observations = [(element.image_id, element.point2D_idx) for element in seen]
-        track = pycolmap.Track([pycolmap.TrackElement(*one) for one in observations])
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(*observation) for observation in observations]
+        )
         copy = pycolmap.Point3D(xyz=np.array(point.xyz), error=point.error, track=track)
         # `point` and `seen` are views into the model, and invalid from here on
         model.delete_point3D(point_id)

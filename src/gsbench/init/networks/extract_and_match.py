@@ -19,7 +19,7 @@ from gsbench.init.networks.features import Features, FeatureSettings, FeatureSto
 from gsbench.init.networks.matchers import build_matcher, match
 from gsbench.init.options import FeatureOptions
 from gsbench.logs import Progress
-from gsbench.scene.images import read_mask
+from gsbench.scene.masks import read_mask
 from gsbench.scene.types import Capture
 from gsbench.system.device import select_device
 from gsbench.words import some_of

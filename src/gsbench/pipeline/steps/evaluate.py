@@ -113,8 +113,8 @@ def _build_from_model(views: Views, trained: Step, parts: Parts) -> Callable[[Pa
                         written.append(beside.submit(Image.fromarray(image).save, path))
                     per_view[view.name] = evaluator.evaluate_view(image, view.image, view.mask)
                     report(phase, done, len(scene.test))
-            for one in written:
-                one.result()  # raises what the thread raised
+            for saved in written:
+                saved.result()  # raises what the thread raised
             return per_view
 
         at: dict[str, Earlier] = {}

@@ -4,7 +4,6 @@ Photographs are read from the user's folder, masked, and resized to views; the t
 as PNG.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -27,34 +26,26 @@ from gsbench.runs.store import Store
 from gsbench.runs.user_code import NO_USER_CODE, UserCode
 from gsbench.scene.colmap import normalize_capture, write_frames
 from gsbench.scene.courtyard.render import render_courtyard
-from gsbench.scene.images import (
-    IMAGES,
-    image_size,
-    png_name,
-    prepare_photograph,
-    prepared_mask,
-    read_image,
-    write_mask,
-)
+from gsbench.scene.images import image_size, png_name, read_image
 from gsbench.scene.load import load_scene
+from gsbench.scene.masks import IMAGES, prepare_photograph, prepared_mask, write_mask
+from gsbench.scene.model_folders import SPARSE_FOLDERS, require_subfolder
 from gsbench.scene.options import Backdrop, SceneConfig, check_final_size
 from gsbench.scene.own_reader import PosedImages, SceneReader, read_posed_images
 from gsbench.scene.readers import (
-    SPARSE_FOLDERS,
     existing_folder,
     fingerprint,
     read_colmap,
     read_photos,
     read_posed,
     read_transforms,
-    require_subfolder,
 )
 from gsbench.scene.transforms import Transforms
 from gsbench.scene.transforms import read_transforms as read_transforms_files
 from gsbench.scene.twins import without_copies
 from gsbench.scene.types import Capture, Scene
 from gsbench.system.install import version_of
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import in_threads
 
 
 class CaptureSource:
@@ -89,16 +80,12 @@ class CaptureSource:
             assert made is not None
             return read_colmap(self.name, made, exact_poses=True, **selection)
         path, selection["masks"] = str(options.path), options.masks
-        if options.kind == "transforms":
-            assert made is not None
-            capture = read_transforms(
-                self.name, path, self._transforms, made / SPARSE_FOLDERS[0], **selection
-            )
-        elif options.kind == "reader":
-            assert made is not None
-            capture = read_posed(
-                self.name, self._folder, self._posed, made / SPARSE_FOLDERS[0], **selection
-            )
+        if made is not None:
+            model = made / SPARSE_FOLDERS[0]
+            if options.kind == "transforms":
+                capture = read_transforms(self.name, path, self._transforms, model, **selection)
+            else:
+                capture = read_posed(self.name, self._folder, self._posed, model, **selection)
         elif options.kind == "photos":
             capture = read_photos(self.name, path, images=options.images, **selection)
         else:
@@ -188,17 +175,12 @@ def masking_step(capture: Capture, backdrop: Backdrop) -> Step | None:
 
     def build(folder: Path) -> None:
         names = capture.image_names
-        with (
-            progress("scene") as report,
-            ThreadPoolExecutor(max_workers=available_threads()) as pool,
-        ):
-            made = pool.map(
-                lambda name: prepare_photograph(
-                    folder, capture.images, capture.masks, name, backdrop
-                ),
-                names,
-            )
-            for done, _ in enumerate(made, 1):
+
+        def prepare(name: str) -> None:
+            prepare_photograph(folder, capture.images, capture.masks, name, backdrop)
+
+        with progress("scene") as report:
+            for done, _ in enumerate(in_threads(prepare, names), 1):
                 report("pixels replaced", done, len(names))
 
     return step_of(CAPTURE, inputs, build)
@@ -331,7 +313,7 @@ def init_step(
 
 def check_readable(capture: Capture, report: Progress) -> None:
     """Decode every photograph once; raises InputError for a damaged one before hours of work."""
-    with ThreadPoolExecutor(max_workers=available_threads()) as pool:
-        made = pool.map(lambda name: read_image(capture.images / name).shape, capture.image_names)
-        for done, _ in enumerate(made, 1):
-            report("photographs", done, len(capture.image_names))
+    names = capture.image_names
+    read = in_threads(lambda name: read_image(capture.images / name).shape, names)
+    for done, _ in enumerate(read, 1):
+        report("photographs", done, len(names))

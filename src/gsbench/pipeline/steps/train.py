@@ -26,7 +26,7 @@ from gsbench.external.exchange import (
     write_test_cameras,
     write_training_views,
 )
-from gsbench.external.program import run_program
+from gsbench.external.program import ProgramResult, run_program
 from gsbench.external.settings import (
     DATA,
     FOLDERS,
@@ -38,17 +38,16 @@ from gsbench.external.settings import (
 )
 from gsbench.files import write_json
 from gsbench.gaussians.initial import gaussians_from_cloud
-from gsbench.gaussians.model import Gaussians, dc_to_rgb
+from gsbench.gaussians.model import Gaussians, dc_to_bytes
 from gsbench.gaussians.ply import read_ply, write_ply
 from gsbench.init import read_cloud
-from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER
+from gsbench.init.base import GAUSSIANS_FILE, MODEL_FOLDER, PointCloud
 from gsbench.logs import progress
-from gsbench.normalization import Normalization
 from gsbench.pipeline.steps.scene import Views
 from gsbench.runs.keys import TRAIN, Step, options_of, rasterizer_inputs, step_of
 from gsbench.runs.layout import EVENTS, LINEAGE, POINT_CLOUD, RENDERS, TRAINER_LOG, TRAINING
 from gsbench.runs.trial_record import FROM_MODEL, FROM_RENDERS, InitialCloud
-from gsbench.scene.types import Capture, Scene
+from gsbench.scene.types import Capture
 from gsbench.system.install import own_checkout
 from gsbench.system.machine import describe_machine
 from gsbench.system.own_modules import SAFE_PATH
@@ -91,7 +90,8 @@ def train_step(views: Views, parts: Parts) -> Step:
         scene = views.scene
         initial = initial_gaussians(views.store.path(views.init), device)
         _log_normalization(views.capture, densifier)
-        start = check_gaussians(initial, scene, parts, views.capture.normalization)
+        points, colors = initial.means.double().cpu().numpy(), dc_to_bytes(initial.sh_dc)
+        start = check_points(points, colors, views, parts)
         trainer = Trainer(scene, initial, densifier, rasterizer, options, seed, snapshot_at)
         reset_peak_memory(device)
         with progress("train") as report:
@@ -115,28 +115,13 @@ def train_step(views: Views, parts: Parts) -> Step:
     return step_of(TRAIN, inputs, build, user)
 
 
-def check_gaussians(
-    initial: Gaussians, scene: Scene, parts: Parts, normalization: Normalization
-) -> InitialCloud:
-    """Check the Gaussians that training starts from against the training views (`check_start`)."""
-    colors = (dc_to_rgb(initial.sh_dc).clamp(0, 1) * 255).round().byte()  # [N, 3]
-    return check_points(
-        initial.means.double().cpu().numpy(), colors.cpu().numpy(), scene, parts, normalization
-    )
-
-
 def check_points(
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    scene: Scene,
-    parts: Parts,
-    normalization: Normalization,
+    points: NDArray[np.float64], colors: NDArray[np.uint8], views: Views, parts: Parts
 ) -> InitialCloud:
     """Check the points that training starts from against the training views (`check_start`)."""
     # A user's initialiser may lack the attribute.
-    return check_start(
-        points, colors, scene, getattr(parts.initializer, "random_points", False), normalization
-    )
+    is_random = getattr(parts.initializer, "random_points", False)
+    return check_start(points, colors, views.scene, is_random, views.capture.normalization)
 
 
 def _log_normalization(capture: Capture, densifier: Densifier) -> None:
@@ -221,34 +206,16 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
 
     def build(folder: Path) -> None:
         cloud = read_cloud(views.store.path(views.init) / MODEL_FOLDER)
-        normalization = views.capture.normalization
-        start = check_points(cloud.points, cloud.colors, views.scene, parts, normalization)
-        executable, work, log_file = trainer.executable(), folder / WORK, folder / TRAINER_LOG
-        places = {name: work / name for name in FOLDERS}
+        start = check_points(cloud.points, cloud.colors, views, parts)
         here = {"device": str(device), "threads": parts.threads}
-        values = {name: str(place.resolve()) for name, place in places.items()}
+        values = {name: str((folder / WORK / name).resolve()) for name in FOLDERS}
         values |= trainer.options | repetition | here
-        environment = environment_of(trainer, values)
-        said = check_version(trainer, values, environment)
-        output = places[OUTPUT]
-        output.mkdir(parents=True)
-        write_training_views(places[DATA], views.scene.train, cloud, normalization)
-        if trainer.needs_test_cameras:
-            write_test_cameras(places[TEST_CAMERAS], views.scene.test, normalization)
-        command = [executable, *filled_command(trainer, values)[1:]]
-        limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
-        log.info("train: %s runs; its output: %s", trainer.program, log_file)
-        try:
-            ended = run_program(command, log_file, output, environment, limit)
-        finally:
-            for place in (DATA, TEST_CAMERAS):
-                shutil.rmtree(places[place], ignore_errors=True)
-        log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
-        count = collect_result(trainer, views, output, values, folder)
-        shutil.rmtree(work)
+        ended, said = _run(trainer, values, views, cloud, folder / TRAINER_LOG)
+        count = collect_result(trainer, views, Path(values[OUTPUT]), values, folder)
+        shutil.rmtree(folder / WORK)
         (folder / EVENTS).write_text("")
         # The record has placeholders instead of the folders in the command, which are deleted.
-        nameless = values | {name: f"{{{name}}}" for name in places}
+        nameless = values | {name: f"{{{name}}}" for name in FOLDERS}
         summary = {
             "evaluated_from": FROM_MODEL if trainer.leaves_model else FROM_RENDERS,
             "num_gaussians": count,
@@ -272,6 +239,33 @@ def external_step(views: Views, trainer: External, parts: Parts) -> Step:
     # not resumable, because a stopped program starts from the beginning.
     stage = replace(TRAIN, version=1, resumable=False)
     return step_of(stage, inputs, build)
+
+
+def _run(
+    trainer: External, values: Mapping[str, Any], views: Views, cloud: PointCloud, log_file: Path
+) -> tuple[ProgramResult, str | None]:
+    """Run the program on its inputs, which are then removed; returns its end, and `check_version`.
+
+    ``values`` replace the placeholders, among them the folders of inputs and results.
+    """
+    executable, environment = trainer.executable(), environment_of(trainer, values)
+    said = check_version(trainer, values, environment)
+    data, cameras, output = (Path(values[name]) for name in (DATA, TEST_CAMERAS, OUTPUT))
+    output.mkdir(parents=True)
+    normalization = views.capture.normalization
+    write_training_views(data, views.scene.train, cloud, normalization)
+    if trainer.needs_test_cameras:
+        write_test_cameras(cameras, views.scene.test, normalization)
+    command = [executable, *filled_command(trainer, values)[1:]]
+    limit = None if trainer.time_limit_minutes is None else 60 * trainer.time_limit_minutes
+    log.info("train: %s runs; its output: %s", trainer.program, log_file)
+    try:
+        ended = run_program(command, log_file, output, environment, limit)
+    finally:
+        for place in (data, cameras):
+            shutil.rmtree(place, ignore_errors=True)
+    log.info("train: %s ended after %s", trainer.program, readable_time(ended.seconds))
+    return ended, said
 
 
 def filled_command(trainer: External, values: Mapping[str, object]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Compositing of blocks, forward and backward, and footprints.
+"""Compositing of blocks, forward and backward.
 
 The formulas are those of 3DGS (Kerbl et al. 2023, eq. 2 to 4; renderCUDA in its code). With the
 density G, the opacity o and the colour c of each Gaussian, front to back,
@@ -9,9 +9,10 @@ density G, the opacity o and the colour c of each Gaussian, front to back,
 and a pixel stops before the Gaussian that would lower T below 1e-4.
 
 One program of one warp composites a block, four pixels per lane. With one warp, nothing is shared
-between warps: the loop over a list has no barrier, a record is read once for all 128 pixels, and
-shuffles compute gradient sums. The four pixels of a lane are in one row, so terms that depend only
-on dy are computed once for all four, and four chains of fma run in parallel.
+between warps: the loop over a list has no barrier, shuffles pass a record from the lane that loaded
+it to all 128 pixels, and compute gradient sums. The four pixels of a lane are in one row, so terms
+that depend only on dy are computed once for all four, and four chains of fma run in parallel. If a
+list is long, four programs composite it, one pixel per lane; each pixel gets the same bits.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ from gsbench.raster.triton.layout import (
 ALPHA_MAX = tl.constexpr(CONSTANTS.alpha_max)
 TRANSMITTANCE_MIN = tl.constexpr(CONSTANTS.transmittance_min)
 UNROLL = tl.constexpr(4)  # entries between two checks whether all pixels have stopped
+BATCH = tl.constexpr(min(LANES.value, SEGMENT.value))  # entries that are loaded at once
+# A list is long if it has several segments and more than this share of all pairs. A GPU has about
+# 500 schedulers, so one program needs a quarter of the whole kernel's time for such a list.
+LONG_SHARE = tl.constexpr(2048)
 NUMBERS = tl.constexpr(9)  # of a record that compositing loads
 UNROLL_BACK = tl.constexpr(2)  # entries per iteration of the backward pass's loop
 # -curve to entry of the inverse covariance, up to sign
@@ -59,28 +64,28 @@ TO_PRECISION = tl.constexpr(2 * math.log(2.0))
 
 
 @triton.jit
-def block_pixels(block, blocks_x, width, height):
-    """The pixels of a block.
+def block_pixels(block, steps, blocks_x, width, height):
+    """The pixels of a block that its lanes have at ``steps`` [S].
 
-    Returns a mask of the pixels in the image and their numbers in it, both [STEPS, LANES]; then for
+    Returns a mask of the pixels in the image and their numbers in it, both [S, LANES]; then for
     each lane the column of its first pixel and the row of all four, both [LANES] px.
     """
-    lane, step = tl.arange(0, LANES), tl.arange(0, STEPS)
+    lane = tl.arange(0, LANES)
     x = block % blocks_x * BLOCK_WIDTH + lane % LANE_COLUMNS
     y = block // blocks_x * BLOCK_HEIGHT + lane // LANE_COLUMNS
-    columns = x[None, :] + step[:, None] * LANE_COLUMNS
+    columns = x[None, :] + steps[:, None] * LANE_COLUMNS
     inside = (columns < width) & (y < height)[None, :]
     return inside, y[None, :] * width + columns, x.to(tl.float32), y.to(tl.float32)
 
 
 @triton.jit
-def block_places():
-    """The places of a block's pixels in memory, [STEPS, LANES]; those of a lane are adjacent.
+def block_places(steps):
+    """The places of a block's pixels in memory, [S, LANES]; those of a lane are adjacent.
 
-    With this order Triton chooses a layout of [STEPS, LANES] in which sums over steps stay within a
+    With this order Triton chooses a layout of [S, LANES] in which sums over steps stay within a
     lane.
     """
-    return tl.arange(0, STEPS)[:, None] + tl.arange(0, LANES)[None, :] * STEPS
+    return steps[:, None] + tl.arange(0, LANES)[None, :] * STEPS
 
 
 @triton.jit
@@ -100,34 +105,25 @@ def load_record(records, entry):
 
 
 @triton.jit
-def _load_entries(entries, position, end, closing):
-    """``UNROLL`` entries of a list from ``position`` on; ``closing`` from ``end`` on."""
-    found = ()
-    for k in tl.static_range(UNROLL):
-        entry = tl.load(entries + position + k, mask=position + k < end, other=closing)
-        found = found + (entry,)  # type: ignore[assignment]  # noqa: RUF005
+def _record_of(batch, lane):
+    """The record that ``lane`` of a batch has, in all lanes."""
+    index, found = tl.zeros([LANES], tl.int32) + lane, ()
+    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
+    for n in tl.static_range(NUMBERS):
+        found = found + (tl.gather(batch[n], index, 0),)  # type: ignore[assignment]  # noqa: RUF005
     return found
 
 
 @triton.jit
-def _load_records(records, found):
-    """The records of the entries ``found``, one after the other in one tuple."""
-    flat = ()
-    for k in tl.static_range(UNROLL):
-        flat = flat + load_record(records, found[k])
-    return flat
+def log2_alpha(record, steps, x, y):
+    """log2(alpha) before the clamp and t, both [S, LANES], and dy [LANES].
 
-
-@triton.jit
-def log2_alpha(record, x, y):
-    """log2(alpha) before the clamp and t, both [STEPS, LANES], and dy [LANES].
-
-    x and y are those of ``block_pixels``. Each fma is explicit, so that the forward and the
-    backward kernel round alike and skip the same pixels.
+    x and y are those of ``block_pixels``. The record's numbers are [] or [LANES]. Each fma is
+    explicit, so that the forward and the backward kernel round alike and skip the same pixels.
     """
     mean_x, mean_y, shear, curve_t, curve_y, log2_opacity, _, _, _ = record
     dy = y - mean_y
-    along = (tl.arange(0, STEPS) * LANE_COLUMNS).to(tl.float32)
+    along = (steps * LANE_COLUMNS).to(tl.float32)
     t = tl.fma(dy, shear, x - mean_x)[None, :] + along[:, None]
     power = tl.fma(curve_t * t, t, tl.fma(curve_y * dy, dy, log2_opacity)[None, :])
     return power, t, dy
@@ -155,10 +151,12 @@ def _leave_light_behind(first_border, crossed, red, green, blue):
     return red, green, blue
 
 
-@triton.jit(do_not_specialize=["closing", "width", "height", "blocks_x"])
-def composite(
-    order,
-    starts,
+@triton.jit
+def _composite_pixels(
+    block,
+    begin,
+    end,
+    steps,
     entries,
     records,
     closing,
@@ -170,31 +168,10 @@ def composite(
     alpha,
     transmittance,
     last,
-    past,
     borders,
-    slots,
-    last_slots,
 ):
-    """Composite the block ``order[program]``.
-
-    In:
-
-    - ``order`` [blocks], ``starts`` [blocks + 1], ``entries`` [pairs] and ``slots`` [pairs], the
-      lists;
-    - ``records`` [N + 1, 16], with an invisible one at ``closing``.
-
-    Out:
-
-    - ``image`` [H, W, 3], ``alpha`` [H, W];
-    - ``transmittance``, the final one, and ``last``, the end of the entries that were read before
-      the pixel stopped; both by block, lane and step;
-    - ``past`` [blocks], the maximum of ``last``; ``last_slots`` [blocks], the slot of the entry
-      before it, -1 if none;
-    - ``borders``, those that compositing crossed.
-    """
-    block = tl.load(order + tl.program_id(0)).to(tl.int32)
-    inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
-    begin, end = tl.load(starts + block), tl.load(starts + block + 1)
+    """Composite a list, ``begin`` to ``end``, into the pixels of ``block`` at ``steps`` [S]."""
+    inside, pixel, x, y = block_pixels(block, steps, blocks_x, width, height)
     # The transmittance of a pixel that has stopped or is outside the image has a minus sign: it
     # does not change again.
     light = tl.where(inside, 1.0, -1.0)
@@ -202,38 +179,46 @@ def composite(
     seen = tl.where(inside, begin, 0)
 
     # The longest lists end last, when nothing else hides that a record comes from far away. So
-    # records are loaded UNROLL entries ahead, all at once, and entries twice as far; behind the end
-    # of the list, the invisible record is used.
-    ahead = _load_records(records, _load_entries(entries, begin, end, closing))
-    found = _load_entries(entries, begin + UNROLL, end, closing)
+    # each lane loads the record of another entry, a whole batch before it is used, and its entry
+    # one batch earlier; behind the end of the list, the invisible record is used.
+    own = begin + tl.arange(0, LANES)
+    ahead = load_record(records, tl.load(entries + own, mask=own < end, other=closing))
+    own += BATCH
+    found = tl.load(entries + own, mask=own < end, other=closing)
     alive = True
     position = begin
-    places = block_places()
+    places = block_places(steps)
     first_border = borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
     crossed = 0
     while (position < end) & alive:
         border = tl.minimum(position + SEGMENT, end)
         while (position < border) & alive:
             current = ahead
-            ahead = _load_records(records, found)
-            found = _load_entries(entries, position + 2 * UNROLL, end, closing)
-            for k in tl.static_range(UNROLL):
-                record = current[NUMBERS * k : NUMBERS * k + NUMBERS]
-                position += 1
-                power, _, _ = log2_alpha(record, x, y)
-                opacity = tl.where(
-                    power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0
-                )
-                weight = light * opacity
-                after = light - weight
-                stopped = after < TRANSMITTANCE_MIN
-                weight = tl.where(stopped, 0.0, weight)
-                light = tl.where(stopped, -tl.abs(light), after)
-                seen = tl.where(stopped, seen, position)
-                red = tl.fma(weight, record[6], red)
-                green = tl.fma(weight, record[7], green)
-                blue = tl.fma(weight, record[8], blue)
-            alive = tl.max(tl.max((light > 0).to(tl.int32), 0), 0) > 0
+            ahead = load_record(records, found)
+            own += BATCH
+            found = tl.load(entries + own, mask=own < end, other=closing)
+            lane = 0
+            while (lane < BATCH) & (position < border) & alive:
+                for _ in tl.static_range(UNROLL):
+                    record = _record_of(current, lane)
+                    lane += 1
+                    position += 1
+                    power, _, _ = log2_alpha(record, steps, x, y)
+                    opacity = tl.where(
+                        power >= LOG2_ALPHA_MIN, tl.minimum(tl.exp2(power), ALPHA_MAX), 0.0
+                    )
+                    weight = light * opacity
+                    # Explicit, so that it rounds alike for all numbers of steps. Triton computes
+                    # -x as 0 - x, an instruction more.
+                    after = tl.fma(-1.0 * light, opacity, light)
+                    stopped = after < TRANSMITTANCE_MIN
+                    weight = tl.where(stopped, 0.0, weight)
+                    light = tl.where(stopped, -tl.abs(light), after)
+                    seen = tl.where(stopped, seen, position)
+                    red = tl.fma(weight, record[6], red)
+                    green = tl.fma(weight, record[7], green)
+                    blue = tl.fma(weight, record[8], blue)
+                alive = tl.max(tl.max((light > 0).to(tl.int32), 0), 0) > 0
         if (position < end) & alive:
             place = first_border + crossed * BORDER
             tl.store(place + TRANSMITTANCE, tl.abs(light))
@@ -250,14 +235,96 @@ def composite(
     light = tl.abs(light)
     state = block * BLOCK_PIXELS + places
     tl.store(transmittance + state, light)
-    tl.store(last + state, seen)
-    stop = tl.minimum(tl.max(tl.max(seen, 0), 0), end)
-    tl.store(past + block, stop)
-    tl.store(last_slots + block, tl.load(slots + stop - 1, mask=begin < stop, other=-1))
+    tl.store(last + state, tl.minimum(seen, end))
     tl.store(alpha + pixel, 1.0 - light, mask=inside)
     tl.store(image + 3 * pixel, tl.fma(light, tl.load(background), red), mask=inside)
     tl.store(image + 3 * pixel + 1, tl.fma(light, tl.load(background + 1), green), mask=inside)
     tl.store(image + 3 * pixel + 2, tl.fma(light, tl.load(background + 2), blue), mask=inside)
+
+
+@triton.jit(do_not_specialize=["split", "closing", "width", "height", "blocks_x"])
+def composite(
+    order,
+    starts,
+    split,
+    entries,
+    records,
+    closing,
+    background,
+    width,
+    height,
+    blocks_x,
+    image,
+    alpha,
+    transmittance,
+    last,
+    borders,
+):
+    """Composite the blocks in ``order`` [blocks]; the first programs have those with long lists.
+
+    Each of the first ``split`` blocks has ``STEPS`` programs. If its list is long, each of them
+    composites the pixels of one step; if not, the first composites all.
+
+    In:
+
+    - ``starts`` [blocks + 1] and ``entries`` [pairs], the lists;
+    - ``records`` [N + 1, 16], with an invisible one at ``closing``.
+
+    Out:
+
+    - ``image`` [H, W, 3], ``alpha`` [H, W];
+    - ``transmittance``, the final one, and ``last``, the end of the entries that were read before
+      the pixel stopped; both by block, lane and step;
+    - ``borders``, those that compositing of the pixel crossed.
+    """
+    program = tl.program_id(0)
+    step = program % STEPS
+    rank = program // STEPS
+    if rank >= split:
+        step = 0
+        rank = program - split * (STEPS - 1)
+    block = tl.load(order + rank).to(tl.int32)
+    begin, end = tl.load(starts + block), tl.load(starts + block + 1)
+    pairs = tl.load(starts + tl.num_programs(0) - split * (STEPS - 1))
+    if (rank < split) & (end - begin > tl.maximum(pairs // LONG_SHARE, SEGMENT)):
+        steps = step + tl.arange(0, 1)
+        _composite_pixels(
+            block,
+            begin,
+            end,
+            steps,
+            entries,
+            records,
+            closing,
+            background,
+            width,
+            height,
+            blocks_x,
+            image,
+            alpha,
+            transmittance,
+            last,
+            borders,
+        )
+    elif step == 0:
+        _composite_pixels(
+            block,
+            begin,
+            end,
+            tl.arange(0, STEPS),
+            entries,
+            records,
+            closing,
+            background,
+            width,
+            height,
+            blocks_x,
+            image,
+            alpha,
+            transmittance,
+            last,
+            borders,
+        )
 
 
 @triton.jit
@@ -351,6 +418,13 @@ def _segment(order, starts, blocks, inner):
     return block, first
 
 
+@triton.jit
+def store_last_slot(slots, last_slots, block, begin, end, mask):
+    """Write the slot of the entry before ``end``, -1 if none, to ``last_slots`` [blocks]."""
+    slot = tl.load(slots + end - 1, mask=mask & (begin < end), other=-1)
+    tl.store(last_slots + block, slot, mask=mask)
+
+
 @triton.jit(do_not_specialize=["blocks", "inner", "closing", "width", "height", "blocks_x"])
 def composite_backward(
     order,
@@ -367,11 +441,11 @@ def composite_backward(
     blocks_x,
     transmittance,
     last,
-    past,
     borders,
     g_image,
     g_alpha,
     rows_out,
+    last_slots,
     HAS_ALPHA: tl.constexpr,
     ABSOLUTE: tl.constexpr,
 ):
@@ -382,14 +456,19 @@ def composite_backward(
     derivative of the loss by alpha is T (c . g) - S / (1 - alpha). Back to front, S is a sum that
     starts with the background and the light behind the segment, so nothing cancels. ``slots``
     [pairs] has the row of each entry. Rows of entries that compositing did not reach are not
-    written. ``g_alpha`` is read only if ``HAS_ALPHA``.
+    written: see ``last_slots`` at `store_last_slot`. ``g_alpha`` is read only if ``HAS_ALPHA``.
     """
     block, begin = _segment(order, starts, blocks, inner)
-    end = tl.load(past + block)
+    steps = tl.arange(0, STEPS)
+    places = block_places(steps)
+    state = block * BLOCK_PIXELS + places
+    seen = tl.load(last + state)
+    end = tl.max(tl.max(seen, 0), 0)
+    store_last_slot(slots, last_slots, block, begin, end, tl.program_id(0) >= inner)
     # Compositing did not reach this segment.
     if begin >= end:
         return
-    inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
+    inside, pixel, x, y = block_pixels(block, steps, blocks_x, width, height)
     stop = tl.minimum(begin + SEGMENT, end)
     lane = tl.arange(0, LANES)
     number, stores = _number_of_sum(lane, ABSOLUTE)
@@ -399,10 +478,7 @@ def composite_backward(
         tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0),
         tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0),
     )
-    places = block_places()
-    state = block * BLOCK_PIXELS + places
     light = tl.load(transmittance + state)
-    seen = tl.load(last + state)
     behind = (
         g[0] * tl.load(background) + g[1] * tl.load(background + 1) + g[2] * tl.load(background + 2)
     )
@@ -410,11 +486,13 @@ def composite_backward(
         behind -= tl.load(g_alpha + pixel, mask=inside, other=0.0)
     behind *= light
     if stop < end:
+        # A pixel that stopped before the border has none if another program composited it.
+        crossed = seen > stop
         border = borders + (begin // SEGMENT).to(tl.int64) * BORDER + places
-        behind = tl.fma(g[0], tl.load(border + BEHIND_RED), behind)
-        behind = tl.fma(g[1], tl.load(border + BEHIND_GREEN), behind)
-        behind = tl.fma(g[2], tl.load(border + BEHIND_BLUE), behind)
-        light = tl.load(border + TRANSMITTANCE)
+        behind = tl.fma(g[0], tl.load(border + BEHIND_RED, mask=crossed, other=0.0), behind)
+        behind = tl.fma(g[1], tl.load(border + BEHIND_GREEN, mask=crossed, other=0.0), behind)
+        behind = tl.fma(g[2], tl.load(border + BEHIND_BLUE, mask=crossed, other=0.0), behind)
+        light = tl.load(border + TRANSMITTANCE, mask=crossed, other=light)
 
     ahead = load_record(records, tl.load(entries + stop - 1, mask=begin < stop, other=closing))
     entry = tl.load(entries + stop - 2, mask=begin + 1 < stop, other=closing)
@@ -426,7 +504,7 @@ def composite_backward(
             ahead = load_record(records, entry)
             entry = tl.load(entries + position - 2, mask=position - 2 >= begin, other=closing)
             slot = tl.load(slots + position, mask=position >= begin, other=0)
-            power, t, dy = log2_alpha(record, x, y)
+            power, t, dy = log2_alpha(record, steps, x, y)
             raw = tl.where((power >= LOG2_ALPHA_MIN) & (position < seen), tl.exp2(power), 0.0)
             opacity = tl.minimum(raw, ALPHA_MAX)
             root = tl.rsqrt(1.0 - opacity)
@@ -443,89 +521,3 @@ def composite_backward(
                 _sums_over_lanes(_lane_sums(h, weight, t, dy, g, record, ABSOLUTE), lane, ABSOLUTE),
                 mask=stores & (position >= begin),
             )
-
-
-@triton.jit(do_not_specialize=["width", "height", "blocks_x"])
-def cover(
-    starts,
-    entries,
-    slots,
-    records,
-    width,
-    height,
-    blocks_x,
-    last,
-    past,
-    values,
-    rows_out,
-    HAS_VALUES: tl.constexpr,
-):
-    """Write the footprints of a block's entries, up to ``past`` [blocks], to ``rows_out``.
-
-    Each entry has a row of ``rows_out`` [pairs, 16]. A footprint is the number of pixels that the
-    Gaussian was blended into, and the sums over them of ``values`` [H, W], read only if
-    ``HAS_VALUES``, and of the distances to its mean, px.
-    """
-    block = tl.program_id(0)
-    inside, pixel, x, y = block_pixels(block, blocks_x, width, height)
-    seen = tl.load(last + block * BLOCK_PIXELS + block_places())
-    given = tl.load(values + pixel, mask=inside & HAS_VALUES, other=0.0)
-    columns = x[None, :] + (tl.arange(0, STEPS) * LANE_COLUMNS).to(tl.float32)[:, None]
-    for position in range(tl.load(starts + block), tl.load(past + block)):
-        record = load_record(records, tl.load(entries + position))
-        power, _, dy = log2_alpha(record, x, y)
-        blended = (power >= LOG2_ALPHA_MIN) & (position < seen)
-        dx = columns - record[0]
-        distance = tl.sqrt(tl.fma(dx, dx, (dy * dy)[None, :]))
-        row = rows_out + tl.load(slots + position) * ROW
-        tl.store(row, tl.sum(tl.sum(tl.where(blended, 1.0, 0.0), 0), 0))
-        tl.store(row + 1, tl.sum(tl.sum(tl.where(blended, given, 0.0), 0), 0))
-        tl.store(row + 2, tl.sum(tl.sum(tl.where(blended, distance, 0.0), 0), 0))
-
-
-@triton.jit
-def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
-    """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
-
-    ``own_rows`` is the number of units of each Gaussian. ``sum_units`` has already summed the pairs
-    of each unit into the row of its first pair.
-    """
-    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
-    zero = tl.zeros_like(own_rows).to(tl.float32)
-    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
-    sums = ()
-    for _ in tl.static_range(NUMBERS):
-        sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
-    for k in range(0, tl.max(own_rows, 0)):
-        active = k < own_rows
-        width = tl.load(unit_widths + unit + k, mask=active, other=0)
-        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
-        grown = ()
-        for n in tl.static_range(NUMBERS):
-            own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
-            grown = grown + (sums[n] + own,)  # type: ignore[assignment]  # noqa: RUF005
-        sums = grown
-    return sums
-
-
-@triton.jit(do_not_specialize=["count"])
-def sum_cover(
-    count,
-    row_counts,
-    first_units,
-    pair_ends,
-    unit_widths,
-    rows,
-    covered,
-    sums,
-    distances,
-    GROUP: tl.constexpr,
-):
-    """Write ``covered`` [N] int32, ``sums`` and ``distances`` [N] from the rows of units."""
-    index = tl.program_id(0).to(tl.int64) * GROUP + tl.arange(0, GROUP)  # [GROUP]
-    inside = index < count
-    own_rows = tl.load(row_counts + index, mask=inside, other=0)
-    total, value, distance = sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, 3)
-    tl.store(covered + index, total.to(tl.int32), mask=inside)
-    tl.store(sums + index, value, mask=inside)
-    tl.store(distances + index, distance, mask=inside)

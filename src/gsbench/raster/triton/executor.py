@@ -22,7 +22,8 @@ from gsbench.raster.staged import (
     raise_for_values,
     upload,
 )
-from gsbench.raster.triton.composite import composite, composite_backward, cover, sum_cover
+from gsbench.raster.triton.composite import composite, composite_backward
+from gsbench.raster.triton.footprint import cover, sum_cover
 from gsbench.raster.triton.launch import Workspace, WorkspacePool, launch, launch_grid
 from gsbench.raster.triton.layout import (
     BLOCK_HEIGHT,
@@ -32,6 +33,7 @@ from gsbench.raster.triton.layout import (
     COLOR_SLOPES,
     RECORD,
     ROW,
+    STEPS,
     TILE,
     count_borders,
 )
@@ -53,6 +55,9 @@ from gsbench.scene.types import Camera
 EXTRA_KERNELS = {"splitting_matrix": store_splitting}  # each writes an extra output
 # the parameters from which the backward pass repeats the geometry of the forward pass
 READ_AGAIN = ("means", "log_scales", "quaternions", "opacity_logits")
+# Blocks, those with the longest lists, that may have four programs each: on a GPU of about 130
+# multiprocessors so many programs run at once. 0: each block has one program.
+SPLIT_BLOCKS = 1024
 
 # Makes an output: name, shape, dtype.
 Allocate = Callable[[str, tuple[int, ...], torch.dtype], Tensor]
@@ -109,22 +114,18 @@ class TritonFrame:
     lists: Lists
     transmittance: Tensor  # [blocks * BLOCK_PIXELS]
     last: Tensor  # [blocks * BLOCK_PIXELS] int32
-    past: Tensor  # [blocks] int32; see `composite` for these five
-    borders: Tensor  # [count_borders(pairs) * BORDER]
-    last_slots: Tensor  # [blocks] int64
+    borders: Tensor  # [count_borders(pairs) * BORDER]; see `composite` for these three
 
     def of_blocks(self, request: RenderRequest) -> dict[str, Any]:
         """The arguments that all kernels which read the lists of blocks have in common."""
         return {
             "starts": self.lists.starts,
             "entries": self.lists.entries,
-            "slots": self.lists.slots,
             "records": self.projected.records,
             "width": request.camera.width,
             "height": request.camera.height,
             "blocks_x": self.blocks_x,
             "last": self.last,
-            "past": self.past,
         }
 
     def of_pixels(self, request: RenderRequest) -> dict[str, Any]:
@@ -254,16 +255,15 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             lists,
             memory.take("transmittance", blocks * BLOCK_PIXELS.value, torch.float32),
             memory.take("last", blocks * BLOCK_PIXELS.value, torch.int32),
-            memory.take("past", blocks, torch.int32),
             memory.take("borders", count_borders(room.pairs) * BORDER.value, torch.float32),
-            memory.take("last_slots", blocks, torch.int64),
         )
-        launch_grid(composite, blocks)(
+        split = min(SPLIT_BLOCKS, blocks)
+        launch_grid(composite, blocks + split * (STEPS.value - 1))(
             **frame.of_blocks(started.request),
             **frame.of_pixels(started.request),
+            split=split,
             image=image,
             alpha=alpha,
-            last_slots=frame.last_slots,
             num_warps=1,
         )
         return image, alpha, started.radii, frame
@@ -311,12 +311,15 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
         lists, projected, count = frame.lists, frame.projected, len(gaussians)
         absolute = request.absolute
         rows = scratch.take("rows", lists.room.pairs * ROW.value, torch.float32)
+        last_slots = scratch.take("last_slots", frame.blocks, torch.int64)
         inner = count_borders(lists.room.pairs)
         launch_grid(composite_backward, inner + frame.blocks)(
             **frame.of_blocks(request),
             **frame.of_pixels(request),
             blocks=frame.blocks,
             inner=inner,
+            slots=lists.slots,
+            last_slots=last_slots,
             g_image=g_image,
             g_alpha=g_image if g_alpha is None else g_alpha,
             rows_out=rows,
@@ -324,7 +327,7 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             ABSOLUTE=absolute is not None,
             num_warps=1,
         )
-        _sum_units(frame, rows)
+        _sum_units(frame, last_slots, rows)
         tensors = gaussians.tensors()
         g_screen = allocate("g_screen", (count, 2), torch.float32)
         g_extra = None
@@ -369,14 +372,17 @@ class TritonRasterizer(StagedRasterizer[TritonFrame]):
             given = sums if values is None else values.detach().float().contiguous()
             # ``cover`` fills 3 of 16 columns
             rows = scratch.take("rows", frame.lists.room.pairs * ROW.value, torch.float32)
+            last_slots = scratch.take("last_slots", frame.blocks, torch.int64)
             launch_grid(cover, frame.blocks)(
                 **frame.of_blocks(request),
+                slots=frame.lists.slots,
+                last_slots=last_slots,
                 values=given,
                 rows_out=rows,
                 HAS_VALUES=values is not None,
                 num_warps=1,
             )
-            _sum_units(frame, rows)
+            _sum_units(frame, last_slots, rows)
             launch(sum_cover, count, 128)(
                 **frame.of_rows(),
                 count=count,
@@ -435,14 +441,14 @@ def _project(
     return projected
 
 
-def _sum_units(frame: TritonFrame, rows: Tensor) -> None:
+def _sum_units(frame: TritonFrame, last_slots: Tensor, rows: Tensor) -> None:
     """Sum the ``rows`` of the pairs of each unit, in place."""
     units, room = frame.units, frame.lists.room
     launch(sum_units, room.units, 32)(
         pair_ends=units.pair_ends,
         unit_widths=units.widths,
         unit_blocks=units.blocks,
-        last_slots=frame.last_slots,
+        last_slots=last_slots,
         status=units.status,
         **room._asdict(),
         rows=rows,

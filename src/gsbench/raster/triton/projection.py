@@ -10,7 +10,6 @@ import triton.language as tl
 
 from gsbench.raster.base import CONSTANTS
 from gsbench.raster.staged import MIN_QUATERNION_NORM
-from gsbench.raster.triton.composite import sum_rows
 from gsbench.raster.triton.geometry import (
     F0,
     clamped_slopes,
@@ -239,6 +238,31 @@ def sum_units(
         total += tl.load(place + k * ROW, mask=(written & (k < width))[:, None], other=0.0)
     written = first <= tl.load(last_slots + block, mask=width == 1, other=-1)
     tl.store(place, total, mask=((width > 1) | ((width == 1) & ~written))[:, None])
+
+
+@triton.jit
+def sum_rows(index, own_rows, first_units, pair_ends, unit_widths, rows, NUMBERS: tl.constexpr):
+    """Sum the first ``NUMBERS`` columns of the ``rows`` of each Gaussian over its units.
+
+    ``own_rows`` is the number of units of each Gaussian. ``sum_units`` has already summed the pairs
+    of each unit into the row of its first pair.
+    """
+    unit = tl.load(first_units + index, mask=own_rows > 0, other=0)
+    zero = tl.zeros_like(own_rows).to(tl.float32)
+    # Triton's tuples grow by ``+``; it knows neither ``*`` nor comprehensions.
+    sums = ()
+    for _ in tl.static_range(NUMBERS):
+        sums = sums + (zero,)  # type: ignore[assignment]  # noqa: RUF005
+    for k in range(0, tl.max(own_rows, 0)):
+        active = k < own_rows
+        width = tl.load(unit_widths + unit + k, mask=active, other=0)
+        slot = tl.load(pair_ends + unit + k, mask=active, other=0) - width
+        grown = ()
+        for n in tl.static_range(NUMBERS):
+            own = tl.load(rows + slot * ROW + n, mask=width > 0, other=0.0)
+            grown = grown + (sums[n] + own,)  # type: ignore[assignment]  # noqa: RUF005
+        sums = grown
+    return sums
 
 
 @triton.jit

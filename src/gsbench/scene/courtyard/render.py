@@ -5,7 +5,6 @@ structure from motion, and a large lawn of faint texture, on which 3DGS grows ov
 Equal seeds give equal images.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from math import cos, pi, radians, sin, tan
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from gsbench.scene.courtyard.kernels import render
 from gsbench.scene.courtyard.layout import Layout, build_layout
 from gsbench.scene.options import MIN_IMAGES, MIN_SIZE
 from gsbench.scene.types import Camera
-from gsbench.system.resources import available_threads
+from gsbench.system.resources import in_threads
 
 VERSION = 1  # raise it when the images change
 # azimuth between neighbouring views; larger steps gave wrong SfM models of scenes like this one
@@ -54,9 +53,8 @@ def render_courtyard(
         name, camera = item
         Image.fromarray(render_view(layout, camera, seed)).save(images / name, format="PNG")
 
-    with ThreadPoolExecutor(available_threads()) as pool:
-        for done, _ in enumerate(pool.map(work, cameras.items()), start=1):
-            progress("courtyard", done, views)
+    for done, _ in enumerate(in_threads(work, cameras.items()), start=1):
+        progress("courtyard", done, views)
     write_model(output_dir / "sparse" / "0", cameras)
 
 

@@ -1,0 +1,132 @@
+"""The photographs that renders are compared with: of a trial, a scene or a folder."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsbench.analysis.results import TrialResult, read_views
+from gsbench.config.compose import compose_one
+from gsbench.config.groups import options
+from gsbench.errors import InputError
+from gsbench.pipeline.parts import Parts
+from gsbench.pipeline.trial import TrialSteps
+from gsbench.runs import keys
+from gsbench.runs.layout import GROUND_TRUTH, MASKS, RENDERS, RESULTS, STORE
+from gsbench.runs.store import Store
+from gsbench.runs.trial_folder import TrialFolder
+from gsbench.scene.images import image_size, list_images, png_name
+from gsbench.scene.readers import fingerprint
+from gsbench.view.trials import find_trial
+from gsbench.words import did_you_mean
+
+CAMERAS_ONLY = ("init=random", "init.count=100")  # the fastest initialiser; its points are not used
+
+
+@dataclass(frozen=True)
+class ReferenceImages:
+    """Photographs by the names of their views, in the order of an evaluation.
+
+    ``what`` describes them in messages. ``data`` is the fingerprint of their capture, and
+    ``resolution`` (width, height) its size in px. ``config`` is the configuration of a trial that
+    is tested on them. ``scene`` is None for a plain folder of pictures, ``init`` is None if they
+    come from no trial.
+    """
+
+    photographs: Mapping[str, Path]
+    what: str
+    data: str
+    resolution: tuple[int, int]
+    config: Mapping[str, Any]
+    scene: str | None = None
+    init: str | None = None
+    # mask files of the views that ignore some pixels
+    masks: Mapping[str, Path] = field(default_factory=dict)
+
+
+def find_reference_images(place: str, settings: Sequence[str], runs: Path) -> ReferenceImages:
+    """The photographs of a folder, a trial (folder or EXPERIMENT:SCENE:ARM), or a scene.
+
+    ``settings`` are overrides of the configuration. Raises `InputError` if ``place`` is none of
+    these.
+    """
+    folder = Path(place).expanduser()
+    if folder.is_dir():
+        home = folder.parent if folder.name in (GROUND_TRUTH, RENDERS) else folder
+        if not (home / RESULTS).is_file():
+            return pictures_in(folder, settings)
+        return reference_images_of(find_trial(str(home), runs))
+    if ":" in place:
+        return reference_images_of(find_trial(place, runs))
+    scenes = options("scene")
+    if place not in scenes:
+        raise InputError(
+            f"--truth {place} is no folder, no trial EXPERIMENT:SCENE:ARM and no scene"
+            f"{did_you_mean(place, scenes)} (scenes: {', '.join(scenes)})"
+        )
+    return _scene(place, settings)
+
+
+def reference_images_of(trial: TrialResult) -> ReferenceImages:
+    """The reference images of a finished trial, as its own evaluation names and orders them."""
+    photographs = {view: trial.path / GROUND_TRUTH / png_name(view) for view in read_views(trial)}
+    if trial.record.resolution is None or "data" not in trial.record.hashes:
+        raise InputError(
+            f"{trial.label} has no record of the size or hash of its test views: run it again"
+        )
+    what = f"the test views of {trial.label}"
+    return ReferenceImages(
+        photographs,
+        what,
+        trial.record.hashes["data"],
+        trial.record.resolution,
+        TrialFolder(trial.path).configuration(),
+        trial.scene,
+        trial.init,
+        _masks(trial.path / MASKS, photographs),
+    )
+
+
+def _scene(name: str, settings: Sequence[str]) -> ReferenceImages:
+    """The test views of a scene as a trial with these settings sees them: undistorted, at its size.
+
+    If the scene comes with cameras, the fastest initialiser is used, unless the settings choose
+    one.
+    """
+    config = compose_one([f"scene={name}", *settings]).values
+    chooses = any(word.startswith("init=") for word in settings)
+    if not chooses and config["scene"]["kind"] != "photos":
+        config = compose_one([f"scene={name}", *CAMERAS_ONLY, *settings]).values
+    store = Store(Path(config["runs"]).expanduser().resolve() / STORE)
+    trial = TrialSteps(Parts(config), store)
+    for step in trial.steps():
+        if step.stage in (keys.CAPTURE, keys.INIT, keys.GROUND_TRUTH):
+            entry = store.get(step)
+            if step.stage is keys.GROUND_TRUTH:
+                folder = entry.path
+    scene = trial.views.scene
+    photographs = {view.name: folder / png_name(view.name) for view in scene.test}
+    sizes = [(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]]
+    masks = _masks(folder / MASKS, photographs)
+    what = f"the test views of {name}"
+    return ReferenceImages(
+        photographs, what, trial.capture.fingerprint, max(sizes), config, name, masks=masks
+    )
+
+
+def _masks(folder: Path, views: Iterable[str]) -> dict[str, Path]:
+    """The existing masks in ``folder``, by view."""
+    files = {view: folder / png_name(view) for view in views}
+    return {view: file for view, file in files.items() if file.is_file()}
+
+
+def pictures_in(folder: Path, settings: Sequence[str]) -> ReferenceImages:
+    names = list_images(folder)
+    if not names:
+        raise InputError(f"--truth {folder} holds no pictures")
+    photographs = {name: folder / name for name in names}
+    resolution = max(image_size(path) for path in photographs.values())
+    config = compose_one(list(settings)).values
+    return ReferenceImages(
+        photographs, f"the pictures in {folder}", fingerprint(folder, names), resolution, config
+    )
