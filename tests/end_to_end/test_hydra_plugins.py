@@ -13,7 +13,6 @@ import psutil
 import pytest
 import yaml
 
-from tests.end_to_end.conftest import start
 from tests.end_to_end.test_hydra import SECONDS, TINY, results_below
 
 pytestmark = pytest.mark.slow
@@ -120,16 +119,14 @@ def ray_workers():
 
 
 def test_ray_runs_a_sweep_on_two_nodes_and_survives_a_killed_worker(
-    cluster, environment, tmp_path, gsbench
+    cluster, start, tmp_path, gsbench
 ):
     words = ["-m", *TINY, "name=x", "seed=0,1,2,3,4,5,6,7", "hydra/launcher=ray"]
     words += [
         "hydra.launcher.ray.init.address=auto",
         "+hydra.launcher.ray.init.object_store_memory=null",
     ]
-    program = start(
-        environment | {"RAY_ADDRESS": cluster.address}, tmp_path, tmp_path / "runs", *words
-    )
+    program = start(*words, RAY_ADDRESS=cluster.address)
     at_once, killed = 0, 0
     until = time.monotonic() + SECONDS
     while program.poll() is None and time.monotonic() < until:
