@@ -22,9 +22,11 @@ pytestmark = pytest.mark.skipif(
 @pytest.mark.parametrize(
     "width, height, count",
     [
-        (32, 16, 12),
+        pytest.param(32, 16, 12, id="tiny"),  # scripts/gpu_day.py chooses it by this name
         pytest.param(
-            *(1600, 1060, 100_000), marks=pytest.mark.skipif(not ON_A_GPU, reason="needs a GPU")
+            *(1600, 1060, 100_000),
+            id="full",
+            marks=pytest.mark.skipif(not ON_A_GPU, reason="needs a GPU"),
         ),
     ],
 )
