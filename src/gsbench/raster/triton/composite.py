@@ -152,25 +152,15 @@ def _leave_light_behind(first_border, crossed, red, green, blue):
 
 
 @triton.jit
-def _composite_pixels(
-    block,
-    begin,
-    end,
-    steps,
-    entries,
-    records,
-    closing,
-    background,
-    width,
-    height,
-    blocks_x,
-    image,
-    alpha,
-    transmittance,
-    last,
-    borders,
-):
-    """Composite a list, ``begin`` to ``end``, into the pixels of ``block`` at ``steps`` [S]."""
+def _composite_pixels(block, begin, end, steps, size, inputs, outputs):
+    """Composite a list, ``begin`` to ``end``, into the pixels of ``block`` at ``steps`` [S].
+
+    The tuples have arguments of ``composite``: those of the image's size, what is read and what is
+    written.
+    """
+    width, height, blocks_x = size
+    entries, records, closing, background = inputs
+    image, alpha, transmittance, last, borders = outputs
     inside, pixel, x, y = block_pixels(block, steps, blocks_x, width, height)
     # The transmittance of a pixel that has stopped or is outside the image has a minus sign: it
     # does not change again.
@@ -286,45 +276,15 @@ def composite(
     block = tl.load(order + rank).to(tl.int32)
     begin, end = tl.load(starts + block), tl.load(starts + block + 1)
     pairs = tl.load(starts + tl.num_programs(0) - split * (STEPS - 1))
+    size = (width, height, blocks_x)
+    inputs = (entries, records, closing, background)
+    outputs = (image, alpha, transmittance, last, borders)
     if (rank < split) & (end - begin > tl.maximum(pairs // LONG_SHARE, SEGMENT)):
         steps = step + tl.arange(0, 1)
-        _composite_pixels(
-            block,
-            begin,
-            end,
-            steps,
-            entries,
-            records,
-            closing,
-            background,
-            width,
-            height,
-            blocks_x,
-            image,
-            alpha,
-            transmittance,
-            last,
-            borders,
-        )
+        _composite_pixels(block, begin, end, steps, size, inputs, outputs)
     elif step == 0:
-        _composite_pixels(
-            block,
-            begin,
-            end,
-            tl.arange(0, STEPS),
-            entries,
-            records,
-            closing,
-            background,
-            width,
-            height,
-            blocks_x,
-            image,
-            alpha,
-            transmittance,
-            last,
-            borders,
-        )
+        steps_of_all = tl.arange(0, STEPS)
+        _composite_pixels(block, begin, end, steps_of_all, size, inputs, outputs)
 
 
 @triton.jit
