@@ -117,10 +117,14 @@ class TrialResult:
         modules = {part: made for part, made in self.code.items() if part.kind == "module"}
         return list(code_changes(modules, partial(present_version, folder=os.getcwd())))
 
-    @property
+    @cached_property
     def finished(self) -> float:
-        """The Unix time at which the trial was finished."""
-        return (self.path / RESULTS).stat().st_mtime
+        """The Unix time at which the trial was finished; if unrecorded, that of the file.
+
+        A copy of the folder may have other times of its files.
+        """
+        made_of = self.folder.made_of()
+        return (made_of and made_of.finished) or (self.path / RESULTS).stat().st_mtime
 
     @cached_property
     def machine(self) -> str | None:
@@ -137,7 +141,7 @@ class TrialResult:
 
     @cached_property
     def measured(self) -> float:
-        """The Unix time of measuring the metrics; if unrecorded, that of the file."""
+        """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
         return self.finished if moment is None else moment
 
@@ -154,7 +158,11 @@ class TrialResult:
         if not self.from_renders:
             conditions["raster"] = self.record.raster
         if not self.made_elsewhere:
-            conditions["iterations"] = str(self.record.iterations)
+            budget, iterations = self.record.budget, self.record.iterations
+            if budget is not None and budget.seconds is not None:
+                # A time limit ends each training at another one: the planned number must agree.
+                iterations = self.config.get("train.iterations", iterations)
+            conditions["iterations"] = str(iterations)
         if not self.made_elsewhere and not self.program:
             conditions["budget"] = (
                 "null" if self.record.budget is None else canonical(asdict(self.record.budget))

@@ -27,6 +27,7 @@ from gsbench.analysis.statistics import Interval, StudentT, t_test
 from gsbench.claims.archive import unpack_archive
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Question
+from gsbench.runs.layout import TUNING
 from gsbench.runs.nested import sha256_of
 
 MIN_STUDIES = 2
@@ -188,6 +189,11 @@ def read_studies(
     studies, notes = [], list[str]()
     with tempfile.TemporaryDirectory() as folder:
         archived = unpack_archive(path, Path(folder))
+        if (archived.folder / TUNING).exists():
+            raise InputError(
+                f"{path} is of a search, whose points were chosen by their results: give the "
+                "archive of the sweep that it was for"
+            )
         notes += [f"{name}: left out, {line}" for line in archived.warnings]
         trials = with_variants(select_trials(archived.trials, question.where))
         by_protocol = sorted(group_by(trials, lambda trial: trial.record.protocol).items())
