@@ -315,6 +315,8 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     known = {frozenset(pair) for pair in usual.pairs}
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]
     lacking, older = unfinished(experiment), experiment.older
+    if declared is not None:
+        lacking += declared.missing(arms.trials)
     answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
     if (experiment.folder / LEDGER).exists():
         answers = [
