@@ -30,6 +30,7 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
+from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 
@@ -69,6 +70,11 @@ class PairVerdicts:
         ):
             return None
         return next((note for note in self.notes if note.about == self.declared.name), None)
+
+    @property
+    def undecided(self) -> bool:
+        """Return whether no verdict that decides about the arms is decided."""
+        return all(one.outcome == UNDECIDED for one in self.primary)
 
     def role(self, verdict: Verdict) -> str:
         """Declared or secondary; "" if all metrics are one family."""
