@@ -317,7 +317,10 @@ def test_an_arm_gains_nothing_by_a_trial_without_a_value(tmp_path, declared):
     found = answer(tmp_path)
     (verdict,) = [one for one in found.answers[0].verdicts if one.question.metric == "psnr"]
     assert verdict.favours_lacking
-    assert "1 trial of one arm alone failed, stopped, went missing or gave no value" in found.sentences[0]
+    assert (
+        "1 trial of one arm alone failed, stopped, went missing or gave no value"
+        in found.sentences[0]
+    )
     line = "PSNR (dB): a seed 1 not compared: it is not a number"
     left_out = found.to_json()["left_out"]
     for told in (remarks(tmp_path), left_out, table_of(tmp_path).notes, page_of(tmp_path)):

@@ -17,7 +17,7 @@ from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
 from gsbench.analysis.unfinished import Unfinished
-from gsbench.runs.experiments import Declaration, Question, merge_planned, of_latest_metric
+from gsbench.runs.experiments import Declaration, Planned, Question, merge_planned, of_latest_metric
 from gsbench.runs.layout import FORGOTTEN, SEED
 from gsbench.words import counted
 
@@ -138,7 +138,8 @@ class ActiveDeclaration:
 
         A trial counts only if its settings are those of its arm's finished trials on its scene.
         """
-        planned = reduce(merge_planned, (one.planned for one in self.declared if not one.looks), {})
+        plans = [one.planned for one in self.declared if not one.looks]
+        planned: Planned = reduce(merge_planned, plans, {})
         configs = {trial.key: trial.config for trial in trials}
         places = {key.rpartition("/")[0] for key in configs}
         done = {(trial.key, trial.seed) for trial in trials}

@@ -1,5 +1,6 @@
 """A complete trial as tables and verdicts see it: its record, settings, code and conditions."""
 
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -23,7 +24,8 @@ class TrialResult:
     """One complete trial.
 
     ``record`` is its ``results.json``, ``config_hash`` the hash in its folder's name. ``settings``
-    reads the configurations of its experiment.
+    reads the configurations of its experiment. ``known`` is the Unix time of a declaration that
+    its results came before, whatever their own time says.
     """
 
     path: Path
@@ -32,6 +34,7 @@ class TrialResult:
     # swept settings that distinguish arms of one initialiser and densifier
     variant: tuple[tuple[str, str], ...] = ()
     settings: Configurations = field(default_factory=Configurations, repr=False, compare=False)
+    known: float = field(default=math.inf, repr=False)
 
     @property
     def experiment(self) -> str:
@@ -143,7 +146,7 @@ class TrialResult:
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
-        return self.finished if moment is None else moment
+        return min(self.finished if moment is None else moment, self.known - 1)
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:
