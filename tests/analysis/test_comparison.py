@@ -270,6 +270,28 @@ def test_a_baseline_that_is_chosen_later_declares_no_other_pairs(tmp_path, looks
     assert turned.beforehand
 
 
+@pytest.mark.parametrize("case", ["three arms", "edited", "late", "late baseline"])
+def test_a_question_that_is_turned_has_the_same_answer(tmp_path, case):
+    """``report --baseline`` may be chosen by what was seen."""
+    days = {"late": (4, 2), "late baseline": (2, 4)}.get(case, (4, 4))
+    adc, mine = (grid(name, 4, day) for name, day in zip(("adc", "mine"), days, strict=True))
+    others = {
+        "three arms": grid("more", 4, 4),
+        "edited": [replace(one, code=OLD) for one in mine],
+    }.get(case, [])
+    mine = [replace(one, code=NEW, day=5) for one in mine] if case == "edited" else mine
+    trials = [*adc, *mine, *others]
+    write(tmp_path, trials)
+    declare(tmp_path, (3, trials))
+    (asked, *_), (turned, *_) = answer(tmp_path).answers, answer(tmp_path, "mine").answers
+    assert (asked.first, asked.second) == (turned.second, turned.first)
+    assert (asked.beforehand, asked.versions) == (turned.beforehand, turned.versions)
+    for one, other in zip(asked.verdicts, turned.verdicts, strict=True):
+        assert other.mean == pytest.approx(-one.mean)
+        assert other.p == pytest.approx(one.p)
+        assert (other.answer.level, other.family) == (one.answer.level, one.family)
+
+
 def gain(runs, trials, by=5.0):
     """Raise the PSNR of trials of one view."""
     for one in trials:
