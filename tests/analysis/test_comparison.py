@@ -368,6 +368,18 @@ def test_no_arm_gains_by_declared_trials_whose_folders_are_gone(tmp_path, gone, 
     assert (bool(verdict.lacking), verdict.favours_lacking) == (len(names) == 1,) * 2
 
 
+def test_a_failed_trial_without_settings_may_be_of_any_arm_that_lacks_it(tmp_path):
+    adc, mine, other = grid("adc"), grid("mine", decay=1), grid("mine", decay=2)
+    write(tmp_path, [*adc, *mine, *other])
+    gain(tmp_path, [*mine, *other])
+    mine[2].results(tmp_path).unlink()
+    write_file(mine[2].results(tmp_path).with_name("config.yaml"), "")
+    lacking, whole = answer(tmp_path).answers
+    assert lacking.verdicts[0].favours_lacking
+    assert not whole.verdicts[0].lacking
+    assert whole.verdicts[0].outcome == "supported"
+
+
 @pytest.mark.parametrize("seconds, answered", [(60.0, True), (None, False)])
 def test_trainings_that_a_time_limit_ended_are_compared(tmp_path, seconds, answered):
     """Each ends at another iteration; without a limit that is another training."""

@@ -57,7 +57,8 @@ class Unfinished:
         if question.scenes:
             return self.key == question.scenes.get(self.scene, ("", ""))[side]
         arm = (question.baseline, question.arm)[side]
-        return arm is not None and arm.has(self.path.parts[-2], self.config)
+        # without readable settings it may be of any arm of that name
+        return arm is not None and arm.has(self.path.parts[-2], self.config or dict(arm.variant))
 
 
 def unfinished(experiment: Experiment) -> list[Unfinished]:
