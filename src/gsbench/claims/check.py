@@ -31,7 +31,7 @@ from gsbench.runs.experiments import (
     read_declarations,
 )
 from gsbench.runs.layout import FAILED, SEED
-from gsbench.runs.trial_record import Failure
+from gsbench.runs.trial_files import Failure
 from gsbench.words import some_of, without_folders
 
 # a line for each thing that these trials need and lack

@@ -17,7 +17,8 @@ from gsbench.files import require_no_links
 from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
 from gsbench.runs.layout import DECLARED, IN_RUNS
 from gsbench.runs.nested import sha256_of
-from gsbench.runs.trial_record import Declared, read_rows
+from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_record import Declared
 from gsbench.settings import ARM_BYTES, is_folder_name
 
 log = logging.getLogger(__name__)
