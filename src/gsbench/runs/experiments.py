@@ -341,11 +341,12 @@ def of_latest_metric(sweeps: Sequence[Declaration]) -> tuple[Declaration, ...]:
     ``sweeps`` are declarations of sweeps, in the order of time.
     """
     latest = sweeps[-1]
-    others = [one.moment for one in sweeps if one.primary != latest.primary]
+    others = [sweep.moment for sweep in sweeps if sweep.primary != latest.primary]
     return tuple(
-        one
-        for one in sweeps
-        if one is latest or (one.primary == latest.primary and one.moment > max(others, default=-1))
+        sweep
+        for sweep in sweeps
+        if sweep is latest
+        or (sweep.primary == latest.primary and sweep.moment > max(others, default=-1))
     )
 
 

@@ -56,7 +56,7 @@ def build_report(
     comparison = compare(experiment, baseline)
     trials = select_trials(comparison.trials, where)
     shown = {trial.arm for trial in trials}
-    judged = [one for one in comparison.answers if {one.first, one.second} <= shown]
+    judged = [answer for answer in comparison.answers if {answer.first, answer.second} <= shown]
     pairs = [pair for pair in comparison.pairs if set(pair) <= shown]
     chosen = ", ".join(f"{key}={values}" for key, values in where.items())
     arms = sorted({trial.arm for trial in trials})
@@ -79,8 +79,10 @@ def build_report(
         votes=[show_votes(one, trials, judged) for one in load_rounds(experiment.folder)],
         declared=texts([*comparison.declared_notes, *verdict_words.families(judged)]),
         unused=[*([CHOSEN.format(chosen)] if where else []), *texts(comparison.remarks)],
-        tables=[_without_verdicts(one) for one in with_agreement(tables)],
-        ranks=[rank_plot(one) for one in rank_all(trials, choose_quantities(trials)) if pairs],
+        tables=[_without_verdicts(table) for table in with_agreement(tables)],
+        ranks=[
+            rank_plot(ranking) for ranking in rank_all(trials, choose_quantities(trials)) if pairs
+        ],
         contradictions=[] if paper_table is None else load_paper().contradictions,
         search=search_summary(experiment.folder),
         say=verdict_words,
@@ -136,7 +138,7 @@ def compare_arms(
     return {
         "judged": judged,
         "title": f"{second} against {first}",
-        "has_like_these": any(one.like_these is not None for one in judged.verdicts),
+        "has_like_these": any(verdict.like_these is not None for verdict in judged.verdicts),
         "caveats": " ".join(
             texts([*caveats(trials, first, second), *limit_notes(trials, [(first, second)])])
         ),
