@@ -98,8 +98,8 @@ def judge_pairs(
     standings: dict[ArmPair, Standing] = {}
     undirected: dict[ArmPair, list[Note]] = {}
     versions: dict[ArmPair, int] = {}
-    asked: list[Asked] = []
-    gone: list[tuple[Asked, OtherTest]] = []
+    asked: list[PairQuestion] = []
+    gone: list[tuple[PairQuestion, OtherTest]] = []
     for pair in pairs:
         first, second = (by_arm.get(arm, []) for arm in pair)
         metrics = [
@@ -119,7 +119,7 @@ def judge_pairs(
         versions[pair] = measured_versions(first, second, older)
         known = standings.get(pair)
         asked += [
-            Asked(pair, metric, _question(first, pair, metric, known), known, versions[pair])
+            PairQuestion(pair, metric, _question(first, pair, metric, known), known, versions[pair])
             for metric in directed
         ]
         if declared is not None:
@@ -167,7 +167,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
 
 
 @dataclass(frozen=True)
-class Asked:
+class PairQuestion:
     """A question about a pair of arms, with the standing of the declaration to it."""
 
     pair: ArmPair
@@ -198,8 +198,8 @@ class Asked:
 def _judge_families(
     by_arm: Mapping[Arm, Sequence[TrialResult]],
     trials: Sequence[TrialResult],
-    asked: Sequence[Asked],
-    gone: Sequence[tuple[Asked, OtherTest]],
+    asked: Sequence[PairQuestion],
+    gone: Sequence[tuple[PairQuestion, OtherTest]],
     lacking: Sequence[Unfinished],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair.
@@ -250,7 +250,7 @@ def _before_late_trials(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     standing: Standing | None,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions as they were before trials were added too late."""
     if standing is None or not standing.added:
         return []
@@ -260,7 +260,8 @@ def _before_late_trials(
     late = {(trial.scene, trial.seed) for trial in standing.added}
     in_time = [trial for trial in arm if (trial.scene, trial.seed) not in late]
     questions = [
-        Asked(pair, metric, _question(baseline, pair, metric, whole), whole) for metric in metrics
+        PairQuestion(pair, metric, _question(baseline, pair, metric, whole), whole)
+        for metric in metrics
     ]
     return [
         (question, other_test([*baseline, *in_time], question.question)) for question in questions
@@ -273,7 +274,7 @@ def _of_earlier_code(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     declared: ActiveDeclaration,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions with each earlier version of the arm's code.
 
     The new code is tested in another family.
@@ -288,7 +289,7 @@ def _of_earlier_code(
         )
         standing = known.standing(baseline, version)
         questions = [
-            Asked(pair, metric, _question(baseline, pair, metric, standing), standing)
+            PairQuestion(pair, metric, _question(baseline, pair, metric, standing), standing)
             for metric in metrics
         ]
         found += [

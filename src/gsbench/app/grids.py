@@ -93,7 +93,7 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
         if batch:
             run(batch)
 
-    stopping.asked.answer(run_planned)
+    stopping.test.answer(run_planned)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [

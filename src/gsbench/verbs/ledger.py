@@ -326,8 +326,8 @@ def show(options: argparse.Namespace, home: Path) -> int:
     """Print the ledger."""
     book, trials = records.read_ledger(home), read_experiment(home).trials
     rules.check_unknown_trials(book, trials)
-    for line in rules.contradictions(book, trials):
-        log.warning("%s", line)
+    for note in rules.contradictions(book, trials):
+        log.warning("%s", note)
     if options.json:
         ideas = [_facts(book, idea) for idea in book.started]
         confirmations = [one.to_json() for pair in book.confirmations for one in pair if one]

@@ -91,7 +91,8 @@ def gate(argv: Sequence[str], runs: Path) -> int:
         made = [*asked.read()]
         left_out = texts(unused_trials(made, [verdict]))
         new_trials = [trial for trial in made if trial.config_hash == gates.NEW]
-        print("\n".join([gates.describe(verdict), *left_out, *gates.deviations(old, new_trials)]))
+        deviations = map(str, gates.deviations(old, new_trials))
+        print("\n".join([gates.describe(verdict), *left_out, *deviations]))
     return EXIT_CODES[gates.result_of(verdict)]
 
 
