@@ -12,8 +12,8 @@ import yaml
 from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.build import build
-from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial, compose_one
+from gsbench.config.overrides import value_text
 from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan

@@ -61,7 +61,7 @@ class Trainings:
 @pytest.fixture
 def trainings(monkeypatch, runs):
     made = Trainings()
-    monkeypatch.setattr(verb, "compose_trials", composed)
+    monkeypatch.setattr("gsbench.app.ledger_trials.compose_trials", composed)
     monkeypatch.setattr(verb, "run_trials", made)
     # The new seeds follow from all lines before, so from their times.
     monkeypatch.setattr(verb, "stamp_now", lambda: "2026-11-28T00:00:00Z")

@@ -13,12 +13,7 @@ from collections.abc import Sequence
 from gsbench.analysis.quantities import COSTS
 from gsbench.app.grids import planned_trials, run_sweep
 from gsbench.app.hydra_main import run_main
-from gsbench.app.plugins import (
-    TrialTask,
-    other_sweep,
-    words_for_plugins,
-    words_without_sweeper,
-)
+from gsbench.app.plugins import TrialTask, other_sweep, words_for_plugins, words_without_sweeper
 from gsbench.app.sweep import HYDRA_ERRORS, Ended, Sweep
 from gsbench.claims.stopping import log_verdicts
 from gsbench.config.command_words import parse

@@ -17,9 +17,10 @@ from omegaconf import DictConfig, OmegaConf
 from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep
-from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
+from gsbench.config.command_words import grid_points, is_interval
 from gsbench.config.compose import Trial
 from gsbench.config.groups import GROUPS
+from gsbench.config.overrides import bare_key, key_of, value_text
 from gsbench.errors import InputError
 from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions

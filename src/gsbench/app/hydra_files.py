@@ -12,8 +12,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import OWN
-from gsbench.config.command_words import key_of
-from gsbench.config.compose import installed_nodes
+from gsbench.config.hydra_setup import installed_nodes
+from gsbench.config.overrides import key_of
 from gsbench.errors import InputError
 from gsbench.launch.jobs import check_job_links
 

@@ -28,27 +28,10 @@ from gsbench.analysis.results import group_by
 from gsbench.app.grids import GRIDS, run_sweep
 from gsbench.app.hydra_files import check_links, words_for_hydras_files, words_for_new_folder
 from gsbench.app.hydra_main import run_main
-from gsbench.app.sweep import (
-    DEFAULT_METRIC,
-    HYDRA_ERRORS,
-    OWN,
-    Ended,
-    Sweep,
-    better_direction,
-)
-from gsbench.config.command_words import (
-    bare_key,
-    grid_points,
-    is_sweep,
-    key_of,
-    parse_word,
-    task_words,
-)
-from gsbench.config.compose import (
-    Trial,
-    check_permitted,
-    trial_of_job,
-)
+from gsbench.app.sweep import DEFAULT_METRIC, HYDRA_ERRORS, OWN, Ended, Sweep, better_direction
+from gsbench.config.command_words import grid_points
+from gsbench.config.compose import Trial, check_permitted, trial_of_job
+from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word, task_words
 from gsbench.errors import GsbenchError, InputError
 from gsbench.files import checked_runs_folder
 from gsbench.launch.batch import begin_for_another_launcher

@@ -35,7 +35,7 @@ from annotated_types import Interval, Predicate, doc
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.quantities import askable_names, asked_quantity
 from gsbench.analysis.statistics import ALPHA
-from gsbench.config.command_words import value_text
+from gsbench.config.overrides import value_text
 from gsbench.config.permissions import PERMISSIONS
 from gsbench.errors import InputError
 from gsbench.parsing import read_yaml, resolved

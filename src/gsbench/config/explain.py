@@ -16,8 +16,9 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from gsbench.config.command_words import key_of, searched_folders
 from gsbench.config.groups import EXTERNAL_FOLDER, GROUPS, options
+from gsbench.config.overrides import key_of
+from gsbench.config.search_path import searched_folders
 from gsbench.errors import GsbenchError, InputError
 from gsbench.system.install import conf_dir
 from gsbench.words import did_you_mean

@@ -16,7 +16,7 @@ from gsbench.analysis.addresses import ArmName
 from gsbench.analysis.quantities import COSTS
 from gsbench.analysis.results import TrialResult, read_experiment
 from gsbench.analysis.trial_settings import config_if_readable
-from gsbench.config.command_words import parse_word
+from gsbench.config.overrides import parse_word
 from gsbench.errors import InputError
 from gsbench.eval.evaluator import Evaluator
 from gsbench.eval.pictures import PicturePair

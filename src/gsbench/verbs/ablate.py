@@ -8,8 +8,8 @@ from typing import Any
 from gsbench.analysis.results import read_experiment
 from gsbench.app.command import compose_trials, run_trials
 from gsbench.claims import ablation
-from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
+from gsbench.config.overrides import value_text
 from gsbench.errors import InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.runs.layout import SEED
