@@ -34,7 +34,7 @@ from gsbench.claims.stopping import log_verdicts
 from gsbench.launch.record import remove
 from gsbench.runs.experiments import Arm, Declaration, Question, open_question, record_text
 from gsbench.tracking.comparison import description
-from gsbench.verbs.claims import plan
+from gsbench.verbs.plan import plan
 from gsbench.verbs.results import explain_cell, tables
 from tests.analysis.helpers import loaded, page_of, table_of, write_declared
 from tests.conftest import script
