@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hydra.core.override_parser.types import Override
 
+from gsbench.analysis.results import group_by
 from gsbench.app.arm_search import (
     RETUNED,
     SEED,
@@ -46,6 +47,9 @@ if TYPE_CHECKING:
     from optuna.trial import Trial as Proposal
 
 log = logging.getLogger(__name__)
+
+# the metric of all searches, its better direction, and the seeds of a point's trials
+Goal = tuple[str, Literal[-1, 1], list[int]]
 
 
 def tuned_jobs(
@@ -194,49 +198,60 @@ def _plan(
         raise InputError(
             f"{TUNE} searches on validation views by itself: leave scene.validation out"
         )
-    metric, direction, seeds = _goal(tune, trials)
-    (home,) = homes
-    arms = [trial.folder.parent.name for trial in trials]
-    searches = []
-    for arm in dict.fromkeys(arms):
-        indices = [index for index, name in enumerate(arms) if name == arm]
-        found: dict[str, Override] = {}
-        arm_jobs = []
-        for i in indices:
-            found |= intervals[i]
-            arm_jobs.append(tuple(word for word in jobs[i] if key_of(word) not in RETUNED))
-        arm_intervals = {key: found[key] for key in sorted(found)}
-        fixed = set(map(key_of, itertools.chain(*arm_jobs)))
-        if both := next((key for key in arm_intervals if bare_key(key) in fixed), None):
-            raise InputError(
-                f"{both} of {arm} is searched in one grid and given in another: leave one of them "
-                "out"
-            )
-        ranges = {key: distribution(interval) for key, interval in arm_intervals.items()}
-        first = own_values(trials[indices[0]].values, ranges)
-        record = TuningRecord(
-            sweep=home.name,
-            arm=arm,
-            metric=metric,
-            direction=direction,
-            wanted=tune.points,
-            seeds=seeds,
-            scenes=list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials)),
-            ranges={
-                key: str(interval.input_line).partition("=")[2]
-                for key, interval in arm_intervals.items()
-            },
-            log=[key for key, values in ranges.items() if getattr(values, "log", False)],
-            points=[],
-        )
-        own_home = home.with_name(f"{home.name}-tune-{arm}")
-        searches.append(
-            ArmSearch(record, own_home, tune.at_once, ranges, list(dict.fromkeys(arm_jobs)), first)
-        )
-    return searches
+    goal = _goal(tune, trials)
+    scenes = list(dict.fromkeys(trial.values["scene"]["name"] for trial in trials))
+    by_arm = group_by(
+        zip(trials, jobs, intervals, strict=True), lambda job: job[0].folder.parent.name
+    )
+    return [_arm_search(tune, arm, goal, scenes, of_arm) for arm, of_arm in by_arm.items()]
 
 
-def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> tuple[str, Literal[-1, 1], list[int]]:
+def _arm_search(
+    tune: TuneSettings,
+    arm: str,
+    goal: Goal,
+    scenes: list[str],
+    jobs: Sequence[tuple[Trial, Sequence[str], Mapping[str, Override]]],
+) -> ArmSearch:
+    """The search of an arm with these ``jobs``: each a trial, its words, and its intervals."""
+    metric, direction, seeds = goal
+    found: dict[str, Override] = {}
+    for _, _, of_job in jobs:
+        found |= of_job
+    intervals = {key: found[key] for key in sorted(found)}
+    kept = [tuple(word for word in words if key_of(word) not in RETUNED) for _, words, _ in jobs]
+    fixed = set(map(key_of, itertools.chain(*kept)))
+    if both := next((key for key in intervals if bare_key(key) in fixed), None):
+        raise InputError(
+            f"{both} of {arm} is searched in one grid and given in another: leave one of them out"
+        )
+    ranges = {key: distribution(interval) for key, interval in intervals.items()}
+    first, home = jobs[0][0], jobs[0][0].files.home
+    record = TuningRecord(
+        sweep=home.name,
+        arm=arm,
+        metric=metric,
+        direction=direction,
+        wanted=tune.points,
+        seeds=seeds,
+        scenes=scenes,
+        ranges={
+            key: str(interval.input_line).partition("=")[2] for key, interval in intervals.items()
+        },
+        log=[key for key, values in ranges.items() if getattr(values, "log", False)],
+        points=[],
+    )
+    return ArmSearch(
+        record,
+        home.with_name(f"{home.name}-tune-{arm}"),
+        tune.at_once,
+        ranges,
+        list(dict.fromkeys(kept)),
+        own_values(first.values, ranges),
+    )
+
+
+def _goal(tune: TuneSettings, trials: Sequence[Trial]) -> Goal:
     """The metric of all searches, its better direction, and the seeds of a point's trials.
 
     Raises InputError for an unknown metric, and for one without a better direction.
