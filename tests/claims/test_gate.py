@@ -124,7 +124,7 @@ def test_a_look_waits_for_every_scene_even_if_the_first_is_equal(tmp_path):
 
 def test_the_code_may_differ_and_the_baseline_may_be_older_than_the_question(tmp_path):
     def made_by(own, state, year):
-        made = {"code": Code(rooms={"densify": state}), "measured": f"{year}-01-01T00:00:00Z"}
+        made = {"code": Code(packages={"densify": state}), "measured": f"{year}-01-01T00:00:00Z"}
         return [replace(one, record=replace(one.record, **made)) for one in own]
 
     old = made_by(trials(tmp_path / "a", 0, 0.01), "one", 2019)

@@ -184,7 +184,8 @@ def _results(destination: Destination, measured: Measured, identity: str) -> Tri
         renders=dict(measured.source),
         hashes={"config": identity, "data": measured.truth.data},
         code=Code(
-            stages={EVALUATE.name: EVALUATE.version}, rooms=states_of(CODE_OF_STAGE[EVALUATE.name])
+            stages={EVALUATE.name: EVALUATE.version},
+            packages=states_of(CODE_OF_STAGE[EVALUATE.name]),
         ),
         versions=versions(),
     )

@@ -350,7 +350,7 @@ def _origin(trial: TrialResult) -> dict[str, str]:
         origin["since"] = "; ".join(map(str, edits))
     if record.code.commit:
         origin["commit"] = f"{record.code.commit}{', edited' if record.code.edited else ''}"
-    packages = record.code.rooms
+    packages = record.code.packages
     differing = list(edited(packages))
     # before the first release all packages count as edited
     if differing and len(differing) < len(packages):
