@@ -71,14 +71,14 @@ class ArmSearch:
 
     def jobs_of(self, values: Mapping[str, Any]) -> list[list[str]]:
         """The words of a point's trials."""
-        own = [
+        of_point = [
             f"name={self.home.name}",
             "scene.validation=true",
             "eval.primary=null",
             *words_of_values(values),
         ]
         seeds = [f"{SEED}={seed}" for seed in self.record.seeds]
-        return [[*job, *own, seed] for job, seed in itertools.product(self.jobs, seeds)]
+        return [[*job, *of_point, seed] for job, seed in itertools.product(self.jobs, seeds)]
 
     def value_of(self, trial: Trial) -> float | None:
         """The metric of a trial, read from its files; None if it has none."""
@@ -131,9 +131,11 @@ def own_values(
 ) -> dict[str, Any] | None:
     """The arm's own values of the searched settings; None if outside the ranges, or if none."""
     settings = flatten(values)
-    own = {key: settings.get(bare_key(key)) for key in ranges}
+    present = {key: settings.get(bare_key(key)) for key in ranges}
     return (
-        own if own and all(_is_in(own[key], searched) for key, searched in ranges.items()) else None
+        present
+        if present and all(_is_in(present[key], searched) for key, searched in ranges.items())
+        else None
     )
 
 

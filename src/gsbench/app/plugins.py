@@ -135,8 +135,8 @@ class TrialTask:
     def _compose(self, config: DictConfig, typed: DictConfig) -> list[Trial]:
         """The job's trial, or one for each seed of the objective."""
         words: Any = OmegaConf.to_container(typed, resolve=False)
-        own = [word for word in words["hydra"] if word.partition("=")[0] not in (MODE, GRIDS)]
-        overrides, trials = [*own, *words["task"]], []
+        of_hydra = [word for word in words["hydra"] if word.partition("=")[0] not in (MODE, GRIDS)]
+        overrides, trials = [*of_hydra, *words["task"]], []
         for word in self.objective.seeds if self.objective else ():
             of_seed = copy.deepcopy(config)
             of_seed.seed = parse_word(word).value()
@@ -282,9 +282,9 @@ def best_line(trials: Sequence[Trial], objective: Objective) -> str:
     """
     by_job = group_by(trials, _words_without_seed)
     values: dict[tuple[str, ...], float] = {}
-    for words, own in by_job.items():
+    for words, of_job in by_job.items():
         with suppress(GsbenchError):  # a job that failed has no value
-            values[words] = objective.value(own)
+            values[words] = objective.value(of_job)
     if not values:
         return ""
     best = max(values, key=lambda words: objective.sign * values[words])

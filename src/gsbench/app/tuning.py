@@ -85,7 +85,7 @@ def tuned_jobs(
     best_words = {arm: _best_words(search) for arm, search in tuned.items()}
     arms = (trial.folder.parent.name for trial in trials)
     tuned_words = (best_words.get(arm, ()) for arm in arms)
-    return [[*job, *own] for job, own in zip(jobs, tuned_words, strict=True)], True
+    return [[*job, *best] for job, best in zip(jobs, tuned_words, strict=True)], True
 
 
 def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) -> bool:
@@ -106,15 +106,15 @@ def _search(composer: Composer, searches: Sequence[ArmSearch], run: Run | None) 
         composed = iter(composer.trials(list(itertools.chain(*(jobs for _, _, jobs in points)))))
         trials = [list(itertools.islice(composed, len(jobs))) for _, _, jobs in points]
         missing: list[Trial] = []
-        for (search, _, _), own in zip(points, trials, strict=True):
-            missing += [trial for trial in own if search.value_of(trial) is None]
+        for (search, _, _), of_point in zip(points, trials, strict=True):
+            missing += [trial for trial in of_point if search.value_of(trial) is None]
         if missing:
             if run is None:
                 return False
             _write(searches)  # before training, so that the ranges were on record before any result
             run(missing)
-        for (search, proposal, _), own in zip(points, trials, strict=True):
-            point, record = search.judge(proposal, own), search.record
+        for (search, proposal, _), of_point in zip(points, trials, strict=True):
+            point, record = search.judge(proposal, of_point), search.record
             if missing:
                 value = "failed" if point.value is None else f"{point.value:.5g}"
                 title = f"{search.home.name}: point {len(record.points)} of {record.wanted}"

@@ -96,8 +96,8 @@ def asked_difference(
     ``values`` is a trial's configuration, which may define the user's own metrics. Raises
     InputError, one line, for a metric that cannot be judged.
     """
-    own = values["eval"].get("extra") or {}
-    metrics = (*known_keys(), *COSTS, *own)
+    users_metrics = values["eval"].get("extra") or {}
+    metrics = (*known_keys(), *COSTS, *users_metrics)
     if metric not in metrics:
         raise InputError(
             f"--metric {metric}: there is no such metric{did_you_mean(metric, metrics)}"
@@ -145,7 +145,7 @@ def deviations(baseline: Sequence[TrialResult], new: Sequence[TrialResult]) -> l
     """A note for each difference of machine or libraries between the two versions' trials."""
     machine = ""  # beside the names of libraries, and sorted before them
     sides = [
-        [{machine: one.machine or "not recorded"} | one.record.versions for one in trials]
+        [{machine: trial.machine or "not recorded"} | trial.record.versions for trial in trials]
         for trials in (baseline, new)
     ]
     notes = []

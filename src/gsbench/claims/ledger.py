@@ -250,8 +250,8 @@ def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
             continue
         declaration = (test_of if idea in ledger.tests else screening_of)(ledger, idea)
         seeds = declaration.questions[0].seeds[: ended.seeds]
-        own = [trial for trial in trials if trial.seed in seeds]
-        (verdict,) = ask_idea(declaration, own.copy).verdicts()
+        counting = [trial for trial in trials if trial.seed in seeds]
+        (verdict,) = ask_idea(declaration, counting.copy).verdicts()
         now = result_of(verdict)
         if verdict.pairs.seeds == ended.seeds and now != ended.result:
             notes.append(Note.of("contradiction", idea=idea, recorded=ended.result, now=now))

@@ -253,12 +253,12 @@ def _seeds(trials: Sequence[PlannedTrial]) -> tuple[int, ...]:
     """
     first: tuple[int, ...] = ()
     for (scene, arm), group in group_by(trials, lambda trial: (trial.scene, trial.arm)).items():
-        own = tuple(dict.fromkeys(trial.seed for trial in group))
-        first = first or own
-        if own != first:
+        of_group = tuple(dict.fromkeys(trial.seed for trial in group))
+        first = first or of_group
+        if of_group != first:
             raise InputError(
                 f"launch.stop_when_decided needs the same seeds everywhere: {arm} on {scene} has "
-                f"{', '.join(map(str, own))}, others {', '.join(map(str, first))}"
+                f"{', '.join(map(str, of_group))}, others {', '.join(map(str, first))}"
             )
     if len(first) < FIRST_LOOK:
         raise InputError(

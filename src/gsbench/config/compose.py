@@ -309,8 +309,8 @@ def typed_address(typed: Sequence[str]) -> tuple[str, ...]:
     """The tracker's address that the ``typed`` words about tracking give by themselves, if any."""
     # Composed from these words alone: whatever else sets the address, such as a file of somebody
     # else's, could send results and a password there.
-    own = ("tracking", "hydra.searchpath")
-    words = [word for word in typed if key_of(word).startswith(own)]
+    about_tracking = ("tracking", "hydra.searchpath")
+    words = [word for word in typed if key_of(word).startswith(about_tracking)]
     with hydra_ready(), explained(words):
         config = hydra.compose(CONFIG_NAME, words)
         return (str(config.tracking.uri),) if config.tracking.get("uri") else ()

@@ -211,8 +211,8 @@ def _config(destination: Destination, truth: ReferenceImages, runs: Path) -> dic
 
 def _has(folder: Path, settings: Mapping[str, Any]) -> bool:
     """Return whether a trial has these settings, or none that tell its arm apart."""
-    own = config_if_readable(folder)
-    return not own or all(own.get(key) == value for key, value in settings.items())
+    config = config_if_readable(folder)
+    return not config or all(config.get(key) == value for key, value in settings.items())
 
 
 def _trials(home: Path, scene: str) -> list[TrialResult]:

@@ -33,8 +33,8 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
     first = _trials(words)
     densify = _only_densifier(first)
     values = first[0].values
-    own = getattr(type(Parts(values).trainer), "SWITCHES", {})
-    declared = ablation.declared_switches(own, values["densify"])
+    of_class = getattr(type(Parts(values).trainer), "SWITCHES", {})
+    declared = ablation.declared_switches(of_class, values["densify"])
     switches = ablation.choose_switches(declared, options.switches, densify)
     by_run = {}
     for run in ablation.runs_to_train(switches):

@@ -248,11 +248,11 @@ def _answer(
     tested = idea in book.tests
     if not fails or verdict.final:
         return rules.end_of(idea, verdict, stamp_now(), tested)
-    own = set(book.keys_of(idea).values())
+    of_idea = set(book.keys_of(idea).values())
     failed = {key for key, trial in trials.items() if trial.files.has_failed()}
     measured = {trial.key for trial in finished_trials(home, trials.values())}
     # An idea of which something is known cannot be tried anew as if it were not.
-    if tested or own & measured or not {key for key, _ in failed} <= own:
+    if tested or of_idea & measured or not {key for key, _ in failed} <= of_idea:
         raise GsbenchError(f"{idea}: {fails}; to go on, give the same command again")
     reason = next((trials[key].files.failure().reason for key in sorted(failed)), fails)
     return records.Ended(time=stamp_now(), idea=idea, result=FAILED, reason=reason, seeds=0)
@@ -304,7 +304,7 @@ def _run_confirmation(
     _run_all(first)
     # Only now are the photographs' hashes known, which show a copy under another name.
     rules.check_untouched(book, read_experiment(home).trials, asked)
-    trials = {key: trial for own in by_idea.values() for key, trial in own.items()}
+    trials = {key: trial for of_idea in by_idea.values() for key, trial in of_idea.items()}
     _run_all(trials)
     declaration = rules.confirmation_of(book.opened, asked)
     done = finished_trials(home, trials.values())
