@@ -37,8 +37,8 @@ from gsbench.runs.config_hash import config_hash
 from gsbench.runs.experiments import Declaration, make_home, stamp_now
 from gsbench.runs.layout import IN_RUNS, LEDGER
 from gsbench.runs.ledger import BASELINE, DROPPED, FAILED, KEPT, UNDECIDED, Ledger
-from gsbench.settings import is_folder_name
-from gsbench.verbs.arguments import ArgumentParser, names, whole_number
+from gsbench.settings import OpenFraction, is_folder_name
+from gsbench.verbs.arguments import ArgumentParser, names, number, whole_number
 from gsbench.words import did_you_mean, listed
 
 EXIT_CODES = {KEPT: 0, DROPPED: 1, FAILED: 1, UNDECIDED: 3}
@@ -81,7 +81,9 @@ def _parser() -> ArgumentParser:
         help=f"new: the most ideas that will be tried ({IDEAS})",
     )
     parser.add_argument(
-        "--fdr", type=_rate, help=f"new: the false discovery rate, from 0 to 1 ({RATE})"
+        "--fdr",
+        type=number(OpenFraction),
+        help=f"new: the false discovery rate, from 0 to 1 ({RATE})",
     )
     parser.add_argument("--against", help="try: a kept idea to start from (default: the baseline)")
     parser.add_argument("--as", dest="idea", help="try: the idea's name (default: densify.name)")
@@ -391,13 +393,3 @@ def _facts(book: Ledger, idea: str) -> dict[str, Any]:
 
 def _left(book: Ledger) -> dict[str, Any]:
     return {"tried": book.tried, "planned": book.opened.ideas, "kept": book.kept}
-
-
-def _rate(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate < 1:
-        raise argparse.ArgumentTypeError(f"must be above 0 and below 1, got {text!r}")
-    return rate
