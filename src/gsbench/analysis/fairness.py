@@ -308,6 +308,7 @@ def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
     searches = {}
+    # Each search has an experiment of its own, and may be from before this sweep.
     for file in sorted(trial.path.parents[3].glob(f"*/{TUNING}")):
         search = read_if_sound(file, TuningRecord)
         if search is None or search.arm != arm:

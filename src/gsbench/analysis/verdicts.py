@@ -100,6 +100,7 @@ def judge_pairs(
     versions: dict[ArmPair, int] = {}
     asked: list[PairQuestion] = []
     gone: list[tuple[PairQuestion, OtherTest]] = []
+    # All questions are collected before one is judged, since families span pairs.
     for pair in pairs:
         first, second = (by_arm.get(arm, []) for arm in pair)
         metrics = [

@@ -163,7 +163,7 @@ def prepare(
             for arm in (claim.baseline, claim.arm):
                 own = file.words(claim, scene, arm)
                 words = (*own, f"name={file.name}", "seed=0", *permissions)
-                if words not in composed:
+                if words not in composed:  # claims share scenes and arms
                     where = f"claim {claim.id}, scene {scene}, arm {arm}"
                     composed[words] = _compose(words, permissions, runs, where)
                 trials.append(composed[words])

@@ -155,6 +155,7 @@ def pool_sources(
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
+        # An archive under two names, or exported again with more trials, is no further study.
         if twice := marks & seen.keys():
             faults.append(
                 f"left out: {source} has trials that {seen[min(twice)]} has, and they would count "

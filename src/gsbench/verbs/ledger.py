@@ -136,6 +136,7 @@ def try_idea(options: argparse.Namespace, home: Path) -> int:
     check_words(options.settings)
     start = permitted_words(book, against, options.settings)
     trials = compose_words(home.name, start, options.settings)
+    # The idea's new seeds need new trials of the baseline, so it must be what it was.
     if keys_by_scene(trials, home.name) != book.keys_of(against):
         raise InputError(
             f"the settings or the code of {against} have changed since its trials ran: bring them "
@@ -162,6 +163,7 @@ def _start(
 ) -> tuple[str, Ledger]:
     """Enter an idea unless the ledger has it; return its name and the ledger."""
     keys, values = keys_by_scene(trials, home.name), next(iter(trials.values())).values
+    # An idea under another name is the same idea: it must not be tried twice.
     nameless = values | {part: values[part] | {"name": ""} for part in ("init", "densify")}
     identity = config_hash(nameless)
     chosen: list[str] = []

@@ -104,7 +104,7 @@ def plan(argv: Sequence[str], runs: Path) -> int:
         try:
             components = _components(trials, question, metric)
         except InputError as error:
-            if len(comparison.pairs) == 1:
+            if len(comparison.pairs) == 1:  # with several, the others may be planned for
                 raise
             lines.append(str(error))
             plans[-1]["no_plan"] = str(error)

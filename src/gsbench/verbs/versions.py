@@ -264,7 +264,7 @@ def _begin(
     # of each step, so that all together err in 5 % at most; only "worse" can be wrong, so the
     # interval with both sides has twice the share
     share = ERROR_RATE / gates.most_steps(len(commits) - 1)
-    seeds = range(max(0, options.seeds))
+    seeds = range(max(0, options.seeds))  # too few are refused below
     declaration = gates.declare_gate(
         options.metric, options.least, arms, seeds, example.values, 2 * share
     )
