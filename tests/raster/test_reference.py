@@ -100,7 +100,7 @@ def test_images_and_footprints_match_brute_force(shift):
     assert (covered[:, 0] > 0).sum() > 30
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_gradients_match_finite_differences(degree):
     gaussians = random_gaussians(6, seed=11, log_scale=(-2.2, -1.2))
     # below the clamp of alpha, whose gradient is passed on purpose
