@@ -18,7 +18,6 @@ from gsbench.scene.masks import (
     read_mask,
     resize_mask,
 )
-from gsbench.scene.options import SceneConfig
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Capture
 from tests.helpers import refusal
@@ -99,11 +98,6 @@ def test_a_mask_of_another_size_is_refused(make_scene):
     path = save(root / "masks" / "02.png.png", half(20, 15))
     with refusal(rf"{path}: the mask is 20x15 px and its image 02\.png 40x30"):
         read_colmap("toy", root, masks="masks")
-
-
-def test_masks_for_the_courtyard_are_refused():
-    with refusal("courtyard"):
-        SceneConfig(name="courtyard", kind="courtyard", masks="masks")
 
 
 @pytest.mark.parametrize(
