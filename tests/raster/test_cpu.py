@@ -30,7 +30,7 @@ from gsbench.raster.cpu.workspace import Arena, ShardRunner, TensorPool
 from gsbench.raster.reference import project, tile_rectangles
 from tests.conftest import ROOT
 from tests.processes import completed
-from tests.raster.promises import BLACK, PROMISES, Subject, bits_of, leaves
+from tests.raster.promises import BLACK, PROMISES, Subject, bits_of
 from tests.raster.strategies import Case, render_with_gradients
 
 CASE = Case(97, 65, 250, sh_degree=3, principal=(7.3, -5.1))
@@ -186,15 +186,6 @@ def test_the_backward_pass_skips_entries_behind_the_one_that_stopped_a_block():
             assert not behind.any()
             skipped += len(behind)
     assert skipped > 100
-
-
-def test_gradients_accumulate():
-    own = leaves(CASE)
-    rasterizer = CpuRasterizer(threads=1)
-    rasterizer.render(own, CASE.camera(), 3, BLACK).image.sum().backward()
-    once = own.sh_rest.grad.clone()
-    rasterizer.render(own, CASE.camera(), 3, BLACK).image.sum().backward()
-    assert torch.equal(own.sh_rest.grad, 2 * once)
 
 
 def test_an_interrupted_backward_pass_does_not_change_later_gradients(monkeypatch):

@@ -164,18 +164,6 @@ def test_filled_pixels_depend_only_on_counted_pixels(height, width, seed):
     assert ((filled >= low) & (filled <= high)).all(), "means of what counts"
 
 
-def test_a_hole_in_one_colour_gets_that_colour_and_a_hole_in_a_ramp_has_no_step():
-    plain = np.full((50, 60, 3), (10, 200, 90), dtype=np.uint8)
-    counts = np.ones((50, 60), bool)
-    counts[10:40, 15:45] = False
-    holed = np.where(counts[..., None], plain, 0).astype(np.uint8)
-    assert_array_equal(fill_ignored(holed, counts), plain)
-    ramp = np.broadcast_to(np.linspace(0, 240, 60)[:, None], (50, 60, 3)).astype(np.uint8)
-    filled = fill_ignored(ramp, counts).astype(int)
-    # filling with black would make a step of 180
-    assert np.abs(np.diff(filled[25, :, 0])).max() < 60
-
-
 def test_filling_between_two_pixels_is_linear():
     """Blocks of two pixels are 0 and 100; a pixel's centre is a quarter block from its block's."""
     row = np.array([[0, 7, 9, 100]], dtype=np.uint8)[..., None].repeat(3, 2)
