@@ -14,6 +14,7 @@ from hydra.errors import HydraException
 
 from gsbench.config.groups import GROUPS, REMOVABLE, options
 from gsbench.config.permissions import PACKAGE, PERMISSIONS, is_allowed, permission_advice
+from gsbench.config.programs import reading
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
 from gsbench.words import did_you_mean
@@ -49,6 +50,7 @@ TEXTS = (
 MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
 MAX_BRACKETS = 40  # open at once in a word, since Hydra's parser recurses into them
 KEY = re.compile(r"[+~]*\w+([./]\w+)*")
+VARIABLE = re.compile(r"\$\{oc\.env:\s*['\"]?(\w+)")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
@@ -192,6 +194,11 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
             )
         allowed = tuple(names)
     return allowed
+
+
+def typed_readings(words: Sequence[str]) -> tuple[str, ...]:
+    """The permissions to read the variables that the words themselves read by ``${oc.env:…}``."""
+    return tuple(dict.fromkeys(reading(name) for name in VARIABLE.findall(" ".join(words))))
 
 
 def search_places(words: Sequence[str]) -> list[str]:

@@ -106,6 +106,7 @@ class Composer:
         # are checked first.
         self.typed = words if typed is None else typed
         self.allowed = command_words.typed_permissions(self.typed)
+        self.allowed += command_words.typed_readings(self.typed)
         packages = command_words.check_search_path(words, self.allowed)
         allow_modules(self.allowed, os.getcwd() if modules is None else modules)
         check_places(command_words.searched_folders(words), packages)
