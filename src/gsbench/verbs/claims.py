@@ -36,7 +36,7 @@ from gsbench.launch.record import declare_questions
 from gsbench.runs.experiments import ERROR_RATE, Question
 from gsbench.runs.layout import SEED
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 HTML = "claims.html"
 MAX_DESIGNS = 5  # combinations of scenes and seeds that `plan` shows
@@ -388,7 +388,7 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
         metric = options.metric or values["eval"].get("primary") or DEFAULT_METRIC
         judged = ablation.judge_runs(read_experiment(home).trials, keys, metric)
         print("\n".join(ablation.markdown_table(judged)))
-        print(f"all metrics and pictures: gsbench report {home.name}")
+        print(f"all metrics and pictures: {command('report', home.name)}")
     return code
 
 

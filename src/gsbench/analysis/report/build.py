@@ -43,7 +43,7 @@ from gsbench.runs.experiments import TuningRecord
 from gsbench.runs.ledger import read_ledger
 from gsbench.runs.trial_record import Histogram
 from gsbench.scene.images import read_image
-from gsbench.words import counted, signed
+from gsbench.words import command, counted, signed
 
 COSTS_COMPARED = ("gaussians", "train_time")
 EVENT_CAUSES = (*RefineEvent.GROWN, "relocated", *RefineEvent.PRUNED)
@@ -87,6 +87,7 @@ def build_report(
         "report.html.j2",
         script=files("gsbench.analysis.report").joinpath("script.js").read_text(encoding="utf-8"),
         name=experiment.name,
+        explained=command("explain", f"{experiment.name}:SCENE:METRIC:ARM"),
         arms=[str(arm) for arm in arms],
         scenes=sorted({trial.scene for trial in trials}),
         seeds=experiment.seeds,
