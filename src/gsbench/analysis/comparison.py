@@ -31,6 +31,7 @@ from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
 from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
+from gsbench.words import command
 
 VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
@@ -333,9 +334,13 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
     if (experiment.folder / LEDGER).exists():
         answers = [
-            replace(answer, undeclared=LEDGER_DECIDES.format(experiment.name)) for answer in answers
+            replace(
+                answer,
+                undeclared=LEDGER_DECIDES.format(command("ledger", "show", experiment.name)),
+            )
+            for answer in answers
         ]
     return Comparison(experiment, arms, declared, tuple(answers))
 
 
-LEDGER_DECIDES = "the ledger's tests decide (gsbench ledger show {}), and this is none of them"
+LEDGER_DECIDES = "the ledger's tests decide ({}), and this is none of them"
