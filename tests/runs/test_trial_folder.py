@@ -191,11 +191,14 @@ def test_a_configuration_that_cannot_be_used_is_refused(trial):
 def test_equal_results_keep_their_time_and_others_do_not(trial):
     folder, path = TrialFolder(trial), trial / "results.json"
     values, record = folder.settings(), folder.record()
-    os.utime(path, ns=(1, 1))
+    finished = folder.made_of().finished
+    os.utime(path, ns=(1, 1))  # a copy of the folder has other times of its files
     assert folder.write_finished(values, record)
     assert path.stat().st_mtime_ns == 1
+    assert folder.made_of().finished == finished
     assert not folder.write_finished(values, replace(record, iterations=record.iterations + 1))
     assert path.stat().st_mtime_ns > 1
+    assert folder.made_of().finished > finished
     path.unlink()
     assert not folder.write_finished(values, record, entries={"train": trial})
     assert path.read_text().startswith('{\n "status": "complete",\n')

@@ -328,10 +328,16 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     arms = pair_arms(experiment, baseline)
     declared = active_declaration(experiment)
     usual = arms if baseline == BASELINE else pair_arms(experiment)
-    known = {frozenset(pair) for pair in usual.pairs}
+    shown, known = ({frozenset(pair) for pair in one.pairs} for one in (arms, usual))
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]
+    turned = {(second, first) for first, second in usual.pairs}.difference(usual.pairs)
+    # A baseline that is chosen later frees no question of the others' share of the error rate.
+    pairs = [*arms.pairs, *(pair for pair in usual.pairs if frozenset(pair) not in shown)]
     lacking, older = unfinished(experiment), experiment.older
-    answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
+    if declared is not None:
+        lacking += declared.missing(arms.trials)
+    answers = judge_pairs(arms.trials, pairs, declared, lacking, others, older, turned)
+    answers = answers[: len(arms.pairs)]
     if (experiment.folder / LEDGER).exists():
         answers = [
             replace(
@@ -340,7 +346,10 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
             )
             for answer in answers
         ]
+    elif any(one.kind == "claims" and one.looks for one in experiment.declarations):
+        answers = [replace(one, undeclared=CLAIMS_DECIDE) for one in answers]
     return Comparison(experiment, arms, declared, tuple(answers))
 
 
+CLAIMS_DECIDE = "declared claims decide (gsbench check), and seeds came in looks until they did"
 LEDGER_DECIDES = "the ledger's tests decide ({}), and this is none of them"

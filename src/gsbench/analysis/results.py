@@ -135,6 +135,18 @@ def read_experiment(folder: Path) -> Experiment:
     usable.sort(
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
+    known = {
+        (key, seed): declared.moment
+        for declared in reversed(read_declarations(folder))
+        for key, seeds in declared.known.items()
+        for seed in seeds
+    }
+    usable = [
+        replace(trial, known=known[trial.key, trial.seed])
+        if (trial.key, trial.seed) in known
+        else trial
+        for trial in usable
+    ]
     forgotten, unread = _forgotten(folder, {trial.path for trial in usable})
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     lacking = tuple(

@@ -18,11 +18,13 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from gsbench import __version__
+from gsbench.analysis.fairness import searches_of
 from gsbench.analysis.images import PixelMeasures, textured_error
 from gsbench.analysis.quantities import TEXTURED
 from gsbench.analysis.results import (
     Experiment,
     TrialResult,
+    group_by,
     newest_code,
     read_views,
 )
@@ -36,6 +38,7 @@ from gsbench.claims.archive import (
     PICTURES,
     PICTURES_FOLDER,
     PIXELS,
+    SEARCHES,
     SEED_KEY,
     TRIALS,
     UNFINISHED,
@@ -44,13 +47,14 @@ from gsbench.claims.archive import (
 )
 from gsbench.errors import InputError
 from gsbench.files import atomic
-from gsbench.parsing import read_bytes, read_yaml
-from gsbench.runs.experiments import read_declarations
+from gsbench.parsing import read_bytes, read_typed, read_yaml
+from gsbench.runs.experiments import STAMP, TuningRecord, read_declarations
 from gsbench.runs.layout import (
     CONFIG,
     DECLARED,
     LEDGER,
     PER_VIEW,
+    TUNING,
 )
 from gsbench.runs.ledger import as_json, chained, read_ledger
 from gsbench.words import without_folders
@@ -72,6 +76,7 @@ FILES = {  # media types and descriptions
     CONFIGURATIONS: ("application/jsonl", "Every configuration, with the trials that had it"),
     PER_VIEW: ("text/csv", "Metrics of every test view of every trial"),
     PIXELS: ("application/jsonl", "What declared claims ask of the trials' pictures, measured"),
+    SEARCHES: ("application/jsonl", "The searches that tuned arms, with all points"),
     DECLARED: ("application/jsonl", "What was declared before the trials were run"),
     LEDGER: ("application/jsonl", "The ideas of a ledger and their tests (gsbench ledger)"),
     MANIFEST: ("application/json", "Version of the archive, and the sha256 of its files"),
@@ -115,6 +120,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         ),
         PER_VIEW: _table(rows),
         **_declared(experiment.folder, kept),
+        **_searches(experiment.folder, kept),
     }
     if unfinished:
         contents[UNFINISHED] = _json_lines(map(_unfinished, unfinished))
@@ -163,6 +169,23 @@ def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
                 measured.append({"folder": _folder(trial.path), "measures": measures})
         contents[PIXELS] = _json_lines(measured)
     return contents
+
+
+def _searches(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:
+    """The search that the experiment in ``home`` is, and those that tuned its arms.
+
+    Points of a search were chosen by their results, so nothing about them may be tested.
+    """
+    found = {}
+    if (home / TUNING).exists():
+        found[home.name] = read_typed(home / TUNING, TuningRecord)
+    for of_arm in group_by(trials, lambda trial: trial.key).values():
+        found |= searches_of(of_arm[0])
+    lines = [
+        {"experiment": name, "search": without_paths(search.to_json())}
+        for name, search in sorted(found.items())
+    ]
+    return {SEARCHES: _json_lines(lines)} if lines else {}
 
 
 def _shared_ledger(home: Path) -> bytes:
@@ -220,6 +243,8 @@ def _configuration(path: Path) -> str:
 def _results(trial: TrialResult) -> dict[str, Any]:
     """The record of the trial without paths of this machine."""
     record = trial.record.to_json()
+    # unpacked files are new, so what was measured before a declaration would look later
+    record.setdefault("measured", time.strftime(STAMP, time.gmtime(trial.measured)))
     reasons = {metric: without_folders(reason) for metric, reason in record["unavailable"].items()}
     results: dict[str, Any] = without_paths(record | {"unavailable": reasons})
     return results
