@@ -205,23 +205,6 @@ def test_keypoints_found_at_a_smaller_size_are_scaled_back_to_the_file(courtyard
     assert np.median(surface_distance(read_cloud(tmp_path / MODEL_FOLDER).points)) < 0.06
 
 
-@pytest.mark.slow
-def test_a_wrong_reference_gives_a_warning(courtyard, tmp_path):
-    """All images get a pose, but a warning says that poses are wrong."""
-    model = pycolmap.Reconstruction(courtyard.model)
-    names = sorted(image.name for image in model.images.values())
-    poses = {name: model.find_image_with_name(name).cam_from_world() for name in names}
-    for name, other in zip(names, reversed(names), strict=True):
-        image = model.find_image_with_name(name)
-        image.frame.set_cam_from_world(image.camera_id, poses[other])
-    (tmp_path / "wrong").mkdir()
-    model.write_binary(tmp_path / "wrong")
-    wrong = replace(courtyard, model=tmp_path / "wrong")
-    report = Sfm(poses="own").run(wrong, tmp_path / "out")
-    assert report.num_registered == 8
-    assert any("degrees against the true ones" in warning for warning in report.warnings)
-
-
 @pytest.mark.parametrize(
     "pixels, said",
     [

@@ -1,6 +1,5 @@
 """Points that do not depend on test photographs (init.points_from=train)."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia, read_cloud
+from gsbench.init import MODEL_FOLDER, Dataset, Sfm, SiftKornia
 from gsbench.init.base import REPORT_FILE
 from gsbench.runs.keys import options_of
 from gsbench.scene.colmap import read_model
@@ -17,16 +16,11 @@ from tests.helpers import read_json
 from tests.init.models import add_point
 
 
-def quick_sfm(**options):
-    """SIFT without enlarged images and with few features, to be fast."""
-    return Sfm(**({"threads": 1, "first_octave": 0, "max_num_features": 1500} | options))
-
-
 @pytest.fixture(scope="module")
 def with_points(courtyard, tmp_path_factory):
     """The courtyard with points of all views, and image ids in the reverse order of names."""
     folder = tmp_path_factory.mktemp("points")
-    quick_sfm().run(courtyard, folder)
+    Sfm(threads=1, first_octave=0, max_num_features=1500).run(courtyard, folder)
     model, turned = read_model(folder / MODEL_FOLDER), pycolmap.Reconstruction()
     camera = next(iter(model.cameras.values()))
     turned.add_camera_with_trivial_rig(camera)
@@ -50,13 +44,6 @@ def seen_by(model):
         {model.images[element.image_id].name for element in point.track.elements}
         for point in model.points3D.values()
     ]
-
-
-def poses(folder):
-    model = read_model(folder / MODEL_FOLDER)
-    return {
-        image.name: image.cam_from_world().matrix().tobytes() for image in model.images.values()
-    }
 
 
 def test_points_and_colours_come_from_training_photographs(with_points, tmp_path):
@@ -87,38 +74,6 @@ def test_points_and_colours_come_from_training_photographs(with_points, tmp_path
                 + dy * ((1 - dx) * picture[row + 1, column] + dx * picture[row + 1, column + 1])
             )
         assert_allclose(point.color, np.mean(samples, axis=0), atol=1.0)
-
-
-def with_noise(capture, folder):
-    """The capture with its test photographs replaced by noise."""
-    shutil.copytree(capture.images, folder)
-    rng = np.random.default_rng(0)
-    for name in capture.test_names:
-        width, height = Image.open(folder / name).size
-        noise = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
-        Image.fromarray(noise).save(folder / name)
-    return replace(capture, images=folder)
-
-
-MAKERS = {
-    "sfm": quick_sfm(points_from="train"),
-    "sfm on all": quick_sfm(points_from="all"),  # this one must see the noise
-    # takes the path of dim without weights
-    "sift_kornia": SiftKornia(points_from="train", max_keypoints=1024, threads=1),
-    "dataset": Dataset(points_from="train"),
-}
-
-
-@pytest.mark.parametrize("name", MAKERS)
-@pytest.mark.slow
-def test_the_cloud_does_not_depend_on_test_photographs(with_points, tmp_path, name):
-    clouds = []
-    for capture, place in ((with_points, "a"), (with_noise(with_points, tmp_path / "noise"), "b")):
-        MAKERS[name].run(capture, tmp_path / place)
-        cloud = read_cloud(tmp_path / place / MODEL_FOLDER)
-        assert len(cloud) > 100
-        clouds.append((cloud.points.tobytes(), cloud.colors.tobytes(), poses(tmp_path / place)))
-    assert (clouds[0] == clouds[1]) == (name != "sfm on all")
 
 
 @pytest.mark.slow

@@ -67,28 +67,6 @@ def test_without_an_output_it_is_refused_for_a_densifier_that_needs_it(folder, a
     parts.check(on_this_machine=False)
 
 
-def test_a_class_without_a_name_of_its_own_or_without_render_is_refused(folder):
-    (folder / "oversampled.py").write_text(
-        "from gsbench.raster.reference import ReferenceRasterizer\n"
-        "class Same(ReferenceRasterizer):\n    pass\n"
-        "class Blind:\n    name = 'blind'\n"
-        "class Nameless:\n    def render(self): pass\n"
-        "class Options:\n    name = 'own'\n    def __init__(self, size=1): self.size = size\n"
-        "    def render(self): pass\n"
-    )
-    for target, options, message in (
-        ("Same", {}, "needs an attribute name.* it has 'reference'"),
-        ("Nameless", {}, "needs an attribute name.* it has None"),
-        ("Blind", {}, r"no render\(\)"),
-        ("Options", {"size": 2}, "not a dataclass"),
-        ("Absent", {}, "cannot be imported"),
-    ):
-        with refusal(message):
-            build_own_rasterizer(
-                {"name": "auto", "_target_": f"oversampled.{target}", **options}, ["oversampled"]
-            )
-
-
 def test_its_source_is_part_of_the_hash(folder):
     own = config_hash(composed(*OWN))
     assert own != config_hash(composed())

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from gsbench.pipeline.steps.scene import masking_step
 from gsbench.scene.load import load_scene
 from gsbench.scene.masks import (
     fill_ignored,
@@ -54,14 +53,6 @@ def test_masks_are_found_by_the_names_of_colmap(make_scene, read):
     root = capture.images.parent
     assert capture.masks == {name: root / "masks" / f"{name}.png" for name in names}
     assert capture.image_names == names
-
-
-def test_photographs_are_prepared_again_for_another_backdrop(make_scene):
-    capture = read_photos("toy", with_masks(make_scene()), masks="masks")
-    steps = {behind: masking_step(capture, behind) for behind in ("black", "white")}
-    assert all(steps.values())
-    assert steps["black"].key != steps["white"].key
-    assert steps["white"].inputs["behind"] == "white"
 
 
 def test_a_mask_file_with_another_name_is_not_used(tmp_path):

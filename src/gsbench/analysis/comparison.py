@@ -31,6 +31,7 @@ from gsbench.analysis.verdict_words import sentence
 from gsbench.analysis.verdicts import PairVerdicts, judge_pairs
 from gsbench.runs.experiments import Question
 from gsbench.runs.layout import LEDGER, TUNING
+from gsbench.words import command
 
 VERDICT = Note.of("verdict", sentence="").sentence  # begins the notes that state verdicts
 
@@ -339,7 +340,11 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     answers = answers[: len(arms.pairs)]
     if (experiment.folder / LEDGER).exists():
         answers = [
-            replace(answer, undeclared=LEDGER_DECIDES.format(experiment.name)) for answer in answers
+            replace(
+                answer,
+                undeclared=LEDGER_DECIDES.format(command("ledger", "show", experiment.name)),
+            )
+            for answer in answers
         ]
     elif any(one.kind == "claims" and one.looks for one in experiment.declarations):
         answers = [replace(one, undeclared=CLAIMS_DECIDE) for one in answers]
@@ -347,4 +352,4 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
 
 
 CLAIMS_DECIDE = "declared claims decide (gsbench check), and seeds came in looks until they did"
-LEDGER_DECIDES = "the ledger's tests decide (gsbench ledger show {}), and this is none of them"
+LEDGER_DECIDES = "the ledger's tests decide ({}), and this is none of them"

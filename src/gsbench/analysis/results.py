@@ -25,7 +25,7 @@ from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SE
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
-from gsbench.words import counted, some_of
+from gsbench.words import command, counted, some_of
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
@@ -281,7 +281,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
-                f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
+                f"damaged, {change}: `{command('retry', record.experiment)}` repairs it"
             )
     except FileNotFoundError:
         raise UnusableError(_why_unfinished(path)) from None

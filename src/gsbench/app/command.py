@@ -25,6 +25,7 @@ from gsbench.launch.batch import check_parts, missing_folders, need_no_check, ru
 from gsbench.launch.dry_run import describe_plan
 from gsbench.launch.jobs import Outcome
 from gsbench.logs import set_up_logging
+from gsbench.words import command
 
 log = logging.getLogger(__name__)
 
@@ -163,9 +164,10 @@ def summarize(outcomes: Sequence[Outcome], trials: Sequence[Trial]) -> int:
     name = trials[-1].values["name"]  # the last one's: a tuning runs before, in its own experiments
     done = sum(outcome.status == "done" for outcome in outcomes)
     if any(outcome.status == "queued" for outcome in outcomes):
-        advice = f"how far the others are: gsbench status {name}"
+        advice = f"how far the others are: {command('status', name)}"
     else:
-        advice = f"again: gsbench retry {name}" if failed else f"the table: gsbench tables {name}"
+        advice = command("retry" if failed else "tables", name)
+        advice = f"{'again' if failed else 'the table'}: {advice}"
         if len(outcomes) == 1:
             advice += f"; renders and model: {outcomes[0].folder}"
     log.info("%d of %d trials done; %s", done, len(outcomes), advice)

@@ -39,7 +39,7 @@ from gsbench.launch.jobs import Outcome, outcome_of_error
 from gsbench.logs import set_up_logging
 from gsbench.runs.experiments import metric_and_question
 from gsbench.system.own_modules import allow_modules
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 GRID_SWEEPER = "basic"  # Hydra's own, which expands lists and asks for no values
 MAX_CHOICES = 1000  # of groups, in a sweep of another sweeper
@@ -265,10 +265,10 @@ def other_sweep(sweep: Sweep, run: Callable[[Sequence[Trial]], list[Outcome]]) -
         ) from error
     if not task.ended.trials:
         log.info(
-            "hydra/sweeper=%s has ended: gsbench status %s; the table: gsbench tables %s",
+            "hydra/sweeper=%s has ended: %s; the table: %s",
             name,
-            config.name,
-            config.name,
+            command("status", config.name),
+            command("tables", config.name),
         )
     elif name != GRID_SWEEPER and (best := best_line(task.ended.trials, objective)):
         log.info("hydra/sweeper=%s: %s", name, best)

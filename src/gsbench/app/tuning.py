@@ -41,7 +41,7 @@ from gsbench.runs.experiments import TuningRecord, make_home, metric_and_questio
 from gsbench.runs.layout import TUNING
 from gsbench.settings import check_values
 from gsbench.system.install import install_command
-from gsbench.words import counted, did_you_mean, listed
+from gsbench.words import command, counted, did_you_mean, listed
 
 if TYPE_CHECKING:
     from optuna.trial import Trial as Proposal
@@ -138,8 +138,8 @@ def _best_words(search: ArmSearch) -> list[str]:
     record, best, name = search.record, search.record.best, search.home.name
     if best is None:
         raise GsbenchError(
-            f"{TUNE}: no point of {record.arm} has a {record.metric} (gsbench status {name} says "
-            "why)"
+            f"{TUNE}: no point of {record.arm} has a {record.metric} "
+            f"({command('status', name)} says why)"
         )
     words = words_of_values(best.settings)
     failed = sum(point.value is None for point in record.points)

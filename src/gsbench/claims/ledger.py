@@ -55,7 +55,7 @@ LOOKS_WORSE = "looks worse"  # by this rate, which is no verdict's
 SEEDS_FROM, SEEDS_TO = 100_000, 1_000_000  # of tests
 
 
-def check_room(ledger: Ledger) -> None:
+def check_ideas_left(ledger: Ledger) -> None:
     """Raise InputError unless another idea may be tried."""
     if ledger.tried >= ledger.opened.ideas:
         raise InputError(

@@ -1,5 +1,6 @@
 """Parse and check the words of a command line, before Hydra composes anything."""
 
+import re
 from collections.abc import Sequence
 from itertools import islice, product
 from pathlib import Path
@@ -10,6 +11,7 @@ from hydra.core.override_parser.types import Override
 from gsbench.config.groups import GROUPS, REMOVABLE, options
 from gsbench.config.overrides import bare_key, is_sweep, key_of, parse_word
 from gsbench.config.permissions import PERMISSIONS
+from gsbench.config.programs import reading
 from gsbench.config.search_path import search_path, searched_folders
 from gsbench.errors import InputError
 from gsbench.runs.config_hash import DECLARED, NOT_HASHED, WITHOUT_EFFECT
@@ -44,6 +46,7 @@ TEXTS = (
     "version",
 )
 MAX_POINTS = 1_000_000  # values of one list; more would fill the memory
+VARIABLE = re.compile(r"\$\{oc\.env:\s*['\"]?(\w+)")
 
 
 def parse(argv: Sequence[str]) -> tuple[list[str], bool, bool]:
@@ -165,6 +168,11 @@ def typed_permissions(words: Sequence[str]) -> tuple[str, ...]:
             )
         allowed = tuple(names)
     return allowed
+
+
+def typed_readings(words: Sequence[str]) -> tuple[str, ...]:
+    """The permissions to read the variables that the words themselves read by ``${oc.env:…}``."""
+    return tuple(dict.fromkeys(reading(name) for name in VARIABLE.findall(" ".join(words))))
 
 
 def check_single(words: Sequence[str], advice: str) -> None:

@@ -18,7 +18,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config.command_words import check_single, typed_permissions
+from gsbench.config.command_words import check_single, typed_permissions, typed_readings
 from gsbench.config.explain import explained, not_a_setting
 from gsbench.config.groups import GROUPS
 from gsbench.config.hydra_setup import (
@@ -93,7 +93,7 @@ class Composer:
         # The order matters: Hydra imports packages of the search path while it composes, so they
         # are checked first.
         self.typed = words if typed is None else typed
-        self.allowed = typed_permissions(self.typed)
+        self.allowed = typed_permissions(self.typed) + typed_readings(self.typed)
         packages = check_search_path(words, self.allowed)
         allow_modules(self.allowed, os.getcwd() if modules is None else modules)
         check_places(searched_folders(words), packages)

@@ -41,6 +41,7 @@ from gsbench.runs.rows import Row, read_rows
 from gsbench.runs.trial_files import Building, Configuration, Failure, MadeOf, ResultsFile
 from gsbench.runs.trial_record import TrialRecord, UnfinishedError, record_from
 from gsbench.system.locks import is_held
+from gsbench.words import command
 
 MADE_OF = "made_of"  # the key in results.json
 State = Literal["done", "running", "failed", "partial", "damaged", "missing"]
@@ -176,9 +177,8 @@ class TrialFolder:
             values = from_json(content)  # compared as values: white space does not matter
             del values[MADE_OF]
             if made_of.results != sha256_of(values):
-                reason = (
-                    f"was changed after it was written: `gsbench retry {self.home.name}` repairs it"
-                )
+                repair = command("retry", self.home.name)
+                reason = f"was changed after it was written: `{repair}` repairs it"
                 raise DamagedError(path, reason)
         self._origin = made_of
         return record

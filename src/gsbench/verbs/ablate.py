@@ -14,7 +14,7 @@ from gsbench.errors import InputError
 from gsbench.launch.dry_run import describe_plan
 from gsbench.runs.layout import SEED
 from gsbench.verbs.arguments import ArgumentParser, names
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 DEFAULT_METRIC = "psnr"
 
@@ -62,7 +62,7 @@ def ablate(argv: Sequence[str], runs: Path) -> int:
         metric = options.metric or values["eval"].get("primary") or DEFAULT_METRIC
         judged = ablation.judge_runs(read_experiment(home).trials, keys, metric)
         print("\n".join(ablation.markdown_table(judged)))
-        print(f"all metrics and pictures: gsbench report {home.name}")
+        print(f"all metrics and pictures: {command('report', home.name)}")
     return code
 
 

@@ -181,9 +181,9 @@ def _start(
             ended = book.ended.get(same[0].idea)
             begun = ended is None and not book.shares_seeds
             if not begun and not book.is_decided(same[0].idea):
-                rules.check_room(book)  # other ideas may have taken its place
+                rules.check_ideas_left(book)  # other ideas may have taken its place
             return None
-        rules.check_room(book)
+        rules.check_ideas_left(book)
         name = options.idea or values["densify"]["name"]
         if name in (*book.started, BASELINE):
             if options.idea:

@@ -23,7 +23,7 @@ from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.layout import VOTE_KEY, VOTES
 from gsbench.runs.votes import Ballot, RoundKey, StoredBallot, check_ballot, read_key, store_ballots
 from gsbench.verbs.arguments import ArgumentParser, names, path, whole_number
-from gsbench.words import counted
+from gsbench.words import command, counted
 
 PAIRS, PEOPLE = 40, 9  # nine: the sign test then lets one person disagree
 MOST = 1000  # pairs, and people
@@ -161,8 +161,8 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
     verdicts = load_rounds(experiment.folder)
     if not verdicts:
         raise InputError(
-            f"{experiment.name} has no round of votes: gsbench vote make {experiment.name} --out "
-            "DIR"
+            f"{experiment.name} has no round of votes: "
+            + command("vote", "make", experiment.name, "--out", "DIR")
         )
     comparison = compare(experiment)
     trials, judged = comparison.trials, comparison.answers
