@@ -19,18 +19,13 @@ from gsbench.errors import InputError
 from gsbench.files import require_no_links
 from gsbench.parsing import DamagedError, one_line
 from gsbench.runs.experiments import Arm as Arm
-from gsbench.runs.experiments import (
-    Declaration,
-    experiment_home,
-    read_declarations,
-    trial_folders,
-)
+from gsbench.runs.experiments import Declaration, experiment_home, read_declarations, trial_folders
 from gsbench.runs.freshness import Change, code_changes
 from gsbench.runs.layout import CONFIG, FAILED, FORGOTTEN, PER_VIEW, RESULTS, SEED
 from gsbench.runs.nested import SHOWN
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import UnfinishedError
-from gsbench.words import counted, some_of
+from gsbench.words import command, counted, some_of
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
@@ -79,6 +74,11 @@ class Experiment:
     @property
     def seeds(self) -> tuple[int, ...]:
         return tuple(sorted({trial.seed for trial in self.trials}))
+
+
+def trials_of(trials: Sequence[TrialResult], arm: Arm) -> list[TrialResult]:
+    """The trials of one arm, in their order."""
+    return [trial for trial in trials if trial.arm == arm]
 
 
 def group_by(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
@@ -135,6 +135,18 @@ def read_experiment(folder: Path) -> Experiment:
     usable.sort(
         key=lambda trial: (trial.scene, trial.init, trial.densify, trial.seed, trial.config_hash)
     )
+    known = {
+        (key, seed): declared.moment
+        for declared in reversed(read_declarations(folder))
+        for key, seeds in declared.known.items()
+        for seed in seeds
+    }
+    usable = [
+        replace(trial, known=known[trial.key, trial.seed])
+        if (trial.key, trial.seed) in known
+        else trial
+        for trial in usable
+    ]
     forgotten, unread = _forgotten(folder, {trial.path for trial in usable})
     warnings = sorted(f"{path.relative_to(runs_dir)}: {fault}" for path, fault in faults.items())
     lacking = tuple(
@@ -269,7 +281,7 @@ def read_trial(path: Path, runs_dir: Path, settings: Configurations) -> TrialRes
         record = folder.record()
         if change := folder.change():
             raise UnusableError(
-                f"damaged, {change}: `gsbench retry {record.experiment}` repairs it"
+                f"damaged, {change}: `{command('retry', record.experiment)}` repairs it"
             )
     except FileNotFoundError:
         raise UnusableError(_why_unfinished(path)) from None

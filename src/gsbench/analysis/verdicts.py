@@ -14,7 +14,7 @@ If several versions of an arm's code were measured on the pairs of a question, i
 smaller (`gsbench.analysis.attempts`). The other arms of its declaration are still adjusted for it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gsbench.analysis.attempts import measured_versions, of_same_arm, share_of_version
@@ -30,6 +30,7 @@ from gsbench.analysis.quantities import (
     choose_quantities,
 )
 from gsbench.analysis.results import Arm, TrialResult, group_by
+from gsbench.analysis.statistics import UNDECIDED
 from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
 
@@ -65,10 +66,15 @@ class PairVerdicts:
     def missing(self) -> Note | None:
         """The reason why the declared metric has no verdict, if it has none."""
         if self.declared is None or any(
-            one.quantity.key == self.declared.key for one in self.verdicts
+            verdict.quantity.key == self.declared.key for verdict in self.verdicts
         ):
             return None
         return next((note for note in self.notes if note.about == self.declared.name), None)
+
+    @property
+    def undecided(self) -> bool:
+        """Return whether no verdict that decides about the arms is decided."""
+        return all(one.outcome == UNDECIDED for one in self.primary)
 
     def role(self, verdict: Verdict) -> str:
         """Declared or secondary; "" if all metrics are one family."""
@@ -77,7 +83,7 @@ class PairVerdicts:
     @property
     def primary(self) -> tuple[Verdict, ...]:
         """The verdicts that are not secondary."""
-        return tuple(one for one in self.verdicts if not one.question.secondary)
+        return tuple(verdict for verdict in self.verdicts if not verdict.question.secondary)
 
 
 def judge_pairs(
@@ -87,26 +93,31 @@ def judge_pairs(
     lacking: Sequence[Unfinished] = (),
     others: Sequence[ArmPair] = (),
     older: Sequence[TrialResult] = (),
+    turned: Collection[ArmPair] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
     ``declared`` defines the families of tests; ``lacking`` are trials without a result, ``older``
-    those of earlier code. The pairs ``others`` are no questions of the declaration.
+    those of earlier code. The pairs ``others`` are no questions of the declaration, and those that
+    are ``turned`` are questions of it with the sides exchanged.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primaries: dict[ArmPair, Quantity] = {}
     standings: dict[ArmPair, Standing] = {}
     undirected: dict[ArmPair, list[Note]] = {}
     versions: dict[ArmPair, int] = {}
-    asked: list[Asked] = []
-    gone: list[tuple[Asked, OtherTest]] = []
+    asked: list[PairQuestion] = []
+    gone: list[tuple[PairQuestion, OtherTest]] = []
+    # All questions are collected before one is judged, since families span pairs.
     for pair in pairs:
         first, second = (by_arm.get(arm, []) for arm in pair)
         metrics = [
             metric for metric in choose_quantities(_trials_of(by_arm, pair)) if not metric.cost
         ]
+        # of a question that is turned, what was asked of the arm stands in the baseline's place
+        sides = (second, first) if pair in turned else (first, second)
         if declared is not None:
-            standing = declared.standing(first, second, other_pair=pair in others)
+            standing = declared.standing(*sides, other_pair=pair in others)
             primary = asked_quantity(standing.active.metric, trials)
             standings[pair], primaries[pair] = standing, primary
             metrics = [primary, *(metric for metric in metrics if metric.key != primary.key)]
@@ -116,15 +127,15 @@ def judge_pairs(
             if not metric.direction
         ]
         directed = [metric for metric in metrics if metric.direction]
-        versions[pair] = measured_versions(first, second, older)
+        versions[pair] = measured_versions(*sides, older)
         known = standings.get(pair)
         asked += [
-            Asked(pair, metric, _question(first, pair, metric, known), known, versions[pair])
+            PairQuestion(pair, metric, _question(first, pair, metric, known), known, versions[pair])
             for metric in directed
         ]
         if declared is not None:
-            gone += _before_late_trials(pair, directed, first, second, known)
-            gone += _of_earlier_code(pair, directed, first, second, declared)
+            gone += _before_late_trials(pair, directed, *sides, known)
+            gone += _of_earlier_code(pair, directed, *sides, declared)
     verdicts = _judge_families(by_arm, trials, asked, gone, lacking)
     by_pair = group_by(zip(asked, verdicts, strict=True), lambda answered: answered[0].pair)
     judged = []
@@ -159,7 +170,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
     if not lacking:
         return why
     reasons = [trial.unavailable.get(metric.key) for trial in lacking]
-    reason = next((short_reason(one) for one in reasons if one is not None), why.sentence)
+    reason = next((short_reason(text) for text in reasons if text is not None), why.sentence)
     if len(lacking) == len(trials):
         return Note.of("no value", reason=reason)
     arms = [str(arm) for arm in dict.fromkeys(trial.arm for trial in lacking)]
@@ -167,7 +178,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
 
 
 @dataclass(frozen=True)
-class Asked:
+class PairQuestion:
     """A question about a pair of arms, with the standing of the declaration to it."""
 
     pair: ArmPair
@@ -198,8 +209,8 @@ class Asked:
 def _judge_families(
     by_arm: Mapping[Arm, Sequence[TrialResult]],
     trials: Sequence[TrialResult],
-    asked: Sequence[Asked],
-    gone: Sequence[tuple[Asked, OtherTest]],
+    asked: Sequence[PairQuestion],
+    gone: Sequence[tuple[PairQuestion, OtherTest]],
     lacking: Sequence[Unfinished],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair.
@@ -224,12 +235,14 @@ def _judge_families(
             if (named := own[0][1].declaration) is not None:
                 looks = named.looks if questions[0].seeds else ()
                 # an arm without any trial yet keeps its share of the error rate
-                asked_scenes = [one.scenes for one in questions]
+                asked_scenes = [question.scenes for question in questions]
                 waiting = [
-                    one for one in named.questions if looks and one.scenes not in asked_scenes
+                    question
+                    for question in named.questions
+                    if looks and question.scenes not in asked_scenes
                 ]
                 # a look's own questions wait already
-                others = [one for one in others if one.secondary or not looks]
+                others = [other for other in others if other.secondary or not looks]
                 declaration = replace(
                     declaration,
                     questions=(*questions, *waiting),
@@ -248,7 +261,7 @@ def _before_late_trials(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     standing: Standing | None,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions as they were before trials were added too late."""
     if standing is None or not standing.added:
         return []
@@ -256,9 +269,14 @@ def _before_late_trials(
     if not whole.beforehand:
         return []
     late = {(trial.scene, trial.seed) for trial in standing.added}
-    in_time = [one for one in arm if (one.scene, one.seed) not in late]
-    questions = [Asked(pair, one, _question(baseline, pair, one, whole), whole) for one in metrics]
-    return [(one, other_test([*baseline, *in_time], one.question)) for one in questions]
+    in_time = [trial for trial in arm if (trial.scene, trial.seed) not in late]
+    questions = [
+        PairQuestion(pair, metric, _question(baseline, pair, metric, whole), whole)
+        for metric in metrics
+    ]
+    return [
+        (question, other_test([*baseline, *in_time], question.question)) for question in questions
+    ]
 
 
 def _of_earlier_code(
@@ -267,27 +285,28 @@ def _of_earlier_code(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     declared: ActiveDeclaration,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions with each earlier version of the arm's code.
 
     The new code is tested in another family.
     """
     found = []
-    old = [replace(one, variant=pair[1].variant) for one in of_same_arm(arm, declared.older)]
+    old = [replace(trial, variant=arm[0].variant) for trial in of_same_arm(arm, declared.older)]
     for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
         # the state when this version was trained
         first = min(trial.measured for trial in version)
         known = replace(
-            declared, older=tuple(one for one in declared.older if one.measured < first)
+            declared, older=tuple(trial for trial in declared.older if trial.measured < first)
         )
         standing = known.standing(baseline, version)
         questions = [
-            Asked(pair, one, _question(baseline, pair, one, standing), standing) for one in metrics
+            PairQuestion(pair, metric, _question(baseline, pair, metric, standing), standing)
+            for metric in metrics
         ]
         found += [
-            (one, other_test([*baseline, *version], one.question))
-            for one in questions
-            if one.declaration is not None
+            (question, other_test([*baseline, *version], question.question))
+            for question in questions
+            if question.declaration is not None
         ]
     return found
 

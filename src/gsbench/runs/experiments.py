@@ -17,7 +17,8 @@ from gsbench.files import require_no_links
 from gsbench.parsing import STRICT, Amount, Count, Number, Record, Text, Whole
 from gsbench.runs.layout import DECLARED, IN_RUNS
 from gsbench.runs.nested import sha256_of
-from gsbench.runs.trial_record import Declared, read_rows
+from gsbench.runs.rows import read_rows
+from gsbench.runs.trial_record import Declared
 from gsbench.settings import ARM_BYTES, is_folder_name
 
 log = logging.getLogger(__name__)
@@ -214,8 +215,9 @@ class Declaration(Record):
     ``error_rate`` is the chance that any answer is false. ``looks`` are the rising numbers of
     seeds at which a question may be decided; without looks, all seeds are judged at once.
     ``trials`` are the planned trials if the questions name none; None if they are not recorded.
-    ``missing`` says by question what could not be tested, and why. ``votes`` is the number of
-    people's votes at which the questions of the round ``vote_round`` are judged.
+    ``known`` are those of them whose results were there already, although their times are later: a
+    clock was set back. ``missing`` says by question what could not be tested, and why. ``votes`` is
+    the number of people's votes at which the questions of the round ``vote_round`` are judged.
     """
 
     time: str
@@ -223,6 +225,7 @@ class Declaration(Record):
     error_rate: Amount = ERROR_RATE
     looks: tuple[Count, ...] = ()
     trials: dict[TrialKey, tuple[Count, ...]] | None = None
+    known: dict[TrialKey, tuple[Count, ...]] = field(default_factory=dict)
     missing: dict[str, list[str]] = field(default_factory=dict)
     votes: Count = 0
     vote_round: str = ""
@@ -276,7 +279,7 @@ class Declaration(Record):
     @property
     def hash(self) -> str:
         """sha256 of all that affects the answers: different hashes are different declarations."""
-        return sha256_of(replace(self, time=NO_TIME, missing={}).to_json())
+        return sha256_of(replace(self, time=NO_TIME, missing={}, known={}).to_json())
 
     def summary(self) -> Declared:
         """The part that a trial's results.json repeats."""
@@ -340,11 +343,12 @@ def of_latest_metric(sweeps: Sequence[Declaration]) -> tuple[Declaration, ...]:
     ``sweeps`` are declarations of sweeps, in the order of time.
     """
     latest = sweeps[-1]
-    others = [one.moment for one in sweeps if one.primary != latest.primary]
+    others = [sweep.moment for sweep in sweeps if sweep.primary != latest.primary]
     return tuple(
-        one
-        for one in sweeps
-        if one is latest or (one.primary == latest.primary and one.moment > max(others, default=-1))
+        sweep
+        for sweep in sweeps
+        if sweep is latest
+        or (sweep.primary == latest.primary and sweep.moment > max(others, default=-1))
     )
 
 
