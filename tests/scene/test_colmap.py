@@ -16,7 +16,8 @@ from gsbench.scene.colmap import (
     read_reference,
     write_model,
 )
-from gsbench.scene.colmap_files import _MODELS, ModelChecks, check_model
+from gsbench.scene.colmap_checks import MODELS, ModelChecks
+from gsbench.scene.colmap_files import check_model
 from gsbench.scene.readers import read_colmap, read_photos
 from gsbench.scene.types import Camera
 from tests.helpers import refusal
@@ -139,8 +140,8 @@ def test_camera_models_are_those_of_colmap():
     """Model numbers and parameter counts are COLMAP's, and focal lengths come first."""
     known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items()}
     known.pop("INVALID")
-    assert {name: number for number, (name, _) in _MODELS.items()} == known
-    for name, length in _MODELS.values():
+    assert {name: number for number, (name, _) in MODELS.items()} == known
+    for name, length in MODELS.values():
         camera = pycolmap.Camera.create_from_model_name(1, name, 50.0, 40, 30)
         assert len(camera.params) == length
         focal = list(camera.focal_length_idxs()) or [0, 1]  # EQUIRECTANGULAR has its size

@@ -246,6 +246,8 @@ def test_focal_lengths_are_assumed_in_a_copy_whose_pairs_are_verified_again(tmp_
     calls = []
     database = tmp_path / "a.db"
     database.write_text("cameras")
+    journal = tmp_path / "assumed-1.4.db-journal"
+    journal.write_text("a stranger's, which could tell SQLite to delete any file")
 
     def note(owner, name, result):
         monkeypatch.setattr(owner, name, lambda *given: calls.append(given) or result)
@@ -261,6 +263,7 @@ def test_focal_lengths_are_assumed_in_a_copy_whose_pairs_are_verified_again(tmp_
     assert (pairs, progress) == ([("a", "b")], no_progress)
     assert (options.ransac.random_seed, options.min_num_inliers) == (4, 9)
     assert mapped_from == [copy, 2.0]
+    assert not journal.exists()
 
 
 def test_all_pairs_or_pairs_of_neighbours_are_selected():
