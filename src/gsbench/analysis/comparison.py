@@ -168,13 +168,10 @@ class Comparison:
     @property
     def _elsewhere(self) -> list[Note]:
         """A note for each arm that other experiments measured by other code on its seeds."""
-        by_arm, home = group_by(self.trials, lambda trial: trial.arm), self.experiment.folder
-        notes = {}
-        for first, second in self.pairs:
-            both = by_arm[first], by_arm[second]
-            if others := measured_elsewhere(home.parent, home.name, *both):
-                notes[second] = Note.of("elsewhere", arm=second, experiments=others)
-        return [*notes.values()]
+        by_arm = group_by(self.trials, lambda trial: trial.arm)
+        compared = {second: by_arm[second] for _, second in self.pairs}
+        found = measured_elsewhere(self.experiment.folder, compared)
+        return [Note.of("elsewhere", arm=arm, experiments=own) for arm, own in found.items()]
 
     @cached_property
     def _progress(self) -> list[Note]:
@@ -314,8 +311,8 @@ def compare(experiment: Experiment, baseline: str = BASELINE) -> Comparison:
     usual = arms if baseline == BASELINE else pair_arms(experiment)
     known = {frozenset(pair) for pair in usual.pairs}
     others = [pair for pair in arms.pairs if frozenset(pair) not in known]
-    lacking, older = unfinished(experiment), experiment.older
-    answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, older)
+    lacking, past = unfinished(experiment), (experiment.older, experiment.seen)
+    answers = judge_pairs(arms.trials, arms.pairs, declared, lacking, others, *past)
     if (experiment.folder / LEDGER).exists():
         answers = [
             replace(one, undeclared=LEDGER_DECIDES.format(experiment.name)) for one in answers

@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from pathlib import Path
 
-from gsbench.analysis.attempts import of_same_arm, places_of
+from gsbench.analysis.attempts import earlier_results, of_same_arm, places_of
 from gsbench.analysis.notes import Note
 from gsbench.analysis.results import Experiment, TrialResult
 from gsbench.analysis.trial_settings import config_if_readable, settings_text
 from gsbench.runs.experiments import Declaration, Question, merge_planned, of_latest_metric
 from gsbench.runs.layout import FORGOTTEN, SEED
+from gsbench.runs.seen import SeenResult
 from gsbench.words import counted
 
 
@@ -27,7 +28,7 @@ class Standing:
 
     ``declaration`` is the one that first named the arm, with its trials up to the arm's first
     result; questions of one such declaration share an error rate. ``question`` is that about these
-    arms if a sweep in looks names its questions. ``seen`` are the arm's trials that were measured
+    arms if a sweep in looks names its questions. ``seen`` are the arm's results that were measured
     before the metric was declared, ``added`` the trials of its pairs that were not declared before
     its first result. ``other_pair``: these arms are no pair of the declaration.
     """
@@ -35,7 +36,7 @@ class Standing:
     active: "ActiveDeclaration"
     declaration: Declaration
     question: Question | None
-    seen: tuple[TrialResult, ...]
+    seen: tuple[SeenResult, ...]
     added: tuple[TrialResult, ...]
     other_pair: bool
 
@@ -62,12 +63,13 @@ class ActiveDeclaration:
     """The declarations in force in an experiment: all of the latest metric, the oldest first.
 
     ``declared`` are those of all metrics, ``folder`` is the experiment's. ``older`` are trials of
-    earlier code, which do not count but were seen.
+    earlier code, which do not count but were seen; ``seen`` is what was ever measured.
     """
 
     declared: tuple[Declaration, ...]
     folder: Path
     older: tuple[TrialResult, ...] = ()
+    seen: tuple[SeenResult, ...] = ()
 
     @cached_property
     def records(self) -> tuple[Declaration, ...]:
@@ -91,7 +93,11 @@ class ActiveDeclaration:
         ``other_pair`` says that the arms would not be compared without a choice made later.
         """
         old = of_same_arm(arm, self.older)
-        first = min((trial.measured for trial in (*arm, *old)), default=math.inf)
+        # also what was removed or overwritten since, or had another name
+        gone = earlier_results(arm, self.seen)
+        times = [(one.measured, one.as_seen) for one in (*arm, *old)]
+        times += [(one.moment, one) for one in gone]
+        first = min((moment for moment, _ in times), default=math.inf)
         if known := [one for one in self.declared if one.moment <= first]:
             metric = known[-1].primary
             kept = tuple(o for o in self.declared if o.moment <= first or o.primary == metric)
@@ -112,7 +118,11 @@ class ActiveDeclaration:
             if any(a in of_baseline for a, _ in question.scenes.values())
             and any(b in keys for _, b in question.scenes.values())
         ]
-        seen = [one for one in (*arm, *old) if one.measured < self.records[0].moment]
+        seen = {
+            (one.place, one.version): one
+            for moment, one in times
+            if moment < self.records[0].moment
+        }
         # Only pairs of trials reach a verdict. Of the baseline, what was there before the arm's
         # first result could not be chosen by it.
         places, others = places_of(baseline), places_of(arm)
@@ -130,7 +140,7 @@ class ActiveDeclaration:
         declaration, question = asked[-1] if asked else ((*in_looks, naming[0])[0], None)
         # a sweep in looks stopped by its own questions
         other_pair = not asked if in_looks else other_pair
-        return Standing(self, declaration, question, tuple(seen), tuple(added), other_pair)
+        return Standing(self, declaration, question, tuple(seen.values()), tuple(added), other_pair)
 
     def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
         """A note on the declared trials that are missing; none if all are there."""
@@ -180,4 +190,6 @@ def active_declaration(experiment: Experiment) -> ActiveDeclaration | None:
     The latest metric is in force. Further commands may add trials to an arm until its first result.
     """
     declared = tuple(one for one in experiment.declarations if one.kind == "sweep")
-    return ActiveDeclaration(declared, experiment.folder, experiment.older) if declared else None
+    if not declared:
+        return None
+    return ActiveDeclaration(declared, experiment.folder, experiment.older, experiment.seen)

@@ -17,7 +17,6 @@ from gsbench.analysis.differences import (
     differing_keys,
     ingredients_between,
     ingredients_note,
-    is_ingredient,
     is_mixed,
 )
 from gsbench.analysis.notes import Note
@@ -28,6 +27,7 @@ from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import PAPER_CAP
 from gsbench.parsing import read_if_sound
+from gsbench.runs.config_hash import is_ingredient
 from gsbench.runs.experiments import SearchPoint, TuningRecord
 from gsbench.runs.layout import EVENTS, TUNING
 from gsbench.words import counted, listed

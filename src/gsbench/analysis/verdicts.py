@@ -32,6 +32,7 @@ from gsbench.analysis.quantities import (
 from gsbench.analysis.results import Arm, TrialResult, group_by
 from gsbench.analysis.unfinished import Unfinished
 from gsbench.runs.experiments import NO_TIME, Declaration, Question
+from gsbench.runs.seen import SeenResult
 
 ArmPair = tuple[Arm, Arm]  # baseline, other arm
 DECLARED, SECONDARY = "declared", "secondary"
@@ -87,11 +88,13 @@ def judge_pairs(
     lacking: Sequence[Unfinished] = (),
     others: Sequence[ArmPair] = (),
     older: Sequence[TrialResult] = (),
+    seen: Sequence[SeenResult] = (),
 ) -> list[PairVerdicts]:
     """Judge each pair of arms in every metric that has a direction.
 
     ``declared`` defines the families of tests; ``lacking`` are trials without a result, ``older``
-    those of earlier code. The pairs ``others`` are no questions of the declaration.
+    those of earlier code, ``seen`` what was ever measured. The pairs ``others`` are no questions of
+    the declaration.
     """
     by_arm = group_by(trials, lambda trial: trial.arm)
     primaries: dict[ArmPair, Quantity] = {}
@@ -116,7 +119,7 @@ def judge_pairs(
             if not metric.direction
         ]
         directed = [metric for metric in metrics if metric.direction]
-        versions[pair] = measured_versions(first, second, older)
+        versions[pair] = measured_versions(first, second, older, seen)
         known = standings.get(pair)
         asked += [
             Asked(pair, metric, _question(first, pair, metric, known), known, versions[pair])
@@ -278,7 +281,9 @@ def _of_earlier_code(
         # the state when this version was trained
         first = min(trial.measured for trial in version)
         known = replace(
-            declared, older=tuple(one for one in declared.older if one.measured < first)
+            declared,
+            older=tuple(one for one in declared.older if one.measured < first),
+            seen=tuple(one for one in declared.seen if one.moment < first),
         )
         standing = known.standing(baseline, version)
         questions = [

@@ -35,6 +35,7 @@ from gsbench.runs import layout
 from gsbench.runs.config_hash import config_hash
 from gsbench.runs.freshness import Change, change_of_files, changes, origin_of
 from gsbench.runs.nested import sha256_of
+from gsbench.runs.seen import remember
 from gsbench.runs.trial_record import (
     Building,
     Configuration,
@@ -246,6 +247,7 @@ class TrialFolder:
         present = self.sound_record()
         before = path.stat() if present is not None and present.to_json() == content else None
         origin = origin_of(self.path, content, values, sources, entries or {}, published)
+        remember(self.home, record)
         with atomic(path) as temporary:
             temporary.write_text(
                 json.dumps(content | {MADE_OF: origin.to_json()}, indent=1, allow_nan=False) + "\n"
