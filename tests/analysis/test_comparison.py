@@ -21,6 +21,7 @@ from scipy import stats
 
 from gsbench.analysis.attempts import share_of_version
 from gsbench.analysis.comparison import compare
+from gsbench.analysis.looks import look_levels, plan_looks
 from gsbench.analysis.notes import texts
 from gsbench.analysis.quantities import quantity
 from gsbench.analysis.results import load_all_trials
@@ -188,6 +189,34 @@ def test_the_baseline_that_a_sweep_in_looks_declared_stays_it_if_another_arm_end
     found = answer(tmp_path)
     assert against(found) == [("sfm-mine", "sfm-absgs")]
     assert "of at most 3 seeds. The metric was declared beforehand." in found.sentences[0]
+
+
+@pytest.mark.parametrize(
+    "days, seeds, doubt",
+    [
+        ((4,), 3, "only after 3 trials of the arm had been measured"),
+        ((1, 6), 5, "4 trials were added after the arm's first result"),
+    ],
+)
+def test_an_exploratory_question_of_a_sweep_in_looks_counts_the_looks(tmp_path, days, seeds, doubt):
+    both = [
+        [replace(one, day=2 + 5 * (one.seed > 2)) for one in grid(name, seeds)]
+        for name in ("adc", "mine")
+    ]
+    write(tmp_path, [*both[0], *both[1]])
+    plans = []
+    for day, most in zip(days, (3, 5), strict=False):
+        plan = replace(in_looks(both), time=midnight(day), looks=plan_looks(most))
+        (asked,) = plan.questions
+        plans.append(replace(plan, questions=(replace(asked, seeds=tuple(range(most))),)))
+    write_declared(tmp_path, *plans)
+    (found,) = answer(tmp_path).answers
+    assert found.standing.doubt == doubt
+    for one in found.verdicts:  # two metrics share 5 %
+        levels = dict(zip(plan_looks(seeds), look_levels(1, plan_looks(seeds), 0.025), strict=True))
+        assert one.answer.rate == levels[one.pairs.seeds]
+    assert "adjusted for their number (2) and for the planned looks." in sentence(found)
+    assert "with equal shares of 5 % at each look" in page_of(tmp_path)
 
 
 def test_a_sweep_in_looks_gets_no_verdict_that_it_did_not_declare(tmp_path):

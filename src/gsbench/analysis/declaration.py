@@ -110,14 +110,18 @@ class ActiveDeclaration:
         naming = [one for one in before if keys & one.planned.keys()] or before[:1]
         in_looks = [one for one in naming if one.looks]
         of_baseline = {trial.key for trial in baseline}
-        asked = [
-            (one, question)
-            for one in in_looks
-            for question in one.questions
-            # some scenes may have no result yet
-            if any(a in of_baseline for a, _ in question.scenes.values())
-            and any(b in keys for _, b in question.scenes.values())
-        ]
+
+        def asked_by(declarations: Iterable[Declaration]) -> list[tuple[Declaration, Question]]:
+            return [
+                (one, question)
+                for one in declarations
+                for question in one.questions
+                # some scenes may have no result yet
+                if any(a in of_baseline for a, _ in question.scenes.values())
+                and any(b in keys for _, b in question.scenes.values())
+            ]
+
+        asked = asked_by(in_looks)
         seen = {
             (one.place, one.version): one
             for moment, one in times
@@ -137,7 +141,11 @@ class ActiveDeclaration:
             named = (one.moment for one in self.records if one.names_trials)
             next_record = min(named, default=math.inf)
             added = [one for one in paired if one.measured >= next_record]
-        declaration, question = asked[-1] if asked else ((*in_looks, naming[0])[0], None)
+        # An exploratory question has all looks that were ever planned for it: trials end at the
+        # one that pleases.
+        late = asked_by(one for one in self.records if one.looks) if seen or added else []
+        latest = (late or asked)[-1:]
+        declaration, question = latest[0] if latest else ((*in_looks, naming[0])[0], None)
         # a sweep in looks stopped by its own questions
         other_pair = not asked if in_looks else other_pair
         return Standing(self, declaration, question, tuple(seen.values()), tuple(added), other_pair)

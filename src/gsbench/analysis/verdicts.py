@@ -224,8 +224,12 @@ def _judge_families(
             # Without a time no trial is late, so Holm's method alone adjusts for the number of
             # metrics.
             declaration = Declaration(time=NO_TIME, questions=questions)
+            standing = own[0][1].standing
+            if standing is not None and questions[0].seeds:
+                # also if it is exploratory: its trials end at the look that pleased
+                declaration = replace(declaration, looks=standing.declaration.looks)
             if (named := own[0][1].declaration) is not None:
-                looks = named.looks if questions[0].seeds else ()
+                looks = declaration.looks
                 # an arm without any trial yet keeps its share of the error rate
                 asked_scenes = [one.scenes for one in questions]
                 waiting = [
@@ -237,7 +241,6 @@ def _judge_families(
                     declaration,
                     questions=(*questions, *waiting),
                     error_rate=named.error_rate,
-                    looks=looks,
                 )
             rate = declaration.error_rate * share_of_version(number)
             found = judge(trials, replace(declaration, error_rate=rate), lacking, others)
@@ -321,14 +324,17 @@ def _question(
         baseline=baseline,
         arm=arm,
     )
-    if standing is None or not standing.beforehand:
+    if standing is None:
         return question
     active, planned = standing.active, standing.question
-    split_question = next((trial.question for trial in of_baseline), "")
-    is_primary = active.question in ("", split_question) and metric.key == active.metric
     if planned is not None:
         question = replace(question, scenes=planned.scenes, seeds=planned.seeds)
-        question = replace(question, least=planned.least) if is_primary else question
+    if not standing.beforehand:
+        return question
+    split_question = next((trial.question for trial in of_baseline), "")
+    is_primary = active.question in ("", split_question) and metric.key == active.metric
+    if planned is not None and is_primary:
+        question = replace(question, least=planned.least)
     return replace(question, secondary=not is_primary)
 
 

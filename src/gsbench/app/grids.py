@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
-from gsbench.claims.stopping import KeyAndSeed, log_verdicts, plan_sweep
+from gsbench.claims.stopping import KeyAndSeed, ask, log_verdicts, plan_sweep
 from gsbench.config.command_words import bare_key, grid_points, is_interval, key_of, value_text
 from gsbench.config.compose import Trial
 from gsbench.config.groups import GROUPS
@@ -93,7 +93,7 @@ def _run_until_decided(trials: Sequence[Trial], run: Run) -> None:
         if batch:
             run(batch)
 
-    stopping.asked.answer(run_planned)
+    ask(stopping).answer(run_planned)
     if not launched:  # else it is said when the trials' outcomes are
         log_verdicts(trials)
     spared = [

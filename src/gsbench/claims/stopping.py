@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 
@@ -99,6 +99,20 @@ class Asked:
         return run_looks(self.declaration, self.judged, run)
 
 
+class InExperiment(Protocol):
+    """A declaration about the experiment in the folder ``home``."""
+
+    @property
+    def declaration(self) -> Declaration: ...
+    @property
+    def home(self) -> Path: ...
+
+
+def ask(one: InExperiment) -> Asked:
+    """The declaration with all trials of its experiment."""
+    return Asked(one.declaration, lambda: read_experiment(one.home).trials)
+
+
 @dataclass(frozen=True)
 class SweepInLooks:
     """The trials of a sweep that stops when decided, with its declaration."""
@@ -106,10 +120,6 @@ class SweepInLooks:
     declaration: Declaration
     home: Path
     trials: Mapping[KeyAndSeed, Trial]
-
-    @property
-    def asked(self) -> Asked:
-        return Asked(self.declaration, lambda: read_experiment(self.home).trials)
 
     def describe(self) -> str:
         """A line about the looks for a dry run."""

@@ -24,7 +24,7 @@ from gsbench.claims.check import Check, prepare, recheck
 from gsbench.claims.check_page import make_page, to_html, to_text
 from gsbench.claims.file import ClaimsFile, read_claims
 from gsbench.claims.ledger import GIVE_UP, IDEAS, RATE, SCREEN, level_of_test
-from gsbench.claims.stopping import KeyAndSeed
+from gsbench.claims.stopping import KeyAndSeed, ask
 from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial
 from gsbench.config.permissions import PERMISSIONS
@@ -177,7 +177,7 @@ def _run(check: Check) -> None:
         if unfinished:
             run_batch(unfinished)
 
-    checked = check.checked(check.asked.answer(run))
+    checked = check.checked(ask(check).answer(run))
     write_text(check.home / HTML, to_html(make_page(checked)))
     for verdict in checked.verdicts:
         print(f"{verdict.word:<19}  {verdict.claim.id}: {verdict.sentence}")
