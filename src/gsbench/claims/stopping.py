@@ -26,7 +26,7 @@ from gsbench.config.compose import Trial
 from gsbench.errors import InputError
 from gsbench.eval.facts import MetricFacts, facts_of, find_metric
 from gsbench.runs.experiments import Declaration, Question, declared_now, trial_key
-from gsbench.runs.layout import SEED
+from gsbench.runs.layout import LEDGER, SEED
 from gsbench.runs.nested import flatten
 from gsbench.words import counted
 
@@ -207,9 +207,11 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
     """Log the verdicts of the experiments of ``trials``, and what one must know beside them.
 
     These are unequal counts and limits without effect, said first, trials in no verdict, and
-    earlier code.
+    earlier code. A ledger says its own verdicts: what is said of a sweep does not fit its ideas.
     """
     for home in dict.fromkeys(trial.files.home for trial in trials):
+        if (home / LEDGER).exists():
+            continue
         comparison = compare(newest_code(read_experiment(home)))
         counts = [
             counts_note(comparison.trials, *pair, equal_counts_settings)
