@@ -14,6 +14,7 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
+from gsbench.analysis.advice import GRIDS
 from gsbench.app.sweep import Run, Sweep
 from gsbench.app.tuning import tuned_jobs
 from gsbench.claims.stopping import KeyAndSeed, ask, log_verdicts, plan_sweep
@@ -25,8 +26,6 @@ from gsbench.files import checked_runs_folder, make_runs_folder
 from gsbench.launch.record import declare_questions
 from gsbench.runs.layout import RESULTS
 from gsbench.words import listed
-
-GRIDS = "hydra.sweeper.grids"
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ import yaml
 from gsbench.analysis.advice import equal_counts_settings
 from gsbench.analysis.cells import with_variants
 from gsbench.analysis.comparison import compare
-from gsbench.analysis.fairness import counts_note, limit_notes
+from gsbench.analysis.fairness import counts_notes, limit_notes
 from gsbench.analysis.judgement import Verdict, judge
 from gsbench.analysis.looks import FIRST_LOOK, plan_looks
 from gsbench.analysis.notes import texts
@@ -213,11 +213,8 @@ def log_verdicts(trials: Iterable[Trial]) -> None:
         if (home / LEDGER).exists():
             continue
         comparison = compare(newest_code(read_experiment(home)))
-        counts = [
-            counts_note(comparison.trials, *pair, equal_counts_settings)
-            for pair in comparison.pairs
-        ]
-        before = [*filter(None, counts), *limit_notes(comparison.trials, comparison.pairs)]
+        both = comparison.trials, comparison.pairs
+        before = [*counts_notes(*both, equal_counts_settings), *limit_notes(*both)]
         said = [*texts(before), *comparison.sentences, *texts(comparison.remarks)]
         said += comparison.experiment.versions
         for line in said:
