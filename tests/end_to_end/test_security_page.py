@@ -10,6 +10,7 @@ import pytest
 
 from gsbench.cli import run
 from gsbench.errors import InputError
+from gsbench.runs.seen import seen_path
 from gsbench.runs.store import read_manifest
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.verbs import VERBS
@@ -171,6 +172,7 @@ def plans(trial, shown):
     for planned in plan["trials"].values():
         planned["time"] = 1
     (home / "plan.json").write_text(json.dumps(plan))
+    seen_path(home).write_text("")
     assert shown() == before
 
 
@@ -187,7 +189,7 @@ HERE = {
     "`metrics.jsonl`, `events.jsonl`, `volume_histograms.jsonl`": curves,
     "pictures of a trial": pictures,
     "`store/`: results of stages and prepared views": store,
-    "`declared.jsonl`, `plan.json`, `tuning.json`": plans,
+    "`declared.jsonl`, `plan.json`, `tuning.json`, `.seen/`": plans,
 }
 
 
