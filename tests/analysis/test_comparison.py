@@ -37,7 +37,7 @@ from gsbench.runs.experiments import Arm, Declaration, Question, open_question, 
 from gsbench.runs.seen import remember
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.tracking.comparison import description
-from gsbench.verbs.claims import plan
+from gsbench.verbs.plan import plan
 from gsbench.verbs.results import explain_cell, tables
 from tests.analysis.helpers import loaded, page_of, table_of, write_declared
 from tests.conftest import script
@@ -660,7 +660,7 @@ def test_each_version_of_the_code_on_the_same_seeds_has_a_smaller_error_rate(tmp
 
 
 EDITED = {"mine": ({"sources": {"mine": OLD}}, {"sources": {"mine": NEW}})}
-EDITED |= {"gsbench": ({"rooms": {"densify": "released"}}, {"rooms": {"densify": "e" * 16}})}
+EDITED |= {"gsbench": ({"packages": {"densify": "released"}}, {"packages": {"densify": "e" * 16}})}
 UPDATED = ({"stages": {"train": 2}}, {"stages": {"train": 3}})
 
 
@@ -736,7 +736,7 @@ def test_an_earlier_version_counts_however_it_was_hidden(tmp_path, hide):
             keep(tmp_path, [one], hashes={"data": "data-a"})
     for one in new:
         hashes = {"data": "data-a", "arm": "a"}
-        keep(tmp_path, [one], hashes=hashes, code={"rooms": {"densify": "e" * 16}})
+        keep(tmp_path, [one], hashes=hashes, code={"packages": {"densify": "e" * 16}})
     declare(tmp_path, (1, [*adc, *old]), (4, [*of_scene, *new]))
     found = answer(tmp_path)
     by_name = {one.second.densify: one for one in found.answers}
@@ -905,6 +905,10 @@ ADDED = {
 }
 
 
+def arms_of(comparison, densify):
+    return {one.arm for one in comparison.trials if one.densify == densify}
+
+
 def outcomes(comparison):
     return {
         (str(one.second), str(one.first)): (
@@ -936,6 +940,9 @@ def test_what_is_added_never_changes_another_verdict(what):
             (runs / "exp" / "d" / "sfm-mine" / "deadbeef-seed0").mkdir(parents=True)  # it failed
             after = answer(runs)
             assert before.pairs
+            # the new seed makes a sweep of a setting that was one value for each scene: other arms
+            if what == SEED_OF_ONE and len(arms_of(before, "adc")) < len(arms_of(after, "adc")):
+                return
             last_arm = next(one.arm for one in before.trials if one.key == made.last.key)
             changed = outcomes(after)
             for pair, found in outcomes(before).items():

@@ -6,7 +6,7 @@ import pytest
 
 from gsbench import cli
 from gsbench.app.command import compose_trials
-from gsbench.config.command_words import check_search_path
+from gsbench.config.search_path import check_search_path
 from gsbench.errors import InputError
 from tests.helpers import write
 

@@ -322,7 +322,7 @@ def test_kernels_are_timed_and_put_back_when_a_step_fails():
     "arguments, cause",
     [
         (["--size", "500"], "500x375"),
-        (["--count", "0"], "at least 1"),
+        (["--count", "0"], "--count: must be a whole number in "),
         (split("--raster nosuch --no-memory"), "nosuch"),
         (["--ply", "/no/such.ply"], "such.ply"),
     ],

@@ -19,12 +19,12 @@ from gsbench.claims.check import (
 )
 from gsbench.claims.check_page import _number, make_page, to_html
 from gsbench.claims.file import parse_claims
-from gsbench.claims.stopping import ask
+from gsbench.claims.stopping import sequential_test
 from gsbench.cli import run
 from gsbench.config.compose import with_seed
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.verbs.claims import describe
+from gsbench.verbs.check import describe
 from tests.claims.test_file import CLAIM, changed
 from tests.helpers import read_json, refusal, write
 from tests.launch.test_declare import TINY
@@ -82,7 +82,7 @@ def looked(check, runner):
             runner(left)
 
     check = replace(check, declaration=replace(check.declaration, time="2020-01-01T00:00:00Z"))
-    return list(check.checked(ask(check).answer(run)).verdicts)
+    return list(check.checked(sequential_test(check).answer(run)).verdicts)
 
 
 def test_a_clear_effect_ends_at_the_first_look_and_a_repeated_check_runs_nothing(tmp_path):
@@ -237,7 +237,7 @@ def test_check_judges_made_up_trials_and_their_archive_alike(
     runs, tmp_path, monkeypatch, said, refused
 ):
     runner = FakeRunner(noise=0.001)
-    monkeypatch.setattr("gsbench.verbs.claims.run_batch", runner)
+    monkeypatch.setattr("gsbench.verbs.check.run_batch", runner)
     path, archive, page = tmp_path / "claims.yaml", tmp_path / "a.zip", tmp_path / "page.html"
     write(path, content())
     out = said("check", path, "--dry-run")

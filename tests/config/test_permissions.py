@@ -12,8 +12,8 @@ import yaml
 from gsbench import cli
 from gsbench.app.command import compose_trials
 from gsbench.config.build import build
-from gsbench.config.command_words import value_text
 from gsbench.config.compose import Trial, compose_one
+from gsbench.config.overrides import value_text
 from gsbench.config.trust import ADDRESS_VARIABLES, check_permissions, foreign_address
 from gsbench.errors import InputError
 from gsbench.launch.record import add_to_plan
@@ -178,7 +178,7 @@ def test_no_file_of_a_stranger_decides_what_runs_and_where_results_go(
     for variable in ADDRESS_VARIABLES:
         monkeypatch.delenv(variable, raising=False)
     settings, said = STRANGE[case]
-    for function in ("verbs.ledger.run_trials", "app.command.run_batch", "verbs.claims.run_batch"):
+    for function in ("verbs.ledger.run_trials", "app.command.run_batch", "verbs.check.run_batch"):
         monkeypatch.setattr(f"gsbench.{function}", no_trial)
     commands = FILES[file](settings)
     for words in commands if case == "an address" else commands[:1]:

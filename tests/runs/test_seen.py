@@ -33,7 +33,7 @@ def test_each_result_is_recorded_once_with_its_first_time(tmp_path):
     "code, version",
     [
         ({"sources": {"mine": "a"}, "stages": {"train": 2}}, {"code of mine": "a"}),
-        ({"rooms": {"eval": "released", "densify": "b"}}, {"gsbench's densify": "b"}),
+        ({"packages": {"eval": "released", "densify": "b"}}, {"gsbench's densify": "b"}),
     ],
 )
 def test_a_version_is_of_what_a_user_may_edit(tmp_path, code, version):

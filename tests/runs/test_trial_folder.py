@@ -254,7 +254,7 @@ def test_pictures_are_sorted_by_name(trial):
         (("made_of", "stages", "train"), 1, r"stage train was 1, it is now \d"),
         (("made_of", "stages", "gone"), 3, "stage gone was 3, it is now none"),
         (("made_of", "stages"), {}, "stage scene was none, it is now 2"),
-        (("code",), {"rooms": {"train": "0" * 16}}, "gsbench's train was 00000000, it is now "),
+        (("code",), {"packages": {"train": "0" * 16}}, "gsbench's train was 00000000, it is now "),
         (("made_of", "pycolmap"), "0.1", r"pycolmap was 0\.1, it is now \d"),
         (("made_of", "sources"), {"/nowhere/a.png": [1, 2, 3]}, r"/nowhere/a\.png cannot be read"),
         (("made_of", "folders"), {"/nowhere": 1}, "files were added to /nowhere, or removed"),

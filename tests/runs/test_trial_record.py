@@ -6,16 +6,9 @@ from pathlib import Path
 import pytest
 
 from gsbench.parsing import DamagedError, parse_typed
-from gsbench.runs.trial_record import (
-    Failure,
-    Histogram,
-    MetricRecord,
-    UnfinishedError,
-    read_rows,
-    record_from,
-    split_text,
-    whole_lines,
-)
+from gsbench.runs.rows import Histogram, read_rows, whole_lines
+from gsbench.runs.trial_files import Failure
+from gsbench.runs.trial_record import MetricRecord, UnfinishedError, record_from, split_text
 from tests.trials import results_of, trial_values
 
 PATH = Path("results.json")
@@ -33,6 +26,12 @@ def test_only_results_of_renders_may_lack_the_number_of_gaussians():
     for evaluated_from in (None, "model"):
         with pytest.raises(DamagedError, match="num_gaussians is not there"):
             record(evaluated_from=evaluated_from, num_gaussians=None)
+
+
+@pytest.mark.parametrize("key", ["packages", "rooms"])  # the second in early files
+def test_the_states_of_packages_are_read_by_either_name(key):
+    code = record(code={key: {"train": "a" * 16}}).code
+    assert code.to_json() == {"packages": {"train": "a" * 16}}
 
 
 def test_unfinished_results_are_distinguished_from_damaged_ones():

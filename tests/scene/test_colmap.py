@@ -227,7 +227,9 @@ def test_each_file_of_a_model_with_rigs_is_checked_to_its_end(rigs, stem):
     check_model(rigs)
     (file,) = rigs.glob(f"{stem}.*")
     whole = file.read_bytes()
-    for torn in (whole[:-1], whole + b"\0") if file.suffix == ".bin" else (b"1 2", whole + b"\xff"):
+    many = struct.pack("<Q", 2**60) + whole[8:]  # a count that the file cannot hold
+    binary = file.suffix == ".bin"
+    for torn in (whole[:-1], whole + b"\0", many) if binary else (b"1 2", whole + b"\xff"):
         file.write_bytes(torn)
         with refusal(f"{file.name}: .*: copy or export it again"):
             check_model(rigs)

@@ -61,7 +61,7 @@ class Trainings:
 @pytest.fixture
 def trainings(monkeypatch, runs):
     made = Trainings()
-    monkeypatch.setattr(verb, "compose_trials", composed)
+    monkeypatch.setattr("gsbench.app.ledger_trials.compose_trials", composed)
     monkeypatch.setattr(verb, "run_trials", made)
     # The new seeds follow from all lines before, so from their times.
     monkeypatch.setattr(verb, "stamp_now", lambda: "2026-11-28T00:00:00Z")
@@ -247,10 +247,10 @@ def test_settings_that_are_no_idea_are_refused_and_leave_no_line(home, words, re
         (["seed=0"], "needs at least 2 seeds"),
         (["seed=0,1", "densify=adc,volumetric"], "one arm at a time"),
         (split("seed=0,1 --metric psmr"), "there is no such metric"),
-        (split("seed=0,1 --fdr 1"), "must be above 0 and below 1"),
-        (split("seed=0,1 --fdr 0"), "must be above 0 and below 1"),
-        (split("seed=0,1 --fdr 5%"), "must be above 0 and below 1, got '5%'"),
-        (split("seed=0,1 --ideas 0"), "must be a whole number from 1 to 10000"),
+        (split("seed=0,1 --fdr 1"), "must be a number in (0, 1)"),
+        (split("seed=0,1 --fdr 0"), "must be a number in (0, 1)"),
+        (split("seed=0,1 --fdr 5%"), "must be a number in (0, 1), got '5%'"),
+        (split("seed=0,1 --ideas 0"), "must be a whole number in [1, 10000]"),
         (["seed=0,1", "eval.primary=psnr"], "eval.primary follows from the ledger"),
         (["seed=0,1", "launch.wait=false"], "launch.wait=false"),
     ],

@@ -4,7 +4,7 @@ Whoever edits a densifier until its verdict pleases asks one question many times
 answer. So each further version has a smaller error rate.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -27,27 +27,23 @@ def measured_versions(
     they showed on other scenes or seeds says nothing about the present pairs. An edit that changed
     no result showed nothing new. An update of gsbench was no choice.
     """
-    places = set.intersection(*({one.as_seen.place for one in own} for own in (baseline, arm)))
+    places = {trial.as_seen.place for trial in baseline} & {trial.as_seen.place for trial in arm}
     results = [trial.as_seen for trial in (*arm, *of_same_arm(arm, older))]
-    results = [one for one in (*results, *earlier_results(arm, seen)) if one.place in places]
+    results = [
+        result for result in (*results, *earlier_results(arm, seen)) if result.place in places
+    ]
     versions: list[Mapping[Place, SeenResult]] = []
-    for same in group_by(results, lambda one: one.version).values():
-        found = {one.place: one for one in same}
-        if not any(map(_equal_to(found), versions)):
-            versions.append(found)
+    for same in group_by(results, lambda result: result.version).values():
+        made = {result.place: result for result in same}
+        if made and not any(_are_equal(made, known) for known in versions):
+            versions.append(made)
     return max(1, len(versions))
 
 
-def _equal_to(
-    one: Mapping[Place, SeenResult],
-) -> Callable[[Mapping[Place, SeenResult]], bool]:
-    """A function that tells whether other results have the same bits on all common places."""
-
-    def is_equal(other: Mapping[Place, SeenResult]) -> bool:
-        common = one.keys() & other.keys()
-        return bool(common) and all(one[place].has_bits_of(other[place]) for place in common)
-
-    return is_equal
+def _are_equal(one: Mapping[Place, SeenResult], other: Mapping[Place, SeenResult]) -> bool:
+    """Return whether results have the same bits on all common scenes and seeds."""
+    common = one.keys() & other.keys()
+    return bool(common) and all(one[place].has_bits_of(other[place]) for place in common)
 
 
 def earlier_results(arm: Sequence[TrialResult], seen: Iterable[SeenResult]) -> list[SeenResult]:
@@ -56,16 +52,16 @@ def earlier_results(arm: Sequence[TrialResult], seen: Iterable[SeenResult]) -> l
     These are all under its name, and those under other names that were measured before it: a later
     name never changes an earlier verdict.
     """
-    own = [trial.as_seen for trial in arm]
-    places, names = {one.place for one in own}, {one.name for one in own}
-    made = {one.arm for one in own} - {""}
+    present = [trial.as_seen for trial in arm]
+    places, names = {result.place for result in present}, {result.name for result in present}
+    made = {result.arm for result in present} - {""}
     first = min((trial.measured for trial in arm), default=0.0)
     return [
-        one
-        for one in seen
-        if one.place in places
-        and (one.arm in made if one.arm and made else one.name in names)
-        and (one.name in names or one.moment < first)
+        result
+        for result in seen
+        if result.place in places
+        and (result.arm in made if result.arm and made else result.name in names)
+        and (result.name in names or result.moment < first)
     ]
 
 
@@ -88,7 +84,7 @@ def measured_elsewhere(
 
     def results_of(other: str, arm: Sequence[TrialResult]) -> Iterable[SeenResult]:
         yield from recorded(other)
-        known = {(one.scene, one.name, one.seed) for one in recorded(other)}
+        known = {(result.scene, result.name, result.seed) for result in recorded(other)}
         for trial in arm:
             scene, name = trial.scene, f"{trial.init}-{trial.densify}"
             if (scene, name, trial.seed) in known:
@@ -101,16 +97,17 @@ def measured_elsewhere(
     others = [other for other in list_experiments(home.parent) if other != home.name]
     found: dict[Arm, list[str]] = {}
     for arm, trials in by_arm.items():
-        own = {trial.as_seen.place: trial.as_seen for trial in trials}
-        versions, names = {one.version for one in own.values()}, {one.name for one in own.values()}
-        made = {one.arm for one in own.values()} - {""}
+        here = {trial.as_seen.place: trial.as_seen for trial in trials}
+        versions = {result.version for result in here.values()}
+        names = {result.name for result in here.values()}
+        made = {result.arm for result in here.values()} - {""}
         for other in others if any(versions) else ():
             if any(
-                one.place in own
-                and (one.name in names or one.arm in made)
-                and one.version not in versions
-                and not one.has_bits_of(own[one.place])
-                for one in results_of(other, trials)
+                result.place in here
+                and (result.name in names or result.arm in made)
+                and result.version not in versions
+                and not result.has_bits_of(here[result.place])
+                for result in results_of(other, trials)
             ):
                 found.setdefault(arm, []).append(other)
     return found
@@ -128,7 +125,11 @@ def share_of_version(number: int) -> float:
 
 def of_same_arm(arm: Sequence[TrialResult], older: Iterable[TrialResult]) -> list[TrialResult]:
     """The trials of earlier code with the name and the swept settings of an arm."""
-    return [one for one in older if arm and arm[0].arm.has(f"{one.init}-{one.densify}", one.config)]
+    return [
+        trial
+        for trial in older
+        if arm and arm[0].arm.has(f"{trial.init}-{trial.densify}", trial.config)
+    ]
 
 
 def places_of(trials: Iterable[TrialResult]) -> set[tuple[str, int]]:

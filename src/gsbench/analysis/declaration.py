@@ -105,10 +105,12 @@ class ActiveDeclaration:
                 return replace(self, declared=kept).standing(baseline, arm, other_pair)
         first = min((trial.measured for trial in arm), default=math.inf)
         # times are whole seconds: a declaration of the arm's first second may be later
-        before = [one for one in self.records if one is self.records[0] or one.moment < first]
+        before = [
+            record for record in self.records if record is self.records[0] or record.moment < first
+        ]
         keys = {trial.key for trial in arm}
-        naming = [one for one in before if keys & one.planned.keys()] or before[:1]
-        in_looks = [one for one in naming if one.looks]
+        naming = [record for record in before if keys & record.planned.keys()] or before[:1]
+        in_looks = [record for record in naming if record.looks]
         of_baseline = {trial.key for trial in baseline}
 
         def asked_by(declarations: Iterable[Declaration]) -> list[tuple[Declaration, Question]]:
@@ -133,12 +135,12 @@ class ActiveDeclaration:
         paired = [trial for trial in arm if (trial.scene, trial.seed) in places]
         paired += [t for t in baseline if (t.scene, t.seed) in others and t.measured >= first]
         if before[-1].names_trials:
-            planned = reduce(merge_planned, (one.planned for one in before))
-            added = [one for one in paired if one.seed not in planned.get(one.key, ())]
+            planned = reduce(merge_planned, (record.planned for record in before))
+            added = [trial for trial in paired if trial.seed not in planned.get(trial.key, ())]
         else:
             # The record's file may be lost, and results repeat only its metric and time. Then every
             # trial that was measured after the next record with trials may have been added.
-            named = (one.moment for one in self.records if one.names_trials)
+            named = (record.moment for record in self.records if record.names_trials)
             next_record = min(named, default=math.inf)
             added = [one for one in paired if one.measured >= next_record]
         # An exploratory question has all looks that were ever planned for it: trials end at the
@@ -152,7 +154,7 @@ class ActiveDeclaration:
 
     def progress(self, trials: Sequence[TrialResult]) -> list[Note]:
         """A note on the declared trials that are missing; none if all are there."""
-        planned = reduce(merge_planned, (one.planned for one in self.declared))
+        planned = reduce(merge_planned, (declaration.planned for declaration in self.declared))
         done = {(trial.key, trial.seed) for trial in trials}
         replaced = {trial.key for trial in self.older}
         wanted = [
@@ -165,7 +167,11 @@ class ActiveDeclaration:
         missing = sum(one not in done for one in wanted)
         if not missing:
             return []
-        kind = "looks to come" if any(one.looks for one in self.declared) else "early look"
+        kind = (
+            "looks to come"
+            if any(declaration.looks for declaration in self.declared)
+            else "early look"
+        )
         return [Note.of(kind, missing=missing, declared=len(wanted))]
 
     def _is_replaced(self, key: str, seeds: Iterable[int], trials: Sequence[TrialResult]) -> bool:
@@ -179,9 +185,11 @@ class ActiveDeclaration:
             if not (config := next(filter(None, found), None)):
                 continue
             place = key.rpartition("/")[0]
-            same_arm = [one for one in trials if one.key.rpartition("/")[0] == place]
+            same_arm = [trial for trial in trials if trial.key.rpartition("/")[0] == place]
             text = settings_text(config)
-            return any(one.key != key and settings_text(one.config) == text for one in same_arm)
+            return any(
+                trial.key != key and settings_text(trial.config) == text for trial in same_arm
+            )
         return False
 
     def notes(self, name: str, doubted: bool) -> list[Note]:

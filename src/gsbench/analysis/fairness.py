@@ -22,7 +22,7 @@ from gsbench.analysis.differences import (
 from gsbench.analysis.notes import Note
 from gsbench.analysis.pairing import pair_trials
 from gsbench.analysis.quantities import COSTS, Reader, relative_change
-from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment
+from gsbench.analysis.results import Arm, TrialResult, group_by, read_experiment, trials_of
 from gsbench.analysis.table_formats import Column, Row, Table, TableEntry
 from gsbench.analysis.trial_settings import canonical
 from gsbench.gaussians.paper_values import PAPER_CAP
@@ -145,7 +145,7 @@ def fairness_table(
     """
     pairs = pair_trials(trials, first, second)
     compared = list(itertools.chain(*pairs)) or trials
-    groups = [[trial for trial in compared if trial.arm == arm] for arm in (first, second)]
+    groups = [trials_of(compared, arm) for arm in (first, second)]
     rows = [_row(what, list(map(show, groups))) for what, show in MEASURED.items()]
     configs = [
         (one.config, other.config) for one, other in compared_trials(compared, first, second)
@@ -274,7 +274,7 @@ def tuning_notes(
     unlike = tuning_note(trials, pair)
     notes = [unlike] if unlike else []
     for arm in pair:
-        own = [trial for trial in trials if trial.arm == arm]
+        own = trials_of(trials, arm)
         notes += [_search_note(own, name, record) for name, record in _searches(own[0]).items()]
         notes += _varied_settings([*trials, *older], own[0])
     return notes or [Note.of("no tuning")]
@@ -286,7 +286,7 @@ def tuning_note(trials: Sequence[TrialResult], pair: Sequence[Arm]) -> Note | No
     A search counts if its best point has exactly the arm's settings. Settings that were all run as
     arms are no search, since each has its own verdict.
     """
-    budgets = [_tuning_budget(next(trial for trial in trials if trial.arm == arm)) for arm in pair]
+    budgets = [_tuning_budget(trials_of(trials, arm)[0]) for arm in pair]
     if len(set(budgets)) < 2:
         return None
     each = [f"{arm} {budget}" for arm, budget in zip(pair, budgets, strict=True)]
@@ -315,6 +315,7 @@ def _searches(trial: TrialResult) -> dict[str, TuningRecord]:
     """
     arm, sweep = f"{trial.init}-{trial.densify}", trial.path.parents[2].name
     searches = {}
+    # Each search has an experiment of its own, and may be from before this sweep.
     for file in sorted(trial.path.parents[3].glob(f"*/{TUNING}")):
         search = read_if_sound(file, TuningRecord)
         if search is None or search.arm != arm:

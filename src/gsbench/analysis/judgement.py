@@ -213,6 +213,7 @@ def judge(
             return [trial for key in keys for trial in by_folder.get(key, [])]
         return [trial for arm in (question.baseline, question.arm) for trial in by_arm.get(arm, [])]  # type: ignore[arg-type]
 
+    # Pairs come first: which questions have any decides the size of a family, and so each test.
     unjudged = [
         _with_pairs(trials_of(question), question, declaration)
         for question in declaration.questions
@@ -236,12 +237,12 @@ def judge(
         else:
             candidates = max((_candidate_metrics(unjudged[k]) for k in family), default=1)
             differences = [unjudged[k].pairs.differences for k in family]
-            tests = [one for one in beside if one.paired]
-            known = [one.p for one in tests if one.p is not None]
+            tests = [other for other in beside if other.paired]
+            known = [test.p for test in tests if test.p is not None]
             answers = answer_family(differences, declaration.error_rate / candidates, known)
             asked = [unjudged[k].question for k in family]
-            arms = {str(one.arm) for one in asked if one.arm and not one.name}
-            named = tuple(sorted(arms | {str(one.arm) for one in tests}))
+            arms = {str(question.arm) for question in asked if question.arm and not question.name}
+            named = tuple(sorted(arms | {str(test.arm) for test in tests}))
             for k, answer in zip(family, answers, strict=True):
                 size = len(family) + len(tests)
                 own = replace(unjudged[k], family=size, family_arms=named)
@@ -402,9 +403,9 @@ def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
     question's own answer.
     """
     several = [
-        one.pairs.differences
-        for one in verdicts
-        if one.answer is not None and len(one.pairs.rows) > 1
+        verdict.pairs.differences
+        for verdict in verdicts
+        if verdict.answer is not None and len(verdict.pairs.rows) > 1
     ]
     answers = iter(
         answer_family([row[None] for differences in several for row in differences], level)
@@ -417,7 +418,7 @@ def _with_scenes(verdicts: Sequence[Verdict], level: float) -> list[Verdict]:
                 next(answers) if verdict.answer and len(verdict.pairs.rows) > 1 else verdict.answer
             )
             if answer is not None:
-                tested = row.scene not in {one.scene for one in verdict.lacking}
+                tested = row.scene not in {trial.scene for trial in verdict.lacking}
                 interval, p = (answer.interval, answer.p) if tested else (None, None)
                 scenes.append(
                     SceneVerdict(row.scene, answer.mean, verdict.pairs.seeds, interval, p)

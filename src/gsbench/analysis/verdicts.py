@@ -66,7 +66,7 @@ class PairVerdicts:
     def missing(self) -> Note | None:
         """The reason why the declared metric has no verdict, if it has none."""
         if self.declared is None or any(
-            one.quantity.key == self.declared.key for one in self.verdicts
+            verdict.quantity.key == self.declared.key for verdict in self.verdicts
         ):
             return None
         return next((note for note in self.notes if note.about == self.declared.name), None)
@@ -78,7 +78,7 @@ class PairVerdicts:
     @property
     def primary(self) -> tuple[Verdict, ...]:
         """The verdicts that are not secondary."""
-        return tuple(one for one in self.verdicts if not one.question.secondary)
+        return tuple(verdict for verdict in self.verdicts if not verdict.question.secondary)
 
 
 def judge_pairs(
@@ -101,8 +101,9 @@ def judge_pairs(
     standings: dict[ArmPair, Standing] = {}
     undirected: dict[ArmPair, list[Note]] = {}
     versions: dict[ArmPair, int] = {}
-    asked: list[Asked] = []
-    gone: list[tuple[Asked, OtherTest]] = []
+    asked: list[PairQuestion] = []
+    gone: list[tuple[PairQuestion, OtherTest]] = []
+    # All questions are collected before one is judged, since families span pairs.
     for pair in pairs:
         first, second = (by_arm.get(arm, []) for arm in pair)
         metrics = [
@@ -122,7 +123,7 @@ def judge_pairs(
         versions[pair] = measured_versions(first, second, older, seen)
         known = standings.get(pair)
         asked += [
-            Asked(pair, metric, _question(first, pair, metric, known), known, versions[pair])
+            PairQuestion(pair, metric, _question(first, pair, metric, known), known, versions[pair])
             for metric in directed
         ]
         if declared is not None:
@@ -162,7 +163,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
     if not lacking:
         return why
     reasons = [trial.unavailable.get(metric.key) for trial in lacking]
-    reason = next((short_reason(one) for one in reasons if one is not None), why.sentence)
+    reason = next((short_reason(text) for text in reasons if text is not None), why.sentence)
     if len(lacking) == len(trials):
         return Note.of("no value", reason=reason)
     arms = [str(arm) for arm in dict.fromkeys(trial.arm for trial in lacking)]
@@ -170,7 +171,7 @@ def _why_missing(trials: Sequence[TrialResult], metric: Quantity, verdict: Verdi
 
 
 @dataclass(frozen=True)
-class Asked:
+class PairQuestion:
     """A question about a pair of arms, with the standing of the declaration to it."""
 
     pair: ArmPair
@@ -201,8 +202,8 @@ class Asked:
 def _judge_families(
     by_arm: Mapping[Arm, Sequence[TrialResult]],
     trials: Sequence[TrialResult],
-    asked: Sequence[Asked],
-    gone: Sequence[tuple[Asked, OtherTest]],
+    asked: Sequence[PairQuestion],
+    gone: Sequence[tuple[PairQuestion, OtherTest]],
     lacking: Sequence[Unfinished],
 ) -> list[Verdict]:
     """Judge each family of questions: those of one declaration, or of one exploratory pair.
@@ -231,12 +232,14 @@ def _judge_families(
             if (named := own[0][1].declaration) is not None:
                 looks = declaration.looks
                 # an arm without any trial yet keeps its share of the error rate
-                asked_scenes = [one.scenes for one in questions]
+                asked_scenes = [question.scenes for question in questions]
                 waiting = [
-                    one for one in named.questions if looks and one.scenes not in asked_scenes
+                    question
+                    for question in named.questions
+                    if looks and question.scenes not in asked_scenes
                 ]
                 # a look's own questions wait already
-                others = [one for one in others if one.secondary or not looks]
+                others = [other for other in others if other.secondary or not looks]
                 declaration = replace(
                     declaration,
                     questions=(*questions, *waiting),
@@ -254,7 +257,7 @@ def _before_late_trials(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     standing: Standing | None,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions as they were before trials were added too late."""
     if standing is None or not standing.added:
         return []
@@ -262,9 +265,14 @@ def _before_late_trials(
     if not whole.beforehand:
         return []
     late = {(trial.scene, trial.seed) for trial in standing.added}
-    in_time = [one for one in arm if (one.scene, one.seed) not in late]
-    questions = [Asked(pair, one, _question(baseline, pair, one, whole), whole) for one in metrics]
-    return [(one, other_test([*baseline, *in_time], one.question)) for one in questions]
+    in_time = [trial for trial in arm if (trial.scene, trial.seed) not in late]
+    questions = [
+        PairQuestion(pair, metric, _question(baseline, pair, metric, whole), whole)
+        for metric in metrics
+    ]
+    return [
+        (question, other_test([*baseline, *in_time], question.question)) for question in questions
+    ]
 
 
 def _of_earlier_code(
@@ -273,13 +281,13 @@ def _of_earlier_code(
     baseline: Sequence[TrialResult],
     arm: Sequence[TrialResult],
     declared: ActiveDeclaration,
-) -> list[tuple[Asked, OtherTest]]:
+) -> list[tuple[PairQuestion, OtherTest]]:
     """The tests of a pair's questions with each earlier version of the arm's code.
 
     The new code is tested in another family.
     """
     found = []
-    old = [replace(one, variant=pair[1].variant) for one in of_same_arm(arm, declared.older)]
+    old = [replace(trial, variant=pair[1].variant) for trial in of_same_arm(arm, declared.older)]
     for version in group_by(old, lambda trial: frozenset(trial.code.items())).values():
         # the state when this version was trained
         first = min(trial.measured for trial in version)
@@ -290,12 +298,13 @@ def _of_earlier_code(
         )
         standing = known.standing(baseline, version)
         questions = [
-            Asked(pair, one, _question(baseline, pair, one, standing), standing) for one in metrics
+            PairQuestion(pair, metric, _question(baseline, pair, metric, standing), standing)
+            for metric in metrics
         ]
         found += [
-            (one, other_test([*baseline, *version], one.question))
-            for one in questions
-            if one.declaration is not None
+            (question, other_test([*baseline, *version], question.question))
+            for question in questions
+            if question.declaration is not None
         ]
     return found
 

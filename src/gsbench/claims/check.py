@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gsbench.analysis.comparison import unused_trials
 from gsbench.analysis.judgement import Verdict, judge
-from gsbench.analysis.notes import Note
+from gsbench.analysis.notes import Note, texts
 from gsbench.analysis.pairing import Pairs
 from gsbench.analysis.quantities import asked_quantity
 from gsbench.analysis.results import read_experiment
@@ -31,7 +31,7 @@ from gsbench.runs.experiments import (
     read_declarations,
 )
 from gsbench.runs.layout import FAILED, SEED
-from gsbench.runs.trial_record import Failure
+from gsbench.runs.trial_files import Failure
 from gsbench.words import some_of, without_folders
 
 # a line for each thing that these trials need and lack
@@ -58,14 +58,15 @@ class ClaimVerdict:
         verdict = self.verdict
         if verdict.untestable:
             return reason(verdict)
-        parts = [f"{self.claim.arm} against {self.claim.baseline}: {in_words(verdict)}"]
+        notes = []
         if verdict.outcome == SUPPORTED and not self._by_least():
-            parts.append(f"by {self.claim.effect} or more is not shown")
+            notes.append(Note.of("least not shown", effect=self.claim.effect))
         if not verdict.final:
-            parts.append("the next look waits for trials that are missing")
+            notes.append(Note.of("look waits"))
         if self.failed:
-            parts.append(f"failed: {some_of(list(self.failed))}")
-        return "; ".join(parts)
+            notes.append(Note.of("failed", reasons=self.failed))
+        words = f"{self.claim.arm} against {self.claim.baseline}: {in_words(verdict)}"
+        return "; ".join([words, *texts(notes)])
 
     def _by_least(self) -> bool:
         """Return whether the difference is shown to be the least that matters, or more."""
@@ -118,7 +119,9 @@ class Check:
     def checked(self, judged: Sequence[Verdict]) -> Checked:
         """All claims in the order of the file, with the reasons why trials failed."""
         verdicts = claim_verdicts(self.file, self.declaration, judged)
-        verdicts = [replace(one, failed=tuple(self._failures(one.verdict))) for one in verdicts]
+        verdicts = [
+            replace(verdict, failed=tuple(self._failures(verdict.verdict))) for verdict in verdicts
+        ]
         unused = unused_trials(read_experiment(self.home).trials, judged)
         declarations = read_declarations(self.home)
         return Checked(self.file, verdicts, self.declaration, declarations, unused)
@@ -156,7 +159,7 @@ def prepare(
             for arm in (claim.baseline, claim.arm):
                 own = file.words(claim, scene, arm)
                 words = (*own, f"name={file.name}", "seed=0", *permissions)
-                if words not in composed:
+                if words not in composed:  # claims share scenes and arms
                     where = f"claim {claim.id}, scene {scene}, arm {arm}"
                     composed[words] = _compose(words, permissions, runs, where)
                 trials.append(composed[words])
@@ -216,7 +219,11 @@ def recheck(file: ClaimsFile, archive: Path, folder: Path) -> Checked:
     experiment = unpack_archive(archive, folder)
     if experiment.name != file.name:
         raise InputError(f"{archive} is of the experiment {experiment.name}, not of {file.name}")
-    declarations = [one for one in read_declarations(experiment.folder) if one.kind == "claims"]
+    declarations = [
+        declaration
+        for declaration in read_declarations(experiment.folder)
+        if declaration.kind == "claims"
+    ]
     if not declarations:
         raise InputError(
             f"{archive}: it declares no claims, so it is not an archive of a gsbench check"

@@ -86,9 +86,9 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
 
     ``pictures`` adds those of the test views. Raises InputError if no trial can be exported.
     """
-    kept, rows, left_out = [], [], list(experiment.warnings)
-    unfinished, experiment = [*experiment.lacking], newest_code(experiment)
-    older = {trial.path for trial in experiment.older}
+    left_out, unfinished = list(experiment.warnings), [*experiment.lacking]
+    experiment = newest_code(experiment)
+    kept, rows = list[TrialResult](), list[dict[str, Any]]()
     # {configuration as JSON: (folder, seed) of its trials}
     configurations: dict[str, list[tuple[str, int]]] = {}
     # results of earlier code were seen, so a declaration after it is late
@@ -105,6 +105,7 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
         kept.append(trial)
     if not kept:
         raise InputError(f"{experiment.name} has no whole trial to export (first: {left_out[0]})")
+    older = {trial.path for trial in experiment.older}
     contents = {
         TRIALS: _json_lines(
             {"folder": _folder(trial.path), "results": _results(trial)}
@@ -126,22 +127,24 @@ def write_archive(experiment: Experiment, out: Path, pictures: bool = False) -> 
             for path in trial.folder.pictures(kind):
                 contents[f"{place}/{path.name}"] = read_bytes(path)
     check_size(sum(map(len, contents.values())))
-    manifest = {
-        "format": FORMAT,
-        "version": VERSION,
-        "experiment": experiment.name,
-        "gsbench": __version__,
-        "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
-    }
-    contents[MANIFEST] = _page(manifest)
-    sizes = {name: len(content) for name, content in contents.items()}
-    # The description of the crate comes first, where other programs look for it.
-    contents = {CRATE: _page(crate_metadata(experiment.name, kept, sizes))} | contents
-    with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, content in contents.items():
-            info = zipfile.ZipInfo(name, FIXED_DATE)
-            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
+    _write_zip(out, experiment.name, kept, contents)
     return left_out
+
+
+def _write_zip(
+    out: Path, name: str, trials: Sequence[TrialResult], contents: dict[str, bytes]
+) -> None:
+    """Write the archive of these ``contents`` by name, with its manifest and its description."""
+    digests = {file: hashlib.sha256(content).hexdigest() for file, content in contents.items()}
+    manifest = {"format": FORMAT, "version": VERSION, "experiment": name}
+    contents = contents | {MANIFEST: _page(manifest | {"gsbench": __version__, "sha256": digests})}
+    sizes = {file: len(content) for file, content in contents.items()}
+    # The description of the crate comes first, where other programs look for it.
+    contents = {CRATE: _page(crate_metadata(name, trials, sizes))} | contents
+    with atomic(out, sync=False) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for file, content in contents.items():
+            info = zipfile.ZipInfo(file, FIXED_DATE)
+            archive.writestr(info, content, zipfile.ZIP_DEFLATED, compresslevel=9)
 
 
 def _declared(home: Path, trials: Sequence[TrialResult]) -> dict[str, bytes]:

@@ -24,7 +24,7 @@ from gsbench.analysis.quantities import COSTS, relative_change
 from gsbench.analysis.results import Arm, TrialResult
 from gsbench.analysis.statistics import REFUTED, SUPPORTED, TOO_SMALL
 from gsbench.analysis.verdict_words import least_words, reason, with_notes
-from gsbench.claims.stopping import Asked
+from gsbench.claims.stopping import SequentialTest
 from gsbench.errors import InputError
 from gsbench.runs.experiments import Declaration, Question
 from gsbench.runs.ledger import (
@@ -86,7 +86,7 @@ def level_of_test(rate: float, ideas: int, number: int, kept: int) -> float:
     The weights ``1 / number`` give the first tests more than equal weights would: few ideas of the
     planned ones pass on to a test, and each kept one raises the levels after it.
     """
-    return rate * (kept + 1) / number / sum(1 / one for one in range(1, ideas + 1))
+    return rate * (kept + 1) / number / sum(1 / test for test in range(1, ideas + 1))
 
 
 def _new_seeds(ledger: Ledger, idea: str) -> tuple[int, ...]:
@@ -169,9 +169,9 @@ def _question(
     )
 
 
-def ask_idea(declaration: Declaration, read: Callable[[], Iterable[TrialResult]]) -> Asked:
+def ask_idea(declaration: Declaration, read: Callable[[], Iterable[TrialResult]]) -> SequentialTest:
     """The question of an idea; it ends also as soon as the idea is given up."""
-    return Asked(declaration, read, lambda verdicts: result_of(verdicts[0]) != UNDECIDED)
+    return SequentialTest(declaration, read, lambda verdicts: result_of(verdicts[0]) != UNDECIDED)
 
 
 def result_of(verdict: Verdict) -> Result:
@@ -214,11 +214,11 @@ def end_of(idea: str, verdict: Verdict, time: str, tested: bool = True) -> Ended
 
 def confirmed(number: int, verdicts: Sequence[Verdict], time: str) -> Confirmed:
     """The ledger's entry for the verdicts of the confirmation ``number``."""
-    differences = {one.question.name: difference_of(one) for one in verdicts}
+    differences = {verdict.question.name: difference_of(verdict) for verdict in verdicts}
     return Confirmed(
         time=time,
         number=number,
-        results={one.question.name: result_of(one) for one in verdicts},
+        results={verdict.question.name: result_of(verdict) for verdict in verdicts},
         differences={idea: one for idea, one in differences.items() if one is not None},
     )
 
@@ -235,30 +235,27 @@ def unused(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
     declarations = [screening_of(ledger, idea) for idea in ledger.started]
     declarations += [test_of(ledger, idea) for idea in ledger.tests]
     declarations += [confirmation_of(ledger.opened, asked) for asked, _ in ledger.confirmations]
-    verdicts = [verdict for one in declarations for verdict in judge(trials, one)]
+    verdicts = [verdict for declaration in declarations for verdict in judge(trials, declaration)]
     return unused_trials(trials, verdicts)
 
 
-def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[str]:
-    """A line for each idea whose recorded result is not what its trials show.
+def contradictions(ledger: Ledger, trials: Sequence[TrialResult]) -> list[Note]:
+    """A note for each idea whose recorded result is not what its trials show.
 
     It is judged again from the seeds that it was decided by, if all its trials are still there.
     """
-    lines = []
+    notes = []
     for idea, ended in ledger.ended.items():
         if ended.result == FAILED:
             continue
         declaration = (test_of if idea in ledger.tests else screening_of)(ledger, idea)
         seeds = declaration.questions[0].seeds[: ended.seeds]
-        own = [trial for trial in trials if trial.seed in seeds]
-        (verdict,) = ask_idea(declaration, own.copy).judged()
+        counting = [trial for trial in trials if trial.seed in seeds]
+        (verdict,) = ask_idea(declaration, counting.copy).verdicts()
         now = result_of(verdict)
         if verdict.pairs.seeds == ended.seeds and now != ended.result:
-            lines.append(
-                f"{idea}: the ledger says {ended.result}, but its trials say {now}: one of them "
-                "was edited"
-            )
-    return lines
+            notes.append(Note.of("contradiction", idea=idea, recorded=ended.result, now=now))
+    return notes
 
 
 def check_unknown_trials(ledger: Ledger, trials: Sequence[TrialResult]) -> None:

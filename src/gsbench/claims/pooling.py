@@ -155,6 +155,7 @@ def pool_sources(
         except InputError as error:
             faults.append(f"left out: {error}")
             continue
+        # An archive under two names, or exported again with more trials, is no further study.
         if twice := marks & seen.keys():
             faults.append(
                 f"left out: {source} has trials that {seen[min(twice)]} has, and they would count "
@@ -263,8 +264,8 @@ def _arm_pairs(
 
 def _budgets(trials: Sequence[TrialResult], pairs: Sequence[tuple[Arm, Arm]]) -> str:
     """``20,000 Gaussians (governor)``: the limits on growth in these pairs of arms."""
-    own = [trial for trial in trials if any(trial.arm in pair for pair in pairs)]
-    return " or ".join(sorted({budget_words(trial) or "not known" for trial in own}))
+    of_arms = [trial for trial in trials if any(trial.arm in pair for pair in pairs)]
+    return " or ".join(sorted({budget_words(trial) or "not known" for trial in of_arms}))
 
 
 def _size(trials: Sequence[TrialResult]) -> str:

@@ -112,9 +112,9 @@ def foreign_address(tracking: Mapping[str, Any], allowed: Sequence[str]) -> str:
 
     The user's own are those ``allowed`` on the command line, and those in the environment.
     """
-    own = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
+    known = {*allowed, *map(os.environ.get, ADDRESS_VARIABLES)}
     given = (str(value) for key, value in tracking.items() if value and _is_place(key, str(value)))
-    return next((address for address in given if address not in own), "")
+    return next((address for address in given if address not in known), "")
 
 
 def _is_place(key: str, value: str) -> bool:

@@ -2,17 +2,10 @@
 
 from gsbench.densify.adc import ADC
 from gsbench.densify.adc_variants import AbsGS, PixelGS, QuantileADC, ResGS, SteepGS
-from gsbench.densify.base import (
-    Densifier,
-    DensifyContext,
-    Lineage,
-    NoDensifier,
-    Refinement,
-    Rule,
-    Statistic,
-)
+from gsbench.densify.base import Densifier, DensifyContext, NoDensifier, Refinement, Rule, Statistic
 from gsbench.densify.budget import Budgeted
 from gsbench.densify.improved_gs import GNS, EdgeAware, LongAxis
+from gsbench.densify.lineage import Lineage
 from gsbench.densify.mcmc import MCMC, MRNF
 from gsbench.densify.scored import FastGS, Taming
 from gsbench.densify.scores import TrainingViews

@@ -11,16 +11,9 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
-from gsbench.densify.base import (
-    NEVER,
-    Refinement,
-    Rule,
-    Statistic,
-    faded,
-    quantile,
-    standard_normal,
-)
+from gsbench.densify.base import NEVER, Refinement, Rule, Statistic
 from gsbench.densify.budget import admit
+from gsbench.densify.formulas import faded, quantile, standard_normal
 from gsbench.errors import InputError
 from gsbench.events import Cause
 from gsbench.gaussians.model import Gaussians

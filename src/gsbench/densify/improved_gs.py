@@ -13,7 +13,8 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from gsbench.densify.adc import ADC, OPACITY_RESET, Grown
-from gsbench.densify.base import DensifyContext, Refinement, Rule, faded, quantile
+from gsbench.densify.base import DensifyContext, Refinement, Rule
+from gsbench.densify.formulas import faded, quantile
 from gsbench.densify.scores import by_mean, draw, draw_views, edge_scores
 from gsbench.gaussians.model import Gaussians
 from gsbench.raster.base import RenderOutput

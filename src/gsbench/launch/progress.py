@@ -16,8 +16,8 @@ from gsbench.errors import InputError
 from gsbench.launch.states import TrialState, names_of, states_of_experiment
 from gsbench.runs.experiments import experiment_home
 from gsbench.runs.layout import CURVES
+from gsbench.runs.rows import read_rows
 from gsbench.runs.trial_folder import TrialFolder
-from gsbench.runs.trial_record import read_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,6 +73,7 @@ def progress_frame(runs: Path, experiment: str) -> pd.DataFrame:
 
 def progress_of(home: Path) -> Progress:
     """The progress of the experiment in ``home``, from its files."""
+    # A superseded trial will never be done, so with it no sweep would end.
     states = [state for state in states_of_experiment(home) if state.state != "superseded"]
     names = names_of(states)
     cells: dict[Name, dict[str, int]] = {

@@ -48,7 +48,9 @@ from gsbench.runs import keys, layout
 from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.runs.experiments import read_declarations
 from gsbench.runs.nested import flatten, sha256_of
+from gsbench.runs.rows import read_rows
 from gsbench.runs.store import Store, StoredResult, read_manifest
+from gsbench.runs.trial_files import Failure
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import (
     FROM_MODEL,
@@ -59,11 +61,9 @@ from gsbench.runs.trial_record import (
     Code,
     Declared,
     Evaluation,
-    Failure,
     Training,
     TrialRecord,
     TwinViews,
-    read_rows,
     split_text,
 )
 from gsbench.runs.user_code import user_modules
@@ -374,7 +374,7 @@ def results_of(
         code=Code(
             sources=user_modules(values),
             stages={stage.name: stage.version for stage in keys.STAGES},
-            rooms=dict(sorted(code.items())),
+            packages=dict(sorted(code.items())),
             **training.checkout,
         ),
         versions=versions(),

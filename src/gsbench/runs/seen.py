@@ -121,7 +121,7 @@ def remember(home: Path, record: TrialRecord) -> None:
     require_no_links(home.parent, path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with hold(path.with_name(f".{home.name}.lock"), "the record of what was measured"):
-        if any(replace(one, time=result.time) == result for one in read_seen(home)):
+        if any(replace(known, time=result.time) == result for known in read_seen(home)):
             return
         text = path.read_text(errors="replace") if path.exists() else ""
         line = json.dumps(replace(result, time=result.time or stamp_now()).to_json())

@@ -156,8 +156,8 @@ def judge(experiment: Experiment, files: Sequence[Path]) -> None:
             raise InputError(
                 f"{file}: this person handed in other votes before, which stay ({place})"
             )
-    for folder, (key, own) in new.items():
-        store_ballots(folder, key, own)
+    for folder, (key, handed_in) in new.items():
+        store_ballots(folder, key, handed_in)
     verdicts = load_rounds(experiment.folder)
     if not verdicts:
         raise InputError(
