@@ -14,6 +14,7 @@ from gsbench.runs.experiments import QUESTIONS, Arm, trial_key, unix_time
 from gsbench.runs.freshness import Change, Part, code_changes, code_of, present_version
 from gsbench.runs.layout import RESULTS
 from gsbench.runs.nested import SHOWN
+from gsbench.runs.seen import SeenResult
 from gsbench.runs.trial_folder import TrialFolder
 from gsbench.runs.trial_record import FROM_RENDERS, TrialRecord, split_text
 from gsbench.system.machine import kind_of_machine
@@ -107,6 +108,11 @@ class TrialResult:
     def code(self) -> dict[Part, str]:
         """The versions of the code that made the trial; empty if another program made it."""
         return code_of(self.record.code)
+
+    @cached_property
+    def as_seen(self) -> SeenResult:
+        """The result as the record of what was ever measured has it."""
+        return SeenResult.of(self.record)
 
     @property
     def code_texts(self) -> list[str]:
