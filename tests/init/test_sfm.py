@@ -40,7 +40,6 @@ def shared(courtyard, told, tmp_path_factory):
     return Sfm().run(courtyard, output, lambda *state: told.append(state[:3])), output
 
 
-@pytest.mark.slow
 def test_own_poses_agree_with_the_exact_ones(own):
     report, _ = own
     assert report.num_registered == report.num_images == 8
