@@ -3,6 +3,7 @@
 import ast
 import os
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -46,12 +47,17 @@ STARTERS = {
 }
 
 
+parse = cache(ast.parse)
+
+
 def starts_of(text):
     """Where a module mentions what starts processes: {(function, name): [call or None]}."""
     found = {}
-    tree = ast.parse(text)
+    if not any(f"{module}." in text for module in STARTERS):
+        return found
+    tree = parse(text)
     parents = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
-    for node in ast.walk(tree):
+    for node in parents:
         if not isinstance(node, ast.Attribute):
             continue
         module, _, name = ast.unparse(node).partition(".")
@@ -76,7 +82,7 @@ def _starts(name):
 
 def hidden_names(text):
     """The imports by which a module could start processes unseen by `starts_of`."""
-    tree = ast.parse(text)
+    tree = parse(text)
     blocks = (node for node in ast.walk(tree) if isinstance(node, ast.If))
     for_types = (node for node in blocks if ast.unparse(node.test) == "TYPE_CHECKING")
     unseen = {part for block in for_types for part in ast.walk(block)}

@@ -146,7 +146,7 @@ class TrialResult:
     def measured(self) -> float:
         """The Unix time of measuring the metrics; if unrecorded, that of finishing the trial."""
         moment = unix_time(self.record.measured)
-        return min(int(self.finished) if moment is None else moment, self.known - 1)
+        return min(self.finished if moment is None else moment, self.known - 1)
 
     @cached_property
     def conditions(self) -> Mapping[str, str]:

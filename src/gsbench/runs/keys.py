@@ -65,7 +65,7 @@ CAPTURE = Stage("scene", 2)
 INIT = Stage("init", 4, resumable=True)
 TRAIN = Stage("train", 3, resumable=True, scratch=("checkpoint-*.pt",))
 GROUND_TRUTH = Stage("ground_truth", 1)
-EVALUATE = Stage("evaluate", 2)
+EVALUATE = Stage("evaluate", 3)
 
 STAGES = (CAPTURE, INIT, TRAIN, GROUND_TRUTH, EVALUATE)
 
