@@ -21,7 +21,7 @@ STARTS = {
     ("external/program.py", "watch", "subprocess.Popen"): "own",
     ("launch/slurm.py", "make_executor", "submitit.SlurmExecutor"): "current",
     ("launch/jobs.py", "run_local", "submitit.LocalExecutor"): "current",
-    ("pipeline/steps/train.py", "check_version", "subprocess.run"): "own",
+    ("pipeline/steps/external.py", "check_version", "subprocess.run"): "own",
     ("system/install.py", "run_git", "subprocess.run"): "neutral",
     ("system/isolate.py", "_run_child", "subprocess.Popen"): "current",
     ("system/isolate.py", "continue_in_child", "os.fork"): "current",

@@ -33,6 +33,7 @@ from gsbench.normalization import Normalization
 from gsbench.parsing import read_json, read_typed
 from gsbench.pipeline.parts import Parts
 from gsbench.pipeline.steps.evaluate import evaluate_step
+from gsbench.pipeline.steps.external import external_step
 from gsbench.pipeline.steps.scene import (
     CaptureSource,
     Views,
@@ -43,7 +44,7 @@ from gsbench.pipeline.steps.scene import (
     normalized_capture,
     normalizing_step,
 )
-from gsbench.pipeline.steps.train import external_step, train_step
+from gsbench.pipeline.steps.train import train_step
 from gsbench.runs import keys, layout
 from gsbench.runs.config_hash import arm_hash, config_hash
 from gsbench.runs.experiments import read_declarations

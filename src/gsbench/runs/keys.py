@@ -85,7 +85,7 @@ CODE_OF_STAGE = {
         "weights.py",
         "pipeline/steps/scene.py",
     ),
-    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py"),
+    "train": (*MODEL, *LOSS, "external", "pipeline/steps/train.py", "pipeline/steps/external.py"),
     "ground_truth": ("scene", "normalization.py", "pipeline/steps/scene.py"),
     "evaluate": (*MODEL, "eval", "weights.py", "pipeline/steps"),
 }
