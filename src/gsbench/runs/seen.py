@@ -1,4 +1,4 @@
-"""What was ever measured in an experiment: ``<runs>/.seen/<experiment>.jsonl``, one result a line.
+"""The results that were ever measured in an experiment: ``<runs>/.seen/<experiment>.jsonl``.
 
 A line is added before ``results.json`` is written, and stays. So an arm's earlier code counts as
 seen, although its results were removed or overwritten, or the arm was renamed.

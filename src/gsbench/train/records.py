@@ -1,4 +1,4 @@
-"""What a training writes down: losses, histograms of volumes, and lines of its JSON-lines files."""
+"""Records of a training: losses, histograms of volumes, and lines of its JSON-lines files."""
 
 import json
 import math
